@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data import MatchTable
-from bayesdist.diagnose.residuals.misfit import STARS_PER_BIN
-from bayesdist.diagnose.statistics import (
-    BandBins,
+from bayesdist.diagnose.residuals import (
+    BinnedSums,
     PatternChange,
     StatisticsTable,
     band_bins,
     pattern_changes,
     period_table,
 )
+from bayesdist.diagnose.residuals.misfit import STARS_PER_BIN
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import LinearFit, Matches
 from bayesdist.infer.compare.period_dates import sum_by_period
@@ -84,7 +84,7 @@ class PeriodPart:
     Parameters
     ----------
     sums : PeriodSums
-    bins : tuple of BandBins
+    bins : tuple of BinnedSums
         Residuals about the fit of all data, of each chip.
     n_rows : int
         Pairs, those included that the fit leaves out.
@@ -93,7 +93,7 @@ class PeriodPart:
     """
 
     sums: PeriodSums
-    bins: tuple[BandBins, ...]
+    bins: tuple[BinnedSums, ...]
     n_rows: int
     stars: Int
 
@@ -303,7 +303,7 @@ def time_variation(
 
 
 def _residuals(
-    periods: Mapping[str, BandBins],
+    periods: Mapping[str, BinnedSums],
     unit: str,
     unit_arcsec: float | None,
     rng: np.random.Generator,
@@ -314,10 +314,9 @@ def _residuals(
     together = sum(others, start=one)
     rows = {COMBINED: together, **periods}
     # of a part of the stars the model of all takes out the same part of its coefficients
-    n_all = float(together.axes.count.sum())
+    n_all = float(together.count.sum())
     absorbed = {
-        name: max(1, round(n_terms * float(one.axes.count.sum()) / n_all))
-        for name, one in rows.items()
+        name: max(1, round(n_terms * float(one.count.sum()) / n_all)) for name, one in rows.items()
     }
     table = period_table(rows, rng=rng, arcsec_per_pixel=unit_arcsec or 1.0, absorbed=absorbed)
     return table if unit_arcsec else replace(table, unit=unit)

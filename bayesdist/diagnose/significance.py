@@ -1,11 +1,12 @@
-"""Probabilities of what is found by chance: in words, and corrected for the number of tests."""
+"""Probabilities of what is found by chance, in words and corrected for the number of tests."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import beta, chi2
 
-__all__ = ["LEAST_P", "holm", "p_words"]
+__all__ = ["chi_square_of", "holm", "hotelling_p", "p_words"]
 
 Float = NDArray[np.float64]
 
@@ -44,3 +45,37 @@ def holm(p_values: ArrayLike) -> Float:
     steps = np.arange(len(p), 0, -1) * p[order]
     out[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
     return out
+
+
+def hotelling_p(statistic: float, dof: float, n: float) -> float:
+    """Probability of a larger chi-square whose covariance is the sum of squares of n vectors.
+
+    For squares about zero (Hotelling 1931).
+
+    Parameters
+    ----------
+    statistic : float
+    dof : float
+        Directions.
+    n : float
+        Stars, or other vectors that are independent of each other.
+
+    Returns
+    -------
+    float
+    """
+    return float(beta.sf(min(statistic / n, 1.0), dof / 2, max(n - dof, 1) / 2))
+
+
+def chi_square_of(p: float, dof: float) -> float:
+    """Chi-square of a probability, for sums of tests that have other distributions.
+
+    Parameters
+    ----------
+    p, dof : float
+
+    Returns
+    -------
+    float
+    """
+    return float(chi2.isf(max(p, LEAST_P), dof))

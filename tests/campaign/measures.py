@@ -14,7 +14,8 @@ from bayesdist.data import MatchTable
 from bayesdist.infer import fit_by_magnitude
 from bayesdist.infer.nodes import TableFit, TablePosterior, fit_with_tables
 from bayesdist.infer.series import Series, TrendModel, fit_series
-from bayesdist.infer.transforms import Solution, View, lines, reference_gauge, without_frames
+from bayesdist.infer.solution import Solution, TransformedSolution
+from bayesdist.infer.transforms import lines, reference_gauge, without_frames
 from bayesdist.missions.acs.simulate.pointings import SPANS
 from bayesdist.missions.acs.simulate.stars import centroid_error
 from bayesdist.model import corrected
@@ -112,12 +113,12 @@ def node_errors(found: Calibrated, tables: TableFit, step: float) -> Outcome:
         "rms after": tables.progress[-1].rms,
         "rms noise": _noise(found),
     }
-    session = found.session
-    pairs = session.pairs
+    pairs = found.matched.stars
+    model = found.matched.affine_model(found.results.config)
     assert isinstance(pairs, MatchTable)
-    _, with_errors, _ = fit_by_magnitude(pairs, session.plain_model)
+    _, with_errors, _ = fit_by_magnitude(pairs, model)
     assert isinstance(with_errors, MatchTable)
-    binned = fit_with_tables(with_errors, session.plain_model, method="binned", step=(step, step))
+    binned = fit_with_tables(with_errors, model, method="binned", step=(step, step))
     others = {table.chip: table for table in binned.tables}
     for posterior in tables.posteriors:
         table = posterior.table
@@ -137,7 +138,7 @@ def node_errors(found: Calibrated, tables: TableFit, step: float) -> Outcome:
 
 def _noise(found: Calibrated) -> float:
     """Rms of the errors of centroids and catalogue, as they were drawn, of all pairs."""
-    pairs = found.session.pairs
+    pairs = found.matched.stars
     assert isinstance(pairs, MatchTable) and pairs.star is not None
     assert pairs.sigma_u is not None and pairs.sigma_v is not None
     single = centroid_error(found.campaign.truth.stars.mag[pairs.star])
@@ -180,7 +181,7 @@ def position_errors(found: Calibrated, tables: TableFit, rng: np.random.Generato
 
 
 def _position(
-    view: View,
+    view: TransformedSolution,
     found: Calibrated,
     posterior: TablePosterior,
     x: np.ndarray,
@@ -188,7 +189,7 @@ def _position(
     where: dict[str, Any],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions (N, 2) and their covariance (N, 2, 2)."""
-    px, py = corrected(found.session.tables, x, y, chip=where["chip"])
+    px, py = corrected(found.results.fitted.tables.tables, x, y, chip=where["chip"])
     D = view.model.jacobian(view.mean, px, py, **where)
     J = view.model.slopes(view.mean, px, py, **where)
     table = posterior.position_sigma(x, y, refitted=True) ** 2
@@ -244,7 +245,7 @@ def alignments(found: Calibrated) -> Outcome:
 
 def _calibrations(found: Calibrated) -> dict[str, Callable[..., np.ndarray]]:
     """Positions (N, 2) of x, y, chip and epoch by three calibrations."""
-    truth, tables = found.campaign.truth, found.session.tables
+    truth, tables = found.campaign.truth, found.results.fitted.tables.tables
     view = reference_gauge(without_frames(found.joint), REFERENCE)
 
     def new(x: np.ndarray, y: np.ndarray, chip: np.ndarray, epoch: float) -> np.ndarray:

@@ -48,7 +48,7 @@ def test_a_gap_that_opens_is_found(frames):
 
 def test_a_chip_that_turns_is_found():
     gap = [Dated(turn=TURNING).of_time(k)["gap"] for k in FEW]
-    assert all("in rotation" in one.present for one in gap)
+    assert all("in rotation" in one.family.present for one in gap)
     assert np.median([one.p_value for one in gap]) < 1e-4
     assert np.median([one.size for one in gap]) == pytest.approx(TURNING, rel=0.15)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from bayesdist.diagnose.statistics import (
+from bayesdist.diagnose.residuals import (
     WISE_ARCSEC,
     band_bins,
     band_to_band_table,

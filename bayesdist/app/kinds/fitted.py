@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.exposures import FIT_AGAIN, ExposureScatter, write_hierarchy, write_series
-from bayesdist.app.kinds.matched import Matched, Prepared
 from bayesdist.app.kinds.table_file import StoredLookupTables, write_tables
 from bayesdist.app.selfcal.solved import SelfCalibrated
 from bayesdist.data.matches import MatchTable
@@ -64,15 +63,13 @@ class Fitted:
     solved: SelfCalibrated | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
 
-    def prepared(self, matched: Matched) -> Prepared:
-        """Stars as the fit took them: where its tables move them, with its errors."""
-        if self.solved is not None:
-            return Prepared(self.solved.matches)
-        held = None if matched.held is None else self.errors.applied(self.placed(matched.held))
-        return Prepared(self.errors.applied(self.placed(matched.stars)), held)
-
     def placed(self, stars: Matches) -> Matches:
-        """Stars at the pixels that the tables move them to, on their chips, with quoted errors."""
+        """Stars at the pixels that the tables move them to, on their chips, with quoted errors.
+
+        Of a self-calibration they are the detections beside the stars as they were solved.
+        """
+        if self.solved is not None:
+            return self.solved.matches
         if not self.tables.tables or not isinstance(stars, MatchTable):
             return stars
         return on_the_chips(corrected_matches(self.tables.tables, stars), self.linear.model)

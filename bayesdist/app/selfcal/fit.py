@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.errors import ErrorLaw, read_magnitude_errors
+from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import FIT, Fitted, required
 from bayesdist.app.selfcal.gauge import fixed_by, gauge_summary
 from bayesdist.app.selfcal.matched import SelfcalMatched
@@ -94,7 +95,7 @@ def load_fitted_selfcal(
 
 
 def sample_detections(
-    fitted: Fitted,
+    data: FitData,
     config: Config,
     *,
     folder: Path | None = None,
@@ -104,7 +105,7 @@ def sample_detections(
 
     Parameters
     ----------
-    fitted : Fitted
+    data : FitData
         Of a self-calibration.
     config : Config
     folder : Path, optional
@@ -119,7 +120,7 @@ def sample_detections(
     """
     s, jitter = config.sampler, config.outliers.jitter
     return sample_selfcal(
-        required(fitted.solved, "solution of detections").solution,
+        required(data.fitted.solved, "solution of detections").solution,
         jitter=None if jitter == "fit" else float(jitter),
         fraction_prior=config.outliers.fraction_prior,
         jitter_scale=config.outliers.jitter_scale,
@@ -165,4 +166,5 @@ def _solved(
         fixed_by(gauge, solution, known),
         matches_of(problem, places, matched.detections, given.inputs, matched.unused),
         arrays,
+        tuple(known.contradictions(theta)),
     )

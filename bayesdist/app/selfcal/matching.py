@@ -13,7 +13,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
-from bayesdist.app.selfcal.given import Given, read_given
+from bayesdist.app.selfcal.given import Given
 from bayesdist.app.selfcal.inputs import Inputs
 from bayesdist.app.selfcal.matched import SelfcalMatched, matched_of
 from bayesdist.data.detections import NO_STAR, Detections
@@ -92,17 +92,17 @@ class Matching:
         )
 
 
-def match_dithers(config: Config, base: Path, *, given: Given | None = None) -> SelfcalMatched:
+def match_dithers(given: Given, config: Config, base: Path) -> SelfcalMatched:
     """Detections of dithered exposures with their stars, and a first solution.
 
     Parameters
     ----------
+    given : Given
+        As `read_given` reads it.
     config : Config
         With a section [selfcal].
     base : Path
         Folder that its files are relative to.
-    given : Given, optional
-        What they hold, where that has been read already.
 
     Returns
     -------
@@ -113,7 +113,6 @@ def match_dithers(config: Config, base: Path, *, given: Given | None = None) -> 
     BayesdistError
         As `calibrated`, and for an exposure that hardly shares stars with the others.
     """
-    given = read_given(config, base) if given is None else given
     found = calibrated(given, lambda text: log.info("match: %s", text))
     matching = matching_of(found, given.inputs, given.block.min_detections)
     matching.refuse_strangers()

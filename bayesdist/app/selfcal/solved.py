@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.output import write_table
-from bayesdist.app.selfcal.gauge import gauge_table
+from bayesdist.app.selfcal.gauge import gauge_table, gauge_words
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal import Gauge, SelfCalibrationMode
@@ -39,6 +39,8 @@ class SelfCalibrated:
         Detections beside their stars.
     arrays : mapping
         From which the solution is made again.
+    contradictions : tuple of str
+        Where what is known beside the detections does not go with them, as sentences.
     """
 
     solution: SelfCalibrationMode
@@ -46,6 +48,12 @@ class SelfCalibrated:
     fixed: Mapping[str, str]
     matches: MatchTable
     arrays: Mapping[str, NDArray[Any]]
+    contradictions: tuple[str, ...] = ()
+
+    @property
+    def gauge_words(self) -> str:
+        """In which gauge the solution stands, as a sentence."""
+        return gauge_words(self.gauge, self.fixed, self.solution.problem.model)
 
     def save(self, folder: Path) -> None:
         """Write the files of a run's folder that belong to it."""

@@ -49,20 +49,12 @@ MOST_STARS = 2_000_000  # of the sky that all patterns see together
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A detector as it is planned for.
-
-    Parameters
-    ----------
-    chips : tuple of Chip
-    coefficients : ndarray, shape (chips, 2, K)
-        Legendre coefficients of its distortion, in pixels: how chips lie matters most.
-    frames : str
-        What is free in each exposure.
-    """
+    """A detector as it is planned for."""
 
     chips: tuple[Chip, ...]
+    # (chips, 2, K), Legendre coefficients of its distortion, in pixels: how chips lie matters most
     coefficients: Float
-    frames: str = "shift_rotation"
+    frames: str = "shift_rotation"  # what is free in each exposure
 
     @property
     def pixels(self) -> float:
@@ -82,48 +74,23 @@ class Camera:
 
 @dataclass(frozen=True)
 class PlannedStars:
-    """A field of stars, and how well they are detected.
+    """A field of stars, and how well they are detected."""
 
-    Parameters
-    ----------
-    per_detector : float
-        Detections of one exposure, on average.
-    sigma : float
-        Error of a detection on one axis, pixels.
-    false : float
-        Share of the detections that are false: they say nothing.
-    least : int
-        Fewest detections of a star that is used.
-    seed : int
-    """
-
-    per_detector: float
-    sigma: float
-    false: float = 0.0
-    least: int = 2
+    per_detector: float  # detections of one exposure, on average
+    sigma: float  # error of a detection on one axis, pixels
+    false: float = 0.0  # share of the detections that are false: they say nothing
+    least: int = 2  # fewest detections of a star that is used
     seed: int = 1
 
 
 @dataclass(frozen=True)
 class Beforehand:
-    """What will be known beside the detections; None for what is not.
+    """Knowledge beside the detections; None for what is not known."""
 
-    Parameters
-    ----------
-    offset_sigma : float, optional
-        Error of a commanded offset on one axis, pixels.
-    roll_sigma : float, optional
-        Of a commanded roll, radians.
-    exposure_scale_sigma : float, optional
-        Scatter of the exposures' scales.
-    scale_sigma : float, optional
-        Relative error of the size of a pixel.
-    """
-
-    offset_sigma: float | None = None
-    roll_sigma: float | None = None
-    exposure_scale_sigma: float | None = None
-    scale_sigma: float | None = None
+    offset_sigma: float | None = None  # error of a commanded offset on one axis, pixels
+    roll_sigma: float | None = None  # of a commanded roll, radians
+    exposure_scale_sigma: float | None = None  # scatter of the exposures' scales
+    scale_sigma: float | None = None  # relative error of the size of a pixel
 
     def prior(self, model: DistortionModel, theta: Float, pattern: DitherPattern) -> Prior:
         """All of it, at a truth."""
@@ -146,26 +113,14 @@ class Beforehand:
 
 @dataclass(frozen=True, eq=False)
 class PlannedPattern:
-    """What a pattern would give.
-
-    Parameters
-    ----------
-    pattern : DitherPattern
-    camera : Camera
-    solution : ExpectedSolution
-    maps : dict of str to tuple of UncertaintyMap, or None
-        Of each chip, by kind:
-
-        'gauge-free'   without whatever the detections of this pattern leave free;
-        'shape'        without shift, rotation and scale of the sky: the same for all patterns;
-        'absolute'     without the zero point alone.
-
-        None where nothing bounds the errors.
-    """
+    """Errors that a pattern would leave."""
 
     pattern: DitherPattern
     camera: Camera
     solution: ExpectedSolution
+    # of each chip, by kind: 'gauge-free'   without whatever the detections of this pattern leave
+    # free; 'shape'        without shift, rotation and scale of the sky: the same for all patterns;
+    # 'absolute'     without the zero point alone. None where nothing bounds the errors
     maps: dict[str, tuple[UncertaintyMap, ...] | None]
 
     def radii(self, kind: str) -> Float:
@@ -222,7 +177,7 @@ class PlannedPattern:
 
     @cached_property
     def chips_share_stars(self) -> bool:
-        """Whether some star is seen on two chips."""
+        """True if some star is seen on two chips."""
         p = self.solution.problem
         chip = p.groups.chip[p.groups.index]
         low, high = (f.reduceat(chip, p.starts[:-1]) for f in (np.minimum, np.maximum))
@@ -235,23 +190,9 @@ def compare_patterns(
     stars: PlannedStars,
     known: Beforehand,
 ) -> tuple[PlannedPattern, ...]:
-    """What each of some patterns would give, on one sky, the best one first.
+    """Outcomes of several patterns on one sky, the best one first.
 
-    Parameters
-    ----------
-    patterns : sequence of DitherPattern
-    camera : Camera
-    stars : PlannedStars
-    known : Beforehand
-
-    Returns
-    -------
-    tuple of PlannedPattern
-
-    Raises
-    ------
-    InputError
-        For a pattern whose exposures do not overlap, and for too many stars.
+    InputError for a pattern whose exposures do not overlap, and for too many stars.
     """
     truths = [
         dithered_model(camera.chips, camera.coefficients, p.offsets, p.rolls, frames=camera.frames)

@@ -16,9 +16,10 @@ from scipy.special import betainc, erf
 from scipy.stats import beta, chi2
 
 from bayesdist.diagnose.holdout.bins import ALL, Partition
+from bayesdist.diagnose.holdout.grouped import ScaleSums
 from bayesdist.diagnose.holdout.predictive import Predictive
-from bayesdist.diagnose.holdout.spread import scale_of, sum_tails
 from bayesdist.diagnose.holdout.sums import LEVELS, PIT_BINS, STEP, TAILS, BinSums, HeldSums
+from bayesdist.diagnose.significance import hotelling_p
 from bayesdist.limits import HELD_OUT_DISTRIBUTION, HELD_OUT_RATIO, HELD_OUT_TAILS
 
 __all__ = ["AXIS", "AxisCoverage", "HeldTest", "all_tests", "coverage_of"]
@@ -129,9 +130,9 @@ def coverage_of(sums: HeldSums) -> tuple[AxisCoverage, ...]:
             axis,
             level,
             sums.n,
-            float(sums.axes.within[a, k]) / sums.n,
+            float(sums.within[a, k]) / sums.n,
             float(erf(level / np.sqrt(2))),
-            _interval(int(sums.axes.within[a, k]), sums.n),
+            _interval(int(sums.within[a, k]), sums.n),
         )
         for a, axis in enumerate("uv")
         for k, level in enumerate(LEVELS)
@@ -162,50 +163,36 @@ def all_tests(
     return [*out, *_distributions(sums, predictive), *_tails(sums, predictive)]
 
 
-def _of_clusters(t: float, dof: int, n: int) -> float:
-    """Probability of a larger chi-square whose covariance is the sum of squares of n stars.
-
-    Hotelling 1931, for squares about zero.
-    """
-    return float(beta.sf(min(t / n, 1.0), dof / 2, max(n - dof, 1) / 2))
-
-
 def _offsets(
     found: BinSums, sums: HeldSums, predictive: Predictive, partition: Partition
 ) -> list[HeldTest]:
     """Whether stars lie about their predictions: each bin, then all together."""
-    n_bins = len(found.n)
-    by = found.place_by.reshape(2 * n_bins, -1)
-    common = found.place_with.reshape(2 * n_bins, -1) @ by.T
-    cov = by @ predictive.cov @ by.T - common - common.T + found.own_cov
-    for name, lost in found.lost.items():
-        along = lost.reshape(2 * n_bins, -1)
-        cov -= along @ sums.frames[name].spent @ along.T
+    # a score of the position is odd: on average the mixture's parameters do not move it
+    cov = found.place.covariance(predictive, sums.frames, mixture=False) + found.place_cov
     out, good = [], []
-    for b in range(n_bins):
+    for b, bin_ in enumerate(partition.bins):
         pair = slice(2 * b, 2 * b + 2)
         least = np.linalg.eigvalsh(cov[pair, pair])[0]
         n = found.independent[b]
         if n < LEAST_STARS or least < 2 * SINGULAR * np.trace(found.place_2[b]):
             continue
         good.append(b)
-        score = found.place[b]
+        score = found.offset_scores[b]
         t = float(score @ np.linalg.solve(cov[pair, pair], score))
         # their variance is their own, as in Hotelling's test about zero
-        p = _of_clusters(t, 2, int(n))
+        p = hotelling_p(t, 2, int(n))
         size = float(np.hypot(*(score / found.weight[b])))
-        bin_ = partition.bins[b]
         out.append(HeldTest("offset", partition.kind, bin_.words, b, int(found.n[b]), size, 0.0, p))
     if len(good) > 1:
         rows = np.ravel([[2 * b, 2 * b + 1] for b in good])
         root = np.sqrt(np.diag(cov)[rows])
         values, vectors = np.linalg.eigh(cov[np.ix_(rows, rows)] / np.outer(root, root))
-        along = vectors.T @ (found.place.ravel()[rows] / root)
+        along = vectors.T @ (found.place.sums[rows] / root)
         known = values > SINGULAR
         t, dof = float((along[known] ** 2 / values[known]).sum()), int(known.sum())
         p = float(chi2.sf(t, dof))
         if sums.shared is not None:
-            p = _of_clusters(t, dof, sums.shared.n_stars)
+            p = hotelling_p(t, dof, sums.shared.n_stars)
         worst = min(out, key=lambda one: (one.p_value, -one.value))
         out.append(
             HeldTest(
@@ -217,38 +204,27 @@ def _offsets(
 
 def _spreads(found: BinSums, predictive: Predictive, partition: Partition) -> list[HeldTest]:
     """Whether true matches scatter as predicted, in each bin."""
-    out = []
-    for b, bin_ in enumerate(partition.bins):
-        if found.n[b] < LEAST_STARS:
-            continue
-        g = found.spread_by[b]
-        variance = float(found.spread_2[b] + g @ predictive.free_cov @ g)
-        p = sum_tails(float(found.spread[b]), variance, float(found.spread_3[b]))
-        out.append(
-            HeldTest(
-                "spread",
-                partition.kind,
-                bin_.words,
-                b,
-                int(found.n[b]),
-                scale_of(found.scales[b]),
-                1.0,
-                p,
-            )
-        )
-    return out
+    return [
+        _spread(found.scale, b, predictive, (partition.kind, bin_.words, b, int(found.n[b])))
+        for b, bin_ in enumerate(partition.bins)
+        if found.n[b] >= LEAST_STARS
+    ]
+
+
+def _spread(
+    sums: ScaleSums, k: int, predictive: Predictive, stars: tuple[str, str, int, int]
+) -> HeldTest:
+    """Test of the scatter of one group: part, words, index and number of its stars."""
+    p = sums.p_value(k, predictive.free_cov)
+    return HeldTest("spread", *stars, sums.factor(k), 1.0, p)
 
 
 def _axes(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
     """Whether true matches scatter as predicted along each axis by itself."""
-    out, axes = [], sums.axes
-    for a, axis in enumerate("uv"):
-        g = axes.by_free[a]
-        variance = float(axes.second[a] + g @ predictive.free_cov @ g)
-        p = sum_tails(float(axes.score[a]), variance, float(axes.third[a]))
-        scale = scale_of(axes.scales[a])
-        out.append(HeldTest("spread", AXIS, f"along {axis}", a, sums.n, scale, 1.0, p))
-    return out
+    return [
+        _spread(axis, 0, predictive, (AXIS, f"along {'uv'[a]}", a, sums.n))
+        for a, axis in enumerate(sums.axes)
+    ]
 
 
 def _distributions(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
@@ -258,25 +234,24 @@ def _distributions(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
     while merge < PIT_BINS // 4 and n * merge < STARS_PER_PIT_BIN * PIT_BINS:
         merge = {1: 2, 2: 4, 4: 5}[merge]
     m = PIT_BINS // merge
-    wider = bool(sums.pit[2] @ (np.arange(PIT_BINS) + 0.5) > sums.n * PIT_BINS / 2)
+    # in merged bins, less the mean over all
+    merged = np.asarray(np.kron(np.eye(m), np.ones(merge)) - 1 / m, np.float64)
+    middle = sums.pit[2].sums @ (np.arange(PIT_BINS) + 0.5)
+    wider = bool(middle > sums.n * PIT_BINS / 2)
     out = []
     for k, what in enumerate(("of u", "of v", "of their distances")):
-        counts = sums.pit[k].reshape(m, merge).sum(axis=1)
-        by = sums.pit_by[k].reshape(m, merge, -1).sum(axis=1)
-        free = sums.pit_free[k].reshape(m, merge, -1).sum(axis=1)
+        counts = sums.pit[k].mapped(merged)
         cov = sums.n * (np.eye(m) / m - 1 / m**2)
         if shared is not None:
             cov = shared.pit_covariance(k, merge)
-        cov += by @ predictive.cov @ by.T + free @ predictive.free_cov @ free.T
-        for name, several in sums.pit_lost.items():
-            along = several[k].reshape(m, merge, -1).sum(axis=1)
-            cov -= along @ sums.frames[name].spent @ along.T
-        rest = (counts - sums.n / m)[:-1]
+        cov += counts.covariance(predictive, sums.frames, mixture=True)
+        rest = counts.sums[:-1]
         t = float(rest @ np.linalg.solve(cov[:-1, :-1], rest))
         p = float(chi2.sf(t, m - 1))
         if shared is not None and shared.stars_repeat:
-            p = _of_clusters(t, m - 1, n)
-        size = float(np.abs(np.cumsum(sums.pit[k]) / sums.n - np.arange(1, 21) / PIT_BINS).max())
+            p = hotelling_p(t, m - 1, n)
+        below = np.cumsum(sums.pit[k].sums) / sums.n
+        size = float(np.abs(below - np.arange(1, PIT_BINS + 1) / PIT_BINS).max())
         out.append(HeldTest("distribution", ALL, what, k, sums.n, size, 0.0, p, wider=wider))
     return out
 

@@ -12,7 +12,6 @@ from bayesdist.diagnose.holdout.bins import Bin, partitions_of
 from bayesdist.diagnose.holdout.deviations import deviation_tests
 from bayesdist.diagnose.holdout.frames import frames_for
 from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
-from bayesdist.diagnose.holdout.spread import scale_of
 from bayesdist.diagnose.holdout.sums import held_sums
 from bayesdist.diagnose.holdout.tests import AxisCoverage, HeldTest, all_tests, coverage_of
 from bayesdist.diagnose.significance import holm, p_words
@@ -198,14 +197,14 @@ def held_out_truth(
         n_left_out=sums.n_left_out,
         exposures=tuple(whole),
         tests=tuple(sorted(tests, key=_rank)),
-        pit=sums.pit,
+        pit=np.stack([counts.sums for counts in sums.pit]),
         regions=regions.bins,
         region_n=found.n,
         region_scale=np.array(
-            [scale_of(s) if n else np.nan for s, n in zip(found.scales, seen, strict=True)]
+            [found.scale.factor(b) if some else np.nan for b, some in enumerate(seen)]
         ),
         region_offset=np.divide(
-            found.place, error, out=np.full_like(error, np.nan), where=error > 0
+            found.offset_scores, error, out=np.full_like(error, np.nan), where=error > 0
         ),
         coverage=coverage_of(sums),
     )

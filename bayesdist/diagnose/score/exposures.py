@@ -11,8 +11,7 @@ are those of a scaled chi-square (Satterthwaite 1946).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +19,13 @@ from scipy import stats
 from scipy.linalg import cho_solve
 
 from bayesdist.diagnose.clusters import add_over, sums_over
+from bayesdist.diagnose.score.directions import independent_directions, squares_of
+from bayesdist.diagnose.score.families import FAMILIES
 from bayesdist.diagnose.score.projection import Projection
-from bayesdist.diagnose.score.result import Outcome
+from bayesdist.diagnose.score.result import Outcome, outcome
 from bayesdist.diagnose.score.sample import Block
-from bayesdist.diagnose.score.score import independent_directions, smallest_pattern
-from bayesdist.diagnose.significance import LEAST_P
-from bayesdist.model.frames import frame_names
+from bayesdist.diagnose.significance import chi_square_of, hotelling_p
+from bayesdist.model.frames import LINEAR_MATRICES, frame_names
 
 __all__ = ["exposure_test"]
 
@@ -35,13 +35,6 @@ Int = NDArray[np.int64]
 STARS_PER_DIRECTION = 4  # of an exposure that is tested
 MOST_PRODUCTS = 1e10  # of scores: beyond, those of other exposures count by their mean
 INDEPENDENT = 0.02  # as for time: what the frames' curvature leaves is no deviation
-
-_LINEAR = {
-    "scale": np.array([[1.0, 0.0], [0.0, 1.0]]),
-    "rotation": np.array([[0.0, -1.0], [1.0, 0.0]]),
-    "shear_plus": np.array([[1.0, 0.0], [0.0, -1.0]]),
-    "shear_cross": np.array([[0.0, 1.0], [1.0, 0.0]]),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,11 +70,10 @@ class _Deviations:
     def statistic(self) -> float:
         """Chi-square of the same probability as Hotelling's statistic about zero."""
         n, t = len(self.score), float(self.score @ np.linalg.solve(self.covariance, self.score))
-        p = stats.beta.sf(min(t / self.n_stars, 1.0), n / 2, (self.n_stars - n) / 2)
-        return float(stats.chi2.isf(max(p, LEAST_P), n))
+        return chi_square_of(hotelling_p(t, n, self.n_stars), n)
 
     def along(self, N: Float) -> _Deviations:
-        """Some directions of them."""
+        """Deviations along some directions N (n, q)."""
         return _Deviations(
             N.T @ self.score,
             N.T @ self.information @ N,
@@ -110,7 +102,7 @@ class _Meat:
 
     @classmethod
     def of(cls, projection: Projection) -> _Meat:
-        """Those of all stars."""
+        """Scores of all stars."""
         sample, G = projection.sample, projection.n_global
         by_star = np.zeros((int(sample.star.max()) + 1, G))
         for block in sample.blocks:
@@ -163,7 +155,8 @@ def exposure_test(projection: Projection) -> Outcome | None:
     found = list(_deviations(projection, names))
     if len(found) < 2:
         return None
-    T, n, size2, noise2 = 0.0, 0, 0.0, 0.0
+    T, n = 0.0, 0
+    squares = [squares_of(one.score, one.own, one.covariance, one.square) for one in found]
     shared, apart = np.zeros((projection.n_global, projection.n_global)), 0.0
     for one in found:
         T += one.statistic
@@ -173,32 +166,28 @@ def exposure_test(projection: Projection) -> Outcome | None:
             one.information, one.cross @ cho_solve(projection.root, one.cross.T)
         )
         apart += float(np.trace(alone @ alone))
-        back = np.linalg.inv(one.own)
-        step = back @ one.score
-        noise = float(np.trace(one.square @ back @ one.covariance @ back))
-        size2 += (float(step @ one.square @ step) - noise) / len(found)
-        noise2 += noise / len(found)
     together = cho_solve(projection.root, shared)
     # mean n, variance 2 n (1 + ...), as a multiple of a chi-square
     stretch = 1.0 + (float((together * together.T).sum()) - apart) / n
     dof = n / stretch
-    return Outcome(
-        name="exposures",
-        statistic=T / stretch,
-        dof=dof,
-        dof_residual=None,
-        p_value=float(stats.chi2.sf(T / stretch, dof)),
-        size=float(np.sqrt(max(size2, 0.0))),
-        smallest=partial(smallest_pattern, float(np.sqrt(noise2)), dof, None),
+    T = T / stretch
+    square, noise = (float(values) for values in np.mean(squares, axis=0))
+    family = replace(FAMILIES["exposures"], remedy=_remedy(model.frames))
+    return outcome(
+        family,
+        T,
+        dof,
+        None,
+        float(stats.chi2.sf(T, dof)),
+        square=square,
+        noise=noise,
         unit=model.unit,
-        remedy=_remedy(model.frames),
-        present="exposures deviate from each other in linear terms that their frames do not fit",
-        absent="no deviations of single exposures are left in the residuals",
     )
 
 
 def _remedy(frames: str) -> str:
-    hierarchy = "use a campaign, whose exposures have a hierarchy of deviations"
+    """What to do about deviations, as a clause, by the kind of the frames."""
+    hierarchy = FAMILIES["exposures"].remedy
     return hierarchy if frames == "affine" else f"set model.frames to 'affine', or {hierarchy}"
 
 
@@ -207,10 +196,7 @@ def _deviations(projection: Projection, names: list[str]) -> Iterator[_Deviation
     meat = None
     if len(projection.sample) * projection.n_global**2 < MOST_PRODUCTS:
         meat = _Meat.of(projection)
-    by_exposure: dict[int, list[Block]] = {}
-    for block in projection.sample.blocks:
-        by_exposure.setdefault(block.exposure, []).append(block)
-    for blocks in by_exposure.values():
+    for blocks in projection.sample.blocks_by("exposure"):
         n = sum(int(projection.sample.used[block.rows].sum()) for block in blocks)
         if n < STARS_PER_DIRECTION * len(names):
             continue
@@ -221,13 +207,13 @@ def _deviations(projection: Projection, names: list[str]) -> Iterator[_Deviation
 
 
 def _fields(block: Block, names: list[str], origin: tuple[float, float]) -> Float:
-    """What each deviation does to the polynomial of a block, (2, K, n)."""
+    """Changes (2, K, n) of the polynomial of a block by unit deviations."""
     out = np.zeros((*block.effective.shape, len(names)))
     about = block.effective.copy()
     about[:, 0] -= origin
     for k, name in enumerate(names):
-        if name in _LINEAR:
-            out[..., k] = _LINEAR[name] @ about
+        if name in LINEAR_MATRICES:
+            out[..., k] = LINEAR_MATRICES[name] @ about
         else:
             out["uv".index(name[-1]), 0, k] = 1.0
     return out

@@ -17,7 +17,7 @@ are alike, is added to var(rate).  The largest of all F is tested, corrected for
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bayesdist.diagnose.clusters import squares_over
+from bayesdist.diagnose.score.families import FAMILIES
 from bayesdist.diagnose.score.projection import Projection
-from bayesdist.diagnose.score.result import Outcome
+from bayesdist.diagnose.score.result import Outcome, outcome, smallest_pattern
 from bayesdist.diagnose.score.sample import Block
-from bayesdist.diagnose.score.score import smallest_pattern
-from bayesdist.model.frames import RIGID, frame_names
+from bayesdist.model.frames import DEVIATIONS, LINEAR_MATRICES, RIGID, frame_names
 
 __all__ = ["gap_test", "visit_codes"]
 
@@ -41,12 +41,6 @@ FEWEST_STARS = 12  # of an exposure on a chip: six linear terms of both axes, an
 SHORTEST = 0.1  # years over which a drift is looked for
 VISIT = 1 / 365.25  # years between exposures that deviate together
 
-_QUARTER = np.array([[0.0, -1.0], [1.0, 0.0]])
-_STRETCHES = {
-    "scale": np.array([[1.0, 0.0], [0.0, 1.0]]),
-    "shear_plus": np.array([[1.0, 0.0], [0.0, -1.0]]),
-    "shear_cross": np.array([[0.0, 1.0], [1.0, 0.0]]),
-}
 _WAYS = ("along x", "along y", "in rotation")
 
 
@@ -123,23 +117,23 @@ def gap_test(projection: Projection) -> Outcome | None:
     if not lines:
         return None
     best = min(lines, key=lambda one: one.p_value)
-    n = len(lines)
     name = model.chips[best.chip].name
-    return Outcome(
-        name="gap",
-        statistic=best.statistic,
-        dof=1,
-        dof_residual=float(best.free),
-        p_value=float(-np.expm1(n * np.log1p(-best.p_value))),
-        size=float(np.sqrt(max(best.rate**2 - best.variance, 0.0))),
-        smallest=partial(_smallest, lines),
+    terms = "['u', 0, 0] and ['v', 0, 0]" if best.way < 2 else "['u', 0, 1] and ['v', 1, 0]"
+    return outcome(
+        replace(
+            FAMILIES["gap"],
+            remedy=f"add {terms} to model.tdd.terms",
+            present=f"chip {name} drifts {_WAYS[best.way]} against chip {model.chips[0].name}, and "
+            "the gap between them is taken to be constant",
+        ),
+        best.statistic,
+        1,
+        float(best.free),
+        float(-np.expm1(len(lines) * np.log1p(-best.p_value))),
+        square=best.rate**2,
+        noise=best.variance,
         unit=f"{model.unit}/yr",
-        remedy="add ['u', 0, 0] and ['v', 0, 0] to model.tdd.terms"
-        if best.way < 2
-        else "add ['u', 0, 1] and ['v', 1, 0] to model.tdd.terms",
-        present=f"chip {name} drifts {_WAYS[best.way]} against chip {model.chips[0].name}, and the "
-        "gap between them is taken to be constant",
-        absent="no drift of the gap between the chips is left in the residuals",
+        smallest=partial(_smallest, lines),
     )
 
 
@@ -226,11 +220,8 @@ def _of_stars(some: list[_Exposure], at: list[tuple[int, int]], pull: Float) -> 
 
 
 def _exposures(projection: Projection) -> Iterator[_Exposure]:
-    """All exposures with stars enough on the first chip and on another."""
-    by_exposure: dict[int, list[Block]] = {}
-    for block in projection.sample.blocks:
-        by_exposure.setdefault(block.exposure, []).append(block)
-    for blocks in by_exposure.values():
+    """Iterator over the exposures with stars enough on the first chip and on another."""
+    for blocks in projection.sample.blocks_by("exposure"):
         if one := _exposure(projection, blocks):
             yield one
 
@@ -293,13 +284,14 @@ def _columns(projection: Projection, block: Block, chips: list[int]) -> Float:
     shared = () if model.chip_deviations else frame_names(model.frames)
     origin = np.zeros(2) + model.origin
     columns = [np.tile(one, (n, 1)) for one in np.eye(2)]
-    columns.append((about + at_centre - origin) @ _QUARTER.T)
-    for name, L in _STRETCHES.items():
-        columns.append((about + at_centre - origin if name in shared else about) @ L.T)
+    columns.append((about + at_centre - origin) @ LINEAR_MATRICES["rotation"].T)
+    for name in DEVIATIONS:
+        at = about + at_centre - origin if name in shared else about
+        columns.append(at @ LINEAR_MATRICES[name].T)
     for chip in chips:
         here = float(chip == block.chip)
         columns += [np.tile(here * block.frame[:, axis], (n, 1)) for axis in (0, 1)]
-        columns.append(here / _half(projection, chip) * about @ _QUARTER.T)
+        columns.append(here / _half(projection, chip) * about @ LINEAR_MATRICES["rotation"].T)
     return np.moveaxis(np.stack(columns), (0, 1, 2), (2, 1, 0))
 
 

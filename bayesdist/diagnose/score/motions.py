@@ -1,4 +1,4 @@
-"""Test for stars that move in ways that nobody has told: do a star's residuals go with time?
+"""Test for stars that move in ways that are not known: do a star's residuals go with time?
 
 Of each star the square of the slope's score is compared with those of its single detections, after
 position and slope, so that nothing is assumed of the size of the errors.  With the slope b_s of
@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bayesdist.diagnose.clusters import sums_over
-from bayesdist.diagnose.score.projection import Projection
-from bayesdist.diagnose.score.result import Outcome, noncentrality
+from bayesdist.diagnose.score.families import FAMILIES, Family
+from bayesdist.diagnose.score.result import Outcome, noncentrality, outcome
+from bayesdist.diagnose.score.sample import ScoredSample
 
 __all__ = ["StarResiduals", "motion_outcome", "motion_test"]
 
@@ -38,18 +39,18 @@ MOVING = 1e-6  # of the determinant of the slope's information, that the positio
 
 @dataclass(frozen=True, eq=False)
 class StarResiduals:
-    """What detections say of the places of their stars.
+    """Gradients and curvatures of detections by the positions of their stars.
 
     Parameters
     ----------
     star : ndarray of int, shape (N,)
     epoch : ndarray, shape (N,)
     gradient : ndarray, shape (N, 2)
-        Of the log-likelihood by the star's place.
+        Of the log-likelihood by the star's position.
     curvature : ndarray, shape (N, 2, 2)
         Minus the second derivatives.
     precision : ndarray, shape (2, 2), (stars, 2, 2) or ()
-        Of what is known of the places beforehand.
+        Of what is known of the positions beforehand.
     stated : ndarray, shape (stars, 2), or None
         Errors of the motions that the catalogue has.
     """
@@ -62,45 +63,38 @@ class StarResiduals:
     stated: Float | None = None
 
 
-def motion_test(projection: Projection) -> Outcome | None:
+def motion_test(sample: ScoredSample) -> Outcome | None:
     """Test of matched stars for motions that the catalogue does not have.
 
     Parameters
     ----------
-    projection : Projection
+    sample : ScoredSample
+        With its leverage.
 
     Returns
     -------
     Outcome or None
         None without dates, and where too few stars are seen at several of them.
     """
-    sample = projection.sample
     if sample.epoch is None or np.ptp(sample.epoch) < SHORTEST:
         return None
     uu, uv, vv = sample.curvature
-    g = projection.whole_score.T
     stated = None
     if sample.motion_sigma is not None:
         stated = np.zeros((int(sample.star.max()) + 1, 2))
         stated[sample.star] = sample.motion_sigma.T
-    return motion_outcome(
-        StarResiduals(
-            sample.star,
-            sample.epoch,
-            g,
-            np.moveaxis(np.array([[uu, uv], [uv, vv]]), 2, 0),
-            np.zeros(()),
-            stated,
-        ),
-        sample.model.unit,
-        remedy="give the catalogue proper motions, or larger errors of those that it has, or leave "
-        "out the stars that move",
-        present="stars move between the dates of the exposures in ways that the catalogue does not "
-        "have",
+    residuals = StarResiduals(
+        sample.star,
+        sample.epoch,
+        sample.whole_score.T,
+        np.moveaxis(np.array([[uu, uv], [uv, vv]]), 2, 0),
+        np.zeros(()),
+        stated,
     )
+    return motion_outcome(residuals, sample.model.unit, FAMILIES["motions"])
 
 
-def motion_outcome(data: StarResiduals, unit: str, *, remedy: str, present: str) -> Outcome | None:
+def motion_outcome(data: StarResiduals, unit: str, family: Family) -> Outcome | None:
     """Test of residuals of stars.
 
     Parameters
@@ -108,8 +102,7 @@ def motion_outcome(data: StarResiduals, unit: str, *, remedy: str, present: str)
     data : StarResiduals
     unit : str
         Of u and v.
-    remedy, present : str
-        As of `Outcome`.
+    family : Family
 
     Returns
     -------
@@ -157,19 +150,17 @@ def motion_outcome(data: StarResiduals, unit: str, *, remedy: str, present: str)
     unit_square = 4 / float(np.trace(left, axis1=1, axis2=2).sum())
     statistic, p = _above_zero(difference)
     noise = float(each.sum()) / (2 * len(many)), float(np.var(difference)), len(many)
-    return Outcome(
-        name="motions",
-        statistic=max(statistic, 0.0) ** 2,
-        dof=1,
-        dof_residual=None,
-        p_value=p,
+    return outcome(
+        family,
+        max(statistic, 0.0) ** 2,
+        1,
+        None,
+        p,
         # of a motion in a year, rms over the stars and both axes together
-        size=float(np.sqrt(max(unit_square * difference.sum(), 0.0))),
-        smallest=partial(_smallest, unit_square, *noise),
+        square=float(unit_square * difference.sum()),
+        noise=0.0,
         unit=f"{unit}/yr",
-        remedy=remedy,
-        present=present,
-        absent="no motions of the stars are left in the residuals",
+        smallest=partial(_smallest, unit_square, *noise),
     )
 
 

@@ -9,7 +9,6 @@ built.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -85,21 +84,21 @@ class Projection:
 
     @property
     def sample(self) -> ScoredSample:
-        """The detections."""
+        """Detections."""
         return self.functions.sample
 
     @property
     def n_global(self) -> int:
-        """Global parameters."""
+        """Number of global parameters."""
         return self.sample.model.n_global
 
     @property
     def n_added(self) -> int:
-        """Functions that the tests add to those of the model."""
+        """Number of functions that the tests add to those of the model."""
         return len(self.functions.terms) - self.sample.model.n_terms
 
     def columns(self, function: Int, chip: int) -> Int:
-        """Where the regressors of some functions on both axes of a chip stand, from 0."""
+        """Indices of the regressors of some functions on both axes of a chip."""
         start = 2 * self.n_added * chip
         return np.ravel(start + 2 * (function[:, None] - self.sample.model.n_terms) + [0, 1])
 
@@ -157,7 +156,7 @@ class Projection:
 
     def star_scores(self, F: Float, block: Block, coefficients: Float) -> Float:
         """Scores (n, q) of detections, by coefficients (2, L, q) of functions F (L, n)."""
-        g = self.whole_score[:, block.rows]
+        g = self.scored.whole_score[:, block.rows]
         return np.asarray(sum((F * g[axis]).T @ coefficients[axis] for axis in (0, 1)))
 
     @cached_property
@@ -191,9 +190,9 @@ class Projection:
         return np.clip(out, 0.0, LARGEST_LEVERAGE)
 
     @cached_property
-    def whole_score(self) -> Float:
-        """Score (2, N), given back what the fit has taken (Bell and McCaffrey 2002)."""
-        return np.asarray(self.sample.score / np.sqrt(1.0 - self.leverage))
+    def scored(self) -> ScoredSample:
+        """Sample with its leverage."""
+        return replace(self.sample, leverage=self.leverage)
 
     def regressor_map(self, block: Block, which: Int) -> Float:
         """Coefficients (2, L, n) of projected regressors in a block.
@@ -238,7 +237,7 @@ class Projection:
     def score_ratio(self) -> float:
         """Mean square of the scores over what the curvature expects."""
         h = self.sample.curvature[[0, 2]]
-        return float((self.whole_score**2).sum() / h.sum())
+        return float((self.scored.whole_score**2).sum() / h.sum())
 
 
 def projection_of(functions: Functions, theta: Float, priors: GaussianPriors) -> Projection:
@@ -273,7 +272,7 @@ def _summed(functions: Functions, theta: Float, priors: GaussianPriors) -> Proje
     information[np.arange(G), np.arange(G)] = priors.precision[:G]
     score[:G] = pull[:G]
     exposures: dict[int, Eliminated] = {}
-    for blocks in _by_frame(sample.blocks):
+    for blocks in sample.blocks_by("frame_exposure"):
         index = np.arange(0)
         for block in blocks:
             index = np.union1d(index, block.columns[block.columns >= G])
@@ -309,14 +308,6 @@ def _summed(functions: Functions, theta: Float, priors: GaussianPriors) -> Proje
     out = Projection(functions, exposures, information, score, priors.precision, theta)
     out.root  # noqa: B018 - raises here, where there is another way
     return out
-
-
-def _by_frame(blocks: tuple[Block, ...]) -> Iterator[list[Block]]:
-    """Blocks of one exposure's frame at a time."""
-    found: dict[int, list[Block]] = {}
-    for block in blocks:
-        found.setdefault(block.frame_exposure, []).append(block)
-    yield from found.values()
 
 
 def _parts(block: Block, n_global: int) -> tuple[Float, Float]:

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
+import numpy as np
 from scipy import special, stats
 
+from bayesdist.diagnose.score.families import Family
 from bayesdist.diagnose.significance import holm, p_words
 from bayesdist.limits import SCORE_TESTS
 
-__all__ = ["POWER", "Outcome", "ScoreTest", "corrected", "noncentrality"]
+__all__ = [
+    "POWER",
+    "Outcome",
+    "ScoreTest",
+    "corrected",
+    "noncentrality",
+    "outcome",
+    "smallest_pattern",
+]
 
-POWER = 0.9  # with which the smallest effect that is told would have been found
+POWER = 0.9  # with which the smallest effect that is stated would have been found
 
 
 @dataclass(frozen=True)
@@ -65,15 +76,14 @@ class Outcome:
 
     Parameters
     ----------
-    name, statistic, dof, dof_residual, p_value, size, unit, remedy
+    family : Family
+    statistic, dof, dof_residual, p_value, size, unit
         As of `ScoreTest`.
     smallest : callable
         Size that is found with probability `POWER`, by the level of the test.
-    present, absent : str
-        Subject and verb of the finding, where there is something and where there is not.
     """
 
-    name: str
+    family: Family
     statistic: float
     dof: float
     dof_residual: float | None
@@ -81,18 +91,25 @@ class Outcome:
     size: float
     smallest: Callable[[float], float]
     unit: str
-    remedy: str
-    present: str
-    absent: str
+
+    @property
+    def name(self) -> str:
+        """Name of the test."""
+        return self.family.name
+
+    def unless(self, clause: str) -> Outcome:
+        """Outcome with another explanation of the finding, as a clause: 'it is not ...'."""
+        present = f"{self.family.present}, if {clause}"
+        return replace(self, family=replace(self.family, present=present))
 
     def judged(self, significant: bool, level: float) -> ScoreTest:
-        """The test among others, by whether it is significant and by the level of each."""
+        """Result of the test among others, by whether it is significant and by its level."""
         smallest = self.smallest(level)
-        p = p_words(self.p_value)
         if significant:
-            finding = f"{self.present} ({self.size:.2g} {self.unit} rms, {p})"
+            size = f"{self.size:.2g} {self.unit} rms, {p_words(self.p_value)}"
+            finding = f"{self.family.present} ({size})"
         else:
-            finding = f"{self.absent} ({smallest:.2g} {self.unit} rms would have been found)"
+            finding = f"{self.family.absent} ({smallest:.2g} {self.unit} rms would have been found)"
         return ScoreTest(
             name=self.name,
             statistic=self.statistic,
@@ -102,10 +119,44 @@ class Outcome:
             size=self.size,
             smallest=smallest,
             unit=self.unit,
-            remedy=self.remedy,
+            remedy=self.family.remedy,
             finding=finding,
             significant=significant,
         )
+
+
+def outcome(
+    family: Family,
+    statistic: float,
+    dof: float,
+    dof_residual: float | None,
+    p_value: float,
+    *,
+    square: float,
+    noise: float,
+    unit: str,
+    smallest: Callable[[float], float] | None = None,
+) -> Outcome:
+    """Outcome of a test that has found a pattern of some mean square.
+
+    Parameters
+    ----------
+    family : Family
+    statistic, dof, dof_residual, p_value, unit
+        As of `ScoreTest`.
+    square, noise : float
+        Mean square of the pattern, noise included, and that of the noise.
+    smallest : callable, optional
+        As of `Outcome`; by default that of a pattern that lies in any direction as noise does.
+
+    Returns
+    -------
+    Outcome
+    """
+    if smallest is None:
+        smallest = partial(smallest_pattern, float(np.sqrt(max(noise, 0.0))), dof, dof_residual)
+    size = float(np.sqrt(max(square - noise, 0.0)))
+    return Outcome(family, statistic, dof, dof_residual, p_value, size, smallest, unit)
 
 
 def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
@@ -144,7 +195,26 @@ def noncentrality(level: float, dof: float, dof_residual: float | None = None) -
     -------
     float
     """
-    if dof_residual is None or dof_residual > 1e5:  # where F is no longer told from chi-square
+    if dof_residual is None or dof_residual > 1e5:  # where F and chi-square are alike
         return float(special.chndtrinc(stats.chi2.isf(level, dof), dof, 1 - POWER))
     limit = stats.f.isf(level, dof, dof_residual)
     return float(special.ncfdtrinc(dof, dof_residual, 1 - POWER, limit))
+
+
+def smallest_pattern(noise: float, dof: float, dof_residual: float | None, level: float) -> float:
+    """Rms of a pattern that is found with the power `POWER`.
+
+    Parameters
+    ----------
+    noise : float
+        Rms of the pattern that noise makes.
+    dof, dof_residual : float
+        Of the test.
+    level : float
+
+    Returns
+    -------
+    float
+        Of a pattern that lies in any direction as noise does.
+    """
+    return float(noise * np.sqrt(noncentrality(level, dof, dof_residual) / dof))

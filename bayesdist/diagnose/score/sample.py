@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.infer.posterior.likelihood import scores_of
-from bayesdist.infer.posterior.memberships import star_averages
+from bayesdist.infer.solution import Solution, likelihood_of
 from bayesdist.infer.stars.stars import Stars, prepare
-from bayesdist.infer.transforms import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["SAMPLE", "Block", "ScoredSample", "scored_sample"]
@@ -83,6 +82,9 @@ class ScoredSample:
         Proper motions along u and v, in the unit of u, v per year.
     motion_sigma : ndarray, shape (2, N), or None
         Their standard errors, where the table has them.
+    leverage : ndarray, shape (2, N), or float
+        Fraction of the noise of each detection that the fit follows, along u and v; 0 where it is
+        not known.
     """
 
     model: DistortionModel
@@ -100,6 +102,7 @@ class ScoredSample:
     blocks: tuple[Block, ...]
     motion: Float | None = None
     motion_sigma: Float | None = None
+    leverage: Float | float = 0.0
 
     def __len__(self) -> int:
         return len(self.X)
@@ -108,6 +111,25 @@ class ScoredSample:
     def used(self) -> NDArray[np.bool_]:
         """Detections that say anything: all but those that a fit rejects."""
         return np.any(self.curvature != 0, axis=0)
+
+    @cached_property
+    def whole_score(self) -> Float:
+        """Score (2, N), given back what the fit has taken (Bell and McCaffrey 2002)."""
+        return np.asarray(self.score / np.sqrt(1.0 - self.leverage))
+
+    def codes(self, name: str) -> Int:
+        """Codes (N,) of what the detections of a block have in common: 'chip', 'exposure'."""
+        out = np.empty(len(self), np.int64)
+        for block in self.blocks:
+            out[block.rows] = getattr(block, name)
+        return out
+
+    def blocks_by(self, name: str) -> list[list[Block]]:
+        """Blocks that have a code in common: 'exposure', 'frame_exposure'."""
+        found: dict[int, list[Block]] = {}
+        for block in self.blocks:
+            found.setdefault(getattr(block, name), []).append(block)
+        return list(found.values())
 
     def with_positive_curvature(self) -> ScoredSample:
         """The sample with what is concave in the likelihood alone.
@@ -138,21 +160,14 @@ def scored_sample(table: MatchTable, solution: Solution) -> ScoredSample:
     Raises
     ------
     InputError
-        As `prepare` and `scores_of`.
+        As `prepare` and `likelihood_of`.
     """
     table = table.sample(SAMPLE)
     by_exposure = np.argsort(table.exposure, kind="stable")
-    scores = scores_of(solution)
+    likelihood = likelihood_of(solution)
     stars, order = prepare(solution.model, table.select(by_exposure))
     rows = by_exposure[order]
-    columns = scores.of(stars)
-    residual = stars.residuals(scores.theta).T
-    variance = np.stack([stars.var_u, stars.var_v])
-    if scores.constants is None:
-        inlier = (columns[2] > 0).astype(float)
-    else:
-        inlier = 1.0 - star_averages(stars, scores.theta[None], scores.constants)[0]
-        variance = variance + scores.constants.j2[0]
+    columns = likelihood.scores(stars)
     codes = np.arange(len(rows)) if table.star is None else table.star[rows]
     return ScoredSample(
         model=solution.model,
@@ -160,14 +175,14 @@ def scored_sample(table: MatchTable, solution: Solution) -> ScoredSample:
         Y=stars.Y,
         score=columns[:2],
         curvature=columns[2:],
-        residual=residual,
-        variance=variance,
-        inlier=inlier,
+        residual=stars.residuals(likelihood.theta).T,
+        variance=likelihood.variances(stars),
+        inlier=likelihood.inliers(stars),
         mag=None if table.mag is None else table.mag[rows],
         colour=None if table.colour is None else table.colour[rows],
         epoch=None if table.epoch is None else table.epoch[rows],
         star=np.unique(codes, return_inverse=True)[1],
-        blocks=_blocks(stars, table.exposure[rows], scores.theta),
+        blocks=_blocks(stars, table.exposure[rows], likelihood.theta),
         motion=_both(table.pm_u, table.pm_v, rows),
         motion_sigma=_both(table.sigma_pm_u, table.sigma_pm_v, rows),
     )

@@ -9,16 +9,17 @@ lie beyond the last ones that there are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, special, stats
+from scipy import optimize, special
 
-from bayesdist.diagnose.score.projection import Projection
+from bayesdist.diagnose.score.families import FAMILIES
 from bayesdist.diagnose.score.result import Outcome
-from bayesdist.diagnose.significance import LEAST_P
+from bayesdist.diagnose.score.sample import ScoredSample
+from bayesdist.diagnose.significance import chi_square_of
 
 __all__ = ["truncation_test"]
 
@@ -83,7 +84,9 @@ class _Radii:
     part : ndarray of int, shape (N,)
         Stars of about equal quoted errors.
     variance : ndarray, shape (2, P)
-        Of the residuals along each axis, in each part.
+        Of the residuals along each axis, in each part, given back what the fit has taken.
+    left : ndarray, shape (2, P)
+        As the fit has left it.
     relative_of : ndarray, shape (P,)
         Its relative error.
     """
@@ -94,20 +97,23 @@ class _Radii:
     radius2: Float
     part: Int
     variance: Float
+    left: Float
     relative_of: Float
 
     @classmethod
-    def of(cls, projection: Projection) -> _Radii:
-        """Those of a sample."""
-        sample, inlier = projection.sample, _weights(projection)
+    def of(cls, sample: ScoredSample, inlier: Float) -> _Radii:
+        """Residuals of a sample, its true matches by their probabilities (N,)."""
         n = inlier.sum()
         # given back what the fit has taken of them
-        square = sample.residual**2 / (1.0 - projection.leverage)
+        square = sample.residual**2 / (1.0 - sample.leverage)
         part = _alike(sample.variance.sum(axis=0), inlier)
         count = np.bincount(part, inlier)
         # not by the quoted errors of single stars: where they are wrong, those with large ones
         # would be expected far out
-        variance = np.stack([np.bincount(part, inlier * one) / count for one in square])
+        variance, left = (
+            np.stack([np.bincount(part, inlier * one) / count for one in both])
+            for both in (square, sample.residual**2)
+        )
         excess = square.sum(axis=0) / variance.sum(axis=0)[part] - 1.0
         square = square / sample.variance
         t = square.mean(axis=0)
@@ -119,6 +125,7 @@ class _Radii:
             radius2=(sample.residual**2).sum(axis=0),
             part=part,
             variance=variance,
+            left=left,
             relative_of=np.sqrt(np.bincount(part, inlier * excess**2)) / count,
         )
 
@@ -131,10 +138,10 @@ class _Radii:
         return float(np.sqrt(np.average(self.variance.mean(axis=0) * excess, weights=count)))
 
 
-def _weights(projection: Projection) -> Float:
+def _weights(sample: ScoredSample) -> Float:
     """Probabilities (N,) of true matches, without those whose residuals the fit has taken."""
-    own = projection.leverage.max(axis=0) < LARGEST_LEVERAGE
-    return np.asarray(projection.sample.inlier * own)
+    leverage = np.broadcast_to(sample.leverage, sample.score.shape)
+    return np.asarray(sample.inlier * (leverage.max(axis=0) < LARGEST_LEVERAGE))
 
 
 def _alike(variance: Float, inlier: Float) -> Int:
@@ -150,12 +157,13 @@ def _alike(variance: Float, inlier: Float) -> Int:
     return np.clip(np.searchsorted(kept, np.arange(len(count))), 0, len(kept) - 1)[part]
 
 
-def truncation_test(projection: Projection, match_radius: float | None = None) -> Outcome | None:
+def truncation_test(sample: ScoredSample, match_radius: float | None = None) -> Outcome | None:
     """Test for true matches missing beyond some radius.
 
     Parameters
     ----------
-    projection : Projection
+    sample : ScoredSample
+        With its leverage.
     match_radius : float, optional
         In the unit of u and v.
 
@@ -164,11 +172,11 @@ def truncation_test(projection: Projection, match_radius: float | None = None) -
     Outcome or None
         None for less than `FEWEST_STARS` true matches.
     """
-    sample, inlier = projection.sample, _weights(projection)
+    inlier = _weights(sample)
     n = float(inlier.sum())
     if n < FEWEST_STARS:
         return None
-    radii = _Radii.of(projection)
+    radii = _Radii.of(sample, inlier)
     found = [
         *_in_sigmas(radii),
         *_along_an_axis(radii),
@@ -180,24 +188,23 @@ def truncation_test(projection: Projection, match_radius: float | None = None) -
     if worst.unit == sample.model.unit:
         end = worst.radius**2 / both
     sigma = float(np.sqrt(np.median(both[radii.part]) / 2))
-    chi2 = sample.residual**2 / (sample.variance * (1.0 - projection.leverage))
+    chi2 = sample.residual**2 / (sample.variance * (1.0 - sample.leverage))
     p_value = min(1.0, len(found) * worst.p_value)
+    present = (
+        f"the residuals end too abruptly: {worst.expected:.3g} true matches are expected beyond "
+        f"{worst.radius:.3g} {worst.unit}, and there are {worst.beyond}, so that the matching has "
+        f"cut the scatter, and chi-square ({float(inlier @ chi2.mean(axis=0)) / n:.2g} of each "
+        "degree of freedom) says nothing of the quoted errors"
+    )
     return Outcome(
-        name="truncation",
-        statistic=float(stats.chi2.isf(max(p_value, LEAST_P), 1)),  # of the same probability
-        dof=1,
-        dof_residual=None,
-        p_value=p_value,
-        size=radii.lost(end),
-        smallest=partial(_smallest, sigma, n, len(found)),
-        unit=sample.model.unit,
-        remedy="match again with a wider radius",
-        present=f"the residuals end too abruptly: {worst.expected:.3g} true matches are expected "
-        f"beyond {worst.radius:.3g} {worst.unit}, and there are {worst.beyond}, so that the "
-        "matching has cut the scatter, and chi-square "
-        f"({float(inlier @ chi2.mean(axis=0)) / n:.2g} of each degree of freedom) says "
-        "nothing of the quoted errors",
-        absent="the residuals do not end abruptly",
+        replace(FAMILIES["truncation"], present=present),
+        chi_square_of(p_value, 1),
+        1,
+        None,
+        p_value,
+        radii.lost(end),
+        partial(_smallest, sigma, n, len(found)),
+        sample.model.unit,
     )
 
 
@@ -229,9 +236,9 @@ def _in_units(radii: _Radii, unit: str, match_radius: float | None) -> list[_Def
         ends.append((outside, match_radius**2))
     out = []
     for k, end in ends:
-        expected = np.bincount(radii.part, radii.inlier) * _tail(radii.variance, end)
+        expected = np.bincount(radii.part, radii.inlier) * _tail(radii.left, end)
         # by how much the logarithm goes with that of the variance
-        slope = end / radii.variance.sum(axis=0)
+        slope = end / radii.left.sum(axis=0)
         spread = np.sqrt(((expected * slope * radii.relative_of) ** 2).sum())
         total = float(expected.sum())
         out.append(_Deficit(total, k, np.sqrt(end), unit, float(spread) / max(total, 1e-300)))
@@ -239,7 +246,7 @@ def _in_units(radii: _Radii, unit: str, match_radius: float | None) -> list[_Def
 
 
 def _ends(values: Float) -> list[tuple[int, float]]:
-    """Where so many values lie beyond, for each number of `BEYOND`."""
+    """Numbers of `BEYOND`, each with the limit beyond which so many values lie."""
     return [(k, float(np.partition(values, -k - 1)[-k - 1])) for k in BEYOND]
 
 

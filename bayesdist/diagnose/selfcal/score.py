@@ -7,20 +7,19 @@ take up cannot be tested: directions in which known stars would say much more ar
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from bayesdist.diagnose.correlated.deviations import deviation_columns
+from bayesdist.diagnose.score.directions import independent_directions, squares_of
+from bayesdist.diagnose.score.families import FAMILIES, Family, order_family
 from bayesdist.diagnose.score.motions import SHORTEST, StarResiduals, motion_outcome
 from bayesdist.diagnose.score.noise import noise_tests
-from bayesdist.diagnose.score.result import Outcome, ScoreTest, corrected, noncentrality
+from bayesdist.diagnose.score.result import Outcome, ScoreTest, corrected, outcome
 from bayesdist.diagnose.score.sample import Block, ScoredSample
-from bayesdist.diagnose.score.score import independent_directions
 from bayesdist.diagnose.selfcal.columns import AddedColumns, pointing_terms
 from bayesdist.diagnose.selfcal.correlated import MOST_EXPOSURES
 from bayesdist.diagnose.selfcal.eliminated import (
@@ -33,9 +32,9 @@ from bayesdist.diagnose.selfcal.eliminated import (
 from bayesdist.diagnose.selfcal.leverage import taken_by_stars
 from bayesdist.diagnose.selfcal.sandwich import star_scores
 from bayesdist.diagnose.selfcal.scores import scores_of_detections
+from bayesdist.diagnose.significance import hotelling_p
 from bayesdist.infer.selfcal.elimination import memberships
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
-from bayesdist.model.basis import MAX_ORDER
 
 __all__ = ["selfcal_score_tests"]
 
@@ -45,6 +44,10 @@ Int = NDArray[np.int64]
 MOST_DETECTIONS = 60_000  # that are looked at
 STARS_PER_DIRECTION = 2  # below, a covariance of the scores says nothing
 TOLD = 0.02  # of what known stars would say of a direction: less is not told from their places
+REMEDIES = {
+    "magnitude": "cut the faint stars, or correct the charge-transfer efficiency",
+    "exposures": "give selfcal.frames a scale where it has none, or leave out exposures",
+}
 OUTSIDE = 0.5  # per cent of the magnitudes at either end that are moved to the others
 
 
@@ -163,80 +166,41 @@ def _tested(sums: _Sums, name: str, which: Int, order: int) -> Outcome | None:
         return None
     U, S, V = N.T @ sums.score[which], N.T @ sums.information[at] @ N, N.T @ sums.covariance[at] @ N
     T = float(U @ np.linalg.solve(V, U))
-    inverse, Q = np.linalg.inv(S), N.T @ sums.square[at] @ N
-    step, noise = inverse @ U, float(np.trace(Q @ inverse @ V @ inverse))
-    remedy, present, absent = _words(name, order)
-    return Outcome(
-        name=name,
-        statistic=T,
-        dof=q,
-        dof_residual=float(n - q),
-        p_value=float(stats.beta.sf(min(T / n, 1.0), q / 2, (n - q) / 2)),
-        size=float(np.sqrt(max(float(step @ Q @ step) - noise, 0.0))),
-        smallest=partial(_smallest, float(np.sqrt(max(noise, 0.0))), q, float(n - q)),
+    square, noise = squares_of(U, S, V, N.T @ sums.square[at] @ N)
+    return outcome(
+        _family(name, order),
+        T,
+        q,
+        float(n - q),
+        hotelling_p(T, q, n),
+        square=square,
+        noise=noise,
         unit=sums.unit,
-        remedy=remedy,
-        present=present,
-        absent=absent,
     )
 
 
-def _smallest(noise: float, dof: float, dof_residual: float, level: float) -> float:
-    return float(noise * np.sqrt(noncentrality(level, dof, dof_residual) / dof))
-
-
-def _words(name: str, order: int) -> tuple[str, str, str]:
-    """Remedy, and the finding where there is something and where there is not."""
+def _family(name: str, order: int) -> Family:
+    """Words of a test, with what can be done in a self-calibration."""
     if name.startswith("order "):
-        total = int(name.removeprefix("order "))
-        raised = f"raise model.order to {total}" if total <= MAX_ORDER else "fit a look-up table"
-        return (
-            raised,
-            f"the residuals hold terms of {name}, and the model ends at order {order}",
-            f"no terms of {name} are left in the residuals",
-        )
-    if name == "magnitude":
-        return (
-            "cut the faint stars, or correct the charge-transfer efficiency",
-            "the residuals go with the magnitude of the stars",
-            "the residuals do not go with the magnitude of the stars",
-        )
-    if name == "pointing":
-        return (
-            "give the true detector.scale_mas, by which tangent planes are taken to one",
-            "the distortion goes with where exposures point, as if a curved sky were taken as flat",
-            "the distortion does not go with where exposures point",
-        )
-    return (
-        "give selfcal.frames a scale where it has none, or leave out exposures",
-        "exposures deviate from each other in linear terms that their frames do not fit",
-        "no deviations of single exposures are left in the residuals",
-    )
+        return order_family(int(name.removeprefix("order ")), order)
+    return replace(FAMILIES[name], remedy=REMEDIES.get(name, FAMILIES[name].remedy))
 
 
 def _motions(solution: SelfCalibrationMode, epoch: Float) -> Outcome | None:
     """Test for stars that move."""
     p, scores = solution.problem, scores_of_detections(solution)
-    return motion_outcome(
-        StarResiduals(p.star, epoch, scores.gradient, scores.curvature, p.priors.precision),
-        p.model.unit,
+    family = replace(
+        FAMILIES["motions"],
         remedy="set selfcal.motion to 'proper_motion'",
         present="stars move between the dates of the exposures, and are taken to stand still",
     )
-
-
-@dataclass(frozen=True, eq=False)
-class _Scored:
-    """As of `Scored`."""
-
-    sample: ScoredSample
-    whole_score: Float
-    leverage: Float
+    residuals = StarResiduals(p.star, epoch, scores.gradient, scores.curvature, p.priors.precision)
+    return motion_outcome(residuals, p.model.unit, family)
 
 
 def _noise_sample(
     solution: SelfCalibrationMode, some: Int, rows: NDArray[np.bool_], mag: Float | None
-) -> _Scored:
+) -> ScoredSample:
     """Some detections along the axes of the detector, in the unit of u and v.
 
     Rolls turn the axes of the sky from exposure to exposure, and errors are those of pixels.
@@ -268,7 +232,8 @@ def _noise_sample(
         for k, (a, b) in enumerate(pairwise(starts))
         if b > a
     )
-    sample = ScoredSample(
+    taken = taken_by_stars(solution)[rows][order]
+    return ScoredSample(
         model=model,
         X=p.X[order],
         Y=p.Y[order],
@@ -282,6 +247,5 @@ def _noise_sample(
         epoch=None,
         star=p.star[order],
         blocks=blocks,
+        leverage=np.stack([taken, taken]),
     )
-    taken = taken_by_stars(solution)[rows][order]
-    return _Scored(sample, sample.score / np.sqrt(1.0 - taken), np.stack([taken, taken]))

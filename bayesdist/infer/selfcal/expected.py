@@ -17,6 +17,7 @@ from bayesdist.infer.selfcal.elimination import Mixture, expand
 from bayesdist.infer.selfcal.gauge import Gauge, find_gauge
 from bayesdist.infer.selfcal.problem import Problem, prepare
 from bayesdist.infer.selfcal.relative import gauge_free_matrix
+from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["ExpectedSolution", "expected_solution"]
@@ -28,7 +29,7 @@ NONE_FALSE = Mixture(jitter=0.0, fraction=1e-300)
 
 
 @dataclass(frozen=True, eq=False)
-class ExpectedSolution:
+class ExpectedSolution(Solution):
     """Expected solution without noise: its mean is the truth."""
 
     model: DistortionModel

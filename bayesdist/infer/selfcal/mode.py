@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError, NotSettledError
 from bayesdist.infer.equations.priors import Prior
-from bayesdist.infer.linear import Clip, LinearFit
+from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.selfcal.elimination import Expansion, Mixture, expand
 from bayesdist.infer.selfcal.gauge import Decision, Gauge, find_gauge
 from bayesdist.infer.selfcal.problem import Problem, StarPriors
+from bayesdist.infer.stars.likelihood import Clip
 
 __all__ = ["PriorAt", "SelfCalibrationMode", "curvatures", "gauge_of", "solve", "solve_in_gauge"]
 

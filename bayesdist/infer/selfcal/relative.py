@@ -7,8 +7,6 @@ removed (an S-transformation: Baarda 1973; Teunissen 1985); the rest is common t
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -57,8 +55,4 @@ def gauge_free(solution: LinearFit | Posterior, null: Float) -> LinearFit | Post
     LinearFit or Posterior
         With the same mean.
     """
-    S = gauge_free_matrix(solution.model, solution.mean, null)
-    if isinstance(solution, LinearFit):
-        return replace(solution, cov=S @ solution.cov @ S.T)
-    mean = solution.mean
-    return replace(solution, theta=mean + (solution.theta - mean) @ S.T)
+    return solution.mapped(gauge_free_matrix(solution.model, solution.mean, null))

@@ -9,7 +9,7 @@ import pytest
 from scipy.special import ndtri
 
 from bayesdist.assess import distortion_vectors
-from bayesdist.diagnose.statistics import StatisticsRow
+from bayesdist.diagnose.residuals import StatisticsRow
 from bayesdist.missions.wise.assess.account import RowAccount
 from bayesdist.missions.wise.assess.distortion_field import field_of_solution
 from bayesdist.missions.wise.assess.histograms import histogram
@@ -21,7 +21,9 @@ PRINT = 0.005  # the report does not say where it looked for maxima: a pixel mor
 
 
 def solution(model: DistortionModel, theta: np.ndarray) -> SimpleNamespace:
-    return SimpleNamespace(model=model, mean=theta, cov=np.zeros((theta.size,) * 2))
+    return SimpleNamespace(
+        model=model, mean=theta, cov=np.zeros((theta.size,) * 2), convergence=None
+    )
 
 
 def field(band: str):

@@ -1,0 +1,110 @@
+"""Did the pattern of residuals change?  Each period against all the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+from scipy.stats import f as f_distribution
+
+from bayesdist.diagnose.residuals.binned import BAND_AXES, BinnedSums, BinValues
+from bayesdist.errors import DegenerateError, InputError
+
+__all__ = ["PatternChange", "pattern_changes"]
+
+Float = NDArray[np.float64]
+
+_FEWEST_STARS = 5
+
+
+@dataclass(frozen=True)
+class PatternChange:
+    """Means of bins in one period against those in all other periods.
+
+    Parameters
+    ----------
+    period, axis : str
+    p_value : float
+        Probability of as large differences by chance.
+    rms : float
+        Of the differences, their noise subtracted; 0 where noise alone is larger.
+    correlation : float
+        Between the two patterns, noise included: near 1 where the same structure stays and noise is
+        small.
+    n_bins : int
+        Bins that hold five stars or more in both.
+    """
+
+    period: str
+    axis: str
+    p_value: float
+    rms: float
+    correlation: float
+    n_bins: int
+
+
+def pattern_changes(periods: Mapping[str, BinnedSums]) -> tuple[PatternChange, ...]:
+    """Every period against the rest.
+
+    A single period shares its stars with the combined set, the rest does not: differences from the
+    rest have independent errors, and those from the combined set are the same, made smaller by the
+    share of the rest.
+
+    Parameters
+    ----------
+    periods : mapping of str to BinnedSums
+        Disjoint in their stars, all against one model, in pixels; two or more.
+
+    Returns
+    -------
+    tuple of PatternChange
+        X and Y of each period.
+
+    Raises
+    ------
+    InputError
+        For less than two periods.
+    DegenerateError
+        When fewer than three bins hold five stars in a period and in the rest.
+    """
+    names = list(periods)
+    if len(names) < 2:
+        raise InputError("one period has no other to be compared with", do="give two or more")
+    out = []
+    for name in names:
+        others = [periods[n] for n in names if n != name]
+        rest = others[0]
+        for more in others[1:]:
+            rest = rest + more
+        out += [
+            _change(name, axis, periods[name].values(axis), rest.values(axis))
+            for axis in BAND_AXES[:2]
+        ]
+    return tuple(out)
+
+
+def _change(period: str, axis: str, one: BinValues, rest: BinValues) -> PatternChange:
+    good = one.good & rest.good & (np.minimum(one.dof, rest.dof) >= _FEWEST_STARS - 1)
+    n = int(good.sum())
+    if n < 3:
+        raise DegenerateError(
+            f"only {n} bins hold {_FEWEST_STARS} stars in this period and in the others",
+            where=f"period {period!r}",
+            do="take fewer bins",
+        )
+    a, b = one.mean[good], rest.mean[good]
+    variance = one.sem[good] ** 2 + rest.sem[good] ** 2
+    difference = BinValues(one.mean, one.sem, one.dof).minus(rest)
+    p_value = _p_value((a - b) ** 2 / variance, difference.dof[good])
+    excess = float(np.mean((a - b) ** 2 - variance))
+    alike = float(np.corrcoef(a, b)[0, 1]) if a.std() > 0 and b.std() > 0 else float("nan")
+    return PatternChange(period, axis, p_value, float(np.sqrt(max(excess, 0.0))), alike, n)
+
+
+def _p_value(t2: Float, dof: Float) -> float:
+    """Of squared t variables together: each through the normal variable of its own probability."""
+    z2 = chi2.isf(f_distribution.sf(t2, 1, dof), 1)
+    return float(chi2.sf(z2.sum(), z2.size))

@@ -1,0 +1,59 @@
+"""Directions in which a model may lack something: which are left, and how large a finding is."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["independent_directions", "squares_of"]
+
+Float = NDArray[np.float64]
+
+
+def independent_directions(whole: Float, left: Float, least: float) -> Float:
+    """Directions of regressors that the parameters have left, (n, q).
+
+    Parameters
+    ----------
+    whole, left : ndarray, shape (n, n)
+        Information of the regressors before and after the parameters are projected out.
+    least : float
+        Fraction of it that a direction must have kept.
+
+    Returns
+    -------
+    ndarray, shape (n, q)
+        In units in which `whole` is the unit matrix.
+    """
+    diagonal = np.diag(whole)
+    scale = np.zeros(len(diagonal))
+    scale[diagonal > 0] = diagonal[diagonal > 0] ** -0.5
+    values, vectors = np.linalg.eigh(whole * np.outer(scale, scale))
+    good = values > 1e-8 * values.max(initial=1e-300)
+    basis = scale[:, None] * vectors[:, good] / np.sqrt(values[good])
+    kept, turn = np.linalg.eigh(basis.T @ left @ basis)
+    return np.asarray(basis @ turn[:, kept > least])
+
+
+def squares_of(
+    score: Float, information: Float, covariance: Float, square: Float
+) -> tuple[float, float]:
+    """Mean squares of the pattern that a score stands for, and of what noise makes of it.
+
+    Parameters
+    ----------
+    score : ndarray, shape (q,)
+    information, covariance : ndarray, shape (q, q)
+        Of the directions, and of their score.
+    square : ndarray, shape (q, q)
+        Mean products of the directions over the detector.
+
+    Returns
+    -------
+    found, noise : float
+        The first with the second included.
+    """
+    inverse = np.linalg.inv(information)
+    step = inverse @ score
+    noise = np.trace(square @ inverse @ covariance @ inverse)
+    return float(step @ square @ step), float(noise)
