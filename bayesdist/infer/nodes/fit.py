@@ -100,6 +100,14 @@ def fit_with_tables(
         the detector's.
     DegenerateError
         When the matches do not determine the model.
+
+    Notes
+    -----
+    The detector's tables come from one filter, and each other one lies over them::
+
+        base = fit_with_tables(matches.select(matches.filter == 0), model)
+        other = matches.select(matches.filter == 1)
+        fit_with_tables(other, model, filter="F814W", beneath=base.fitted)
     """
     _check(matches, beneath, method, max_iterations, tolerance)
     matches, model = _with_own_exposures(matches, model)
