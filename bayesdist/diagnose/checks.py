@@ -26,16 +26,10 @@ OF_EXPOSURES, OF_CURVATURE = "exposures", "curvature in time"
 def structure_checks(
     misfits: Sequence[Misfit], correlated: Discrepancy | None = None, *, fit: str = "the fit"
 ) -> Iterator[Check]:
-    """Whether a fit leaves structure in the residuals, and whether it could have been seen.
+    """Checks of the structure that a fit leaves in the residuals.
 
-    Parameters
-    ----------
-    misfits : sequence of Misfit
-        One for each chip; nothing is checked where there is none.
-    correlated : Discrepancy, optional
-        Correlated errors of the solution, which hold some of it.
-    fit : str
-        Which fit, in words.
+    `misfits`: one for each chip; nothing is checked where there is none; `correlated`: correlated
+    errors of the solution, which hold some of it; `fit`: which fit, in words.
     """
     if not misfits:
         return
@@ -75,13 +69,9 @@ def structure_checks(
 def score_checks(
     tests: Sequence[ScoreTest], correlated: Discrepancy | None = None
 ) -> Iterator[Check]:
-    """What targeted tests have found, each as a remark.
+    """Checks of what targeted tests have found, each as a remark.
 
-    Parameters
-    ----------
-    tests : sequence of ScoreTest
-    correlated : Discrepancy, optional
-        Correlated errors: verdicts stand where these hold what a test has found.
+    `correlated`: correlated errors: verdicts stand where these hold what a test has found.
     """
     for test in tests:
         if test.significant:
@@ -91,7 +81,7 @@ def score_checks(
 
 
 def _held(correlated: Discrepancy | None, test: str) -> bool:
-    """Whether correlated errors hold what a test has found."""
+    """True where correlated errors hold what a test has found."""
     if correlated is None:
         return False
     scatter = set() if correlated.linear is None else set(correlated.linear.scatter)
@@ -104,12 +94,7 @@ def _held(correlated: Discrepancy | None, test: str) -> bool:
 
 
 def holdout_checks(found: HeldOutTruth | None) -> Iterator[Check]:
-    """The verdict of held-out stars; nothing where there are none.
-
-    Parameters
-    ----------
-    found : HeldOutTruth or None
-    """
+    """Check of held-out stars; nothing where there are none."""
     if found is None:
         return
     agrees = found.level == "pass"

@@ -30,34 +30,22 @@ MOST_CELLS = 24  # along an axis
 
 @dataclass(frozen=True, eq=False)
 class OverlapTest:
-    """Two exposures of the run laid on each other, through the old files and the new ones.
-
-    Parameters
-    ----------
-    names : tuple of str
-    epochs : tuple of float
-    pa_v3 : tuple of float
-        NaN where it is not known.
-    old, new : Alignment
-        Of the same stars: through the known distortion of the start, and through the solution.
-    binned_old, binned_new : BinnedResiduals
-        Over the area that both exposures see; axes (xi, eta), pixels.
-    corner : tuple of float
-        (xi, eta) of the area's corner, which the cells count from, pixels.
-    pixel_mas : float
-    with_motions : bool
-        Whether the catalogue's proper motions between the two epochs were taken out.
-    """
+    """Two exposures of the run laid on each other, through the old files and the new ones."""
 
     names: tuple[str, str]
     epochs: tuple[float, float]
-    pa_v3: tuple[float, float]
+    pa_v3: tuple[float, float]  # NaN where it is not known
+    # old, new: of the same stars: through the known distortion of the start, and through the
+    # solution
     old: Alignment
     new: Alignment
+    # binned_old, binned_new: over the area that both exposures see; axes (xi, eta), pixels
     binned_old: BinnedResiduals
     binned_new: BinnedResiduals
+    # (xi, eta) of the area's corner, which the cells count from, pixels
     corner: tuple[float, float]
     pixel_mas: float
+    # True where the catalogue's proper motions between the two epochs were taken out
     with_motions: bool
 
     @property
@@ -78,26 +66,10 @@ def overlap_test(
 ) -> OverlapTest | None:
     """Lay the two exposures that are farthest apart in time on each other.
 
-    Parameters
-    ----------
-    pairs : MatchTable
-        Raw pixels beside positions of the catalogue.
-    solution : Solution
-    known : Calibration
-        The known distortion of the start.
-    tables : sequence of LookupTable
-        That go with the solution.
-    unit_arcsec : float
-        Size of the unit of u and v.
-    pixel : float
-        Size of a pixel, arcsec.
-    rolls : mapping of str to float
-        PA_V3 of the exposures, where it is known.
-
-    Returns
-    -------
-    OverlapTest or None
-        None where no two exposures share enough stars.
+    `pairs`: raw pixels beside positions of the catalogue; `known`: the known distortion of the
+    start; `tables`: that go with the solution; `unit_arcsec`: size of the unit of u and v; `pixel`:
+    size of a pixel, arcsec; `rolls`: PA_V3 of the exposures, where it is known. None where no two
+    exposures share enough stars.
     """
     chosen = chosen_exposures(pairs)
     if chosen is None:
@@ -138,15 +110,8 @@ def overlap_test(
 def chosen_exposures(pairs: MatchTable) -> tuple[int, int] | None:
     """Codes of the two exposures farthest apart in time that share half of their stars.
 
-    Parameters
-    ----------
-    pairs : MatchTable
-        With codes of the catalogue's stars and epochs.
-
-    Returns
-    -------
-    tuple of int, or None
-        The earlier one first; None where no two share enough.
+    `pairs`: with codes of the catalogue's stars and epochs. The earlier one comes first;
+    None where no two share enough.
     """
     if pairs.star is None or pairs.epoch is None:
         return None

@@ -41,7 +41,7 @@ class StructureFunctions:
 
     @classmethod
     def for_stars(cls, order: int, size: tuple[float, float], n: int) -> StructureFunctions:
-        """As many functions as n stars on the chip can resolve."""
+        """Functions as fine as n stars on the chip can resolve."""
         side = int(np.clip(np.sqrt(n / STARS_PER_SINE), LEAST_SIDE, MOST_SIDE))
         return cls(order, size, side)
 

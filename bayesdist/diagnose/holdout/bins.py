@@ -1,4 +1,4 @@
-"""How held-out stars are divided: by place, magnitude, date and exposure.
+"""Division of held-out stars by position, magnitude, date and exposure.
 
 An exposure that was held out whole is also divided by place: what bends it alone leaves its mean
 where it was.
@@ -33,42 +33,25 @@ MOST_EXPOSURES = 60  # beyond it only those that were held out whole are looked 
 
 @dataclass(frozen=True)
 class Bin:
-    """One part of the held-out stars.
+    """One part of the held-out stars."""
 
-    Parameters
-    ----------
-    words : str
-        Where it is, as a clause: 'at x 1 to 512, y 1 to 512'.
-    chip : Chip or None
-        Of a region.
-    limits : tuple of float
-        x and y of a region's edges, pixels; lowest and highest magnitude or date.
-    """
-
-    words: str
-    chip: Chip | None = None
+    words: str  # where it is, as a clause: 'at x 1 to 512, y 1 to 512'
+    chip: Chip | None = None  # of a region
+    # x and y of a region's edges, pixels; lowest and highest magnitude or date
     limits: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class Partition:
-    """Bins that hold each star once, or not at all.
+    """Bins that hold each star once, or not at all."""
 
-    Parameters
-    ----------
-    kind : str
-        'all', 'region', 'magnitude', 'epoch', 'exposure' or 'place in exposure'.
-    bins : tuple of Bin
-    code : callable
-        Of a table and some of its rows: bin of each, negative where there is none.
-    """
-
-    kind: str
+    kind: str  # 'all', 'region', 'magnitude', 'epoch', 'exposure' or 'place in exposure'
     bins: tuple[Bin, ...]
+    # of a table and some of its rows: bin of each, negative where there is none
     code: Callable[[MatchTable, Int], Int]
 
     def codes(self, table: MatchTable, rows: Int) -> Int:
-        """Bin of each of some rows."""
+        """Bins (n,) of some rows."""
         return self.code(table, rows)
 
 
@@ -77,18 +60,8 @@ def partitions_of(
 ) -> tuple[Partition, ...]:
     """The parts in which held-out stars are judged.
 
-    Parameters
-    ----------
-    model : DistortionModel
-    held : MatchTable or PartitionedMatches
-    sample : MatchTable
-        Some of them, evenly spread: they say where bins end.
-    whole : sequence of str
-        Exposures that were held out whole.
-
-    Returns
-    -------
-    tuple of Partition
+    `sample`: some of them, evenly spread: they say where bins end; `whole`: exposures that were
+    held out whole.
     """
     n = len(held)
     out = [Partition(ALL, (Bin("over the whole detector"),), lambda _, rows: rows * 0)]

@@ -1,4 +1,4 @@
-"""Whether an exposure that was held out whole deviates from the others as these scatter.
+"""Deviations of exposures that were held out whole, against the scatter of the others.
 
 Its scale and shears, and where its chips lie, are fitted to its own stars before these are judged:
 what is wrong with them does not show in residuals.  With b and v the estimate of one deviation
@@ -30,17 +30,9 @@ LEAST_TOLD = 0.5  # of a deviation's variance beforehand: where stars tell less,
 
 
 def deviation_tests(predictive: Predictive, frames: Mapping[str, Frame]) -> list[HeldTest]:
-    """Each deviation of each exposure that was held out whole.
+    """Tests of each deviation of each exposure that was held out whole.
 
-    Parameters
-    ----------
-    predictive : Predictive
-    frames : mapping of str to Frame
-
-    Returns
-    -------
-    list of HeldTest
-        Their `limit` is the scatter.
+    Their `limit` is the scatter.
     """
     known = predictive.deviations
     if known is None:

@@ -53,7 +53,7 @@ class SharedErrors:
         size: Float,
         codes: Mapping[str, Int],
     ) -> None:
-        """Some matches, with their scores and the bins that they lie in."""
+        """Add matches, with their scores and the bins that they lie in."""
         stars, index = self._predictive.stars, rows.index
         if stars is None or table.star is None:
             star = -1 - self._n - np.arange(len(index))  # each by itself

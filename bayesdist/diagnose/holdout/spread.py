@@ -1,4 +1,4 @@
-"""How much the scores of the scale of errors scatter by themselves, and sums of them against it."""
+"""Moments of the scores of the scale of errors, and tails of their sums."""
 
 from __future__ import annotations
 
@@ -23,10 +23,6 @@ class SpreadMoments:
     in which true matches fall as exp(-t) and false ones as k exp(-k t) or not at all, tabulated in
     k, the ratio of their variances; errors that differ between the axes count as their geometric
     mean.
-
-    Parameters
-    ----------
-    predictive : Predictive
     """
 
     def __init__(self, predictive: Predictive) -> None:
@@ -60,7 +56,7 @@ class SpreadMoments:
         )
 
     def of_axis(self, cov: Float) -> tuple[Float, Float]:
-        """The same of the score of an axis: both axes have the same."""
+        """Moments (n,) of the score of an axis: both axes have the same."""
         log_k = self._ratio(cov)
         return (
             np.interp(log_k, self._log_k, self._axis_second),

@@ -30,7 +30,7 @@ ORDER = ("offset", "deviation", "spread", "tails", "distribution")  # of what te
 
 @dataclass(frozen=True, eq=False)
 class HeldOutTruth:
-    """What held-out stars say of a solution.
+    """Results of held-out stars against a solution.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ class HeldOutTruth:
 
     @property
     def doubtful(self) -> bool:
-        """Whether errors are larger than the solution says, beyond chance."""
+        """True where errors are larger than the solution states, beyond chance."""
         return self._telling(HELD_OUT_DOUBTFUL.value) is not None
 
     @property
@@ -136,9 +136,9 @@ class HeldOutTruth:
 
 
 def _rank(test: HeldTest) -> tuple[float, int, float, bool]:
-    """Where a test stands among others: tails of distributions underflow together.
+    """Key by which tests are sorted: tails of distributions underflow together.
 
-    Of an exposure that is alone at its date it is the exposure that is told.
+    Of an exposure that is alone at its date the exposure is named.
     """
     size = -abs(test.value - test.expected)
     return test.p_value, ORDER.index(test.name), size, test.part == "epoch"
@@ -147,7 +147,7 @@ def _rank(test: HeldTest) -> tuple[float, int, float, bool]:
 def held_out_truth(
     solution: Posterior | Predictive, held: Matches, *, whole: Sequence[str] = ()
 ) -> HeldOutTruth:
-    """Judge a solution by stars that it has not seen.
+    """Results of stars that a solution has not seen.
 
     Parameters
     ----------

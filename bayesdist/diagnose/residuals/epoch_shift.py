@@ -45,33 +45,20 @@ NORMAL = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
 
 @dataclass(frozen=True)
 class EpochShift:
-    """An error of the epochs that explains residuals.
+    """An error of the epochs that explains residuals."""
 
-    Parameters
-    ----------
-    years : float
-        From the epoch that the reference positions have to that of the exposures.
-    sigma : float
-        Its standard error.
-    before, after : float
-        Robust scatter of the residuals along an axis, as they are and with the shift, in `unit`; of
-        stars with well known motions.
-    unit : str
-        Of u and v.
-    significant : bool
-        More than five standard errors, and the scatter falls.
-    """
-
-    years: float
-    sigma: float
+    years: float  # from the epoch that the reference positions have to that of the exposures
+    sigma: float  # its standard error
+    # before, after: robust scatter of the residuals along an axis, as they are and with the shift,
+    # in `unit`; of stars with well known motions
     before: float
     after: float
-    unit: str
-    significant: bool
+    unit: str  # of u and v
+    significant: bool  # more than five standard errors, and the scatter falls
 
     @property
     def sentence(self) -> str:
-        """What it means, and what to do about it."""
+        """Meaning of the shift, and remedy."""
         when = "after" if self.years > 0 else "before"
         return (
             f"the residuals go with the proper motions of the stars: the exposures were taken "
@@ -84,16 +71,8 @@ class EpochShift:
 def epoch_shift(table: MatchTable, solution: Solution) -> EpochShift | None:
     """The error of the epochs that the residuals show.
 
-    Parameters
-    ----------
-    table : MatchTable
-        With proper motions; of more than `SAMPLE` rows, every k-th is taken.
-    solution : Posterior or LinearFit
-
-    Returns
-    -------
-    EpochShift or None
-        None without proper motions, or with too few.
+    `table`: with proper motions; of more than `SAMPLE` rows, every k-th is taken. None without
+    proper motions, or with too few.
     """
     if table.pm_u is None or table.pm_v is None:
         return None
@@ -146,7 +125,7 @@ def _scatter(values: Float) -> float:
 
 
 def _left_over(sample: ScoredSample, weight: Float, *fields: Float) -> Iterator[Float]:
-    """What polynomials on each chip of each exposure leave of vectors (2, N)."""
+    """Vectors (2, N) less their polynomials on each chip of each exposure."""
     out = [field.copy() for field in fields]
     order = sample.model.order
     i, j = np.array(polynomial_terms(order)).T

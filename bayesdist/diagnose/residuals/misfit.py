@@ -67,22 +67,22 @@ class Misfit:
 
     @property
     def significant(self) -> bool:
-        """Whether the structure is more than chance."""
+        """True where the structure is more than chance."""
         return not STRUCTURE.met_by(self.p_value)
 
     @property
     def hidden(self) -> bool:
-        """Whether most structure would not have been seen."""
+        """True where most structure would not have been seen."""
         return not STRUCTURE_SEEN.met_by(self.told)
 
     @property
     def sentence(self) -> str:
-        """What it means, as a clause."""
+        """Meaning and consequence of the structure, as a clause."""
         return f"{self.finding}, so that errors are larger than the posterior says"
 
     @property
     def finding(self) -> str:
-        """The same without the consequence."""
+        """Meaning of the structure, as a clause."""
         part = "the detector" if self.chip is None else f"chip {self.chip.name}"
         return (
             f"the residuals hold structure that the model does not describe ({self.structure:.2g} "

@@ -36,21 +36,11 @@ WISE_ARCSEC = {"W1": 2.75, "W2": 2.75, "W3": 2.75, "W4": 5.5}  # per pixel; W4 i
 
 @dataclass(frozen=True, eq=False)
 class StatisticsTable:
-    """Rows of statistics.
-
-    Parameters
-    ----------
-    title : str
-    first : str
-        Head of the column of labels.
-    unit : str
-        'pix' or 'arcsec'.
-    rows : tuple of StatisticsRow
-    """
+    """Rows of statistics."""
 
     title: str
-    first: str
-    unit: str
+    first: str  # head of the column of labels
+    unit: str  # 'pix' or 'arcsec'
     rows: tuple[StatisticsRow, ...]
 
     def __getitem__(self, label: str) -> StatisticsRow:
@@ -62,17 +52,10 @@ class StatisticsTable:
     def to_table(self, *, errors: bool = False) -> Table:
         """The table in the report's layout.
 
-        Parameters
-        ----------
-        errors : bool
-            Add for every statistic its error and its value without noise, and the numbers of bins.
-
-        Returns
-        -------
-        astropy.table.Table
-            Columns 'Band/Axis' (or as `first`), Mean, Sigma, Min, Max, Median, 1%-tile, 99%-tile;
-            with errors also 'Mean error', 'Mean noise-free' and so on, 'Sigma noise', 'Bins' and
-            'Bins left out'.
+        `errors`: add for every statistic its error and its value without noise, and the numbers of
+        bins. The result is columns 'Band/Axis' (or as `first`), Mean, Sigma, Min, Max, Median,
+        1%-tile, 99%-tile; with errors also 'Mean error', 'Mean noise-free' and so on, 'Sigma
+        noise', 'Bins' and 'Bins left out'.
         """
         out = Table(meta={"title": self.title, "unit": self.unit})
         out[self.first] = [row.label for row in self.rows]
@@ -262,7 +245,7 @@ def period_table(
 
 
 def _two_bands(bands: Iterable[str]) -> Iterator[tuple[str, str, str]]:
-    """Every band with every later one, on each axis."""
+    """Iterator over every band with every later one, on each axis."""
     for (earlier, later), axis in product(combinations(bands, 2), _AXES):
         yield earlier, later, axis
 

@@ -39,42 +39,20 @@ MOVING = 1e-6  # of the determinant of the slope's information, that the positio
 
 @dataclass(frozen=True, eq=False)
 class StarResiduals:
-    """Gradients and curvatures of detections by the positions of their stars.
+    """Gradients and curvatures of detections by the positions of their stars."""
 
-    Parameters
-    ----------
-    star : ndarray of int, shape (N,)
-    epoch : ndarray, shape (N,)
-    gradient : ndarray, shape (N, 2)
-        Of the log-likelihood by the star's position.
-    curvature : ndarray, shape (N, 2, 2)
-        Minus the second derivatives.
-    precision : ndarray, shape (2, 2), (stars, 2, 2) or ()
-        Of what is known of the positions beforehand.
-    stated : ndarray, shape (stars, 2), or None
-        Errors of the motions that the catalogue has.
-    """
-
-    star: Int
-    epoch: Float
-    gradient: Float
-    curvature: Float
-    precision: Float
-    stated: Float | None = None
+    star: Int  # (N,)
+    epoch: Float  # (N,)
+    gradient: Float  # (N, 2) of the log-likelihood by the star's position
+    curvature: Float  # (N, 2, 2) minus the second derivatives
+    precision: Float  # (2, 2) or (stars, 2, 2) or () of what is known of the positions beforehand
+    stated: Float | None = None  # (stars, 2) errors of the motions that the catalogue has
 
 
 def motion_test(sample: ScoredSample) -> Outcome | None:
     """Test of matched stars for motions that the catalogue does not have.
 
-    Parameters
-    ----------
-    sample : ScoredSample
-        With its leverage.
-
-    Returns
-    -------
-    Outcome or None
-        None without dates, and where too few stars are seen at several of them.
+    None without dates, and where too few stars are seen at several of them.
     """
     if sample.epoch is None or np.ptp(sample.epoch) < SHORTEST:
         return None
@@ -97,17 +75,7 @@ def motion_test(sample: ScoredSample) -> Outcome | None:
 def motion_outcome(data: StarResiduals, unit: str, family: Family) -> Outcome | None:
     """Test of residuals of stars.
 
-    Parameters
-    ----------
-    data : StarResiduals
-    unit : str
-        Of u and v.
-    family : Family
-
-    Returns
-    -------
-    Outcome or None
-        None for too few stars.
+    None for too few stars.
     """
     star, g, H = data.star, data.gradient, data.curvature
     S = int(star.max()) + 1

@@ -37,25 +37,15 @@ MOST_MAGNITUDES = 10
 
 @dataclass(frozen=True, eq=False)
 class _Squares:
-    """Squared scores and curvatures of the detections that say anything, in units of their errors.
+    """Squared scores and curvatures of detections, in units of their errors."""
 
-    Parameters
-    ----------
-    square, expected : ndarray, shape (2, N)
-        Along u and v.
-    star : ndarray of int, shape (N,)
-    sigma : float
-        Typical standard deviation along an axis.
-    free : float
-        Degrees of freedom of the residuals, over their number: what the fit takes from all of them
-        together makes their squares scatter more than each by itself shows.
-    unit : str
-    """
-
+    # square, expected (2, N): along u and v
     square: Float
     expected: Float
-    star: Int
-    sigma: float
+    star: Int  # (N,)
+    sigma: float  # typical standard deviation along an axis
+    # degrees of freedom of the residuals, over their number: what the fit takes from all of them
+    # together makes their squares scatter more than each by itself shows
     free: float
     unit: str
 
@@ -66,17 +56,7 @@ class _Squares:
 
 
 def noise_tests(sample: ScoredSample) -> list[Outcome]:
-    """Outcomes of the tests by position, magnitude, exposure and axis, as far as the data go.
-
-    Parameters
-    ----------
-    sample : ScoredSample
-        With its leverage.
-
-    Returns
-    -------
-    list of Outcome
-    """
+    """Outcomes of the tests by position, magnitude, exposure and axis, as far as the data go."""
     leverage = np.broadcast_to(sample.leverage, sample.score.shape)
     # what the fit has taken of a residual says nothing of its noise
     rows = np.flatnonzero(sample.used & (leverage.max(axis=0) < LARGEST_LEVERAGE))

@@ -29,15 +29,7 @@ def pattern_test(sample: ScoredSample) -> Outcome | None:
     At each frequency k the power |sum g exp(i k x)|^2 of the scores g of one axis, over the sum of
     their squares, is exponential where there is no wave, whatever the errors of single stars.
 
-    Parameters
-    ----------
-    sample : ScoredSample
-        With its leverage.
-
-    Returns
-    -------
-    Outcome or None
-        None for less than `FEWEST_STARS` detections.
+    None for less than `FEWEST_STARS` detections.
     """
     if len(sample) < FEWEST_STARS:
         return None

@@ -41,16 +41,7 @@ MOST_CHIPS = 4  # that are tested together, with the covariance of all their sco
 
 
 def regressor_tests(projection: Projection) -> list[Outcome]:
-    """Outcomes of all regressor tests that there are stars enough for.
-
-    Parameters
-    ----------
-    projection : Projection
-
-    Returns
-    -------
-    list of Outcome
-    """
+    """Outcomes of all regressor tests that there are stars enough for."""
     found: dict[str, list[_Part]] = {}
     for chips in _chips_together(projection):
         for name, part in _parts_of(projection, chips):
@@ -61,20 +52,13 @@ def regressor_tests(projection: Projection) -> list[Outcome]:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One test on one chip, or on a few together.
-
-    Parameters
-    ----------
-    statistic, p_value : float
-    dof, dof_residual : float
-    square, noise : float
-        Mean square of the pattern over these chips, noise included, and of the noise.
-    """
+    """One test on one chip, or on a few together."""
 
     statistic: float
     p_value: float
     dof: float
     dof_residual: float
+    # square, noise: mean square of the pattern over these chips, noise included, and of the noise
     square: float
     noise: float
 
@@ -133,22 +117,12 @@ def _parts_of(projection: Projection, chips: list[int]) -> Iterator[tuple[str, _
 
 @dataclass(frozen=True, eq=False)
 class _Directions:
-    """Regressors of one family that the parameters have left, in units of their information.
-
-    Parameters
-    ----------
-    regressors : Regressors
-    columns : ndarray of int, shape (n,)
-    basis : ndarray, shape (n, q)
-        With unit information beside all parameters.
-    score : ndarray, shape (q,)
-        Also the step by which the fit would move.
-    """
+    """Regressors of one family that the parameters have left, in units of their information."""
 
     regressors: Regressors
-    columns: Int
-    basis: Float
-    score: Float
+    columns: Int  # (n,)
+    basis: Float  # (n, q) with unit information beside all parameters
+    score: Float  # (q,) also the step by which the fit would move
 
     @property
     def q(self) -> int:
@@ -228,21 +202,12 @@ def _star_sums(
 
 @dataclass(frozen=True, eq=False)
 class _Together:
-    """Directions of several families, one after the other.
+    """Directions of several families, one after the other."""
 
-    Parameters
-    ----------
-    columns : ndarray of int, shape (n,)
-    basis : ndarray, shape (n, q)
-    step : ndarray, shape (q,)
-    starts : ndarray of int, shape (families,)
-        Where the directions of each family begin.
-    """
-
-    columns: Int
-    basis: Float
-    step: Float
-    starts: Int
+    columns: Int  # (n,)
+    basis: Float  # (n, q)
+    step: Float  # (q,)
+    starts: Int  # (families,) where the directions of each family begin
 
     @classmethod
     def of(cls, tried: Sequence[_Directions]) -> _Together:

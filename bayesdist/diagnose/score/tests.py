@@ -1,4 +1,4 @@
-"""All tests of one solution, corrected for their number."""
+"""Tests of one solution, corrected for their number."""
 
 from __future__ import annotations
 

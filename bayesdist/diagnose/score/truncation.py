@@ -39,22 +39,13 @@ ANGLES = (np.arange(8) + 0.5) * np.pi / 16  # of a quarter of the circle
 
 @dataclass(frozen=True, eq=False)
 class _Deficit:
-    """True matches expected beyond a radius, and detections that are there.
-
-    Parameters
-    ----------
-    expected : float
-    beyond : int
-    radius : float
-    unit : str
-    spread : float
-        Standard deviation of the logarithm of `expected`, as the scale is not known exactly.
-    """
+    """True matches expected beyond a radius, and detections that are there."""
 
     expected: float
     beyond: int
     radius: float
     unit: str
+    # standard deviation of the logarithm of `expected`, as the scale is not known exactly
     spread: float
 
     @property
@@ -69,33 +60,16 @@ class _Deficit:
 
 @dataclass(frozen=True, eq=False)
 class _Radii:
-    """Residuals in units of their own scatter.
+    """Residuals in units of their own scatter."""
 
-    Parameters
-    ----------
-    inlier : ndarray, shape (N,)
-        Probability of being a true match.
-    square : ndarray, shape (2, N)
-        Squared residuals over their quoted variance, by which they scatter as a whole.
-    relative : float
-        Relative error of that factor.
-    radius2 : ndarray, shape (N,)
-        Squared residuals of both axes, in the unit of u and v.
-    part : ndarray of int, shape (N,)
-        Stars of about equal quoted errors.
-    variance : ndarray, shape (2, P)
-        Of the residuals along each axis, in each part.
-    relative_of : ndarray, shape (P,)
-        Its relative error.
-    """
-
-    inlier: Float
+    inlier: Float  # (N,) probability of being a true match
+    # (2, N) squared residuals over their quoted variance, by which they scatter as a whole
     square: Float
-    relative: float
-    radius2: Float
-    part: Int
-    variance: Float
-    relative_of: Float
+    relative: float  # relative error of that factor
+    radius2: Float  # (N,) squared residuals of both axes, in the unit of u and v
+    part: Int  # (N,) stars of about equal quoted errors
+    variance: Float  # (2, P) of the residuals along each axis, in each part
+    relative_of: Float  # (P,) its relative error
 
     @classmethod
     def of(cls, sample: ScoredSample, inlier: Float) -> _Radii:
@@ -153,17 +127,7 @@ def _alike(variance: Float, inlier: Float) -> Int:
 def truncation_test(sample: ScoredSample, match_radius: float | None = None) -> Outcome | None:
     """Test for true matches missing beyond some radius.
 
-    Parameters
-    ----------
-    sample : ScoredSample
-        With its leverage.
-    match_radius : float, optional
-        In the unit of u and v.
-
-    Returns
-    -------
-    Outcome or None
-        None for less than `FEWEST_STARS` true matches.
+    `match_radius`: in the unit of u and v. None for less than `FEWEST_STARS` true matches.
     """
     inlier = _weights(sample)
     n = float(inlier.sum())
@@ -256,10 +220,7 @@ def _tail(variance: Float, radius2: float) -> Float:
 def _lost(end: float) -> float:
     """Scatter along an axis that was cut off, in units of what is left.
 
-    Parameters
-    ----------
-    end : float
-        Half the square of the radius in units of the scatter that is left.
+    `end`: half the square of the radius in units of the scatter that is left.
     """
     # mean of an exponential of scale s cut at `end`: s - end / (exp(end / s) - 1) = 1
     if end <= 2.0:  # as flat a distribution as there is

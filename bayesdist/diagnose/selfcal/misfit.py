@@ -39,18 +39,7 @@ TOLD = 0.05  # of what detections would say of a cell if stars were known: less 
 
 
 def dithered_misfit(solution: Solution) -> Misfit:
-    """Test the detections of a self-calibration for structure over the detector.
-
-    Parameters
-    ----------
-    solution : Solution
-
-    Returns
-    -------
-    Misfit
-        Of all chips together, since they share stars; `told` is the share of the patterns over
-        all partitions, polynomials apart, that the detections can tell from places of stars.
-    """
+    """Misfit of a self-calibration: structure over the detector, of all chips together."""
     model, unit = solution.problem.model, solution.problem.model.pixel_size(solution.theta)
     partitions = _partitions(len(solution.problem), len(model.chips))
     found, told, patterns = [], 0, 0
@@ -75,30 +64,19 @@ def _partitions(n: int, n_chips: int) -> dict[str, tuple[int, int]]:
 
 @dataclass(frozen=True, eq=False)
 class _Shifts:
-    """What detections say of shifts of K cells in x and in y, pixels.
+    """Gradient and curvature of the log density by shifts of K cells in x and in y, pixels."""
 
-    Parameters
-    ----------
-    gradient : ndarray, shape (2 K,)
-        Of the log density at no shift; x of all cells, then y.
-    curvature : ndarray, shape (2 K, 2 K)
-        With the stars eliminated.
-    weight : ndarray, shape (2 K,)
-        Its diagonal if the stars were known.
-    chi2, dof : float
-        Of the residuals; the rest of it is the unit: errors that are too large or too small as a
-        whole are no structure.
-    """
-
-    gradient: Float
-    curvature: Float
-    weight: Float
+    gradient: Float  # (2 K,) of the log density at no shift; x of all cells, then y
+    curvature: Float  # (2 K, 2 K) with the stars eliminated
+    weight: Float  # (2 K,) its diagonal if the stars were known
+    # chi2, dof: of the residuals; the rest of it is the unit: errors that are too large or too
+    # small as a whole are no structure
     chi2: float = 0.0
     dof: float = 1.0
 
 
 def _shifts(solution: Solution, partitions: Sequence[tuple[int, int]]) -> list[_Shifts]:
-    """What detections say of shifts of the cells of each partition, in one pass over them."""
+    """Gradients and curvatures by shifts of the cells of each partition, in one pass."""
     p, expansion = solution.problem, solution.expansion
     out = []
     for nx, ny in partitions:

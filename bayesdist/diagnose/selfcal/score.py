@@ -53,27 +53,14 @@ OUTSIDE = 0.5  # per cent of the magnitudes at either end that are moved to the 
 
 @dataclass(frozen=True, eq=False)
 class _Sums:
-    """What the detections say of the further columns of a problem.
+    """Information and score of the further columns of a problem."""
 
-    Parameters
-    ----------
-    known : ndarray, shape (n, n)
-        Information if stars and parameters were known.
-    information, score : ndarray, shape (n, n), (n,)
-        With both eliminated.
-    covariance : ndarray, shape (n, n)
-        Of the score, by the scores of single stars.
-    square : ndarray, shape (n, n)
-        Mean products of displacements over the detections.
-    n_stars : int
-    unit : str
-    """
-
-    known: Float
+    known: Float  # (n, n) information if stars and parameters were known
+    # information, score (n, n) or (n,): with both eliminated
     information: Float
     score: Float
-    covariance: Float
-    square: Float
+    covariance: Float  # (n, n) of the score, by the scores of single stars
+    square: Float  # (n, n) mean products of displacements over the detections
     n_stars: int
     unit: str
 
@@ -201,7 +188,7 @@ def _motions(solution: Solution, epoch: Float) -> Outcome | None:
 def _noise_sample(
     solution: Solution, some: Int, rows: NDArray[np.bool_], mag: Float | None
 ) -> ScoredSample:
-    """Some detections along the axes of the detector, in the unit of u and v.
+    """Sample of detections along the axes of the detector, in the unit of u and v.
 
     Rolls turn the axes of the sky from exposure to exposure, and errors are those of pixels.
     """

@@ -1,4 +1,4 @@
-"""What a look-up table leaves between its nodes: measured, not derived from how smooth it looks.
+"""Error that a look-up table leaves between its nodes: measured, not derived from smoothness.
 
 A table is bilinear between nodes, and the distortion is not.  Two stars at the same place, of two
 exposures, see the same of it and nothing else in common: the mean product of their residuals is the
@@ -41,26 +41,18 @@ SOME = 1500  # cells in which the variance of the fit is looked at
 
 @dataclass(frozen=True, eq=False)
 class BetweenNodes:
-    """Mean square of what a table leaves on one chip.
+    """Mean square of what a table leaves on one chip."""
 
-    Parameters
-    ----------
-    chip : int
-        Chip number.
-    square, error : ndarray, shape (2,)
-        Along x and y, square pixels, and standard deviations; a square may come out below zero.
-    n_pairs : int
-        Of stars.
-    """
-
-    chip: int
+    chip: int  # chip number
+    # square, error (2,): along x and y, square pixels, and standard deviations; a square may come
+    # out below zero
     square: Float
     error: Float
-    n_pairs: int
+    n_pairs: int  # of stars
 
     @property
     def left(self) -> MeanSquare:
-        """What the mean squares may be, given that they are not negative."""
+        """Mean squares, given that they are not negative."""
         return MeanSquare(self.square, self.error)
 
 
@@ -78,32 +70,13 @@ def between_nodes(
 ) -> BetweenNodes:
     """Mean square of what a table leaves of the distortion of one chip.
 
-    Parameters
-    ----------
-    x, y : ndarray, shape (N,)
-        Raw pixels.
-    residual : ndarray, shape (N, 2)
-        After table and polynomial, pixels.
-    precision : ndarray, shape (N, 2)
-        Inverse variances that these were fitted with; zero for a star that did not count.
-    star, exposure : ndarray of int, shape (N,)
-        Codes.
-    chip : Chip
-    step : tuple of float
-        Pixels between nodes.
-    taken : callable
-        Variance (n, 2) of table and polynomial at pixels (n,), square pixels: what the fit has
-        taken of the residuals.  Below zero for a table that was not fitted to them and errs by
-        itself: its error is in the products as it is.
-
-    Returns
-    -------
-    BetweenNodes
-
-    Raises
-    ------
-    DegenerateError
-        When too few stars lie that near to each other, or in too few places.
+    `x` and `y` (N,): raw pixels; `residual` (N, 2): after table and polynomial, pixels; `precision`
+    (N, 2): inverse variances that these were fitted with; zero for a star that did not count;
+    `star` and `exposure` (N,): codes; `step`: pixels between nodes; `taken`: variance (n, 2) of
+    table and polynomial at pixels (n,), square pixels: what the fit has taken of the residuals.
+    Below zero for a table that was not fitted to them and errs by itself: its error is in the
+    products as it is. Raises `DegenerateError` when too few stars lie that near to each other, or
+    in too few places.
     """
     used = (precision > 0).all(axis=1)
     stars = x[used], y[used], residual[used], precision[used], star[used], exposure[used]
@@ -169,27 +142,19 @@ class _Axis:
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Sums over ordered pairs of different stars in different exposures of the same cell.
-
-    Parameters
-    ----------
-    cells : NodeCells
-    by_cell : ndarray, shape (cells, 2)
-        Weights.
-    product, weight, spread : ndarray, shape (squares, 2)
-        Products and weights by square; variance of the former as far as stars err by themselves.
-    number : ndarray, shape (squares,)
-    """
+    """Sums over ordered pairs of different stars in different exposures of the same cell."""
 
     cells: NodeCells
-    by_cell: Float
+    by_cell: Float  # (cells, 2) weights
+    # product, weight, spread (squares, 2): products and weights by square; variance of the former
+    # as far as stars err by themselves
     product: Float
     weight: Float
     spread: Float
-    number: Float
+    number: Float  # (squares,)
 
     def axis(self, a: int, told: NDArray[np.bool_]) -> _Axis:
-        """Of one axis, in some of the squares; noise goes with one over the weight."""
+        """Sums along one axis, in some of the squares; noise goes with one over the weight."""
         scatter = self.spread[:, a].sum() / self.weight[:, a].sum()
         return _Axis(self.product[told, a], self.weight[told, a], float(scatter))
 
