@@ -16,7 +16,7 @@ from bayesdist.diagnose.checks import holdout_checks, score_checks, structure_ch
 from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors, estimate_discrepancy
 from bayesdist.diagnose.correlated.storage import as_stored
 from bayesdist.diagnose.holdout.predictive import Predictive
-from bayesdist.diagnose.holdout.validation import HeldOutTruth, held_out_truth
+from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_validation
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, time_variation
 from bayesdist.diagnose.residuals.binned import BinnedSums
@@ -25,7 +25,7 @@ from bayesdist.diagnose.residuals.coverage import Coverage, coverage_of
 from bayesdist.diagnose.residuals.epoch_shift import EpochShift, epoch_shift
 from bayesdist.diagnose.residuals.majority import majority_sentence
 from bayesdist.diagnose.residuals.misfit import (
-    MOST_BINS,
+    MAX_BINS,
     STARS_PER_BIN,
     Misfit,
     misfit_of,
@@ -96,7 +96,7 @@ class Diagnostics:
         Covariance of the parameters by errors of the catalogue, where these are known by star.
     periods : TimeVariation or None
         Models of several periods compared, where that was asked for.
-    holdout : HeldOutTruth or None
+    holdout : HoldoutValidation or None
         Results of stars that were set aside before the fit, where there are any.
     overlap : OverlapTest or None
         Two exposures far apart in time laid on each other, of a campaign.
@@ -115,7 +115,7 @@ class Diagnostics:
     correlated: Discrepancy | None = None
     catalogue: StarCovariance | None = None
     periods: TimeVariation | None = None
-    holdout: HeldOutTruth | None = None
+    holdout: HoldoutValidation | None = None
     overlap: OverlapTest | None = None
 
     @property
@@ -142,7 +142,7 @@ class Diagnostics:
         out += [Check("Fit", level="warn", sentence=text) for text in texts]
         if self.majority:
             out.append(Check("Fit", level="warn", sentence=self.majority, doubt=EITHER))
-        if self.periods is not None and self.periods.matters:
+        if self.periods is not None and self.periods.is_material:
             verdict = self.periods.verdict.rstrip(".")
             out.append(Check("Periods", level="warn", sentence=verdict))
         return tuple(out)
@@ -220,7 +220,7 @@ def residual_sums(fit: LinearFit, shards: Shards) -> tuple[dict[int, dict[str, B
     partitions = {}
     for chip, found in zip(fit.model.chips, shards.survey.chips, strict=True):
         n = round(fit.n_used * found.n / len(shards))
-        side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 4, MOST_BINS))
+        side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 4, MAX_BINS))
         partitions[chip.number] = partitions_for(n) | {SHOWN: (side, side)}
     wanted = {chip: tuple(dict.fromkeys(bins.values())) for chip, bins in partitions.items()}
     return partitions, shards.sum(star_sums, fit.mean, fit.clip, wanted)
@@ -417,4 +417,4 @@ def hold_out(
     InputError
         For too few stars.
     """
-    return replace(diagnostics, holdout=held_out_truth(predictive, held, whole=whole))
+    return replace(diagnostics, holdout=holdout_validation(predictive, held, whole=whole))

@@ -22,10 +22,10 @@ __all__ = ["OverlapTest", "chosen_exposures", "overlap_test"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-WELL = 0.5  # of the stars of the exposure that has fewer: what "overlap well" means
-FEWEST = 100  # shared stars below which there is no map to be drawn
-IN_CELL = 12  # stars in a cell, on average
-MOST_CELLS = 24  # along an axis
+MIN_OVERLAP = 0.5  # of the stars of the exposure that has fewer: what "overlap well" means
+MIN_SHARED_STARS = 100  # shared stars below which there is no map to be drawn
+STARS_PER_CELL = 12  # stars in a cell, on average
+MAX_CELLS = 24  # along an axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ def chosen_exposures(pairs: MatchTable) -> tuple[int, int] | None:
     common = (seen @ seen.T).toarray()
     own = np.diag(common)
     epoch = np.bincount(pairs.exposure, pairs.epoch, n) / np.maximum(own, 1)
-    enough = (common >= WELL * np.minimum.outer(own, own)) & (common >= FEWEST)
+    enough = (common >= MIN_OVERLAP * np.minimum.outer(own, own)) & (common >= MIN_SHARED_STARS)
     apart = np.where(enough, np.abs(np.subtract.outer(epoch, epoch)), -1.0)
     a, b = (int(k) for k in np.unravel_index(int(apart.argmax()), apart.shape))
     if a == b or apart[a, b] <= 0:
@@ -203,8 +203,8 @@ def _binned(
     """Residuals in square cells over the area that both exposures see."""
     corner = new.position.min(axis=0)
     width, height = np.ptp(new.position, axis=0) + 1e-6
-    cell = np.sqrt(width * height * IN_CELL / len(new.position))
-    cell = max(cell, max(width, height) / MOST_CELLS)
+    cell = np.sqrt(width * height * STARS_PER_CELL / len(new.position))
+    cell = max(cell, max(width, height) / MAX_CELLS)
     bins = (max(1, round(width / cell)), max(1, round(height / cell)))
     # cells count from 0.5, as pixels do
     x, y = (new.position - corner + 0.5).T

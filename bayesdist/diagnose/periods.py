@@ -48,7 +48,7 @@ __all__ = [
 
 Int = NDArray[np.int64]
 
-MOST_BINS = 45  # along each side, as in Appendix C
+MAX_BINS = 45  # along each side, as in Appendix C
 COMBINED = "combined"
 
 
@@ -108,7 +108,7 @@ class TimeVariation:
         return self.comparison.homogeneity[2] < DIFFERENCE.value
 
     @property
-    def matters(self) -> bool:
+    def is_material(self) -> bool:
         """True where one model is refuted, and not known to be good enough all the same."""
         harmless = self.tolerance is not None and all_below(self.changes, self.tolerance)
         return self.significant and not harmless
@@ -154,7 +154,7 @@ class TimeVariation:
 
 def bins_for(n: int) -> int:
     """Bins on each axis for so many pairs of the smallest period on a chip."""
-    return int(np.clip(np.sqrt(n / STARS_PER_BIN), 2, MOST_BINS))
+    return int(np.clip(np.sqrt(n / STARS_PER_BIN), 2, MAX_BINS))
 
 
 def period_part(

@@ -10,12 +10,12 @@ __all__ = ["chi_square_of", "holm", "hotelling_p", "p_words"]
 
 Float = NDArray[np.float64]
 
-LEAST_P = 1e-300  # tails underflow: no probability is zero
+MIN_P = 1e-300  # tails underflow: no probability is zero
 
 
 def p_words(p: float) -> str:
     """Words for a probability: 'p = 0.02'."""
-    return f"p < {LEAST_P:g}" if p < LEAST_P else f"p = {p:.1g}"
+    return f"p < {MIN_P:g}" if p < MIN_P else f"p = {p:.1g}"
 
 
 def holm(p_values: ArrayLike) -> Float:
@@ -44,4 +44,4 @@ def hotelling_p(statistic: float, dof: float, n: float) -> float:
 
 def chi_square_of(p: float, dof: float) -> float:
     """Chi-square of a probability, for sums of tests that have other distributions."""
-    return float(chi2.isf(max(p, LEAST_P), dof))
+    return float(chi2.isf(max(p, MIN_P), dof))

@@ -36,7 +36,7 @@ HALVINGS = 6  # at most: neighbouring stars may determine an amplitude to some p
 CHANGE = 0.7  # of the log density between two points, below which none is inserted between them,
 WIDEST = 0.4  # or width of their interval in the logarithm, where most of the density is
 NEGLIGIBLE = 10.0  # in log density, below the largest
-MOST_OF_IT = 2.0  # likewise, for most of the density
+NEAR_TOP = 2.0  # likewise, for most of the density
 UNLIKE = 0.2  # prior probability that the field differs on the two axes, by about a factor e
 TERM_STEPS = 24  # of the amplitude of the higher orders
 
@@ -232,7 +232,7 @@ def _middles(grid: Sequence[float], tops: Sequence[float], best: float) -> list[
         top = max(top_a, top_b)
         changes = top > best - NEGLIGIBLE and abs(top_a - top_b) > CHANGE
         # a peak may lie between two points of the same height
-        if changes or (top > best - MOST_OF_IT and b - a > WIDEST):
+        if changes or (top > best - NEAR_TOP and b - a > WIDEST):
             out.append(0.5 * (a + b))
     return out
 

@@ -24,11 +24,11 @@ Int = NDArray[np.int64]
 
 ALL = "all"
 STARS_PER_BIN = 60
-MOST_CELLS = 8  # along each side of a chip
-MOST_BINS = 8  # of magnitudes, and of dates
-MOST_PLACES = 4  # along each side of a chip of one exposure
-MOST_CELLS_IN_ALL = 512  # of all such exposures
-MOST_EXPOSURES = 60  # beyond it only those that were held out whole are looked at one by one
+MAX_CELLS = 8  # along each side of a chip
+MAX_BINS = 8  # of magnitudes, and of dates
+MAX_PLACES = 4  # along each side of a chip of one exposure
+MAX_CELLS_IN_ALL = 512  # of all such exposures
+MAX_EXPOSURES = 60  # beyond it only those that were held out whole are looked at one by one
 
 
 @dataclass(frozen=True)
@@ -65,15 +65,15 @@ def partitions_of(
     """
     n = len(held)
     out = [Partition(ALL, (Bin("over the whole detector"),), lambda _, rows: rows * 0)]
-    out.append(_regions(model, _cells(model, n, MOST_CELLS)))
+    out.append(_regions(model, _cells(model, n, MAX_CELLS)))
     share = n // STARS_PER_BIN
     if sample.mag is not None:
-        out += _quantiles("magnitude", "mag", sample.mag, min(share, MOST_BINS))
+        out += _quantiles("magnitude", "mag", sample.mag, min(share, MAX_BINS))
     if sample.epoch is not None:
-        out += _quantiles("epoch", "epoch", sample.epoch, min(share, MOST_BINS))
+        out += _quantiles("epoch", "epoch", sample.epoch, min(share, MAX_BINS))
     out += _places(model, sample, n / len(sample), whole)
     names = held.exposure_names
-    if len(names) > MOST_EXPOSURES:
+    if len(names) > MAX_EXPOSURES:
         names = tuple(name for name in names if name in set(whole))
     if len(held.exposure_names) > 1 and names:
         out.append(_exposures(names, set(whole)))
@@ -91,13 +91,13 @@ def _places(
     """Cells of each exposure that was held out whole; none where stars are few."""
     if len(np.unique(sample.exposure)) < 2:
         return []  # its places are those of all stars
-    names = tuple(name for name in sample.exposure_names if name in set(whole))[:MOST_EXPOSURES]
+    names = tuple(name for name in sample.exposure_names if name in set(whole))[:MAX_EXPOSURES]
     if not names:
         return []
     codes = [sample.exposure_names.index(name) for name in names]
     n = min(float((sample.exposure == k).sum()) * share for k in codes)
-    few = np.sqrt(MOST_CELLS_IN_ALL / (len(model.chips) * len(names)))
-    side = _cells(model, n, min(MOST_PLACES, int(few)))
+    few = np.sqrt(MAX_CELLS_IN_ALL / (len(model.chips) * len(names)))
+    side = _cells(model, n, min(MAX_PLACES, int(few)))
     if side * len(model.chips) < 2:
         return []
     cells = _regions(model, side)

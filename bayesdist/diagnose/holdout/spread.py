@@ -13,7 +13,7 @@ __all__ = ["SpreadMoments", "scale_of", "sum_tails"]
 Float = NDArray[np.float64]
 
 KNOTS, POINTS, LAST = 48, 2000, 60.0
-LEAST_SKEW = 1e-4
+MIN_SKEW = 1e-4
 
 
 class SpreadMoments:
@@ -79,7 +79,7 @@ def sum_tails(value: float, variance: float, third: float) -> float:
         return 1.0
     z = value / np.sqrt(variance)
     skew = third / variance**1.5
-    if abs(skew) < LEAST_SKEW:
+    if abs(skew) < MIN_SKEW:
         return float(2 * norm.sf(abs(z)))
     shape = 4 / skew**2
     x = shape + np.sign(skew) * z * np.sqrt(shape)

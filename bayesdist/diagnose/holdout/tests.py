@@ -28,7 +28,7 @@ Float = NDArray[np.float64]
 
 AXIS = "axis"  # a part: the stars along one axis
 
-LEAST_STARS = 20  # of a bin that is judged by itself
+MIN_STARS = 20  # of a bin that is judged by itself
 STARS_PER_PIT_BIN = 20
 SINGULAR = 0.05  # of a variance: what is left where frames have taken up nearly all
 
@@ -54,12 +54,12 @@ class HeldTest:
     wider: bool = True  # of distributions: True where stars lie farther out than predicted
 
     @property
-    def together(self) -> bool:
+    def is_omnibus(self) -> bool:
         """True where all bins are tested at once; `where` and `value` are of the worst."""
         return self.index < 0
 
     @property
-    def matters(self) -> bool:
+    def is_material(self) -> bool:
         """True where errors would be larger than predicted, if it is no chance."""
         if self.name == "spread":
             return not HELD_OUT_RATIO.met_by(self.value)
@@ -124,7 +124,7 @@ def _offsets(
         pair = slice(2 * b, 2 * b + 2)
         least = np.linalg.eigvalsh(cov[pair, pair])[0]
         n = found.independent[b]
-        if n < LEAST_STARS or least < 2 * SINGULAR * np.trace(found.place_2[b]):
+        if n < MIN_STARS or least < 2 * SINGULAR * np.trace(found.place_2[b]):
             continue
         good.append(b)
         score = found.offset_scores[b]
@@ -157,7 +157,7 @@ def _spreads(found: BinSums, predictive: Predictive, partition: Partition) -> li
     return [
         _spread(found.scale, b, predictive, (partition.kind, bin_.words, b, int(found.n[b])))
         for b, bin_ in enumerate(partition.bins)
-        if found.n[b] >= LEAST_STARS
+        if found.n[b] >= MIN_STARS
     ]
 
 

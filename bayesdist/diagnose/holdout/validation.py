@@ -20,7 +20,7 @@ from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.stars.shards import Matches
 from bayesdist.limits import HELD_OUT, HELD_OUT_DOUBTFUL, HELD_OUT_UNUSUAL
 
-__all__ = ["HeldOutTruth", "held_out_truth"]
+__all__ = ["HoldoutValidation", "holdout_validation"]
 
 Float = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ ORDER = ("offset", "deviation", "spread", "tails", "distribution")  # of what te
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOutTruth:
+class HoldoutValidation:
     """Results of held-out stars against a solution.
 
     Parameters
@@ -106,7 +106,7 @@ class HeldOutTruth:
 
     def _telling(self, level: float) -> HeldTest | None:
         """The test that tells most of those that matter."""
-        found = [t for t in self.tests if t.p_corrected < level and t.matters]
+        found = [t for t in self.tests if t.p_corrected < level and t.is_material]
         places = [t for t in found if t.name in ("offset", "spread", "deviation")]
         return min(places or found, key=_rank, default=None)
 
@@ -144,9 +144,9 @@ def _rank(test: HeldTest) -> tuple[float, int, float, bool]:
     return test.p_value, ORDER.index(test.name), size, test.part == "epoch"
 
 
-def held_out_truth(
+def holdout_validation(
     solution: Posterior | Predictive, held: Matches, *, whole: Sequence[str] = ()
-) -> HeldOutTruth:
+) -> HoldoutValidation:
     """Results of stars that a solution has not seen.
 
     Parameters
@@ -159,7 +159,7 @@ def held_out_truth(
 
     Returns
     -------
-    HeldOutTruth
+    HoldoutValidation
 
     Raises
     ------
@@ -191,7 +191,7 @@ def held_out_truth(
     found = sums.bins["region"]
     seen = found.n >= 1
     error = np.sqrt(np.einsum("bii->bi", found.place_2))
-    return HeldOutTruth(
+    return HoldoutValidation(
         unit=predictive.model.unit,
         n=sums.n,
         n_left_out=sums.n_left_out,

@@ -9,7 +9,7 @@ from bayesdist.diagnose.residuals.sample import StarSample
 
 __all__ = ["centroid_scatter"]
 
-FEWEST = 50  # stars whose scatter says anything by magnitude
+MIN_STARS = 50  # stars whose scatter says anything by magnitude
 CERTAIN = 0.5  # probability of a false match from which on a star is left out
 
 
@@ -26,7 +26,7 @@ def centroid_scatter(stars: StarSample, *, n_params: int = 0) -> MagnitudeErrors
     good = np.isfinite(mag) & (
         stars.used if stars.outlier_probability is None else stars.outlier_probability < CERTAIN
     )
-    if good.sum() < FEWEST:
+    if good.sum() < MIN_STARS:
         return None
     share = round(n_params * len(stars) / max(stars.n_total, 1))
     return estimate(mag[good], *stars.residual[good].T, n_params=share)

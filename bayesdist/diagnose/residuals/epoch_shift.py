@@ -33,10 +33,10 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 SAMPLE = 20_000  # detections that are looked at
-FEWEST = 30  # stars with motions
+MIN_STARS = 30  # stars with motions
 FARTHEST = 60.0  # years that are scanned
 STEPS = 481  # of the scan, a quarter of a year each
-ROUNDS = 30
+MAX_ITERATIONS = 30
 # error of a motion over the scatter of motions, at most: larger ones are often quoted too small
 WELL_KNOWN = 0.2
 BIWEIGHT = 4.685  # robust standard deviations, beyond which a star has no weight (Tukey)
@@ -81,11 +81,11 @@ def epoch_shift(table: MatchTable, solution: Solution) -> EpochShift | None:
     if motion is None:
         return None
     moving = np.any(motion != 0, axis=0)  # 0 on both axes is that none was measured
-    if moving.sum() < FEWEST:
+    if moving.sum() < MIN_STARS:
         return None
     error = np.zeros_like(motion) if sample.motion_sigma is None else sample.motion_sigma
     known = moving & (error < WELL_KNOWN * _scatter(motion[:, moving])).all(axis=0)
-    if known.sum() < FEWEST:
+    if known.sum() < MIN_STARS:
         return None
     residual, P = _left_over(sample, known * sample.inlier, sample.residual, motion)
     grid = np.linspace(-FARTHEST, FARTHEST, STEPS)
@@ -93,7 +93,7 @@ def epoch_shift(table: MatchTable, solution: Solution) -> EpochShift | None:
     dt = float(grid[int(np.argmin(sizes))])
     before = _scatter(residual[:, known])
     weight = information = np.zeros(0)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ITERATIONS):
         scale = np.sqrt(_scatter((residual + dt * P)[:, known]) ** 2 + (dt * error) ** 2)
         if not (scale > 0).all():
             return None

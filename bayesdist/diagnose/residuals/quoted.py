@@ -16,7 +16,7 @@ from bayesdist.limits import QUOTED_ERRORS
 
 __all__ = ["error_scale", "error_scale_sentence"]
 
-FEW = 0.1  # of the matches
+LOW_QUANTILE = 0.1  # of the matches
 
 
 def error_scale(fit: LinearFit, table: MatchTable) -> float:
@@ -28,8 +28,8 @@ def error_scale(fit: LinearFit, table: MatchTable) -> float:
     """
     stars, _ = prepare(fit.model, table)
     r = stars.residuals(np.asarray(fit.mean))
-    found = np.quantile(r[:, 0] ** 2 / stars.var_u + r[:, 1] ** 2 / stars.var_v, FEW)
-    factor = float(np.sqrt(found / chi2.ppf(FEW, 2)))
+    found = np.quantile(r[:, 0] ** 2 / stars.var_u + r[:, 1] ** 2 / stars.var_v, LOW_QUANTILE)
+    factor = float(np.sqrt(found / chi2.ppf(LOW_QUANTILE, 2)))
     return 1.0 if QUOTED_ERRORS.met_by(factor) else factor
 
 

@@ -33,7 +33,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 STARS_PER_DIRECTION = 4  # of an exposure that is tested
-MOST_PRODUCTS = 1e10  # of scores: beyond, those of other exposures count by their mean
+MAX_PRODUCTS = 1e10  # of scores: beyond, those of other exposures count by their mean
 INDEPENDENT = 0.02  # as for time: what the frames' curvature leaves is no deviation
 
 
@@ -158,7 +158,7 @@ def _remedy(frames: str) -> str:
 def _deviations(projection: Projection, names: list[str]) -> Iterator[_Deviations]:
     """Deviations of every exposure with stars enough, along the directions that it has left."""
     meat = None
-    if len(projection.sample) * projection.n_global**2 < MOST_PRODUCTS:
+    if len(projection.sample) * projection.n_global**2 < MAX_PRODUCTS:
         meat = _Meat.of(projection)
     for blocks in projection.sample.blocks_by("exposure"):
         n = sum(int(projection.sample.used[block.rows].sum()) for block in blocks)

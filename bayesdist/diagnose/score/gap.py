@@ -36,8 +36,8 @@ __all__ = ["gap_test", "visit_codes"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-FEWEST_FREE = 3  # visits beyond those that the line takes
-FEWEST_STARS = 12  # of an exposure on a chip: six linear terms of both axes, and as many beside
+MIN_FREE = 3  # visits beyond those that the line takes
+MIN_STARS = 12  # of an exposure on a chip: six linear terms of both axes, and as many beside
 SHORTEST = 0.1  # years over which a drift is looked for
 VISIT = 1 / 365.25  # years between exposures that deviate together
 
@@ -166,7 +166,7 @@ def _line(projection: Projection, exposures: list[_Exposure], chip: int, way: in
     design = (segment[:, None] == np.unique(segment)).astype(float)
     design = np.column_stack([design, t - t.mean()])
     free = len(t) - np.linalg.matrix_rank(design)
-    if free < FEWEST_FREE or np.linalg.matrix_rank(design[:, :-1]) == np.linalg.matrix_rank(design):
+    if free < MIN_FREE or np.linalg.matrix_rank(design[:, :-1]) == np.linalg.matrix_rank(design):
         return None
     weight = _weights(design, d, 1 / total)
     root = np.sqrt(weight)[:, None]
@@ -213,7 +213,7 @@ def _exposure(projection: Projection, blocks: list[Block]) -> _Exposure | None:
     for block in blocks:
         n = int(sample.used[block.rows].sum())
         number[block.chip] = number.get(block.chip, 0) + n
-    enough = sorted(chip for chip, n in number.items() if n >= FEWEST_STARS)
+    enough = sorted(chip for chip, n in number.items() if n >= MIN_STARS)
     if len(enough) < 2 or enough[0] != 0:
         return None
     chips = enough[1:]

@@ -31,8 +31,8 @@ LARGEST_LEVERAGE = 0.5
 STARS_PER_PART = 40  # of a part of the data; smaller ones are joined
 STARS_PER_CELL = 60
 STARS_PER_BIN = 150  # of magnitudes
-MOST_CELLS = 8  # along each side of a chip
-MOST_MAGNITUDES = 10
+MAX_CELLS = 8  # along each side of a chip
+MAX_MAGNITUDES = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,17 +90,17 @@ def _cells(sample: ScoredSample, rows: Int) -> Int:
     for c in np.unique(chip):
         here = chip == c
         n = len(np.unique(sample.star[rows[here]]))
-        side = int(np.clip(np.sqrt(n / STARS_PER_CELL), 1, MOST_CELLS))
+        side = int(np.clip(np.sqrt(n / STARS_PER_CELL), 1, MAX_CELLS))
         at = rows[here]
         iy, ix = np.divmod(cell_index(sample.X[at], sample.Y[at], (side, side)), side)
         # boustrophedon: cells with few stars are joined to neighbours
-        code[here] = c * MOST_CELLS**2 + iy * side + np.where(iy % 2, side - 1 - ix, ix)
+        code[here] = c * MAX_CELLS**2 + iy * side + np.where(iy % 2, side - 1 - ix, ix)
     return code
 
 
 def _magnitudes(mag: Float, n_stars: int) -> Int:
     """Bins with equal numbers of detections."""
-    n = int(np.clip(n_stars // STARS_PER_BIN, 1, MOST_MAGNITUDES))
+    n = int(np.clip(n_stars // STARS_PER_BIN, 1, MAX_MAGNITUDES))
     edges = np.quantile(mag, np.linspace(0, 1, n + 1)[1:-1])
     return np.searchsorted(np.unique(edges), mag)
 

@@ -20,7 +20,7 @@ BINS = 256  # along each side of a chip: periods from a hundredth of it are seen
 PADDED = 2  # finer frequencies than the bins', so that none falls between
 INDEPENDENT = 2.0  # frequencies that the padding makes of one, as far as maxima go
 SLOWEST = 1.5  # periods beyond the polynomial's own, below which it takes waves for terms
-FEWEST_STARS = 100
+MIN_STARS = 100
 
 
 def pattern_test(sample: ScoredSample) -> Outcome | None:
@@ -29,9 +29,9 @@ def pattern_test(sample: ScoredSample) -> Outcome | None:
     At each frequency k the power |sum g exp(i k x)|^2 of the scores g of one axis, over the sum of
     their squares, is exponential where there is no wave, whatever the errors of single stars.
 
-    None for less than `FEWEST_STARS` detections.
+    None for less than `MIN_STARS` detections.
     """
-    if len(sample) < FEWEST_STARS:
+    if len(sample) < MIN_STARS:
         return None
     model = sample.model
     power, trials, at = 0.0, 0.0, (0, 0, 0, 0)

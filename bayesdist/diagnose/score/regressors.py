@@ -24,7 +24,7 @@ EDGES, EDGES_BESIDE_ORDERS = "edges", "edges beside orders"
 LINEAR = 1  # order of the terms that go with magnitude, colour and time
 HIGHER = 2  # orders above the model's that are tested
 OUTSIDE = 0.5  # per cent of the values at either end that are moved to the others
-FEWEST_AT_EDGES = 200  # detections: some in each margin
+MIN_AT_EDGES = 200  # detections: some in each margin
 NEAR_EDGE = 0.05  # of half a side, over which what is at an edge falls off
 SHORTEST = 0.1  # years over which a drift is looked for
 # information that a direction has kept beside the parameters, over what it had: below, it is theirs
@@ -145,7 +145,7 @@ def functions_for(sample: ScoredSample) -> Functions:
         if values is not None:
             add(name, Factor(_standing_out(values), LINEAR))
     edges = [np.exp((s * Z - 1.0) / NEAR_EDGE) for Z in (sample.X, sample.Y) for s in (-1, 1)]
-    if len(sample) >= FEWEST_AT_EDGES:
+    if len(sample) >= MIN_AT_EDGES:
         factors += [Factor(one - one.mean(), 0) for one in edges]
         orders = np.concatenate([one.functions for one in regressors[:HIGHER]])
         alone = Regressors(FAMILIES[EDGES], start + np.arange(len(edges)))

@@ -35,9 +35,9 @@ __all__ = ["regressor_tests"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-MOST_TAKEN = 0.5  # of the noise, by fit and step: what is left then says nothing of it
-LEAST_DOF = 3  # of the noise: below, its covariance says nothing
-MOST_CHIPS = 4  # that are tested together, with the covariance of all their scores
+MAX_TAKEN = 0.5  # of the noise, by fit and step: what is left then says nothing of it
+MIN_DOF = 3  # of the noise: below, its covariance says nothing
+MAX_CHIPS = 4  # that are tested together, with the covariance of all their scores
 
 
 def regressor_tests(projection: Projection) -> list[Outcome]:
@@ -66,7 +66,7 @@ class _Part:
 def _chips_together(projection: Projection) -> list[list[int]]:
     """Codes of the chips that are tested together: all, or each of many by itself."""
     chips = sorted({block.chip for block in projection.sample.blocks})
-    return [chips] if len(chips) <= MOST_CHIPS else [[one] for one in chips]
+    return [chips] if len(chips) <= MAX_CHIPS else [[one] for one in chips]
 
 
 def _outcome(projection: Projection, family: Family, parts: Sequence[_Part]) -> Outcome:
@@ -100,12 +100,12 @@ def _parts_of(projection: Projection, chips: list[int]) -> Iterator[tuple[str, _
             tried.append(one)
     sums = _star_sums(projection, chips, tried)
     for one, (V, spread, taken) in zip(tried, sums, strict=True):
-        if taken > MOST_TAKEN:
+        if taken > MAX_TAKEN:
             continue
         # as a Wishart matrix that scatters as much
         dof = one.q * (one.q + 1) / spread
         dof_residual = dof - one.q + 1
-        if dof_residual < LEAST_DOF:
+        if dof_residual < MIN_DOF:
             continue
         T = dof_residual / dof * float(one.score @ np.linalg.solve(V, one.score))
         p = float(stats.f.sf(T / one.q, one.q, dof_residual))

@@ -26,12 +26,12 @@ __all__ = ["truncation_test"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-FEWEST_STARS = 50
+MIN_STARS = 50
 LARGEST_LEVERAGE = 0.5
-ENDS = 0.25  # of the expected number: with more, nothing ends at the match radius
+MAX_FRACTION_BEYOND = 0.25  # of the expected number: with more, nothing ends at the match radius
 STARS_PER_PART = 150  # with errors alike, from which their scatter is measured
-MOST_PARTS = 12
-FEW = 0.5  # expected matches whose absence says nothing
+MAX_PARTS = 12
+MIN_EXPECTED = 0.5  # expected matches whose absence says nothing
 BEYOND = (0, 3)  # stars that may lie beyond a radius: the edge need not be sharp
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
 ANGLES = (np.arange(8) + 0.5) * np.pi / 16  # of a quarter of the circle
@@ -51,7 +51,7 @@ class _Deficit:
     @property
     def p_value(self) -> float:
         """Probability of so few, over what the scale may be."""
-        if self.expected < FEW or self.beyond > ENDS * self.expected:
+        if self.expected < MIN_EXPECTED or self.beyond > MAX_FRACTION_BEYOND * self.expected:
             return 1.0
         at = self.expected * np.exp(self.spread * NODES)
         chance = special.gammaincc(self.beyond + 1, at)
@@ -113,7 +113,7 @@ def _weights(sample: ScoredSample) -> Float:
 
 def _alike(variance: Float, inlier: Float) -> Int:
     """Parts (N,) with stars of about equal errors."""
-    n = int(np.clip(inlier.sum() // STARS_PER_PART, 1, MOST_PARTS))
+    n = int(np.clip(inlier.sum() // STARS_PER_PART, 1, MAX_PARTS))
     edges = np.unique(np.quantile(variance, np.linspace(0, 1, n + 1)[1:-1]))
     part = np.searchsorted(edges, variance, side="right")
     count = np.bincount(part, inlier, minlength=len(edges) + 1)
@@ -127,11 +127,11 @@ def _alike(variance: Float, inlier: Float) -> Int:
 def truncation_test(sample: ScoredSample, match_radius: float | None = None) -> Outcome | None:
     """Test for true matches missing beyond some radius.
 
-    `match_radius`: in the unit of u and v. None for less than `FEWEST_STARS` true matches.
+    `match_radius`: in the unit of u and v. None for less than `MIN_STARS` true matches.
     """
     inlier = _weights(sample)
     n = float(inlier.sum())
-    if n < FEWEST_STARS:
+    if n < MIN_STARS:
         return None
     radii = _Radii.of(sample, inlier)
     found = [

@@ -33,30 +33,30 @@ __all__ = ["dithered_misfit"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-MOST_SIDE = 16  # cells along each side of a chip
-MOST_CELLS = 512  # of all chips: the matrix of all shifts is decomposed
-TOLD = 0.05  # of what detections would say of a cell if stars were known: less is not told
+MAX_SIDE = 16  # cells along each side of a chip
+MAX_CELLS = 512  # of all chips: the matrix of all shifts is decomposed
+MIN_INFORMATION = 0.05  # of a direction, relative to that with known stars
 
 
 def dithered_misfit(solution: Solution) -> Misfit:
     """Misfit of a self-calibration: structure over the detector, of all chips together."""
     model, unit = solution.problem.model, solution.problem.model.pixel_size(solution.theta)
     partitions = _partitions(len(solution.problem), len(model.chips))
-    found, told, patterns = [], 0, 0
+    found, seen, patterns = [], 0, 0
     for (name, bins), shifts in zip(
         partitions.items(), _shifts(solution, list(partitions.values())), strict=True
     ):
         one = _test(shifts, _polynomials(model.order, len(model.chips), bins))
         found.append(Misfit(one.p_value, name, one.pixels * unit, model.unit))
-        told, patterns = told + one.told, patterns + one.patterns
-    return replace(worst_misfit(found), told=told / patterns if patterns else 1.0)
+        seen, patterns = seen + one.seen, patterns + one.patterns
+    return replace(worst_misfit(found), power=seen / patterns if patterns else 1.0)
 
 
 def _partitions(n: int, n_chips: int) -> dict[str, tuple[int, int]]:
     """Bins on x and on y of each chip, by name."""
-    out, most = {}, MOST_CELLS // n_chips
+    out, most = {}, MAX_CELLS // n_chips
     for name, bins in partitions_for(n // n_chips).items():
-        side = min(MOST_SIDE, int(np.sqrt(most))) if name == "cells" else most
+        side = min(MAX_SIDE, int(np.sqrt(most))) if name == "cells" else most
         nx, ny = (min(b, max(side, 2)) for b in bins)
         out[name] = nx, ny
     return out
@@ -126,11 +126,11 @@ def _polynomials(order: int, n_chips: int, bins: tuple[int, int]) -> Float:
 
 @dataclass(frozen=True)
 class _Test:
-    """Outcome for one partition: structure is rms in pixels, `told` of how many `patterns`."""
+    """Outcome for one partition: structure is rms in pixels, `seen` of how many `patterns`."""
 
     p_value: float
     pixels: float
-    told: int
+    seen: int
     patterns: int
 
 
@@ -145,10 +145,10 @@ def _test(shifts: _Shifts, fields: Float) -> _Test:
     lost = lost[:, singular > 1e-9 * max(singular[0], 1.0)]
     free = np.linalg.svd(lost, full_matrices=True)[0][:, lost.shape[1] :]
     values, vectors = np.linalg.eigh(free.T @ C @ free)
-    told = values > TOLD
-    if not told.any():
+    known = values > MIN_INFORMATION
+    if not known.any():
         return _Test(1.0, 0.0, 0, free.shape[1])
-    values, vectors = values[told], free @ vectors[:, told]
+    values, vectors = values[known], free @ vectors[:, known]
     along = vectors.T @ g
     k, explained = len(values), float(np.sum(along**2 / values))
     left = max(shifts.dof - k, 1.0)

@@ -21,7 +21,7 @@ from bayesdist.diagnose.score.noise import noise_tests
 from bayesdist.diagnose.score.result import Outcome, ScoreTest, corrected, outcome
 from bayesdist.diagnose.score.sample import Block, ScoredSample
 from bayesdist.diagnose.selfcal.columns import AddedColumns, pointing_terms
-from bayesdist.diagnose.selfcal.correlated import MOST_EXPOSURES
+from bayesdist.diagnose.selfcal.correlated import MAX_EXPOSURES
 from bayesdist.diagnose.selfcal.eliminated import (
     add_products,
     even_stars,
@@ -41,9 +41,11 @@ __all__ = ["selfcal_score_tests"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-MOST_DETECTIONS = 60_000  # that are looked at
+MAX_DETECTIONS = 60_000  # that are looked at
 STARS_PER_DIRECTION = 2  # below, a covariance of the scores says nothing
-TOLD = 0.02  # of what known stars would say of a direction: less is not told from their places
+MIN_INFORMATION = (
+    0.02  # of what known stars would say of a direction: less is not told from their places
+)
 REMEDIES = {
     "magnitude": "cut the faint stars, or correct the charge-transfer efficiency",
     "exposures": "give selfcal.frames a scale where it has none, or leave out exposures",
@@ -83,7 +85,7 @@ def selfcal_score_tests(
     tuple of ScoreTest
     """
     whole = solution.problem
-    some = even_stars(whole, MOST_DETECTIONS)
+    some = even_stars(whole, MAX_DETECTIONS)
     rows = np.isin(whole.star, some)
     problem, model = whole.of_stars(some), whole.model
     varied = None
@@ -93,7 +95,7 @@ def selfcal_score_tests(
         varied = inside - inside.mean()
     counts = np.bincount(problem.groups.index, minlength=len(problem.groups)).astype(float)
     deviations = deviation_columns(
-        model, solution.theta, problem.groups, counts, most=MOST_EXPOSURES
+        model, solution.theta, problem.groups, counts, most=MAX_EXPOSURES
     )
     pointed = pointing_terms(problem, solution.theta)
     columns = AddedColumns(problem, solution.theta, {}, deviations, varied, pointed)
@@ -147,7 +149,7 @@ def _summed(
 def _tested(sums: _Sums, name: str, which: Int, order: int) -> Outcome | None:
     """Outcome of one test; None where the data cannot be asked."""
     at = np.ix_(which, which)
-    N = independent_directions(sums.known[at], sums.information[at], TOLD)
+    N = independent_directions(sums.known[at], sums.information[at], MIN_INFORMATION)
     q, n = N.shape[1], sums.n_stars
     if q == 0 or n < STARS_PER_DIRECTION * q + 2:
         return None
