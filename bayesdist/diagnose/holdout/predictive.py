@@ -195,47 +195,47 @@ def marginals_of(predictive: Predictive, residual: Float, cov: Float) -> Float:
 
     `predictive`, `residual` and `cov` as of `scores_of`.
     """
-    f, s = predictive.fraction, predictive.scale
-    out = []
+    f, out = predictive.fraction, []
     for r, var in zip(residual.T, cov[:, :2].T, strict=True):
-        far = np.zeros_like(r)
-        if predictive.outliers == "gaussian":
-            far = ndtr(r / s)
-        elif predictive.outliers == "uniform":
-            x = np.clip(r / s, -1.0, 1.0)
-            far = 0.5 + (x * np.sqrt(1 - x * x) + np.arcsin(x)) / np.pi
-        out.append((1 - f) * ndtr(r / np.sqrt(var)) + f * far)
+        out.append((1 - f) * ndtr(r / np.sqrt(var)) + f * _false_along(predictive, r)[1])
     return np.stack(out)
 
 
 def uniforms_of(predictive: Predictive, residual: Float, cov: Float) -> Float:
-    """Predictive probabilities of less, uniform where the prediction is right.
+    """Predictive probabilities (3, n) of less, uniform where the prediction is right.
 
-    `predictive`, `residual` and `cov` as of `scores_of`. The result (3, n): of u; of v where u is
-    what it is (Rosenblatt 1952), which is independent of the first; and of the distance that both
-    make once they are brought to normal variables.
+    Of u; of v where u is what it is (Rosenblatt 1952), which is independent of the first; and of
+    the distance that both make once they are brought to normal variables.  `predictive`, `residual`
+    and `cov` as of `scores_of`.
     """
     a, b, c = cov.T
     u, v = residual.T
     f, s = predictive.fraction, predictive.scale
     core = np.exp(-0.5 * u * u / a) / np.sqrt(2 * np.pi * a)
-    if predictive.outliers == "gaussian":
-        far = np.exp(-0.5 * (u / s) ** 2) / (np.sqrt(2 * np.pi) * s)
-        below_u, below_v = ndtr(u / s), ndtr(v / s)
-    elif predictive.outliers == "uniform":
-        x = np.clip(u / s, -1.0, 1.0)
-        half = np.sqrt(1 - x * x)
-        far = 2 * half / (np.pi * s)
-        below_u = 0.5 + (x * half + np.arcsin(x)) / np.pi
+    far, below_u = _false_along(predictive, u)
+    if predictive.outliers == "uniform":
+        half = np.sqrt(1 - np.clip(u / s, -1.0, 1.0) ** 2)
         below_v = np.clip(0.5 + 0.5 * v / np.maximum(s * half, NEVER), 0.0, 1.0)
     else:
-        far, below_u, below_v = np.zeros_like(u), np.zeros_like(u), np.zeros_like(u)
+        below_v = _false_along(predictive, v)[1]
     w = (1 - f) * core
     w = np.where(f * far > 0, w / np.maximum(w + f * far, NEVER), 1.0)
     first = (1 - f) * ndtr(u / np.sqrt(a)) + f * below_u
     rest = np.sqrt(b - c * c / a)
     second = w * ndtr((v - c / a * u) / rest) + (1 - w) * below_v
     return np.stack([first, second, _radial(first, second)])
+
+
+def _false_along(predictive: Predictive, x: Float) -> tuple[Float, Float]:
+    """Density (n,) of false matches along one axis, and probability of less."""
+    s = predictive.scale
+    if predictive.outliers == "gaussian":
+        return np.exp(-0.5 * (x / s) ** 2) / (np.sqrt(2 * np.pi) * s), ndtr(x / s)
+    if predictive.outliers == "uniform":
+        z = np.clip(x / s, -1.0, 1.0)
+        half = np.sqrt(1 - z * z)
+        return 2 * half / (np.pi * s), 0.5 + (z * half + np.arcsin(z)) / np.pi
+    return np.zeros_like(x), np.zeros_like(x)
 
 
 def _radial(first: Float, second: Float) -> Float:

@@ -1,6 +1,6 @@
 """Score tests of self-calibrations: what a model lacks, with the stars eliminated.
 
-As for matched stars (`bayesdist.diagnose.score.score`), with the positions of stars among the
+As for matched stars (`diagnose.score.regressor_tests`), with the positions of stars among the
 parameters that are projected out, and with the scores of a star's detections added up.  What stars
 take up cannot be tested: directions in which known stars would say much more are left out.
 """
