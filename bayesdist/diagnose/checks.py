@@ -28,8 +28,8 @@ def structure_checks(
 ) -> Iterator[Check]:
     """Checks of the structure that a fit leaves in the residuals.
 
-    `misfits`: one for each chip; nothing is checked where there is none; `correlated`: correlated
-    errors of the solution, which hold some of it; `fit`: which fit, in words.
+    There is one misfit for each chip, or none; `correlated` errors of the solution hold some of the
+    structure; `fit` says which fit, in words.
     """
     if not misfits:
         return
@@ -71,7 +71,7 @@ def score_checks(
 ) -> Iterator[Check]:
     """Checks of what targeted tests have found, each as a remark.
 
-    `correlated`: correlated errors: verdicts stand where these hold what a test has found.
+    Verdicts stand where correlated errors hold what a test has found.
     """
     for test in tests:
         if test.significant:

@@ -21,8 +21,7 @@ Int = NDArray[np.int64]
 def sums_over(cluster: Int, values: Float, n: int = 0) -> Float:
     """Sums of values over clusters.
 
-    `cluster` (N,): numbered from 0; `values` (N, ...); `n`: clusters that there are at least. The
-    result (c, ...).
+    `cluster` (N,) counts from 0, `values` are (N, ...); there are at least `n` clusters.
     """
     columns = values.reshape(len(values), math.prod(values.shape[1:])).T
     sums = [np.bincount(cluster, column, n) for column in columns]
@@ -32,7 +31,7 @@ def sums_over(cluster: Int, values: Float, n: int = 0) -> Float:
 def add_over(total: Float, cluster: Int, values: Float) -> None:
     """Add values (N, ...) to the totals (c, ...) of their clusters, which may be few of many.
 
-    `total` (c, ...): changed in place; `cluster` (N,); `values` (N, ...).
+    `total` is changed in place.
     """
     present, of = np.unique(cluster, return_inverse=True)
     total[present] += sums_over(of, values)
@@ -41,7 +40,7 @@ def add_over(total: Float, cluster: Int, values: Float) -> None:
 def joint_clusters(group: Int, cluster: Int) -> tuple[Int, Int]:
     """Group (c,) of each part of a cluster that lies in one group, and part (N,) of each value.
 
-    `group` and `cluster` (N,): not negative.
+    `group` and `cluster` (N,) are not negative.
     """
     n = int(cluster.max(initial=0)) + 1
     keys, of = np.unique(group * n + cluster, return_inverse=True)
@@ -51,8 +50,7 @@ def joint_clusters(group: Int, cluster: Int) -> tuple[Int, Int]:
 def squares_over(cluster: Int, values: Float, group: Int | None = None, n: int = 1) -> Float:
     """Squares (n, ...) of the sums over clusters, added up in each group.
 
-    `cluster` (N,): not negative; `values` (N, ...); `group` (N,): one group by default; `n`: number
-    of groups.
+    `cluster` (N,) is not negative, `values` are (N, ...); one of `n` groups by default.
     """
     owner, of = joint_clusters(np.zeros_like(cluster) if group is None else group, cluster)
     return sums_over(owner, sums_over(of, values) ** 2, n)
@@ -61,7 +59,7 @@ def squares_over(cluster: Int, values: Float, group: Int | None = None, n: int =
 def products_over(group: Int, cluster: Int, values: Float, n: int) -> Float:
     """Products of sums of k values over groups and clusters, added up over the clusters.
 
-    `group` and `cluster` (N,); `values` (N, k); `n`: number of groups. The result (k n, k n).
+    Matrix (k n, k n) for values (N, k) of n groups.
     """
     k = values.shape[1]
     rows = (group[:, None] * k + np.arange(k)).ravel()

@@ -215,7 +215,7 @@ def diagnose_fit(
 def residual_sums(fit: LinearFit, shards: Shards) -> tuple[dict[int, dict[str, Bins]], StarSums]:
     """Bins of each chip by the name of the partition, and sums of residuals in them.
 
-    `shards`: all stars that were fitted.
+    `shards` has all stars that were fitted.
     """
     partitions = {}
     for chip, found in zip(fit.model.chips, shards.survey.chips, strict=True):
@@ -231,7 +231,7 @@ def misfits_of(
 ) -> tuple[Misfit, ...]:
     """Structure in the residuals of each chip.
 
-    `partitions` and `sums` as of `residual_sums`.
+    `partitions` and `sums` are those of `residual_sums`.
     """
     out = []
     for chip, bins in zip(fit.model.chips, partitions.values(), strict=True):
@@ -375,8 +375,8 @@ def catalogue_covariance(
     parameters a few thousand draws leave factors of several in the eigenvalues of theirs.
     Polynomials and drift are followed exactly, frames as far as they are correlated with these.
 
-    `stars`: with errors that contain the catalogue's, and codes of the stars. None where the
-    catalogue has no errors, or the matches no codes of stars.
+    `stars` have errors that contain the catalogue's, and codes. None where the catalogue has no
+    errors, or the matches no codes.
     """
     if errors is None or stars is None or stars.star is None:
         return None

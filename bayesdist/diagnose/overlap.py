@@ -66,9 +66,9 @@ def overlap_test(
 ) -> OverlapTest | None:
     """Lay the two exposures that are farthest apart in time on each other.
 
-    `pairs`: raw pixels beside positions of the catalogue; `known`: the known distortion of the
-    start; `tables`: that go with the solution; `unit_arcsec`: size of the unit of u and v; `pixel`:
-    size of a pixel, arcsec; `rolls`: PA_V3 of the exposures, where it is known. None where no two
+    `pairs` have raw pixels beside positions of the catalogue, `known` is the distortion of the
+    start, `tables` go with the solution, `unit_arcsec` is the size of the unit of u and v, `pixel`
+    that of a pixel in arcsec, `rolls` the PA_V3 of exposures where it is known. None where no two
     exposures share enough stars.
     """
     chosen = chosen_exposures(pairs)
@@ -110,8 +110,8 @@ def overlap_test(
 def chosen_exposures(pairs: MatchTable) -> tuple[int, int] | None:
     """Codes of the two exposures farthest apart in time that share half of their stars.
 
-    `pairs`: with codes of the catalogue's stars and epochs. The earlier one comes first;
-    None where no two share enough.
+    `pairs` have codes of the catalogue's stars, and epochs. The earlier exposure comes first; None
+    where no two share enough.
     """
     if pairs.star is None or pairs.epoch is None:
         return None

@@ -162,8 +162,8 @@ def period_part(
 ) -> PeriodPart:
     """A task for `sum_by_period`.
 
-    `matches` is of one period; `fit` is of all data; `bins`: on each axis; `radial_weight` as the
-    fit's.
+    `matches` are those of one period, `fit` is that of all data; `bins` are those on each axis,
+    `radial_weight` is the fit's.
     """
     stars, _ = prepare(fit.model, matches)
     used = fit.clip.keeps_of(stars)
@@ -189,9 +189,9 @@ def time_variation(
 ) -> TimeVariation:
     """Comparison of periods, in one pass over the data.
 
-    `fit` is of all data, without frames and time dependence; `matches`: with errors and epochs.
-    Raises `InputError` as `sum_by_period` and `compare_periods`. Raises `DegenerateError` for a
-    period with too few pairs.
+    `fit` is that of all data, without frames and time dependence; `matches` have errors and epochs.
+    Raises InputError as `sum_by_period` and `compare_periods`, DegenerateError for a period with
+    too few pairs.
     """
     periods, unit_arcsec = settings.spans, settings.unit_arcsec
     task = partial(period_part, fit=fit, bins=settings.bins, radial_weight=settings.radial_weight)

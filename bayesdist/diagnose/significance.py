@@ -19,10 +19,9 @@ def p_words(p: float) -> str:
 
 
 def holm(p_values: ArrayLike) -> Float:
-    """Probabilities corrected for their number (Holm 1979).
+    """Probabilities (m,) corrected for their number (Holm 1979).
 
-    `p_values` (m,). The result is at or under a level where the test is significant at that
-    level among all of them.
+    They are at or under a level where the test is significant at that level among all of them.
     """
     p = np.asarray(p_values, float)
     order = np.argsort(p, kind="stable")
@@ -37,7 +36,8 @@ def hotelling_p(statistic: float, dof: float, n: float) -> float:
 
     For squares about zero (Hotelling 1931).
 
-    `dof`: directions; `n`: stars, or other vectors that are independent of each other.
+    `dof` is the number of directions, `n` that of stars, or other vectors that are independent of
+    each other.
     """
     return float(beta.sf(min(statistic / n, 1.0), dof / 2, max(n - dof, 1) / 2))
 

@@ -60,8 +60,8 @@ def partitions_of(
 ) -> tuple[Partition, ...]:
     """The parts in which held-out stars are judged.
 
-    `sample`: some of them, evenly spread: they say where bins end; `whole`: exposures that were
-    held out whole.
+    `sample` are some of the held-out stars, evenly spread, which say where bins end; `whole` are
+    the exposures that were held out whole.
     """
     n = len(held)
     out = [Partition(ALL, (Bin("over the whole detector"),), lambda _, rows: rows * 0)]

@@ -80,7 +80,8 @@ def frames_for(
 ) -> dict[str, Frame]:
     """Frames of exposures that the solution does not know, fitted to their own stars.
 
-    `pieces` is of the held-out stars; they are gone through once for every step.
+    The pieces of the held-out stars are gone through once for every step. Exposures with too few
+    stars are left out.
     """
     unknown = [name for name in names if name not in set(predictive.model.exposures)]
     if not predictive.model.n_frame or not unknown:

@@ -143,7 +143,7 @@ class Scores:
 def scores_of(predictive: Predictive, residual: Float, cov: Float) -> Scores:
     """Scores of stars.
 
-    `residual` (n, 2): data minus prediction; `cov` (n, 3): uu, vv and uv of S.
+    `residual` (n, 2) is data minus prediction, `cov` (n, 3) the uu, vv and uv of S.
     """
     a, b, c = cov.T
     det = a * b - c * c
@@ -193,7 +193,7 @@ def _along_each(log_core: Float, of_axis: Float, far: Float) -> Float:
 def marginals_of(predictive: Predictive, residual: Float, cov: Float) -> Float:
     """Predictive probabilities (2, n) of less in u and in v, whatever the other is.
 
-    `predictive`, `residual` and `cov` as of `scores_of`.
+    `residual` and `cov` as of `scores_of`.
     """
     f, out = predictive.fraction, []
     for r, var in zip(residual.T, cov[:, :2].T, strict=True):

@@ -33,8 +33,8 @@ Int = NDArray[np.int64]
 class SharedErrors:
     """Matches with the stars and cells that they share errors with.
 
-    `predictive` has errors of the catalogue, of places, or both; predictive probabilities are
-    counted in `n_bins`.
+    `predictive` has errors of the catalogue, of positions on the detector, or both; predictive
+    probabilities are counted in `n_bins`.
     """
 
     def __init__(self, predictive: Predictive, n_bins: int) -> None:

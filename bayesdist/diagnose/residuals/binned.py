@@ -158,7 +158,7 @@ class BinnedSums:
     def values(self, axis: str) -> BinValues:
         """Means of the bins along one axis, of `band_bins`.
 
-        `axis`: one of `BAND_AXES`. Raises `InputError` for an unknown axis.
+        `axis` is one of `BAND_AXES`; else InputError.
         """
         require_known(axis, BAND_AXES, "axis")
         k = BAND_AXES.index(axis)

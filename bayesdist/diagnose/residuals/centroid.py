@@ -16,9 +16,9 @@ CERTAIN = 0.5  # probability of a false match from which on a star is left out
 def centroid_scatter(stars: StarSample, *, n_params: int = 0) -> MagnitudeErrors | None:
     """Scatter of the residuals by magnitude.
 
-    `stars`: with a posterior its likely false matches are left out, else what the fit rejected;
-    `n_params`: parameters of the fit, for all stars there are. None where the stars have no
-    magnitudes, or too few of them.
+    Of stars with a posterior the likely false matches are left out, else what the fit rejected;
+    `n_params` are the parameters of the fit to all stars. None where the stars have no magnitudes,
+    or too few of them.
     """
     mag = stars.table.mag
     if mag is None:

@@ -73,11 +73,11 @@ def coverage_of(sums: BinnedSums, corners: Float, chip: Chip, *, several: bool =
     It lies within the hull of all stars, and within that of the cells that hold more than strays:
     a few false matches in the corners cover nothing.
 
-    `sums` is of the stars used; `corners` (m, 2): vertices of the convex hull of all stars:
-    `ChipSurvey.corners`; `several`: whether the detector has other chips.
+    `sums` are those of the stars used, `corners` (m, 2) the vertices of the convex hull of all
+    stars (`ChipSurvey.corners`); `several` chips make the detector, or one.
 
-    References: The gap that n even stars leave in a rectangle, (8/3) ln n / n of its area: Renyi &
-    Sulanke 1963, Z. Wahrscheinlichkeitstheorie 2, 75.
+    The gap that n even stars leave in a rectangle is (8/3) ln n / n of its area (Renyi & Sulanke
+    1963, Z. Wahrscheinlichkeitstheorie 2, 75).
     """
     count, size = sums.count, np.array(chip.size)
     n = int(count.sum())

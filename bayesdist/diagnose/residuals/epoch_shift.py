@@ -71,8 +71,8 @@ class EpochShift:
 def epoch_shift(table: MatchTable, solution: Solution) -> EpochShift | None:
     """The error of the epochs that the residuals show.
 
-    `table`: with proper motions; of more than `SAMPLE` rows, every k-th is taken. None without
-    proper motions, or with too few.
+    Of a table of more than `SAMPLE` rows every k-th is taken. None without proper motions, or with
+    too few.
     """
     if table.pm_u is None or table.pm_v is None:
         return None

@@ -24,7 +24,8 @@ def majority_sentence(
 ) -> str:
     """Warning that most pairs are false, as a clause; empty where they are not.
 
-    `quoted`: usual quoted error of one axis, in the unit of u, v; `things`: word for the matches.
+    `quoted` is the usual quoted error of one axis, in the unit of u, v; `things` is the word for
+    the matches.
     """
     if posterior is not None and "f" in posterior.hyper:
         fraction = float(posterior.hyper["f"].mean())

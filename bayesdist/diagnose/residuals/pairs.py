@@ -21,10 +21,9 @@ def pair_statistics(a: Float, b: Float, *, tolerance: float = 0.0) -> dict[str, 
     With b the same as a these are the columns of Table 5-3 of WSDC D-T033, whose n^2 differences
     contain each bin against itself.
 
-    `a` (n,); `b` (m,): finite values; both are non-empty; `tolerance`: allowed error of median and
-    percentiles, in the unit of the values; 0 stands for rounding. The result is mean, sigma (about
-    the mean, over n m), min, max, median, p01, p99.  The percentiles interpolate between neighbours
-    as `numpy.percentile` does.
+    `a` (n,) and `b` (m,) are finite and not empty, `tolerance` is the allowed error of median and
+    percentiles, 0 for rounding. By name: mean, sigma (about the mean, over n m), min, max, median,
+    p01, p99; percentiles interpolate between neighbours as `numpy.percentile` does.
     """
     same = a is b
     a = np.sort(a)

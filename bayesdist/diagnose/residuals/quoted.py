@@ -24,7 +24,7 @@ def error_scale(fit: LinearFit, table: MatchTable) -> float:
 
     A low quantile of chi-square is compared with its expectation: most matches may be false.
 
-    `table`: the matches, or some of them.
+    `table` has the matches, or some of them.
     """
     stars, _ = prepare(fit.model, table)
     r = stars.residuals(np.asarray(fit.mean))
@@ -36,7 +36,8 @@ def error_scale(fit: LinearFit, table: MatchTable) -> float:
 def error_scale_sentence(factor: float, sigma: float, unit: str, *, by_magnitude: bool) -> str:
     """Warning that errors were multiplied, and what else may help, as a clause.
 
-    `sigma`: median error after it; `by_magnitude`: there are magnitudes to estimate errors by.
+    `sigma` is the median error after it; `by_magnitude` says that there are magnitudes to estimate
+    errors by.
     """
     do = "check their unit and the order of the model"
     if by_magnitude:

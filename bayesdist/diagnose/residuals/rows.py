@@ -59,9 +59,9 @@ def bin_row(
 ) -> StatisticsRow:
     """A row of Tables 5-1, 5-2 and C-1 of WSDC D-T033.
 
-    `absorbed`: coefficients of this axis that the fit took out of the residuals, at least 1: they
-    carry away that many degrees of freedom of the noise. Raises `DegenerateError` when too few bins
-    hold two stars.
+    `absorbed` are the coefficients of this axis that the fit took out of the residuals, at least 1:
+    they carry away that many degrees of freedom of the noise. Raises `DegenerateError` when too few
+    bins hold two stars.
     """
     some = _Bins.of(label, bins, absorbed)
     drawn, calm = _along_last(some.draws(rng)), _along_last(some.centre)
@@ -78,8 +78,8 @@ def pair_row(
 ) -> StatisticsRow:
     """A row of Table 5-3 of WSDC D-T033: differences over all pairs of bins.
 
-    `second`: bins of another band, which are subtracted; by default those of the same one;
-    `absorbed` and `rng` as `bin_row`. Raises `DegenerateError` as `bin_row`.
+    `second` are bins of another band, which are subtracted; by default those of the same one.
+    `absorbed` and `rng` as of `bin_row`. Raises `DegenerateError` as `bin_row`.
     """
     a = _Bins.of(label, first, absorbed)
     b = a if second is None else _Bins.of(label, second, absorbed)

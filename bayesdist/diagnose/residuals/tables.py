@@ -52,10 +52,9 @@ class StatisticsTable:
     def to_table(self, *, errors: bool = False) -> Table:
         """The table in the report's layout.
 
-        `errors`: add for every statistic its error and its value without noise, and the numbers of
-        bins. The result is columns 'Band/Axis' (or as `first`), Mean, Sigma, Min, Max, Median,
-        1%-tile, 99%-tile; with errors also 'Mean error', 'Mean noise-free' and so on, 'Sigma
-        noise', 'Bins' and 'Bins left out'.
+        Columns are 'Band/Axis' (or as `first`), Mean, Sigma, Min, Max, Median, 1%-tile and
+        99%-tile; with `errors` also 'Mean error', 'Mean noise-free' and so on, 'Sigma noise',
+        'Bins' and 'Bins left out'.
         """
         out = Table(meta={"title": self.title, "unit": self.unit})
         out[self.first] = [row.label for row in self.rows]

@@ -11,11 +11,11 @@ Float = NDArray[np.float64]
 
 
 def independent_directions(whole: Float, left: Float, least: float) -> Float:
-    """Directions of regressors that the parameters have left, (n, q).
+    """Directions (n, q) of regressors that the parameters have left.
 
-    `whole` and `left` (n, n): information of the regressors before and after the parameters are
-    projected out; `least`: fraction of it that a direction must have kept. The result is in units
-    in which `whole` is the unit matrix.
+    `whole` and `left` (n, n) are the information of the regressors before and after the parameters
+    are projected out, `least` the fraction of it that a direction must have kept. Directions are in
+    units in which `whole` is the unit matrix.
     """
     diagonal = np.diag(whole)
     scale = np.zeros(len(diagonal))
@@ -32,9 +32,9 @@ def squares_of(
 ) -> tuple[float, float]:
     """Mean squares of the pattern that a score stands for, and of what noise makes of it.
 
-    `score` (q,); `information` and `covariance` (q, q): of the directions, and of their score;
-    `square` (q, q): mean products of the directions over the detector. `found`: the first with the
-    second included.
+    The first holds the second. `information` and `covariance` (q, q) are those of the directions
+    and of their `score` (q,), `square` (q, q) the mean products of the directions over the
+    detector.
     """
     inverse = np.linalg.inv(information)
     step = inverse @ score

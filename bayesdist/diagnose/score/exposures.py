@@ -94,9 +94,9 @@ class _Meat:
     def covariance(self, nuisance: Float, star: Int, own: Float) -> tuple[Float, Float]:
         """Covariance (n, n) of an exposure's scores: of its own stars, and of all others.
 
-        `nuisance` (G, n): parameters that the deviations are taken for; `star` (N,): stars of the
-        exposure's detections; `own` (N, n): scores of the detections before the parameters are
-        projected out.
+        `nuisance` (G, n) are the parameters that the deviations are taken for, `star` (N,) the
+        stars of the exposure's detections, `own` (N, n) the scores of the detections before the
+        parameters are projected out.
         """
         which, of = np.unique(star, return_inverse=True)
         # a star is one, in this exposure and in all others

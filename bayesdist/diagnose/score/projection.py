@@ -172,7 +172,7 @@ class Projection:
     def regressor_map(self, block: Block, which: Int) -> Float:
         """Coefficients (2, L, n) of projected regressors in a block.
 
-        `which` (n,): from 0 to q - 1.
+        `which` (n,) are from 0 to q - 1.
         """
         K, nuisance = self.sample.model.n_terms, self.nuisance[:, which]
         by_global, by_local = _parts(block, self.n_global)
@@ -209,7 +209,7 @@ class Projection:
 def projection_of(functions: Functions, theta: Float, priors: GaussianPriors) -> Projection:
     """Sums over the detections of a sample.
 
-    `functions`: with the sample; `theta` (D,): where the scores were taken.
+    `theta` (D,) is where the scores were taken.
     """
     try:
         return _summed(functions, theta, priors)

@@ -132,9 +132,9 @@ def outcome(
 ) -> Outcome:
     """Outcome of a test that has found a pattern of some mean square.
 
-    `statistic`, `dof`, `dof_residual`, `p_value` and `unit` as of `ScoreTest`; `square` and
-    `noise`: mean square of the pattern, noise included, and that of the noise; `smallest` as of
-    `Outcome`; by default that of a pattern that lies in any direction as noise does.
+    `square` and `noise` are the mean square of the pattern, noise included, and that of the noise;
+    `smallest` is by default that of a pattern that lies in any direction as noise does. Others as
+    of `ScoreTest`.
     """
     if smallest is None:
         smallest = partial(smallest_pattern, float(np.sqrt(max(noise, 0.0))), dof, dof_residual)
@@ -156,7 +156,7 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
 def noncentrality(level: float, dof: float, dof_residual: float | None = None) -> float:
     """Noncentrality at which a chi-square or F test has the power `POWER`.
 
-    `dof_residual` is of the F test.
+    `dof_residual` is that of an F test.
     """
     if dof_residual is None or dof_residual > 1e5:  # where F and chi-square are alike
         return float(special.chndtrinc(stats.chi2.isf(level, dof), dof, 1 - POWER))
@@ -167,6 +167,7 @@ def noncentrality(level: float, dof: float, dof_residual: float | None = None) -
 def smallest_pattern(noise: float, dof: float, dof_residual: float | None, level: float) -> float:
     """Rms of a pattern that is found with the power `POWER`.
 
-    `noise`: rms of the pattern that noise makes.
+    `noise` is the rms of the pattern that noise makes; the pattern lies in any direction as noise
+    does.
     """
     return float(noise * np.sqrt(noncentrality(level, dof, dof_residual) / dof))

@@ -70,7 +70,7 @@ class ScoredSample:
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """Detections that say anything: all but those that a fit rejects."""
+        """Boolean mask (N,) of the detections that count: all but those that a fit rejects."""
         return np.any(self.curvature != 0, axis=0)
 
     @cached_property
@@ -93,7 +93,7 @@ class ScoredSample:
         return list(found.values())
 
     def with_positive_curvature(self) -> ScoredSample:
-        """The sample with what is concave in the likelihood alone.
+        """Sample with what is concave in the likelihood alone.
 
         Detections between true and false curve the wrong way; where there are many of them, their
         sum is no information matrix.
@@ -106,10 +106,10 @@ class ScoredSample:
 
 
 def scored_sample(table: MatchTable, solution: Solution) -> ScoredSample:
-    """Detections of a table with what a solution says of each.
+    """Sample of the detections of a table, with their scores at a solution.
 
-    `table`: with errors; of more than `SAMPLE` rows, every k-th is taken. Raises `InputError` as
-    `prepare` and `scores_of`.
+    The table has errors; of more than `SAMPLE` rows, every k-th is taken. Raises InputError where
+    the table does not go with the solution.
     """
     table = table.sample(SAMPLE)
     by_exposure = np.argsort(table.exposure, kind="stable")

@@ -127,7 +127,7 @@ def _alike(variance: Float, inlier: Float) -> Int:
 def truncation_test(sample: ScoredSample, match_radius: float | None = None) -> Outcome | None:
     """Test for true matches missing beyond some radius.
 
-    `match_radius`: in the unit of u and v. None for less than `MIN_STARS` true matches.
+    `match_radius` is in the unit of u and v. None for less than `MIN_STARS` true matches.
     """
     inlier = _weights(sample)
     n = float(inlier.sum())
@@ -220,7 +220,7 @@ def _tail(variance: Float, radius2: float) -> Float:
 def _lost(end: float) -> float:
     """Scatter along an axis that was cut off, in units of what is left.
 
-    `end`: half the square of the radius in units of the scatter that is left.
+    `end` is half the square of the radius in units of the scatter that is left.
     """
     # mean of an exponential of scale s cut at `end`: s - end / (exp(end / s) - 1) = 1
     if end <= 2.0:  # as flat a distribution as there is

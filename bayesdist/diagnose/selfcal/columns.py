@@ -82,12 +82,11 @@ class AddedColumns(Columns):
 
 
 def pointing_terms(problem: Problem, theta: Float) -> Float | None:
-    """Quadratic terms of the position times the offset, along the axes of the detector.
+    """Quadratic terms (N, 6) of the position times the offset, along the axes of the detector.
 
     To their first order these are what a curved sky makes of the tangent planes of exposures.
 
-    `theta` (D,). The result (N, 6): lengths in half sides of the detector; None where nothing was
-    dithered.
+    Lengths are in half sides of the detector; None where nothing was dithered.
     """
     model = problem.model
     exposure = problem.groups.exposure[problem.groups.index]

@@ -70,13 +70,13 @@ def between_nodes(
 ) -> BetweenNodes:
     """Mean square of what a table leaves of the distortion of one chip.
 
-    `x` and `y` (N,): raw pixels; `residual` (N, 2): after table and polynomial, pixels; `precision`
-    (N, 2): inverse variances that these were fitted with; zero for a star that did not count;
-    `star` and `exposure` (N,): codes; `step`: pixels between nodes; `taken`: variance (n, 2) of
-    table and polynomial at pixels (n,), square pixels: what the fit has taken of the residuals.
-    Below zero for a table that was not fitted to them and errs by itself: its error is in the
-    products as it is. Raises `DegenerateError` when too few stars lie that near to each other, or
-    in too few places.
+    `x` and `y` (N,) are raw pixels, `residual` (N, 2) is what table and polynomial leave, pixels,
+    `precision` (N, 2) the inverse variances that they were fitted with, 0 for a star that did not
+    count; `star` and `exposure` (N,) are codes, `step` the pixels between nodes. `taken` is the
+    variance (n, 2) of table and polynomial at pixels (n,): what the fit has taken of the residuals,
+    square pixels. It is negative for a table that was not fitted to them: its own error is in the
+    products. Raises `DegenerateError` when too few stars lie that near to each other, or in too few
+    places.
     """
     used = (precision > 0).all(axis=1)
     stars = x[used], y[used], residual[used], precision[used], star[used], exposure[used]
