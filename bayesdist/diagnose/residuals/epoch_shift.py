@@ -143,8 +143,6 @@ def _left_over(sample: ScoredSample, weight: Float, *fields: Float) -> Iterator[
 
 def _together(sample: ScoredSample) -> list[Int]:
     """Rows of each chip of each exposure."""
-    rows: dict[tuple[int, int], list[Int]] = {}
-    for block in sample.blocks:
-        own = np.arange(block.rows.start, block.rows.stop)
-        rows.setdefault((block.chip, block.exposure), []).append(own)
-    return [np.concatenate(parts) for parts in rows.values()]
+    keys = np.column_stack([sample.codes("chip"), sample.codes("exposure")])
+    code = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
+    return np.split(np.argsort(code, kind="stable"), np.cumsum(np.bincount(code))[:-1])
