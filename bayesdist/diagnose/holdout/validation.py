@@ -30,43 +30,22 @@ ORDER = ("offset", "deviation", "spread", "tails", "distribution")  # of what te
 
 @dataclass(frozen=True, eq=False)
 class HoldoutValidation:
-    """Results of held-out stars against a solution.
+    """Results of held-out stars against a solution."""
 
-    Parameters
-    ----------
-    unit : str
-        Of u and v.
-    n : int
-        Stars that were predicted.
-    n_left_out : int
-        Of exposures with too few stars for a frame of their own.
-    exposures : tuple of str
-        Held out whole.
-    tests : tuple of HeldTest
-        The most telling first.
-    pit : ndarray, shape (3, bins)
-        Counts of the predictive probabilities: of u, of v given u, of the distance.
-    regions : tuple of Bin
-    region_n : ndarray, shape (B,)
-    region_scale : ndarray, shape (B,)
-        Factor on the predicted errors in each region; NaN where there are too few stars.
-    region_offset : ndarray, shape (B, 2)
-        Mean offset from the prediction, in units of its own predicted error.
-    coverage : tuple of AxisCoverage
-        Along each axis.
-    """
-
-    unit: str
-    n: int
-    n_left_out: int
-    exposures: tuple[str, ...]
-    tests: tuple[HeldTest, ...]
+    unit: str  # of u and v
+    n: int  # stars that were predicted
+    n_left_out: int  # of exposures with too few stars for a frame of their own
+    exposures: tuple[str, ...]  # held out whole
+    tests: tuple[HeldTest, ...]  # the most telling first
+    # (3, bins) counts of the predictive probabilities: of u, of v given u, of the distance
     pit: Float
     regions: tuple[Bin, ...]
-    region_n: Float
+    region_n: Float  # (B,)
+    # (B,) factor on the predicted errors in each region; NaN where there are too few stars
     region_scale: Float
+    # (B, 2) mean offset from the prediction, in units of its own predicted error
     region_offset: Float
-    coverage: tuple[AxisCoverage, ...] = ()
+    coverage: tuple[AxisCoverage, ...] = ()  # along each axis
 
     @property
     def coverage_words(self) -> str:
@@ -149,22 +128,8 @@ def holdout_validation(
 ) -> HoldoutValidation:
     """Results of stars that a solution has not seen.
 
-    Parameters
-    ----------
-    solution : Posterior or Predictive
-    held : MatchTable or PartitionedMatches
-        Held-out stars, with errors.
-    whole : sequence of str
-        Exposures all of whose stars were held out.
-
-    Returns
-    -------
-    HoldoutValidation
-
-    Raises
-    ------
-    InputError
-        For too few stars, and for a campaign's posterior of which only the draws are given.
+    Of the exposures `whole` all stars were held out. Raises InputError for too few stars, and for a
+    campaign's posterior of which only the draws are given.
     """
     predictive = solution if isinstance(solution, Predictive) else predictive_of(solution)
     where = ", ".join(held.sources)

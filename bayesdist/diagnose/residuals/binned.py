@@ -303,21 +303,8 @@ def band_bins(
 
     The mean length of a bin is that of single stars, not the length of the mean residual.
 
-    Parameters
-    ----------
-    x, y, ru, rv, size, weights
-        As `binned_sums`; residuals in pixels of the band.
-    bins : int or tuple of int
-        31 in section 5 of WSDC D-T033, 45 in its Appendix C.
-
-    Returns
-    -------
-    BinnedSums
-
-    Raises
-    ------
-    InputError
-        As `binned_sums`.
+    Parameters are those of `binned_sums`, residuals in pixels of the band; `bins` are 31 in section
+    5 of WSDC D-T033 and 45 in its Appendix C.
     """
     length = np.hypot(np.asarray(ru, float), np.asarray(rv, float))
     return binned_sums(x, y, ru, rv, length, bins=bins, size=size, weights=weights)

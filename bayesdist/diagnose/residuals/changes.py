@@ -41,22 +41,9 @@ def pattern_changes(periods: Mapping[str, BinnedSums]) -> tuple[PatternChange, .
     rest have independent errors, and those from the combined set are the same, made smaller by the
     share of the rest.
 
-    Parameters
-    ----------
-    periods : mapping of str to BinnedSums
-        Disjoint in their stars, all against one model, in pixels; two or more.
-
-    Returns
-    -------
-    tuple of PatternChange
-        X and Y of each period.
-
-    Raises
-    ------
-    InputError
-        For less than two periods.
-    DegenerateError
-        When fewer than three bins hold five stars in a period and in the rest.
+    Periods are disjoint in their stars, two or more, all against one model in pixels; changes are
+    those in X and Y of each. Raises InputError for less than two periods, DegenerateError when
+    fewer than three bins hold five stars in a period and in the rest.
     """
     names = list(periods)
     if len(names) < 2:

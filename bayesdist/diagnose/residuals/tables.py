@@ -80,24 +80,10 @@ def fitting_table(
 ) -> StatisticsTable:
     """Table 5-1: residuals of the fit in bins, in pixels.
 
-    Parameters
-    ----------
-    bands : mapping of str to BinnedSums
-        By the name of the band, in the order of the table.
-    rng : numpy.random.Generator
-        For the errors.
-    absorbed : int
-        Coefficients of one axis that the fit took out of the residuals: 15 at order 4; 1 where the
-        residuals are of a model that was not fitted to these stars.
-
-    Returns
-    -------
-    StatisticsTable
-
-    Raises
-    ------
-    DegenerateError
-        When too few bins of a band hold two stars.
+    Bands are in the order of the table, `rng` is for the errors. `absorbed` are the coefficients of
+    one axis that the fit took out of the residuals: 15 at order 4; 1 where the residuals are of a
+    model that was not fitted to these stars. Raises DegenerateError when too few bins of a band
+    hold two stars.
     """
     rows = tuple(
         # the scatter of single stars is not what the coefficients are fitted to
@@ -126,23 +112,9 @@ def band_to_band_table(
     frames they are not: the catalogue's errors cancel in the difference, its noise is smaller than
     said here, and its noise-free part larger.
 
-    Parameters
-    ----------
-    bands, rng, absorbed
-        As `fitting_table`; the bins of all bands are as many and cover the same field.
-    arcsec : mapping of str to float
-        Arcsec per pixel of each band.
-
-    Returns
-    -------
-    StatisticsTable
-
-    Raises
-    ------
-    InputError
-        For one band only, for bands whose bins differ in number, or a band without scale.
-    DegenerateError
-        As `fitting_table`.
+    As `fitting_table`; the bins of all bands are as many and cover the same field, `arcsec` are
+    those per pixel of each band. Raises InputError for one band only, for bands whose bins differ
+    in number, or a band without scale.
     """
     values = _in_arcsec(bands, arcsec)
     names = list(bands)
@@ -178,21 +150,7 @@ def multiframe_table(
 ) -> StatisticsTable:
     """Table 5-3: differences over all pairs of bins, in arcsec.
 
-    Parameters
-    ----------
-    bands, rng, absorbed, arcsec
-        As `band_to_band_table`.
-
-    Returns
-    -------
-    StatisticsTable
-
-    Raises
-    ------
-    InputError
-        For a band without scale.
-    DegenerateError
-        As `fitting_table`.
+    As `band_to_band_table`, of one band or more.
     """
     values = _in_arcsec(bands, arcsec)
     rows = tuple(
@@ -212,23 +170,8 @@ def period_table(
 ) -> StatisticsTable:
     """Table C-1: residuals of one band in several periods, in arcsec.
 
-    Parameters
-    ----------
-    periods : mapping of str to BinnedSums
-        By the name of the period, in the order of the table: the combined one and single ones, all
-        against the combined model.
-    rng, absorbed
-        As `fitting_table`; by the name of the period where they differ.
-    arcsec_per_pixel : float
-
-    Returns
-    -------
-    StatisticsTable
-
-    Raises
-    ------
-    DegenerateError
-        As `fitting_table`.
+    Periods are in the order of the table, the combined one among them, all against the combined
+    model; `absorbed` is by the name of the period where it differs. Others as of `fitting_table`.
     """
     rows = tuple(
         bin_row(
