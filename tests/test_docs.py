@@ -21,6 +21,7 @@ from pydantic import BaseModel
 import bayesdist as bd
 from bayesdist.app.cli import bayesdist as root
 from bayesdist.app.config import KINDS
+from bayesdist.app.config.data import data_sections
 
 from .docs_blocks import DOCS, blocks, run_page
 
@@ -137,7 +138,8 @@ def _configured(kind: type[BaseModel], section: str = "") -> set[tuple[str, str]
 
 
 def _configured_of_any_kind() -> set[tuple[str, str]]:
-    return {pair for kind in KINDS.values() for pair in _configured(kind)}
+    own = {pair for section in data_sections().values() for pair in _configured(section, "data")}
+    return own | {pair for kind in KINDS.values() for pair in _configured(kind)}
 
 
 def _models(annotation: object) -> list[type[BaseModel]]:

@@ -13,8 +13,8 @@ from astropy.table import Table
 from bayesdist.app.checks import provenance_notes
 from bayesdist.app.fingerprint import fingerprint_of
 from bayesdist.app.margins import margin_rows, margin_table
+from bayesdist.app.output import write_table
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.session import Session, write_table
 from bayesdist.assess import Margin
 from bayesdist.assess.budget.budget import ErrorBudget
 from bayesdist.assess.coefficients import coefficient_table
@@ -32,37 +32,71 @@ FILE = "evaluation.h5"
 COLUMNS = ("epoch", "probability", "low", "high", "value")
 
 
-def save_evaluation(session: Session, found: Evaluation) -> None:
-    """Write an evaluation: maps.fits, tables, sections of summary.json, and evaluation.h5."""
-    run, solution, head = session.run, session.solution, provenance_notes(session)
+def save_evaluation(
+    run: RunDirectory,
+    fit: LinearFit,
+    posterior: Posterior,
+    solution: Posterior,
+    gauge: str,
+    found: Evaluation,
+) -> None:
+    """Write an evaluation: maps.fits, tables, sections of summary.json, and evaluation.h5.
+
+    Parameters
+    ----------
+    run : RunDirectory
+    fit, posterior
+        What was evaluated.
+    solution : Posterior
+        With all errors of the parameters.
+    gauge : str
+        In which gauge it stands, as a sentence; empty where that is no question.
+    found : Evaluation
+    """
+    head = provenance_notes(posterior, gauge)
     maps = [*found.formal, *found.maps, *found.relative]
     write_maps(
         run / "maps.fits",
         maps,
         found.areas,
-        notes=(solution.approximation, session.gauge_words),
+        notes=(solution.approximation, gauge),
         converged=solution.convergence.converged,
     )
-    coefficients = coefficient_table(session.fit, solution)
+    coefficients = coefficient_table(fit, solution)
     coefficients.meta |= head
     write_table(coefficients, run / "coefficients.ecsv")
     write_table(_budget_table(found, head), run / "budget.ecsv")
-    _write_margins(session, found.margins, found.validity)
+    _write_margins(run, posterior, head, found.margins, found.validity)
     run.summarise(
         map=_map_summary(found),
         budget=found.budget.rows(),
         warnings=list(warnings_of(found.checks)),
     )
-    _write(run, session.fit, session.posterior, found)
+    _write(run, fit, posterior, found)
 
 
-def save_margins(session: Session, margins: Sequence[Margin], validity: Sequence[Horizon]) -> None:
-    """Replace the margins and validity periods of a run by others."""
-    _write_margins(session, margins, validity)
-    if (session.run / FILE).exists():
-        found = load_evaluation(session.run, session.fit, session.posterior)
+def save_margins(
+    run: RunDirectory,
+    fit: LinearFit,
+    posterior: Posterior,
+    gauge: str,
+    margins: Sequence[Margin],
+    validity: Sequence[Horizon],
+) -> None:
+    """Replace the margins and validity periods of a run by others.
+
+    Parameters
+    ----------
+    run, fit, posterior, gauge
+        As of `save_evaluation`.
+    margins : sequence of Margin
+    validity : sequence of Horizon
+    """
+    _write_margins(run, posterior, provenance_notes(posterior, gauge), margins, validity)
+    if (run / FILE).exists():
+        found = load_evaluation(run, fit, posterior)
         found = replace(found, margins=tuple(margins), validity=tuple(validity))
-        _write(session.run, session.fit, session.posterior, found)
+        _write(run, fit, posterior, found)
 
 
 def load_evaluation(run: RunDirectory, fit: LinearFit, posterior: Posterior) -> Evaluation:
@@ -97,11 +131,14 @@ def _budget_table(found: Evaluation, head: Mapping[str, Any]) -> Table:
 
 
 def _write_margins(
-    session: Session, margins: Sequence[Margin], validity: Sequence[Horizon]
+    run: RunDirectory,
+    posterior: Posterior,
+    head: Mapping[str, Any],
+    margins: Sequence[Margin],
+    validity: Sequence[Horizon],
 ) -> None:
-    run, several = session.run, len(session.posterior.model.chips) > 1
-    table = margin_table(margins, several=several)
-    table.meta = provenance_notes(session)
+    table = margin_table(margins, several=len(posterior.model.chips) > 1)
+    table.meta = dict(head)
     write_table(table, run / "margins.ecsv")
     _write_validity(run / "horizon.ecsv", validity)
     run.summarise(margins=margin_rows(margins), horizons=validity_rows(validity))

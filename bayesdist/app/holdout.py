@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.assess.error_model import solution_with_errors
+from bayesdist.app.campaign.holdout import predictive_of_campaign
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.assess.error_model import ErrorModel, solution_with_errors
+from bayesdist.assess.evaluation import EvaluationSettings
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
-
-if TYPE_CHECKING:
-    from bayesdist.app.session import Session
+from bayesdist.infer import Posterior
 
 __all__ = [
     "holdout_summary",
@@ -23,19 +24,36 @@ __all__ = [
 ]
 
 
-def predictive_of_run(session: Session, found: Diagnostics) -> Predictive:
+def predictive_of_run(
+    posterior: Posterior,
+    found: Diagnostics,
+    errors: ErrorModel,
+    data: FitData,
+    settings: EvaluationSettings,
+) -> Predictive:
     """The solution as it is assessed, as it predicts.
 
     Quoted errors and jitter hold what the model leaves out at a position, as each star errs by it;
     neighbours err by it together.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    found : Diagnostics
+        Of it, without what is held out.
+    errors : ErrorModel
+    data : FitData
+    settings : EvaluationSettings
     """
-    out = predictive_of(solution_with_errors(session.posterior, found, session.hierarchy))
+    if data.fitted.scatter is not None:
+        return predictive_of_campaign(posterior, found, errors, data, settings)
+    out = predictive_of(solution_with_errors(posterior, found))
     correlated = found.correlated
     rows = None if correlated is None else correlated.facts.get("structure")
     if not rows:
         return out
     side = max(row["length_pix"] for row in rows)
-    local = session.errors_from(found).local_tables(session.evaluation_settings.grid, session.epoch)
+    local = errors.local_tables(settings.grid, settings.epoch)
     return replace(out, local=local, cell=(side, side), local_in_noise=True)
 
 

@@ -10,15 +10,14 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.campaign.monitoring import fit_exposures_of, read_new_exposures
-from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.comparison_files import joined
 from bayesdist.app.config import Config, load_config
-from bayesdist.app.folder import atomic_directory
+from bayesdist.app.folder import record_folder
 from bayesdist.app.kinds.errors import read_magnitude_errors
-from bayesdist.app.matches import load_matches, reading_options
-from bayesdist.app.rundir import RunDirectory, versions, write_json
-from bayesdist.app.rvb import load_rvb
-from bayesdist.app.session import Session, write_table
+from bayesdist.app.match_sources import read_configured
+from bayesdist.app.output import write_table
+from bayesdist.app.results import results_of
+from bayesdist.app.rundir import RunDirectory
 from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_late
 from bayesdist.assess.comparison.tables import comparison_table, difference_table
 from bayesdist.assess.units import convert, pixel_scale_of
@@ -37,7 +36,7 @@ from bayesdist.report.drawing import save_figures
 
 __all__ = ["monitor"]
 
-SCHEMA = 1
+CHANGE_MAPS = 1  # of the random streams that follow from the one seed
 
 
 def monitor(
@@ -86,7 +85,7 @@ def monitor(
             change=change,
             maps=change_maps(
                 date.change if late and date is not None else change,
-                rng=np.random.default_rng([config.sampler.seed, SCHEMA]),
+                rng=np.random.default_rng([config.sampler.seed, CHANGE_MAPS]),
                 names=(str(new), str(run)),
                 grid=(nx, ny),
             ),
@@ -107,9 +106,9 @@ def _fitted(
 ) -> tuple[Posterior, Matches, NewFit, tuple[str, ...]]:
     """Release, new matches and their fit, and the exposures that the release has seen."""
     if config.campaign is not None:
-        session = CampaignSession(run)
-        exposures = read_new_exposures(session, new)
-        found = fit_exposures_of(session, exposures)
+        release = results_of(run)
+        exposures = read_new_exposures(release, new)
+        found = fit_exposures_of(release, exposures)
         return exposures.released, exposures.matches, found, exposures.left_out
     if config.selfcal is not None:
         raise InputError(
@@ -117,7 +116,7 @@ def _fitted(
             where=str(run.path),
             do="calibrate the new exposures by themselves, and use 'bayesdist compare'",
         )
-    posterior = Session(run).solution
+    posterior = results_of(run).solution
     matches = _new_matches(run, config, new)
     found = fit_new(
         posterior,
@@ -155,10 +154,7 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
             )
     assert data is not None
     _refuse_the_same(run, path)
-    if data.format == "rvb" and size is not None:
-        matches: Matches = load_rvb(path, data, size)
-    else:
-        matches = load_matches(path, **reading_options(data, config.chip))
+    matches = read_configured(path, data, size=size, chips=config.chip)
     if data.sigma != "by_magnitude":
         return matches
     errors = read_magnitude_errors(run.path)
@@ -245,7 +241,7 @@ def _write(
     command: str,
 ) -> None:
     date, maps = found.date, found.maps
-    with atomic_directory(output) as folder:
+    with record_folder(output, "monitor.json", command) as (folder, record):
         write_table(joined(maps, comparison_table), folder / "change.ecsv")
         write_table(joined(maps, difference_table), folder / "difference.ecsv")
         figures = {"change": difference_vectors(maps, names=("new", "release"))}
@@ -264,10 +260,10 @@ def _write(
                     table["first"], date.gain, date.dof, found.p_since
                 )
         save_figures(figures, folder / "figures")
-        write_json(folder / "monitor.json", _summary(found, facts, command))
+        record |= _summary(found, facts)
 
 
-def _summary(found: Monitored, facts: dict[str, Any], command: str) -> dict[str, Any]:
+def _summary(found: Monitored, facts: dict[str, Any]) -> dict[str, Any]:
     test, date, worst = found.change.test, found.date, found.worst
     since = None
     if date is not None:
@@ -282,9 +278,6 @@ def _summary(found: Monitored, facts: dict[str, Any], command: str) -> dict[str,
         }
     scale = found.pixel_mas
     return {
-        "schema": SCHEMA,
-        "command": command,
-        "versions": versions(),
         "verdict": found.verdict,
         "changed": found.changed,
         "p_value": found.p_either,

@@ -8,25 +8,28 @@ import numpy as np
 from astropy.table import Table, vstack
 from astropy.time import Time
 
+from bayesdist.app.config import Config
+from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.assess import SAMPLE, convert, pixel_scale_of
 from bayesdist.data import MatchTable
 from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, bins_for
 from bayesdist.errors import InputError
+from bayesdist.infer.stars.shards import Matches
 
 if TYPE_CHECKING:
-    from bayesdist.app.session import Session
     from bayesdist.diagnose.residuals import PatternChange, StatisticsTable
     from bayesdist.infer.compare.positions import PositionChange
 
 __all__ = ["check_pairs", "period_settings", "periods_summary", "periods_table"]
 
 
-def check_pairs(session: Session) -> dict[str, int]:
+def check_pairs(raw: Matches, config: Config) -> dict[str, int]:
     """About how many pairs each period has, from the epochs of some of the pairs.
 
     Parameters
     ----------
-    session : Session
+    raw : MatchTable or PartitionedMatches
+    config : Config
 
     Returns
     -------
@@ -38,10 +41,9 @@ def check_pairs(session: Session) -> dict[str, int]:
     InputError
         Without epochs, and for a period without pairs: before anything is sampled.
     """
-    spans = session.config.spans()
+    spans = config.spans()
     if not spans:
         return {}
-    raw = session.raw_matches
     where = ", ".join(raw.sources)
     if not raw.has_epoch:
         raise InputError(
@@ -67,12 +69,13 @@ def check_pairs(session: Session) -> dict[str, int]:
     return out
 
 
-def period_settings(session: Session) -> PeriodSettings | None:
+def period_settings(data: FitData, config: Config) -> PeriodSettings | None:
     """Which periods are compared, and how; None where none are asked for.
 
     Parameters
     ----------
-    session : Session
+    data : FitData
+    config : Config
 
     Returns
     -------
@@ -83,11 +86,10 @@ def period_settings(session: Session) -> PeriodSettings | None:
     InputError
         As `check_pairs`.
     """
-    config = session.config
     if config.periods is None:
         return None
-    fit = session.fit
-    least = min(check_pairs(session).values())
+    fit = data.fit
+    least = min(check_pairs(data.placed, config).values())
     scale = pixel_scale_of(fit, scale_mas=config.detector.scale_mas)
     angle = fit.unit != "pix" or scale is not None
     limits = [

@@ -3,22 +3,38 @@
 from __future__ import annotations
 
 import logging
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from bayesdist.app.config import load_config
+from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.made_from import NEEDS
+from bayesdist.app.rehearsal import rehearse
+from bayesdist.app.results import Results, open_results
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.screen import log_file, progress_bar
-from bayesdist.app.session import STAGES, Session
-from bayesdist.app.sessions import own_stages, rehearse_run, session_of
-from bayesdist.app.stages import run_stage
+from bayesdist.app.screen import log_file
+from bayesdist.app.stages.assess import run_assess
+from bayesdist.app.stages.export import run_export
+from bayesdist.app.stages.fit import run_fit
+from bayesdist.app.stages.match import run_match
+from bayesdist.app.stages.report import run_report
+from bayesdist.app.stages.sample import run_sample
 from bayesdist.errors import InputError, NotConvergedError
 from bayesdist.infer.checks import convergence_check
 
-__all__ = ["continue_stage", "run"]
+__all__ = ["continue_stage", "initialized", "run", "run_stage"]
 
 log = logging.getLogger("bayesdist")
+
+STAGES: dict[str, Callable[[Results], Results]] = {
+    "match": run_match,
+    "fit": run_fit,
+    "sample": run_sample,
+    "assess": run_assess,
+    "export": run_export,
+    "report": run_report,
+}
 
 
 def run(
@@ -70,12 +86,11 @@ def run(
         seed=seed,
         command=command,
     )
-    with ExitStack() as stack:
-        session = _begun(directory, stack)
-        for stage in STAGES:
-            if stage != "match" or stage in own_stages(session):
-                _run_stage(session, stage, force=False)
-        _judge(session, strict)
+    with initialized(directory) as results:
+        names = list(STAGES)
+        for stage in names[names.index(results.kind.begins_with) :]:
+            results = run_stage(results, stage, force=False)
+        _judge(results, strict)
     return directory.path
 
 
@@ -87,49 +102,66 @@ def continue_stage(path: str | Path, stage: str, *, strict: bool = False) -> Run
     BayesdistError
     """
     directory = RunDirectory.open(path)
-    begins_with = "fit" if directory.config.data is not None else "match"
+    begins_with = kind_of(directory.config).begins_with
     if stage == "match" != begins_with:
         raise InputError(
             "has no star lists to match", where=str(path), do="begin with the stage 'fit'"
         )
     needs = (begins_with,) if stage == "fit" != begins_with else NEEDS[stage]
     directory.require(stage, needs, thorough=True)
-    with ExitStack() as stack:
-        session = _begun(directory, stack)
-        _run_stage(session, stage, force=True)
+    with initialized(directory) as results:
+        results = run_stage(results, stage)
         if stage == "sample":
-            _judge(session, strict)
+            _judge(results, strict)
     return directory
 
 
-def _begun(directory: RunDirectory, stack: ExitStack) -> Session:
-    """The session of a run that has begun, once it is known that it can be carried out."""
-    session = stack.enter_context(closing(session_of(directory)))
-    begins = directory.is_planned
-    if begins:
-        rehearse_run(session)
-    stack.enter_context(directory.locked())
-    directory.begin()
-    if begins:
-        session.begun()
-    stack.enter_context(log_file(directory / "bayesdist.log"))
-    return session
+def run_stage(results: Results, stage: str, *, force: bool = True) -> Results:
+    """Results with the artefact of a stage: loaded where it stands, and else made.
+
+    Parameters
+    ----------
+    results : Results
+    stage : str
+    force : bool
+        Make it also where it stands.
+    """
+    made = results.run.make(stage, lambda: STAGES[stage](results), force=force)
+    return made.value() if made.was_made else results
 
 
-def _run_stage(session: Session, stage: str, *, force: bool) -> None:
-    """Run a stage, with a progress bar where it samples."""
-    with progress_bar(stage) as progress:
-        session.progress = progress if stage == "sample" else None
-        run_stage(session, stage, own_stages(session).get(stage), force=force)
+@contextmanager
+def initialized(directory: RunDirectory) -> Iterator[Results]:
+    """Results of a run whose folder is there, once it is known that it can be carried out.
+
+    Parameters
+    ----------
+    directory : RunDirectory
+
+    Yields
+    ------
+    Results
+    """
+    with open_results(directory) as results:
+        begins = directory.is_planned
+        if begins:
+            results = rehearse(results)
+        with directory.locked():
+            directory.begin()
+            if begins:
+                results = results.adopting_inputs()
+            with log_file(directory / "bayesdist.log"):
+                yield results
 
 
-def _judge(session: Session, strict: bool) -> None:
-    posterior = session.posterior
+def _judge(results: Results, strict: bool) -> None:
+    """Raise where a sampler has not converged, if that is asked for."""
+    posterior = results.posterior
     if strict and convergence_check(posterior.convergence).level == "fail":
         exact = posterior.sampler.exact
         raise NotConvergedError(
             f"the sampler has not converged ({'; '.join(posterior.convergence.reasons)})",
-            where=str(session.run.path),
+            where=str(results.run.path),
             do="raise sampler.max_steps and resume, or simplify the model"
             if exact
             else "set sampler.second_stage = 'always' and run with --force",

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import platform
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from bayesdist.app.config import (
     Config,
     config_of_record,
     load_config,
 )
+from bayesdist.app.folder import versions
 from bayesdist.app.made_from import CODECS, changes, made_from_of, with_seed
 from bayesdist.app.named_files import files_of_products, named_files
 from bayesdist.app.refusals import (
@@ -26,17 +24,16 @@ from bayesdist.app.refusals import (
     refuse_other_inputs,
 )
 from bayesdist.app.star_files import PAIRS, part_files
-from bayesdist.app.store import SCHEMA, Made, Record, RunStore, as_json, write_json
+from bayesdist.app.store import SCHEMA, Made, Record, RunStore, as_json
 from bayesdist.app.summary import head_of
 from bayesdist.assess import Requirement
 from bayesdist.data import input_files
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.files import atomic_path, made_folder, remove_leftovers, sha256_of
-from bayesdist.version import __version__
 
-__all__ = ["RunDirectory", "as_json", "versions", "write_json"]
+__all__ = ["RunDirectory"]
 
-PACKAGES = ("arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
+T = TypeVar("T")
 
 
 class RunDirectory:
@@ -258,8 +255,8 @@ class RunDirectory:
 
     # -- stages -----------------------------------------------------------------------------------
 
-    def make(self, stage: str, function: Callable[[], None], *, force: bool = False) -> bool:
-        """Make a stage where what it was made from or what it wrote is not as it was.
+    def make(self, stage: str, function: Callable[[], T], *, force: bool = False) -> Made[T]:
+        """The artefact of a stage: made where it or what it was made from is not as it was.
 
         Parameters
         ----------
@@ -268,11 +265,6 @@ class RunDirectory:
             Writes its files into the folder and its sections by `summarise`.
         force : bool
             Make it also where it stands.
-
-        Returns
-        -------
-        bool
-            Whether it was made.
         """
         made_from = self._made_from(stage)
         if made_from is None:
@@ -281,7 +273,7 @@ class RunDirectory:
                 where=str(self.path),
                 do="run them first",
             )
-        return self.store.stage(stage, lambda *_: function(), *made_from, force=force).was_made
+        return self.store.stage(stage, lambda *_: function(), *made_from, force=force)
 
     def made(self, stage: str) -> Made[None] | None:
         """A stage that stands; None for one that was not run, or on something else."""
@@ -393,11 +385,3 @@ def _hashes(config: Config, base: Path) -> dict[str, str]:
     """SHA-256 of every file that the configuration names, by its absolute path."""
     named, others = named_files(config, base.resolve()), files_of_products(config, base.resolve())
     return {str(f): sha256_of(f) for f in [*input_files(named), *others]}
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python, the platform, and the packages that matter."""
-    out = {"python": sys.version.split()[0], "platform": platform.platform()}
-    out["bayesdist"] = __version__  # also where it runs from a source tree
-    out |= {name: metadata.version(name) for name in PACKAGES}
-    return out

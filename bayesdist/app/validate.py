@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 from bayesdist.app.config import load_requirements
@@ -11,8 +11,8 @@ from bayesdist.app.dates import idle_dates
 from bayesdist.app.evaluation_files import save_margins
 from bayesdist.app.judging import margins_of, validity_periods_of
 from bayesdist.app.margins import margin_rows
+from bayesdist.app.results import open_results
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.sessions import session_of
 from bayesdist.app.summary_text import margins_text
 from bayesdist.assess import Margin, Requirement
 from bayesdist.errors import InputError
@@ -44,17 +44,18 @@ def validate(run: str | Path, requirements: str | Path) -> tuple[str, bool]:
         run cannot be judged by; its name is in the message.
     """
     asked = load_requirements(requirements)
-    with closing(session_of(RunDirectory.open(run))) as session:
-        session.run.require("requirements", ("fit", "sample"))
+    directory = RunDirectory.open(run)
+    with open_results(directory) as results:
+        directory.require("requirements", ("fit", "sample"))
         with _named_after(requirements, asked):
-            margins = margins_of(session, asked)
-            horizons = validity_periods_of(session, asked)
-        with session.run.locked(), session.run.judged_by(asked):
-            save_margins(session, margins, horizons)
-        report = session.run / "report.html"
-        outdated = report.exists() and not session.run.done("report")
-        label = session.posterior.approximation
-    warnings = label, idle_dates(session.config, asked, str(requirements))
+            margins = margins_of(results, asked)
+            horizons = validity_periods_of(results, asked)
+        fit, posterior, gauge = results.fit, results.posterior, results.gauge_words
+        with directory.locked(), directory.judged_by(asked):
+            save_margins(directory, fit, posterior, gauge, margins, horizons)
+        report = directory / "report.html"
+        outdated = report.exists() and not directory.done("report")
+    warnings = posterior.approximation, idle_dates(results.config, asked, str(requirements))
     lines = [*_lines(margins), *(one.sentence for one in horizons)]
     lines += [f"WARNING: {text}" for text in warnings if text]
     if outdated:

@@ -1,4 +1,4 @@
-"""What a solution is worth: uncertainty maps, error budget, margins against requirements."""
+"""Assessment of a solution: uncertainty maps, error budget, margins against requirements."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.catalogue.star_errors import StarCovariance
 from bayesdist.infer.equations.scaled import scaled_cholesky
-from bayesdist.infer.posterior.recoloured import with_spread
+from bayesdist.infer.posterior.covariance import recolouring
 
 __all__ = ["covariance_of", "with_correlated_errors", "with_noise", "with_shared_stars"]
 
@@ -24,20 +24,11 @@ def with_shared_stars(posterior: Posterior, fit: LinearFit, stars: StarCovarianc
     the fit takes for independent may cancel.  Where the posterior is as much wider than the fit as
     its jitter says, so is the covariance that the map begins with.
 
-    Parameters
-    ----------
-    posterior : Posterior
-    fit : LinearFit
-        That `stars` was computed for.
-    stars : StarCovariance
-
-    Returns
-    -------
-    Posterior
-        With other draws of theta and the same mean; all else is as it was.
+    `fit`: that `stars` was computed for. The result comes with other draws of theta and the same
+    mean; all else is as it was.
     """
     before = covariance_of(posterior, fit)
-    return with_spread(posterior, before, before + stars.extra)
+    return posterior.mapped(recolouring(before, before + stars.extra))
 
 
 def covariance_of(
@@ -45,15 +36,7 @@ def covariance_of(
 ) -> Float:
     """Covariance of a posterior without the noise of its draws, and with a catalogue's errors.
 
-    Parameters
-    ----------
-    posterior : Posterior
-    fit : LinearFit
-    stars : StarCovariance, optional
-
-    Returns
-    -------
-    ndarray, shape (D, D)
+    Returns (D, D).
     """
     formal = np.asarray(fit.cov, float)
     wider = float(np.trace(np.linalg.solve(formal, posterior.cov))) / len(formal)
@@ -65,16 +48,8 @@ def with_noise(
 ) -> Posterior:
     """A posterior whose draws are spread by the errors of the stars as they scatter.
 
-    Parameters
-    ----------
-    posterior : Posterior
-    correlated : Discrepancy
-    before : ndarray, shape (D, D), optional
-        Its covariance where that is not the formal one, as in a hierarchy of exposures.
-
-    Returns
-    -------
-    Posterior
+    `before`: (D, D), its covariance where that is not the formal one, as in a hierarchy of
+    exposures.
     """
     return _widened(posterior, correlated, correlated.noise, before)
 
@@ -84,14 +59,7 @@ def with_correlated_errors(
 ) -> Posterior:
     """A posterior whose draws are spread by all that is known of errors of its parameters.
 
-    Parameters
-    ----------
-    posterior, correlated, before
-        As `with_noise`.
-
-    Returns
-    -------
-    Posterior
+    `posterior`, `correlated`, `before`: as `with_noise`.
     """
     return _widened(posterior, correlated, correlated.covariance, before)
 
@@ -101,16 +69,17 @@ def _widened(
 ) -> Posterior:
     formal = correlated.formal
     if before is None:
-        return with_spread(posterior, formal, cov)
+        return posterior.mapped(recolouring(formal, cov))
     # frames follow as they are correlated with polynomials and drift
     D = correlated.model.n_distortion
     follow = np.linalg.solve(before[:D, :D], before[:D]).T
     more = follow @ (cov - formal)[:D, :D] @ follow.T
-    return with_spread(posterior, before, before + _least(before, (more + more.T) / 2))
+    after = before + _least(before, (more + more.T) / 2)
+    return posterior.mapped(recolouring(before, after))
 
 
 def _least(before: Float, more: Float) -> Float:
-    """What is added to a covariance, so that no direction loses more than half its variance."""
+    """Addition to a covariance, limited so that no direction loses more than half its variance."""
     root = scaled_cholesky(before)
     white = np.linalg.solve(root, np.linalg.solve(root, more).T)
     values, vectors = np.linalg.eigh((white + white.T) / 2)

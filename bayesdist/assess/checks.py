@@ -21,16 +21,10 @@ GROUP = "Assumptions"
 def matching_checks(
     match_radius: float | None, sigma: float, *, in_circle: bool
 ) -> Iterator[Check]:
-    """What the matching may have cut off, where the likelihood does not know of it.
+    """Check of residuals that the match circle may have cut off, unknown to the likelihood.
 
-    Parameters
-    ----------
-    match_radius : float or None
-        In the unit of u and v.
-    sigma : float
-        Usual error of a star.
-    in_circle : bool
-        Whether the likelihood knows of the circles.
+    `match_radius`: in the unit of u and v. `sigma`: usual error of a star. `in_circle`: True if the
+    likelihood knows of the circles.
     """
     if in_circle or match_radius is None or MATCH_RADIUS.met_by(match_radius / sigma):
         return
@@ -44,7 +38,7 @@ def matching_checks(
 
 
 def catalogue_checks(catalogue_stated: bool | None) -> Iterator[Check]:
-    """Whether the errors of the reference catalogue are stated; None without a catalogue."""
+    """Check that the errors of the reference catalogue are stated; None without a catalogue."""
     if catalogue_stated is False:
         yield Check(
             GROUP,
@@ -57,16 +51,10 @@ def catalogue_checks(catalogue_stated: bool | None) -> Iterator[Check]:
 def time_checks(
     time: TimeDependence | None, dates: Float, motions_stated: bool | None
 ) -> Iterator[Check]:
-    """Whether the data determine a drift, and whether the motions' errors are stated.
+    """Checks that the data determine a drift, and that the motions' errors are stated.
 
-    Parameters
-    ----------
-    time : TimeDependence or None
-        Nothing is checked without.
-    dates : ndarray
-        Of the matches, decimal years.
-    motions_stated : bool or None
-        None without a catalogue.
+    `time`: nothing is checked without. `dates`: of the matches, decimal years. `motions_stated`:
+    None without a catalogue.
     """
     if time is None:
         return

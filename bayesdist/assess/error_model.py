@@ -38,7 +38,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ErrorModel:
-    """What the error of a position is made of.
+    """All errors of a position: those of the solution, and independent terms.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class ErrorModel:
         return DrawnErrors(solution, (self.solution, *self.terms), (one, *draws), image, n, seed)
 
     def with_terms(self, *terms: ErrorTerm) -> ErrorModel:
-        """The same with more terms; errors of centroids replace those that were there."""
+        """Error model with more terms; errors of centroids replace those that were there."""
         known = self.terms
         if any(isinstance(term, Centroids) for term in terms):
             known = tuple(term for term in known if not isinstance(term, Centroids))
@@ -231,17 +231,7 @@ def solution_with_errors(
 ) -> Posterior:
     """The solution that is exported and shown: all errors of the parameters are in its draws.
 
-    Parameters
-    ----------
-    posterior : Posterior
-        As it was sampled.
-    diagnostics : Diagnostics or None
-    hierarchy : LinearFit, optional
-        As of `error_model`.
-
-    Returns
-    -------
-    Posterior
+    `posterior`: as it was sampled. `hierarchy`: as of `error_model`.
     """
     if diagnostics is None:
         return posterior

@@ -1,4 +1,4 @@
-"""What a calibration is worth, as one value: made by a function of its arguments."""
+"""The evaluation of a calibration: maps, budget, margins and one verdict, as one value."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ VERDICT_LEVELS = {"met": "pass", "undecided": "warn", "missed": "fail"}
 
 @dataclass(frozen=True, eq=False)
 class EvaluationSettings:
-    """Where and how errors are evaluated.
+    """Epoch, grid and number of draws at which errors are evaluated.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ class EvaluationSettings:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What a calibration is worth.
+    """Errors of a calibration, and how they stand against requirements.
 
     Parameters
     ----------
@@ -231,12 +231,7 @@ def drawn_errors(
 ) -> DrawnErrors:
     """Draws of all errors: those of the centroids, and of files, among them.
 
-    Parameters
-    ----------
-    errors, diagnostics, settings, rng, files
-        As `evaluate`.
-    n : int, optional
-        Number of draws.
+    `errors`, `diagnostics`, `settings`, `rng`, `files`: as `evaluate`. `n`: number of draws.
     """
     known = _contradiction(diagnostics, settings) is None
     centroids = centroids_of(diagnostics, settings.contained) if known else None
@@ -263,23 +258,9 @@ def judged(
 ) -> tuple[Margin, ...]:
     """Margins of requirements, and what they rest on.
 
-    Parameters
-    ----------
-    errors, diagnostics, requirements, settings, rng
-        As `evaluate`.
-    checks : sequence of Check
-        All of them: their doubts keep verdicts from being given.
-    drawn : DrawnErrors, optional
-        As of `drawn_errors`.
-
-    Returns
-    -------
-    tuple of Margin
-
-    Raises
-    ------
-    InputError
-        For a requirement that cannot be judged.
+    `errors`, `diagnostics`, `requirements`, `settings`, `rng`: as `evaluate`. `checks`: all of
+    them: their doubts keep verdicts from being given. `drawn`: as of `drawn_errors`. InputError for
+    a requirement that cannot be judged.
     """
     if not requirements:
         return ()
@@ -322,15 +303,8 @@ def validity_of(
 ) -> tuple[Horizon, ...]:
     """Until when requirements at one date are met, on fewer draws than their margins.
 
-    Parameters
-    ----------
-    errors, diagnostics, requirements, settings, rng
-        As `evaluate`.
-
-    Returns
-    -------
-    tuple of Horizon
-        Empty where nothing depends on time.
+    `errors`, `diagnostics`, `requirements`, `settings`, `rng`: as `evaluate`. The result is empty
+    where nothing depends on time.
     """
     epoch = diagnostics.sample.table.epoch
     if errors.solution.solution.model.time is None or not requirements or not settings.years_ahead:
@@ -356,7 +330,7 @@ def validity_of(
 def _own_checks(
     errors: ErrorModel, diagnostics: Diagnostics, settings: EvaluationSettings
 ) -> Iterator[Check]:
-    """What is asked for and cannot be given."""
+    """Checks of requests that cannot be met."""
     linear = None if diagnostics.correlated is None else diagnostics.correlated.linear
     measured = errors.aligned or (linear is not None and bool(linear.kinds))
     if settings.single and not measured:
@@ -373,7 +347,7 @@ def _own_checks(
 
 
 def _contradiction(diagnostics: Diagnostics, settings: EvaluationSettings) -> InputError | None:
-    """What is said to be in the residuals and is larger than these; None where nothing is."""
+    """Check of an error that is larger than the residuals said to hold it; None where none is."""
     try:
         centroids_of(diagnostics, settings.contained)
     except InputError as error:

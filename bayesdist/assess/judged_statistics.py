@@ -35,25 +35,10 @@ def drawn_statistics(
 ) -> tuple[dict[str, Float], ...]:
     """Statistics of each draw's errors, of several errors with the same noise.
 
-    Parameters
-    ----------
-    errors : sequence of callable
-    names : sequence of str
-        Of `STATISTICS`.
-    n_draws, n_places : int
-    block : int
-        Places times draws that a thread holds at once.
-    seed : int
-        Of the noise.
-    pairs : ndarray, shape (2, P), optional
-        Pairs of places whose differences are judged; places themselves by default.
-    over_all : bool
-        Whether largest differences are those of all places, not of `pairs`.
-
-    Returns
-    -------
-    tuple of dict of str to ndarray, shape (n_draws,)
-        One for each of the errors.
+    `names`: of `STATISTICS`. `block`: places times draws that a thread holds at once. `seed`: of
+    the noise. `pairs`: (2, P), pairs of places whose differences are judged; places themselves by
+    default. `over_all`: True if largest differences are those of all places, not of `pairs`.
+    Returns (n_draws,), one for each of the errors.
     """
     width = max(n_places, 0 if pairs is None else pairs.shape[1])
     step = ROWS * max(1, block // (ROWS * width))

@@ -57,16 +57,9 @@ def field_statistic(name: str, error: Float) -> Float:
 def extent(name: str, error: Float) -> Float:
     """Largest difference between the errors at any two points.
 
-    Parameters
-    ----------
-    name : {'max', 'u_max', 'v_max'}
-    error : ndarray, shape (..., N, 2)
-
-    Returns
-    -------
-    ndarray, shape (...)
-        Of both axes the largest extent along any of 64 directions, which falls short of the largest
-        distance by 0.03 % at most.
+    `name`: one of 'max', 'u_max', 'v_max'. `error`: (..., N, 2). Returns (...), of both axes the
+    largest extent along any of 64 directions, which falls short of the largest distance by 0.03 %
+    at most.
     """
     axis = name.removesuffix("max").rstrip("_")
     if axis:

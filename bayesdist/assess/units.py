@@ -57,12 +57,7 @@ def convert(
 
 
 def require_scale(scale_mas: float) -> None:
-    """Pass a pixel scale that is positive and finite.
-
-    Raises
-    ------
-    InputError
-    """
+    """Pass a pixel scale that is positive and finite."""
     if not (math.isfinite(scale_mas) and scale_mas > 0):
         raise InputError(
             f"the pixel scale is {scale_mas} mas",
@@ -76,24 +71,10 @@ def pixel_scale_of(
 ) -> float | None:
     """Size of one pixel, in mas.
 
-    Parameters
-    ----------
-    solution : LinearFit or Posterior
-    chip : int, optional
-        Chip number; the first chip by default.
-    scale_mas : float, optional
-        The scale where the user gives it; it is returned as it is.
-
-    Returns
-    -------
-    float or None
-        In mas per pixel.  Without `scale_mas`: where u and v are angles, the square root of the
-        pixel area at the reference pixel, without drift and frames; where they are pixels, None.
-
-    Raises
-    ------
-    InputError
-        For an unknown chip or a scale that is not positive.
+    `chip`: chip number; the first chip by default. `scale_mas`: the scale where the user gives it;
+    it is returned as it is. The result is in mas per pixel.  Without `scale_mas`: where u and v are
+    angles, the square root of the pixel area at the reference pixel, without drift and frames;
+    where they are pixels, None. InputError for an unknown chip or a scale that is not positive.
     """
     if scale_mas is not None:
         require_scale(scale_mas)
@@ -105,16 +86,7 @@ def pixel_scale_of(
 
 
 def pixel_doubt(solution: Solution) -> str:
-    """Doubt about u and v that are called pixels and are not, as a clause; empty without one.
-
-    Parameters
-    ----------
-    solution : LinearFit or Posterior
-
-    Returns
-    -------
-    str
-    """
+    """Doubt about u and v that are called pixels and are not, as a clause; empty without one."""
     model = solution.model
     if model.unit != "pix":
         return ""

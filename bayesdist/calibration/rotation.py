@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
-from bayesdist.infer.transforms import View
+from bayesdist.infer.solution import TransformedSolution
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["coefficient_map", "is_exact", "pixel_matrix", "rotated"]
@@ -126,7 +126,7 @@ def rotated(
 
     cov = linear @ np.asarray(solution.cov, float) @ linear.T
     mean = transform(np.asarray(solution.mean, float))
-    turned = View(new, mean, (cov + cov.T) / 2, solution, transform)
+    turned = TransformedSolution(new, mean, (cov + cov.T) / 2, solution, transform)
     return replace(calibration, solution=turned, plane=Plane(), with_plane=None, inverses={})
 
 

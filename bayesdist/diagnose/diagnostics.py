@@ -44,7 +44,7 @@ from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, Shard
 from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance
 from bayesdist.infer.catalogue.star_influence import StarErrors
 from bayesdist.infer.exposures.chip_offsets import Settling
-from bayesdist.infer.selfcal import Solution as Eliminated
+from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.streams import restarted
 
 __all__ = [
@@ -155,7 +155,7 @@ def diagnose_fit(
     shards: Shards,
     table: MatchTable,
     *,
-    eliminated: Eliminated | None = None,
+    eliminated: SelfCalibrationMode | None = None,
     centroid: MagnitudeErrors | Literal["residuals"] | None = "residuals",
     things: str = "pairs",
 ) -> Diagnostics:
@@ -171,7 +171,7 @@ def diagnose_fit(
         The same, as passes go over them.
     table : MatchTable
         Evenly spread ones of them, or all.
-    eliminated : infer.selfcal.Solution, optional
+    eliminated : infer.selfcal.SelfCalibrationMode, optional
         The solution with its stars, where places of stars were fitted too.
     centroid : MagnitudeErrors, 'residuals' or None
         Errors of the centroids where the fit has found them; else they are the scatter of the
@@ -243,7 +243,7 @@ def misfits_of(
     return tuple(out)
 
 
-def _taken(eliminated: Eliminated, rows: Int) -> NDArray[np.float64]:
+def _taken(eliminated: SelfCalibrationMode, rows: Int) -> NDArray[np.float64]:
     """Fraction (N,) of the variance that places of stars take out of detections."""
     own = eliminated.problem.rows
     taken = np.zeros(max(int(own.max(initial=-1)), int(rows.max(initial=-1))) + 1)
@@ -267,7 +267,7 @@ def diagnose(
     exposures: bool = True,
     settling: Settling | None = None,
     catalogue: StarErrors | None = None,
-    eliminated: Eliminated | None = None,
+    eliminated: SelfCalibrationMode | None = None,
     centroid: MagnitudeErrors | Literal["residuals"] | None = "residuals",
     periods: PeriodSettings | None = None,
     things: str = "pairs",

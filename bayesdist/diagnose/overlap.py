@@ -14,7 +14,8 @@ from bayesdist.calibration.calibration import Calibration
 from bayesdist.data import MatchTable
 from bayesdist.diagnose.alignment import Alignment, alignment_residuals
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
-from bayesdist.infer.transforms import Solution, without_frames
+from bayesdist.infer.solution import Solution
+from bayesdist.infer.transforms import without_frames
 from bayesdist.model import LookupTable, corrected
 
 __all__ = ["OverlapTest", "chosen_exposures", "overlap_test"]

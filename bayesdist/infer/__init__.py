@@ -29,12 +29,11 @@ _HOMES = {
     "bayesdist.infer.posterior": ("Posterior", "SamplerInfo"),
     "bayesdist.infer.convergence": ("Convergence", "Limits"),
     "bayesdist.infer.sampler.sample": ("sample",),
+    "bayesdist.infer.solution": ("ReferenceGauge", "Solution", "TransformedSolution"),
     "bayesdist.infer.stars.mixture": ("OutlierMixture",),
     "bayesdist.infer.stars.shards": ("Compute", "Matches", "Shards", "load"),
     "bayesdist.infer.transforms": (
         "LinearTerms",
-        "ReferenceGauge",
-        "View",
         "linear_terms",
         "lines",
         "reference_gauge",

@@ -27,15 +27,7 @@ FIT, SAMPLING = "Fit", "Sampling"
 
 
 def scatter_too_small(total: float, dof: float) -> bool:
-    """Whether residuals scatter less than their quoted errors say.
-
-    Parameters
-    ----------
-    total : float
-        Chi-square.
-    dof : float
-        Its degrees of freedom.
-    """
+    """True if residuals with this chi-square scatter less than their quoted errors."""
     by_chance = float(chi2.cdf(total, max(dof, 1)))
     return total < CHI2_TOO_SMALL.value * dof and by_chance < CHI2_TOO_SMALL_CHANCE.value
 
@@ -47,21 +39,10 @@ def fit_checks(
     things: str = "stars",
     chooser: str = "least-squares fit",
 ) -> tuple[Check, ...]:
-    """Chi-square, what was left out and condition of a fit.
+    """Checks of chi-square, of the rows left out and of the condition of a fit.
 
-    Parameters
-    ----------
-    fit : LinearFit
-    in_circle : bool
-        Whether the likelihood knows of the circles that the stars were matched in.
-    things : str
-        What is fitted, one row each.
-    chooser : str
-        What leaves out rows that are far off.
-
-    Returns
-    -------
-    tuple of Check
+    `in_circle` if the likelihood knows of the circles that the stars were matched in; `things` are
+    what is fitted, one row each, and `chooser` leaves out rows that are far off.
     """
     ratio = fit.chi2 / fit.dof if fit.dof > 0 else float("nan")
     left_out = fit.n_rejected / fit.n_rows
@@ -95,7 +76,7 @@ def fit_checks(
 
 
 def _of_chi2(fit: LinearFit, small: bool, in_circle: bool) -> str:
-    """What chi-square means where it is not about one; empty where it is."""
+    """Sentence on a chi-square that is not about one; empty where it is."""
     ratio = fit.chi2 / max(fit.dof, 1)
     if small and in_circle:
         return (
@@ -117,10 +98,10 @@ def _of_chi2(fit: LinearFit, small: bool, in_circle: bool) -> str:
 
 
 def convergence_check(c: Convergence) -> Check:
-    """Whether draws can be relied on at all."""
+    """Check that the draws can be relied on at all."""
     sentence = ""
     if not c.converged:
-        why = "; ".join(getattr(c, "reasons", ()))
+        why = "; ".join(c.reasons)
         sentence = "the posterior is not converged" + (f": {why}" if why else "")
     good = "yes" if c.converged else "NO"
     return Check(
@@ -129,16 +110,7 @@ def convergence_check(c: Convergence) -> Check:
 
 
 def sampling_checks(posterior: Posterior | None) -> tuple[Check, ...]:
-    """Criteria of the draws; that there are none, for a fit alone.
-
-    Parameters
-    ----------
-    posterior : Posterior or None
-
-    Returns
-    -------
-    tuple of Check
-    """
+    """Checks of the draws; that there are none, for a fit alone."""
     if posterior is None:
         return (Check(SAMPLING, "Posterior", "not sampled", "sampled and converged", "warn"),)
     c = posterior.convergence

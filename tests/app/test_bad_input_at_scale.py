@@ -186,18 +186,18 @@ def test_a_part_that_is_damaged_between_two_stages(job, tmp_path):
 
 def test_a_part_that_is_damaged_while_it_is_read(job, tmp_path, monkeypatch):
     """After the scan, before the passes: found when the piece is read, with its row group."""
-    from bayesdist.app.session import Session
+    from bayesdist.app.kinds.fit_data import FitData
 
-    model = Session.model
+    model = FitData.model
     path = job.parent / "stars" / "b.parquet"
 
-    def first_damage(session):
-        found = model.func(session)
+    def first_damage(data):
+        found = model.fget(data)
         _flip(path, 6, 3)
         return found
 
     before = path.read_bytes()
-    monkeypatch.setattr(Session, "model", property(first_damage))
+    monkeypatch.setattr(FitData, "model", property(first_damage))
     from tests.app.support import cli
 
     result = cli("run", job, "-o", tmp_path / "run")

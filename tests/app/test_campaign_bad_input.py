@@ -10,10 +10,10 @@ from astropy.io import fits
 from astropy.table import Table, vstack
 from astropy.time import Time
 
-from bayesdist.app import stages
 from bayesdist.app.campaign.soundness import frames_not_set, shear_warnings
+from bayesdist.app.results import results_of
+from bayesdist.app.run import STAGES
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.sessions import session_of
 from bayesdist.data import MatchTable
 from bayesdist.data.tables.files import read_table
 from bayesdist.errors import DegenerateError
@@ -139,8 +139,8 @@ def test_an_exposure_with_one_chip_serves_for_that_one(campaign, folder, name, m
     assert np.isfinite(fit.mean).all() and np.isfinite(fit.cov).all()
     assert 0.8 < fit.chi2 / fit.dof < 1.3
     assert name in summary_of(run)["exposures_skipped"]  # of those that are fitted alone
-    doubts = session_of(RunDirectory.open(run)).doubts
-    assert any(f"chip {missing}" in text and name in text for text in doubts)
+    warnings = results_of(RunDirectory.open(run)).matched.warnings
+    assert any(f"chip {missing}" in text and name in text for text in warnings)
 
 
 @pytest.mark.parametrize(("kept", "name"), [(2, "WFC1"), (1, "WFC2")])
@@ -565,7 +565,7 @@ def test_resuming_after_a_list_was_removed(campaign):
 
 @pytest.mark.slow
 def test_a_damaged_campaign_is_calibrated_and_says_so(campaign, monkeypatch):
-    monkeypatch.setitem(stages._FUNCTIONS, "report", lambda session: None)
+    monkeypatch.setitem(STAGES, "report", lambda results: results)
     campaign.lists(scattered, ONE).lists(lambda t: t[t["chip"] == 1], "f606w-006")
     # a few steps: what is said does not rest on the draws
     campaign.replaced("target_ess = 100", "max_steps = 20")

@@ -9,11 +9,19 @@ import pytest
 
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.errors import ErrorLaw
+from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.reader import StarReader
-from bayesdist.app.kinds.stars import fit_stars, load_fitted_stars, match_stars, sample_stars
+from bayesdist.app.kinds.stars import (
+    fit_stars,
+    load_fitted_stars,
+    match_stars,
+    read_stars,
+    sample_stars,
+)
 from bayesdist.app.kinds.summary import fit_sections
-from bayesdist.app.rundir import RunDirectory, as_json
-from bayesdist.app.session import Session
+from bayesdist.app.results import open_results
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store import as_json
 from bayesdist.data import MagnitudeErrors
 from bayesdist.infer import load_fit, load_posterior
 from tests.app.support import as_table, simulated, snapshot, summary_of, write_job
@@ -28,14 +36,14 @@ def job(finished):
 @pytest.fixture(scope="module")
 def fitted(job):
     config, base = job
-    matched = match_stars(config, base)
+    matched = match_stars(read_stars(config, base), config, base)
     return matched, fit_stars(matched, config)
 
 
 def test_functions_find_what_a_run_finds(finished, job, fitted):
     before = snapshot(finished.path.parent)
     (config, _), (matched, found) = job, fitted
-    posterior = sample_stars(found, found.prepared(matched).stars, config)
+    posterior = sample_stars(FitData(matched, found), config)
     assert snapshot(finished.path.parent) == before
     known, draws = load_fit(finished.path / "fit.nc"), load_posterior(finished.path)
     np.testing.assert_array_equal(found.linear.mean, known.mean)
@@ -59,14 +67,14 @@ def test_a_fit_that_is_read_gives_the_same_stars(data, tmp_path):
         holdout={"fraction": 0.3},
     )
     config, _ = load_config(path)
-    matched = match_stars(config, path.parent)
+    matched = match_stars(read_stars(config, path.parent), config, path.parent)
     found = fit_stars(matched, config)
     found.save(tmp_path)
     read = load_fitted_stars(tmp_path, config, as_json(fit_sections(found, matched.stars)))
     assert (found.errors.factor > 20) == (not data)
     for made, again in (
-        (found.prepared(matched).stars, read.prepared(matched).stars),
-        (found.prepared(matched).held, read.prepared(matched).held),
+        (FitData(matched, found).stars, FitData(matched, read).stars),
+        (FitData(matched, found).held, FitData(matched, read).held),
     ):
         assert len(made) == len(again) > 0
         np.testing.assert_array_equal(made.sigma_u, again.sigma_u)
@@ -74,18 +82,17 @@ def test_a_fit_that_is_read_gives_the_same_stars(data, tmp_path):
     assert len(matched.stars) + len(matched.held) == len(matches)
 
 
-def test_another_value_of_a_stage_makes_a_new_state(finished, fitted):
-    session = Session(RunDirectory.open(finished.path))
-    _, found = fitted
-    posterior, sums, prepared = session.posterior, session.sums, session.prepared
-    session.renew("posterior", replace(posterior, n_flagged=7))
-    assert session.posterior.n_flagged == 7
-    assert session.prepared is prepared and session.sums is not sums
-    session.renew("fitted", found)
-    assert session.fit is found.linear and session.prepared is not prepared
-    assert session.posterior.n_flagged == posterior.n_flagged  # of the run's folder again
-    assert session.made("fitted") and not session.made("posterior")
-    session.close()
+def test_another_artefact_drops_what_rested_on_the_former(finished, fitted):
+    with open_results(RunDirectory.open(finished.path)) as results:
+        _, found = fitted
+        posterior, sums, data = results.posterior, results.diagnostics.sums, results.data
+        flagged = results.having(posterior=replace(posterior, n_flagged=7))
+        assert flagged.posterior.n_flagged == 7 and results.posterior is posterior
+        assert flagged.data is data and flagged.diagnostics.sums is not sums
+        refitted = flagged.having(fitted=found)
+        assert refitted.fit is found.linear and refitted.data is not data
+        assert refitted.posterior.n_flagged == posterior.n_flagged  # of the run's folder again
+        assert refitted.matched is results.matched
 
 
 def test_one_law_of_errors_for_all_stars():

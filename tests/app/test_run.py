@@ -22,8 +22,8 @@ from astropy.table import Table
 from astropy.wcs import WCS, FITSFixedWarning
 
 import bayesdist
-from bayesdist.app import stages
 from bayesdist.app.config import load_config, parse_config
+from bayesdist.app.run import STAGES
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import progress_bar
 from bayesdist.app.stages.report import title_of
@@ -468,16 +468,16 @@ def test_resuming_a_finished_run_changes_nothing(copy, finished):
 
 
 def test_an_interrupted_run_goes_on(finished, posterior, tmp_path, monkeypatch):
-    def interrupt(session):
+    def interrupt(results):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setitem(stages._FUNCTIONS, "assess", interrupt)
+        patch.setitem(STAGES, "assess", interrupt)
         result = cli("run", finished.config, "-o", tmp_path / "run")
     assert result.code == 130 and "--resume" in result.err and "Traceback" not in result.err
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert list(record["stages"]) == ["fit", "sample"]
-    monkeypatch.setitem(stages._FUNCTIONS, "report", lambda session: None)
+    monkeypatch.setitem(STAGES, "report", lambda results: results)
     result = good("run", finished.config, "-o", tmp_path / "run", "--resume")
     assert "sample: done before" in result.err
     np.testing.assert_array_equal(load_posterior(tmp_path / "run").theta, posterior.theta)

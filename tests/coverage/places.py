@@ -88,9 +88,9 @@ def covered(name: str, seed: int) -> dict[str, dict[str, np.ndarray]]:
     kind = KINDS[name]
     with TemporaryDirectory() as folder, one_thread():
         truth = campaign(kind, seed)
-        with closing(assessed(kind, seed, truth.stars, Path(folder))) as session:
-            solution, errors = session.solution, errors_of(session)
-            discrepancy = session.diagnostics.correlated
+        with closing(assessed(kind, seed, truth.stars, Path(folder))) as results:
+            solution, errors = results.solution, errors_of(results)
+            discrepancy = results.diagnostics.correlated
         rng = truth.rng
         x, y = rng.uniform(0.5, SIDE + 0.5, (2, PLACES))
         mag = np.repeat(rng.uniform(BRIGHT, FAINT, DATES), PLACES // DATES)

@@ -12,7 +12,7 @@ from bayesdist.diagnose.score.regressor_tests import regressor_tests
 from bayesdist.diagnose.score.regressors import functions_for
 from bayesdist.diagnose.score.sample import scored_sample
 from bayesdist.infer import GaussianPriors, Rejection, fit_linear
-from bayesdist.infer.posterior.likelihood import scores_of
+from bayesdist.infer.solution import likelihood_of
 from bayesdist.infer.stars.stars import in_table_order, prepare
 from bayesdist.model import DistortionModel
 
@@ -48,7 +48,7 @@ class Dense:
     def __init__(self, table, solution, priors=None):
         model, theta = solution.model, np.asarray(solution.mean)
         stars, order = prepare(model, table)
-        g_u, g_v, uu, uv, vv = in_table_order(scores_of(solution).of(stars).T, order).T
+        g_u, g_v, uu, uv, vv = in_table_order(likelihood_of(solution).scores(stars).T, order).T
         self.g = np.stack([g_u, g_v], 1)
         self.H = np.stack([np.stack([uu, uv], 1), np.stack([uv, vv], 1)], 2)
         self.J = model.jacobian(theta, table.x, table.y, **columns_of(table))

@@ -24,7 +24,7 @@ from bayesdist.diagnose.residuals import (
 )
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import build_model, fit_linear, residuals
-from bayesdist.infer.linear import Clip
+from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.shards import LocalShards
 from bayesdist.missions.wise.assess.contradictions import (
     contradictions_across,

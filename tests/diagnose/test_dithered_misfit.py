@@ -11,7 +11,7 @@ from scipy.stats import binom
 from bayesdist.diagnose.selfcal.leverage import taken_by_stars
 from bayesdist.diagnose.selfcal.misfit import _shifts, dithered_misfit
 from bayesdist.infer.selfcal import self_calibrate
-from bayesdist.infer.selfcal.normal import memberships
+from bayesdist.infer.selfcal.elimination import memberships
 from bayesdist.simulate.dithers import simulate_dithers, smooth_distortion
 from tests.infer.selfcal.fields import SIZE, chips, field
 
@@ -23,7 +23,7 @@ def _solved(simulated, detections=None):
         simulated.theta,
         match_radius=1.0,
         start_radius=2.0,
-    ).solution
+    ).mode
 
 
 def _simulated(seed, **more):
@@ -95,7 +95,7 @@ def test_a_star_of_as_many_numbers_as_detections_takes_all():
         match_radius=1.0,
         start_radius=2.0,
         motion="proper_motion",
-    ).solution
+    ).mode
     counts = found.problem.counts
     assert (counts == 2).any() and counts.max() == 6
     taken = taken_by_stars(found)

@@ -10,7 +10,8 @@ import numpy as np
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer import LinearFit
 from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance
-from bayesdist.infer.posterior.recoloured import Recoloured
+from bayesdist.infer.posterior.covariance import with_covariance
+from bayesdist.infer.solution import Solution, TransformedSolution
 from bayesdist.infer.transforms import lines, without_frames
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.frames import CHIP_DEVIATIONS
@@ -215,7 +216,7 @@ def shared_stars(
     return SharedStars(model, theta, matches, position, motion)
 
 
-class Truth:
+class Truth(Solution):
     """True parameters as a solution without errors."""
 
     def __init__(self, model: DistortionModel, theta: np.ndarray) -> None:
@@ -226,9 +227,9 @@ class Truth:
         return np.tile(self.mean, (n, 1))
 
 
-def with_star_errors(solution, stars: StarCovariance) -> Recoloured:
+def with_star_errors(solution, stars: StarCovariance) -> TransformedSolution:
     """A solution whose covariance and draws know that a star has one error."""
-    return Recoloured(solution, np.asarray(solution.cov) + stars.extra)
+    return with_covariance(solution, np.asarray(solution.cov) + stars.extra)
 
 
 def seen_by(exposure: str, epoch: float | None, model: DistortionModel, theta: np.ndarray) -> Truth:

@@ -11,8 +11,7 @@ import pytest
 from astropy.io import fits
 from numpy.testing import assert_allclose
 
-from bayesdist.assess.solution import kind_of
-from bayesdist.calibration.calibration import calibration_of, gaussian_solution
+from bayesdist.calibration.calibration import GaussianSolution, calibration_of
 from bayesdist.calibration.plane import Orientation
 from bayesdist.errors import InputError
 from bayesdist.infer.transforms import reference_gauge
@@ -351,11 +350,11 @@ def test_draws_and_convergence_come_through(solutions) -> None:
     o = laid_on(sampled, reference_of(base), epoch=2004.5, reference_drift=False)
     held, _ = storable(turned_by(sampled, o), years=(2009.5, 2015.0), segment=1)
     stored = held.solution
-    assert kind_of(stored) == "posterior"
+    assert stored.kind == "posterior"
     header = build_idctab({"F606W": held}, **ACS, scale_arcsec=0.05).header
     assert header["BDCONV"] == "NO" and "Laplace" in str(header["COMMENT"])
     plain, _ = storable(turned_by(base, o), years=(2009.5, 2015.0), segment=1)
-    assert kind_of(plain.solution) == "least squares"
+    assert plain.solution.kind == "least squares"
     n = 3000
     draws = stored.draws(n, np.random.default_rng(7))
     ratio = draws.std(axis=0) / np.sqrt(np.diag(stored.cov))
@@ -412,7 +411,7 @@ def test_solutions_that_do_not_go_into_one_table_are_refused(solutions, orientat
     mean, cov = base.solution.mean, base.solution.cov
     moved = mean.copy()
     moved[base.model.tdd_slice(1).start] *= 1.01
-    other = replace(base, solution=gaussian_solution(base.model, moved, cov))
+    other = replace(base, solution=GaussianSolution(base.model, moved, cov))
     with pytest.raises(InputError, match="drifts otherwise than the first one"):
         build_idctab({"F606W": base, "F814W": other}, **ACS)
     with pytest.raises(InputError, match="stands twice"):

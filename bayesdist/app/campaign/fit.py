@@ -20,7 +20,7 @@ from bayesdist.app.campaign.tables import fit_tables, scatter_by_magnitude, tabl
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.errors import ErrorLaw, read_magnitude_errors
 from bayesdist.app.kinds.exposures import FIT_AGAIN, ExposureScatter, read_hierarchy, read_series
-from bayesdist.app.kinds.fitted import FIT, TABLES, Fitted, moved_by
+from bayesdist.app.kinds.fitted import FIT, TABLES, Fitted
 from bayesdist.app.kinds.table_file import read_tables
 from bayesdist.data import centroid_errors
 from bayesdist.data.matches import MatchTable
@@ -29,7 +29,7 @@ from bayesdist.infer.exposures.alone import ExposureSolutions, fit_exposures
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
 from bayesdist.infer.exposures.trends import trend_p_values
 from bayesdist.infer.linear import Rejection
-from bayesdist.infer.nodes.alternation import on_the_chips
+from bayesdist.infer.nodes import corrected_matches, on_the_chips
 from bayesdist.infer.series import Series
 from bayesdist.limits import TREND
 from bayesdist.model import Chip, DistortionModel
@@ -74,7 +74,7 @@ def _fitted(matched: CampaignMatched, config: Config, base: Path) -> Fitted:
     tables = fit_tables(matched, affine, config, base)
     pairs = matched.stars
     if tables.stored.tables:
-        pairs = on_the_chips(moved_by(tables.stored.tables, pairs), affine)
+        pairs = on_the_chips(corrected_matches(tables.stored.tables, pairs), affine)
     _, _, total = scatter_by_magnitude(pairs, affine, matched.inputs)
     errors = ErrorLaw(by_magnitude=centroid_errors(pairs, total), with_catalogue=True)
     stars = errors.applied(pairs)

@@ -37,8 +37,8 @@ __all__ = [
     "errors_by_star",
     "lists_of",
     "parities_of",
+    "read_campaign",
     "read_campaign_catalog",
-    "read_inputs",
     "start_of",
     "unit_arcsec_of",
 ]
@@ -103,8 +103,15 @@ def unit_arcsec_of(unit: str, config: Config) -> float:
     return scale or (config.detector.scale_mas or 50.0) / 1000
 
 
-def read_inputs(block: CampaignBlock, base: Path) -> Inputs:
+def read_campaign(config: Config, base: Path) -> Inputs:
     """Read catalogue, exposures and star lists.
+
+    Parameters
+    ----------
+    config : Config
+        With a section [campaign].
+    base : Path
+        Folder that its files are relative to.
 
     Raises
     ------
@@ -112,6 +119,7 @@ def read_inputs(block: CampaignBlock, base: Path) -> Inputs:
         For files that cannot be read, lists without an entry in the log, a filter without
         exposures, and exposures without VAFACTOR.
     """
+    block = campaign_block(config)
     log = read_exposures(base / block.exposures)
     catalog, plane = read_campaign_catalog(block, base, log)
     logged = set(log.names)

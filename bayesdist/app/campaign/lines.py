@@ -2,15 +2,8 @@
 
 from __future__ import annotations
 
-from bayesdist.infer.transforms import (
-    LinearTerms,
-    ReferenceGauge,
-    Solution,
-    View,
-    lines,
-    reference_gauge,
-    without_frames,
-)
+from bayesdist.infer.solution import ReferenceGauge, Solution, TransformedSolution
+from bayesdist.infer.transforms import LinearTerms, lines, reference_gauge, without_frames
 
 __all__ = ["FIXED", "line_sections"]
 
@@ -45,7 +38,7 @@ def _gauge(gauge: ReferenceGauge | None) -> dict[str, object] | None:
     }
 
 
-def _lines(view: View) -> list[dict[str, object]]:
+def _lines(view: TransformedSolution) -> list[dict[str, object]]:
     """alpha and beta of the joint fit in the reference gauge, as Tables 1 to 3 of the report."""
     time = view.model.time
     if time is None:

@@ -14,7 +14,6 @@ from bayesdist.app.campaign.inputs import (
     campaign_block,
     cuts_of,
     parities_of,
-    read_inputs,
     start_of,
     unit_arcsec_of,
 )
@@ -40,17 +39,17 @@ __all__ = ["match_lists"]
 log = logging.getLogger("bayesdist")
 
 
-def match_lists(config: Config, base: Path, *, inputs: Inputs | None = None) -> CampaignMatched:
+def match_lists(inputs: Inputs, config: Config, base: Path) -> CampaignMatched:
     """Star lists matched with a catalogue, exposure by exposure.
 
     Parameters
     ----------
+    inputs : Inputs
+        As `read_campaign` reads them.
     config : Config
         With a section [campaign].
     base : Path
         Folder that its files are relative to.
-    inputs : Inputs, optional
-        What they hold, where that has been read already.
 
     Returns
     -------
@@ -63,7 +62,6 @@ def match_lists(config: Config, base: Path, *, inputs: Inputs | None = None) -> 
         exposures.
     """
     block = campaign_block(config)
-    inputs = read_inputs(block, base) if inputs is None else inputs
     cuts = cuts_of(block)
     tab = read_idctab(base / block.initial_distortion)
     parities = parities_of(block, inputs.catalog, tab)

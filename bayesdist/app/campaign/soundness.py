@@ -6,12 +6,13 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.inputs import Inputs, campaign_block, cuts_of
-from bayesdist.app.campaign.reference import free_rates
+from bayesdist.app.campaign.reference import free_rates, rehearse_references
 from bayesdist.app.config import Config
 from bayesdist.app.config.campaign import ReleaseBlock
 from bayesdist.data import StarCuts, StarList
@@ -19,10 +20,12 @@ from bayesdist.data.holdout import refuse_strangers
 from bayesdist.data.matching.reports import check_campaign
 from bayesdist.errors import ConfigError, DegenerateError, InputError
 from bayesdist.model import Chip, TimeDependence
+from bayesdist.products import read_idctab
 
 __all__ = [
     "frames_not_set",
     "input_warnings",
+    "refuse_campaign",
     "refuse_few",
     "refuse_unsound",
     "segment_counts",
@@ -40,6 +43,28 @@ OFF_CHIP = 0.02  # of a list's detections beyond the edge of a chip: more are no
 EDGE = 1.0  # pixels: half of one to the edge, and half of one for lists that count from 0
 NAMED = 5  # exposures in a sentence
 STILL = 1.0  # years over which stars may stand still
+
+
+def refuse_campaign(inputs: Inputs, config: Config, base: Path) -> None:
+    """Refuse inputs that do not go together, and files of others that cannot be used.
+
+    Parameters
+    ----------
+    inputs : Inputs
+    config : Config
+    base : Path
+        Folder that its files are relative to.
+
+    Raises
+    ------
+    BayesdistError
+        As `refuse_unsound`, `rehearse_references` and `read_idctab`.
+    """
+    refuse_unsound(config, inputs)
+    read_idctab(base / campaign_block(config).initial_distortion)
+    rehearse_references(config, inputs.catalog.unit, base)
+    if config.products.release is not None:
+        read_idctab(base / config.products.release.reference)
 
 
 def refuse_unsound(config: Config, inputs: Inputs) -> None:

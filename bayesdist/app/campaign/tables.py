@@ -17,15 +17,19 @@ from bayesdist.app.campaign.outrun import refuse_outrun_stars
 from bayesdist.app.campaign.reference import held_tables
 from bayesdist.app.config import Config
 from bayesdist.app.config.campaign import TablesBlock
-from bayesdist.app.kinds.fitted import moved_by
 from bayesdist.app.kinds.table_file import StoredLookupTables
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.infer import LinearFit, fit_by_magnitude
-from bayesdist.infer.nodes import Round, TableFit, fit_with_tables, pixel_jacobian
-from bayesdist.infer.nodes.alternation import on_the_chips
-from bayesdist.infer.nodes.table_fit import held_sigma
+from bayesdist.infer.nodes import (
+    Iteration,
+    TableFit,
+    corrected_matches,
+    fit_with_tables,
+    held_sigma,
+    on_the_chips,
+)
 from bayesdist.model import DistortionModel, LookupTable, corrected
 from bayesdist.model.grid import grid_pixels, mesh
 
@@ -36,7 +40,7 @@ ErrorsAt = Callable[[Float, Float, int], Float]  # of positions (n, 2), at pixel
 
 log = logging.getLogger("bayesdist")
 
-ROUGH = 1  # rounds of the tables from whose residuals the errors of the stars are taken
+ROUGH = 1  # iterations of the tables from whose residuals the errors of the stars are taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +80,7 @@ def fit_tables(
     if block.method == "none":
         if not held:
             return FittedTables(StoredLookupTables())
-        placed = on_the_chips(moved_by(held, matched.stars), model)
+        placed = on_the_chips(corrected_matches(held, matched.stars), model)
         fit, _, errors = scatter_by_magnitude(placed, model, matched.inputs)
         pairs = matched.stars.with_errors_by_magnitude(errors)
         between = measured_between(pairs, fit, held, filter=filter, fitted=False)
@@ -86,26 +90,25 @@ def fit_tables(
     found = fit_with_tables(
         pairs,
         model,
-        base=filter,
-        detector=held,
+        filter=filter if held else "",
+        beneath=held,
         method=block.method,
         step=block.step,
-        rounds=block.max_iterations,
+        max_iterations=block.max_iterations,
         report=_say,
     )
-    part = found.part()
 
     def by_covariance(x: Float, y: Float, chip: int) -> Float:
         return found.table_sigma(x, y, chip=chip)
 
-    errors_at = by_covariance if part.posteriors else _errors_of(found.tables, part.fit)
+    errors_at = by_covariance if found.posteriors else _errors_of(found.tables, found.solution)
     between = measured_between(
         pairs,
-        part.fit,
+        found.solution,
         found.tables,
-        filter=part.filter,
-        posteriors=part.posteriors,
-        trust=part.trust,
+        filter=found.filter,
+        posteriors=found.posteriors,
+        mixture=found.mixture,
     )
     of_nodes = _on_the_grid(model, grid, errors_at)
     return FittedTables(_stored(found.tables, of_nodes, between), found)
@@ -143,11 +146,11 @@ def _with_errors(
     rough = fit_with_tables(
         rough_errors,
         model,
-        base=inputs.filter,
-        detector=held,
+        filter=inputs.filter if held else "",
+        beneath=held,
         method=block.method,
         step=block.step,
-        rounds=ROUGH,
+        max_iterations=ROUGH,
     )
     _, _, errors = scatter_by_magnitude(rough.corrected(pairs), model, inputs)
     return pairs.with_errors_by_magnitude(errors)
@@ -164,7 +167,7 @@ def _stored(
     )
 
 
-def _say(one: Round) -> None:
+def _say(one: Iteration) -> None:
     log.info(
         "fit: tables, round %d: moved %.2g px, residuals %.4f px", one.number, one.moved, one.rms
     )
@@ -186,7 +189,7 @@ def _errors_of(tables: tuple[LookupTable, ...], fit: LinearFit) -> ErrorsAt:
 
     def errors_at(x: Float, y: Float, chip: int) -> Float:
         px, py = corrected(tables, x, y, chip=chip)
-        J = pixel_jacobian(fit.model, fit.mean, px, py, chip=chip)
+        J = fit.model.slopes(fit.mean, px, py, chip=chip)
         sigma = held_sigma(tables, x, y, chip=chip)
         return np.asarray(np.sqrt(np.einsum("nab,nb->na", J**2, sigma**2)))
 

@@ -7,6 +7,7 @@ from difflib import get_close_matches
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from bayesdist.errors import ConfigError
 
@@ -141,11 +142,20 @@ def _known_keys(kind: Kind, sections: Sequence[str]) -> list[str]:
     """Keys of a section, given by the names that lead to it; none where it is not known."""
     current: Any = kind
     for name in sections:
-        field = current.model_fields.get(name)
+        field = _fields(current).get(name)
         current = None if field is None else _section_of(field.annotation)
         if current is None:
             return []
-    return list(current.model_fields)
+    return list(_fields(current))
+
+
+def _fields(kind: Kind) -> dict[str, FieldInfo]:
+    """Fields of a section, and those of the sections that formats of missions derive from it."""
+    return {
+        name: field
+        for one in (kind, *kind.__subclasses__())
+        for name, field in one.model_fields.items()
+    }
 
 
 def _section_of(annotation: Any) -> Any:

@@ -12,7 +12,7 @@ from pydantic import Discriminator, Field, Tag, TypeAdapter, model_validator
 from bayesdist.app.config.assess import Assess, BudgetBlock, Periods, RequirementBlock
 from bayesdist.app.config.campaign import CampaignBlock, TablesBlock
 from bayesdist.app.config.common import RunConfig
-from bayesdist.app.config.data import Data, names_nominal
+from bayesdist.app.config.data import DataOfFormat, names_nominal
 from bayesdist.app.config.detector import ChipBlock, Detector
 from bayesdist.app.config.holdout import HoldoutBlock
 from bayesdist.app.config.model import (
@@ -47,7 +47,7 @@ class MatchesConfig(RunConfig):
     gauge: ClassVar[GaugeBlock] = GaugeBlock()
     tables: ClassVar[TablesBlock] = TablesBlock()
 
-    data: Data
+    data: DataOfFormat
     model: MatchedModel
     detector: Detector = Detector()
     chip: list[ChipBlock] = Field(default_factory=list)
@@ -66,9 +66,10 @@ class MatchesConfig(RunConfig):
 
     @model_validator(mode="after")
     def _one_array(self) -> MatchesConfig:
-        if self.data.format == "rvb" and self.chip:
+        if self.data.one_array and self.chip:
             raise ValueError(
-                "RvB pairs are of one array; give detector.size in place of [[chip]] blocks"
+                f"matches of the format {self.data.format!r} are of one array; give "
+                "detector.size in place of [[chip]] blocks"
             )
         return self
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,19 +12,17 @@ from numpy.typing import NDArray
 
 from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.exposures import FIT_AGAIN, ExposureScatter, write_hierarchy, write_series
-from bayesdist.app.kinds.matched import Matched, Prepared
 from bayesdist.app.kinds.table_file import StoredLookupTables, write_tables
 from bayesdist.app.selfcal.solved import SelfCalibrated
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, LinearFit, save_fit
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
-from bayesdist.infer.nodes.alternation import inside_chips, on_the_chips, with_columns
+from bayesdist.infer.nodes import corrected_matches, inside_chips, on_the_chips
 from bayesdist.infer.series import Series
 from bayesdist.infer.stars.shards import Matches
-from bayesdist.model import LookupTable, corrected
 
-__all__ = ["FIT", "TABLES", "Fitted", "moved_by", "required"]
+__all__ = ["FIT", "TABLES", "Fitted", "required"]
 
 FIT, TABLES = "fit.nc", "tables.h5"
 
@@ -65,24 +63,22 @@ class Fitted:
     solved: SelfCalibrated | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
 
-    def prepared(self, matched: Matched) -> Prepared:
-        """Stars as the fit took them: where its tables move them, with its errors."""
-        if self.solved is not None:
-            return Prepared(self.solved.matches)
-        held = None if matched.held is None else self.errors.applied(self.placed(matched.held))
-        return Prepared(self.errors.applied(self.placed(matched.stars)), held)
-
     def placed(self, stars: Matches) -> Matches:
-        """Stars at the pixels that the tables move them to, on their chips, with quoted errors."""
+        """Stars at the pixels that the tables move them to, on their chips, with quoted errors.
+
+        Of a self-calibration they are the detections beside the stars as they were solved.
+        """
+        if self.solved is not None:
+            return self.solved.matches
         if not self.tables.tables or not isinstance(stars, MatchTable):
             return stars
-        return on_the_chips(moved_by(self.tables.tables, stars), self.linear.model)
+        return on_the_chips(corrected_matches(self.tables.tables, stars), self.linear.model)
 
     def inside(self, stars: MatchTable) -> NDArray[np.bool_]:
         """Boolean mask (N,) of the stars that the tables do not move off their chip."""
         if not self.tables.tables:
             return np.ones(len(stars), bool)
-        return inside_chips(moved_by(self.tables.tables, stars), self.linear.model)
+        return inside_chips(corrected_matches(self.tables.tables, stars), self.linear.model)
 
     def save(self, folder: Path) -> None:
         """Write the files of a run's folder that belong to it."""
@@ -108,10 +104,3 @@ def required(part: T | None, what: str) -> T:
     if part is None:
         raise InputError(f"has no {what}", where=FIT, do=FIT_AGAIN)
     return part
-
-
-def moved_by(tables: Sequence[LookupTable], stars: MatchTable) -> MatchTable:
-    """Stars at the pixels that tables of the detector and of one filter move them to."""
-    filter = next((table.filter for table in tables if table.filter), "")
-    x, y = corrected(tables, stars.x, stars.y, chip=stars.chip_number, filter=filter)
-    return with_columns(stars, x=x, y=y)

@@ -13,12 +13,12 @@ from bayesdist.app.added_errors import compared_errors, grouped_errors_of, knows
 from bayesdist.app.chips import check_chips
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw, read_magnitude_errors
+from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import FIT, Fitted
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.kinds.split import set_aside
-from bayesdist.app.matches import load_matches, reading_options
-from bayesdist.app.rvb import load_rvb
+from bayesdist.app.match_sources import read_configured
 from bayesdist.assess import SAMPLE
 from bayesdist.diagnose.residuals.quoted import error_scale
 from bayesdist.errors import ConfigError, DegenerateError, InputError, NotSettledError
@@ -52,17 +52,17 @@ __all__ = [
 SAMPLING = 1  # of the random streams that follow from the one seed: that of the stage 'sample'
 
 
-def match_stars(config: Config, base: Path, *, stars: Matches | None = None) -> Matched:
+def match_stars(stars: Matches, config: Config, base: Path) -> Matched:
     """Matched stars of a configuration, those that are fitted and those that are held out.
 
     Parameters
     ----------
+    stars : MatchTable or PartitionedMatches
+        As `read_stars` reads them.
     config : Config
         With a section [data].
     base : Path
         Folder that its files are relative to.
-    stars : MatchTable or PartitionedMatches, optional
-        What the configuration names, where that has been read already.
 
     Returns
     -------
@@ -75,7 +75,6 @@ def match_stars(config: Config, base: Path, *, stars: Matches | None = None) -> 
     ConfigError
         For settings that do not go with nominal positions.
     """
-    stars = read_stars(config, base) if stars is None else stars
     if stars.has_nominal:
         try:  # columns may be found by their names
             config.refuse_circle()
@@ -93,14 +92,12 @@ def read_stars(config: Config, base: Path) -> Matches:
     InputError
         For a configuration that names none, and for files that cannot be read.
     """
-    data, size = config.data, config.detector.size
+    data = config.data
     if data is None:
         raise InputError("names no matched stars", where="data", do="give data.matches")
     names = data.matches
     path = base / names if isinstance(names, str) else [base / name for name in names]
-    if data.format == "rvb" and size is not None:
-        return load_rvb(path, data, size)
-    return load_matches(path, **reading_options(data, config.chip))
+    return read_configured(path, data, size=config.detector.size, chips=config.chip)
 
 
 def model_of(stars: Matches, config: Config) -> DistortionModel:
@@ -233,8 +230,7 @@ def load_fitted_stars(folder: Path, config: Config, summary: Mapping[str, Any]) 
 
 
 def sample_stars(
-    fitted: Fitted,
-    stars: Matches | Shards,
+    data: FitData,
     config: Config,
     *,
     folder: Path | None = None,
@@ -244,9 +240,7 @@ def sample_stars(
 
     Parameters
     ----------
-    fitted : Fitted
-    stars : MatchTable, PartitionedMatches or Shards
-        As `Fitted.prepared` gives them.
+    data : FitData
     config : Config
     folder : Path, optional
         For checkpoints.
@@ -259,10 +253,10 @@ def sample_stars(
     """
     s = config.sampler
     posterior = sample(
-        fitted.linear,
-        stars,
+        data.fit,
+        data.shards,
         outliers=config.mixture(),
-        priors=fitted.priors,
+        priors=data.fitted.priors,
         seed=s.seed,
         ensembles=s.ensembles,
         walkers=s.walkers,
@@ -275,6 +269,6 @@ def sample_stars(
         method=s.method,
         second_stage=s.second_stage,
     )
-    if fitted.scatter is None:
+    if data.fitted.scatter is None:
         return posterior
-    return fitted.scatter.averaged(posterior, np.random.default_rng([s.seed, SAMPLING]))
+    return data.fitted.scatter.averaged(posterior, np.random.default_rng([s.seed, SAMPLING]))

@@ -8,17 +8,16 @@ import numpy as np
 
 from bayesdist.app.screen import number
 from bayesdist.app.selfcal.gauge import CONVENTION, fixed_by
+from bayesdist.app.selfcal.given import Given
 from bayesdist.app.selfcal.matching import calibrated, matching_of
-from bayesdist.app.selfcal.session import SelfcalSession
 
 __all__ = ["selfcal_lines"]
 
 
-def selfcal_lines(session: SelfcalSession) -> Iterator[str]:
+def selfcal_lines(given: Given) -> Iterator[str]:
     """Stars and free directions of a self-calibration, as lines of text: nothing is sampled."""
-    given = session.given
     found = calibrated(given, lambda text: None)
-    s, gauge, model = found.solution, found.gauge, found.solution.problem.model
+    s, gauge, model = found.mode, found.gauge, found.mode.problem.model
     matching = matching_of(found, given.inputs, given.block.min_detections)
     matching.refuse_strangers()
     summary = matching.summary

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +11,17 @@ from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.errors import ErrorLaw, read_magnitude_errors
+from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import FIT, Fitted, required
 from bayesdist.app.selfcal.gauge import fixed_by, gauge_summary
 from bayesdist.app.selfcal.matched import SelfcalMatched
-from bayesdist.app.selfcal.matches import fit_of, magnitude_errors_of, matches_of
+from bayesdist.app.selfcal.matches import magnitude_errors_of, matches_of
 from bayesdist.app.selfcal.solved import SelfCalibrated, arrays_of, read_solution
 from bayesdist.infer import GaussianPriors, Posterior, load_fit
-from bayesdist.infer.selfcal import Solution, sample_selfcal
+from bayesdist.infer.selfcal import SelfCalibrationMode, sample_selfcal
+from bayesdist.infer.selfcal.elimination import Mixture, expand
 from bayesdist.infer.selfcal.gauge import Decision
-from bayesdist.infer.selfcal.normal import Mixture, expand
-from bayesdist.infer.selfcal.settled import gauge_of, solved_in_gauge
+from bayesdist.infer.selfcal.mode import gauge_of, solve_in_gauge
 from bayesdist.model import DistortionModel
 
 __all__ = ["fit_selfcal", "load_fitted_selfcal", "sample_detections"]
@@ -43,10 +43,10 @@ def fit_selfcal(matched: SelfcalMatched) -> Fitted:
     Raises
     ------
     DegenerateError, NotSettledError
-        As `solved_in_gauge`.
+        As `solve_in_gauge`.
     """
     given, model = matched.given, matched.problem.model
-    mode = solved_in_gauge(
+    mode = solve_in_gauge(
         matched.problem,
         matched.theta,
         given.known_for(model),
@@ -57,7 +57,7 @@ def fit_selfcal(matched: SelfcalMatched) -> Fitted:
     solved = _solved(matched, model, arrays_of(mode, matched.theta))
     summary = gauge_summary(solved.gauge, solved.fixed, model)
     return Fitted(
-        fit_of(mode),
+        mode.solution,
         ErrorLaw(by_magnitude=magnitude_errors_of(solved.solution, solved.matches)),
         GaussianPriors.none(model),
         solved=solved,
@@ -95,7 +95,7 @@ def load_fitted_selfcal(
 
 
 def sample_detections(
-    fitted: Fitted,
+    data: FitData,
     config: Config,
     *,
     folder: Path | None = None,
@@ -105,7 +105,7 @@ def sample_detections(
 
     Parameters
     ----------
-    fitted : Fitted
+    data : FitData
         Of a self-calibration.
     config : Config
     folder : Path, optional
@@ -119,9 +119,8 @@ def sample_detections(
         With errors in the unit of u, v.
     """
     s, jitter = config.sampler, config.outliers.jitter
-    solution = required(fitted.solved, "solution of detections").solution
-    posterior = sample_selfcal(
-        solution,
+    return sample_selfcal(
+        required(data.fitted.solved, "solution of detections").solution,
         jitter=None if jitter == "fit" else float(jitter),
         fraction_prior=config.outliers.fraction_prior,
         jitter_scale=config.outliers.jitter_scale,
@@ -134,7 +133,6 @@ def sample_detections(
         folder=folder,
         progress=progress,
     )
-    return _in_unit(posterior, fitted.linear.model.pixel_size(solution.theta))
 
 
 def _solved(
@@ -150,7 +148,7 @@ def _solved(
     for _ in range(RELINEARISED):
         problem = problem.at(theta, stars)
     found = expand(problem, theta, mixture, stars)
-    solution = Solution(
+    solution = SelfCalibrationMode(
         problem,
         theta,
         problem.found_again(theta, found.stars),
@@ -168,21 +166,5 @@ def _solved(
         fixed_by(gauge, solution, known),
         matches_of(problem, places, matched.detections, given.inputs, matched.unused),
         arrays,
-    )
-
-
-def _in_unit(posterior: Posterior, pixel: float) -> Posterior:
-    """A posterior whose errors are pixels, with errors in the unit of u, v like all others."""
-    m, hyper = posterior.mixture, dict(posterior.hyper)
-    if "j" in hyper:
-        hyper["j"] = pixel * hyper["j"]
-    lengths = {
-        key: None if (value := getattr(m, key)) is None else pixel * value
-        for key in ("match_radius", "jitter", "jitter_scale")
-    }
-    return replace(
-        posterior,
-        mixture=replace(m, **lengths),
-        hyper=hyper,
-        reference_sigma=pixel * posterior.reference_sigma,
+        tuple(known.contradictions(theta)),
     )

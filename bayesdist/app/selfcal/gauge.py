@@ -15,22 +15,21 @@ from bayesdist.app.selfcal.inputs import Commanded
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.selfcal.gauge import FAR, Gauge, NamedDirection, find_gauge
-from bayesdist.infer.selfcal.information import (
-    Information,
-    frame_information,
-    pointing_information,
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode, curvatures
+from bayesdist.infer.selfcal.prior import (
+    Prior,
+    frame_prior,
+    pointing_prior,
     tie,
 )
-from bayesdist.infer.selfcal.moves import functionals
-from bayesdist.infer.selfcal.settled import curvatures
-from bayesdist.infer.selfcal.solve import Solution
+from bayesdist.infer.selfcal.sky_moves import functionals
 from bayesdist.limits import GAUGE_CONTRADICTION
 from bayesdist.model import DistortionModel
 
 __all__ = ["CONVENTION", "Known", "fixed_by", "gauge_summary", "gauge_table", "gauge_words"]
 
 Float = NDArray[np.float64]
-Piece = Callable[[Float], Information]
+Piece = Callable[[Float], Prior]
 
 CONVENTION, DETECTIONS, REFERENCES = "convention", "detections", "reference stars"
 
@@ -42,14 +41,14 @@ class Known:
     Parameters
     ----------
     pieces : mapping of str to callable
-        Information linearised at parameters (D,), by what it is from.
+        Prior linearised at parameters (D,), by what it is from.
     """
 
     pieces: Mapping[str, Piece]
 
-    def __call__(self, theta: Float) -> Information:
+    def __call__(self, theta: Float) -> Prior:
         """All of it, linearised at theta (D,)."""
-        out = Information.none(theta)
+        out = Prior.none(theta)
         for piece in self.pieces.values():
             out = out + piece(theta)
         return out
@@ -87,7 +86,7 @@ class Known:
         block, pieces = config.gauge, dict[str, Piece]()
         if commanded is not None and commanded.offsets is not None:
             offsets, errors, groups = commanded.offsets, commanded.sigma, commanded.group
-            pieces["commanded offsets"] = lambda theta: pointing_information(
+            pieces["commanded offsets"] = lambda theta: pointing_prior(
                 model, theta, offsets, errors, group=groups
             )
         if block.roll_sigma_deg is not None:
@@ -102,7 +101,7 @@ class Known:
         if block.exposure_scale_sigma is not None:
             scatter = block.exposure_scale_sigma
             same = np.zeros(len(model.exposures))  # scales are deviations from one
-            pieces["scatter of the scales"] = lambda theta: frame_information(
+            pieces["scatter of the scales"] = lambda theta: frame_prior(
                 model, theta, "scale", same, scatter
             )
         if block.scale is not None and unit_arcsec is not None:
@@ -112,13 +111,13 @@ class Known:
         if config.prior:
             named = {p.parameter: (p.mean, p.sigma) for p in config.prior}
             priors = GaussianPriors.of(model, named)
-            pieces["priors"] = lambda theta: Information(
+            pieces["priors"] = lambda theta: Prior(
                 theta, np.diag(priors.precision), priors.pull(theta)
             )
         return cls(pieces)
 
 
-def _rolls(model: DistortionModel, theta: Float, roll: Float, sigma: float) -> Information:
+def _rolls(model: DistortionModel, theta: Float, roll: Float, sigma: float) -> Prior:
     """Commanded rolls, each with its error; the first one's is shared by all the differences."""
     now = np.zeros(len(model.exposures))
     for e in range(1, len(now)):
@@ -128,10 +127,10 @@ def _rolls(model: DistortionModel, theta: Float, roll: Float, sigma: float) -> I
     off = np.exp(1j * (roll - now))  # of each, all by one unknown zero point
     # that is where the angles lie on average, and no angle is far from it
     zero = np.nanmean(off)
-    return frame_information(model, theta, "rotation", now + np.angle(off / zero), sigma)
+    return frame_prior(model, theta, "rotation", now + np.angle(off / zero), sigma)
 
 
-def _scale(model: DistortionModel, theta: Float, size: float, sigma: float) -> Information:
+def _scale(model: DistortionModel, theta: Float, size: float, sigma: float) -> Prior:
     """A tie of the pixel at the first chip's reference pixel to a size."""
     row = functionals(model, theta)["scale"]
     return tie(theta, row, float(np.log(size / model.linear_scale(theta))), sigma)
@@ -140,20 +139,20 @@ def _scale(model: DistortionModel, theta: Float, size: float, sigma: float) -> I
 # -- in words -------------------------------------------------------------------------------------
 
 
-def fixed_by(gauge: Gauge, solution: Solution, pieces: Known) -> dict[str, str]:
+def fixed_by(gauge: Gauge, solution: SelfCalibrationMode, pieces: Known) -> dict[str, str]:
     """What fixes each property of the solution, by its name.
 
     Parameters
     ----------
     gauge : Gauge
-    solution : Solution
+    solution : SelfCalibrationMode
     pieces : Known
     """
     problem, theta = solution.problem, solution.theta
     alone, known = curvatures(problem, theta, solution.mixture, solution.stars)
     found = {name: piece(theta) for name, piece in pieces.pieces.items()}
     sigmas: dict[str, dict[str, float]] = {}
-    none = Information.none(theta)
+    none = Prior.none(theta)
     for name, information in found.items():
         one = find_gauge(problem, theta, alone, information)
         sigmas[name] = {d.name: d.sigma_fixed for d in one.directions}

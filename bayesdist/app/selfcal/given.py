@@ -26,11 +26,12 @@ from bayesdist.data.detections import Detections
 from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal import ReferenceStars
-from bayesdist.infer.selfcal.problem import Problem, prepared
+from bayesdist.infer.selfcal.problem import Problem, prepare
 from bayesdist.infer.selfcal.tangent import TangentPlane
 from bayesdist.model import DistortionModel
+from bayesdist.products import read_idctab
 
-__all__ = ["Given", "read_given"]
+__all__ = ["Given", "read_given", "refuse_given"]
 
 Float = NDArray[np.float64]
 
@@ -153,12 +154,12 @@ class Given:
         first : ndarray, shape (D,)
             By which reference stars are found among the detected ones.
         """
-        problem = prepared(
+        problem = prepare(
             model,
             detections,
             theta,
             match_radius=self.block.match_radius,
-            least=self.block.min_detections,
+            min_detections=self.block.min_detections,
             motion=self.block.motion,
             parallax_factors=self.parallax_factors,
             dilation=self.inputs.dilation,
@@ -195,6 +196,20 @@ def read_given(config: Config, base: Path) -> Given:
             gauge.offset_sigma,
         )
     return Given(config, base, inputs, catalog, commanded)
+
+
+def refuse_given(given: Given, config: Config, base: Path) -> None:
+    """Refuse exposures that cannot be laid onto each other, and a start that cannot be read.
+
+    Raises
+    ------
+    BayesdistError
+    """
+    model, _ = given.start
+    given.known_for(model)
+    path = base / (given.block.initial_distortion or "")
+    if path.suffix == ".fits":
+        read_idctab(path)
 
 
 def unit_arcsec_of(config: Config) -> float | None:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from astropy.table import Table
@@ -17,13 +17,14 @@ from bayesdist.app.selfcal.given import Given
 from bayesdist.app.selfcal.matches import matches_of
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import MatchTable
+from bayesdist.errors import InputError
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal import SelfCalibration
-from bayesdist.infer.selfcal.normal import Mixture
+from bayesdist.infer.selfcal.elimination import Mixture
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import DistortionModel
 
-__all__ = ["SelfcalMatched", "load_matched_selfcal", "matched_of"]
+__all__ = ["SelfcalMatched", "load_matched_selfcal", "matched_of", "selfcal_matches"]
 
 Float = NDArray[np.float64]
 
@@ -52,6 +53,9 @@ class SelfcalMatched(Matched):
         Magnitudes and errors in pixels, where these were measured.
     """
 
+    section: ClassVar[str] = "selfcal"
+    has_catalogue: ClassVar[bool] = False
+
     stars: MatchTable
     given: Given = field(kw_only=True)
     detections: Detections = field(kw_only=True)
@@ -60,6 +64,11 @@ class SelfcalMatched(Matched):
     places: Float = field(kw_only=True)
     mixture: Mixture = field(kw_only=True)
     magnitudes: tuple[Float, Float] | None = field(kw_only=True, default=None)
+
+    @property
+    def tangent_point(self) -> None:
+        """None: u and v lie along the detector."""
+        return None
 
     @property
     def unused(self) -> dict[str, int]:
@@ -84,7 +93,7 @@ def matched_of(
     found: SelfCalibration, given: Given, facts: Mapping[str, Any], table: Table
 ) -> SelfcalMatched:
     """What a self-calibration made of its detections, as later stages take it."""
-    solution = found.solution
+    solution = found.mode
     return _matched(
         given,
         found.detections,
@@ -94,6 +103,19 @@ def matched_of(
         table=table,
         magnitudes=found.magnitude_errors,
     )
+
+
+def selfcal_matches(matched: Matched) -> SelfcalMatched:
+    """Matches that are detections of a self-calibration.
+
+    Raises
+    ------
+    InputError
+        For others.
+    """
+    if not isinstance(matched, SelfcalMatched):
+        raise InputError("are no detections of a self-calibration", do="give such a run")
+    return matched
 
 
 def load_matched_selfcal(folder: Path, given: Given, summary: Mapping[str, Any]) -> SelfcalMatched:

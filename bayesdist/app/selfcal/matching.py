@@ -13,7 +13,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
-from bayesdist.app.selfcal.given import Given, read_given
+from bayesdist.app.selfcal.given import Given
 from bayesdist.app.selfcal.inputs import Inputs
 from bayesdist.app.selfcal.matched import SelfcalMatched, matched_of
 from bayesdist.data.detections import NO_STAR, Detections
@@ -21,7 +21,7 @@ from bayesdist.data.matching.pairs import hull_of, inside_hull
 from bayesdist.errors import DegenerateError, InputError, NotSettledError
 from bayesdist.infer.selfcal import SelfCalibration
 from bayesdist.infer.selfcal.calibrate import self_calibrate
-from bayesdist.infer.selfcal.normal import memberships
+from bayesdist.infer.selfcal.elimination import memberships
 from bayesdist.infer.selfcal.tangent import places_of
 from bayesdist.model import DistortionModel
 
@@ -92,17 +92,17 @@ class Matching:
         )
 
 
-def match_dithers(config: Config, base: Path, *, given: Given | None = None) -> SelfcalMatched:
+def match_dithers(given: Given, config: Config, base: Path) -> SelfcalMatched:
     """Detections of dithered exposures with their stars, and a first solution.
 
     Parameters
     ----------
+    given : Given
+        As `read_given` reads it.
     config : Config
         With a section [selfcal].
     base : Path
         Folder that its files are relative to.
-    given : Given, optional
-        What they hold, where that has been read already.
 
     Returns
     -------
@@ -113,7 +113,6 @@ def match_dithers(config: Config, base: Path, *, given: Given | None = None) -> 
     BayesdistError
         As `calibrated`, and for an exposure that hardly shares stars with the others.
     """
-    given = read_given(config, base) if given is None else given
     found = calibrated(given, lambda text: log.info("match: %s", text))
     matching = matching_of(found, given.inputs, given.block.min_detections)
     matching.refuse_strangers()
@@ -147,17 +146,17 @@ def calibrated(given: Given, report: Callable[[str], None]) -> SelfCalibration:
             model,
             given.inputs.detections,
             theta,
-            knowledge=given.known_for(model),
+            prior_at=given.known_for(model),
             match_radius=block.match_radius,
             start_radius=block.start_radius,
-            least=block.min_detections,
+            min_detections=block.min_detections,
             motion=block.motion,
             parallax_factors=given.parallax_factors,
             dilation=given.inputs.dilation,
             jitter=given.jitter,
             references=given.references,
             plane=given.tangent_plane,
-            rounds=block.max_iterations,
+            max_iterations=block.max_iterations,
             log=report,
         )
     except (NotSettledError, DegenerateError) as error:
@@ -192,7 +191,7 @@ def matching_of(found: SelfCalibration, inputs: Inputs, least: int) -> Matching:
     least : int
         Fewest detections of a star.
     """
-    s, d, friends = found.solution, found.detections, found.friends
+    s, d, friends = found.mode, found.detections, found.friends
     p, model = s.problem, s.problem.model
     E = len(d.exposure_names)
     used = np.zeros(len(d), bool)
@@ -247,7 +246,7 @@ def matching_of(found: SelfCalibration, inputs: Inputs, least: int) -> Matching:
         "n_ambiguous": friends.n_ambiguous,
         "n_doubled": friends.n_doubled,
         "n_chains": friends.n_chains,
-        "rounds": found.rounds,
+        "rounds": found.iterations,
         "match_radius": p.match_radius,
         "tangent_planes_pix": _moved(d, inputs),
         "detections": {

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.output import write_table
-from bayesdist.app.selfcal.gauge import gauge_table
+from bayesdist.app.selfcal.gauge import gauge_table, gauge_words
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
-from bayesdist.infer.selfcal import Gauge, Solution
+from bayesdist.infer.selfcal import Gauge, SelfCalibrationMode
 
 __all__ = ["SelfCalibrated", "arrays_of", "read_solution"]
 
@@ -30,7 +30,7 @@ class SelfCalibrated:
 
     Parameters
     ----------
-    solution : Solution
+    solution : SelfCalibrationMode
     gauge : Gauge
         What the detections leave free, and what fixes it.
     fixed : mapping of str to str
@@ -39,13 +39,21 @@ class SelfCalibrated:
         Detections beside their stars.
     arrays : mapping
         From which the solution is made again.
+    contradictions : tuple of str
+        Where what is known beside the detections does not go with them, as sentences.
     """
 
-    solution: Solution
+    solution: SelfCalibrationMode
     gauge: Gauge
     fixed: Mapping[str, str]
     matches: MatchTable
     arrays: Mapping[str, NDArray[Any]]
+    contradictions: tuple[str, ...] = ()
+
+    @property
+    def gauge_words(self) -> str:
+        """In which gauge the solution stands, as a sentence."""
+        return gauge_words(self.gauge, self.fixed, self.solution.problem.model)
 
     def save(self, folder: Path) -> None:
         """Write the files of a run's folder that belong to it."""
@@ -54,7 +62,7 @@ class SelfCalibrated:
         write_table(table, folder / GAUGE)
 
 
-def arrays_of(solution: Solution, reference: Float) -> dict[str, NDArray[Any]]:
+def arrays_of(solution: SelfCalibrationMode, reference: Float) -> dict[str, NDArray[Any]]:
     """A solution as arrays; `reference` is where what is known beside it was linearised."""
     mixture, decision = solution.mixture, solution.decision
     counts = (0, 0) if decision is None else (decision.n_null, decision.n_open)

@@ -1,22 +1,18 @@
-"""Stage 5: figures and report.html."""
+"""Stage 'report': figures and report.html."""
 
 from __future__ import annotations
 
 import logging
 import os
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from bayesdist.app.campaign.report import campaign_results
-from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.config import Config
-from bayesdist.app.evaluation_files import load_evaluation
-from bayesdist.app.rundir import as_json
+from bayesdist.app.results import Results
 from bayesdist.app.selfcal.report import selfcal_results
-from bayesdist.app.selfcal.session import SelfcalSession
-from bayesdist.app.session import Session
+from bayesdist.app.store import as_json
 from bayesdist.assess import VectorMap, distortion_vectors
 from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.evaluation import Evaluation
@@ -33,12 +29,13 @@ log = logging.getLogger("bayesdist")
 VECTOR_GRID = 17  # vectors along the longer side of a diagram: more would hide each other
 
 
-def run_report(session: Session) -> None:
+def run_report(results: Results) -> Results:
+    """Draw and write the report."""
     # figures take seconds to import
     from bayesdist.report.drawing import save_drawings
     from bayesdist.report.run_report import draw_report, write_report
 
-    run, inputs = session.run, _inputs(session)
+    run, inputs = results.run, report_input(results)
     drawings = draw_report(inputs, processes=2 if _is_command_line() else 1)
     names = [f"{name}.{kind}" for name in drawings for kind in ("png", "pdf")]
     save_drawings(drawings, run / "figures")
@@ -47,6 +44,7 @@ def run_report(session: Session) -> None:
     run.summarise(figures=names)  # what is there, should the disk be full
     write_report(run / "report.html", inputs, drawings)
     log.info("report: %s", run / "report.html")
+    return results
 
 
 def _is_command_line() -> bool:
@@ -56,10 +54,10 @@ def _is_command_line() -> bool:
     return name == "bayesdist" and (os.cpu_count() or 1) > 1
 
 
-def _inputs(session: Session) -> ReportInput:
+def report_input(results: Results) -> ReportInput:
     """All that the report shows."""
-    run, config = session.run, session.config
-    fit, posterior = session.fit, session.posterior
+    run, config, fitted = results.run, results.config, results.fitted
+    fit, posterior = results.fit, results.posterior
     record, folder = run.record, run.path.resolve().name
     products = tuple(
         Product(
@@ -69,17 +67,16 @@ def _inputs(session: Session) -> ReportInput:
         )
         for p in run.summary.get("products", [])
     )
-    campaign = campaign_results(session) if isinstance(session, CampaignSession) else None
-    found, evaluation = session.diagnostics, load_evaluation(run, fit, posterior)
-    inputs = ReportInput(
+    found, evaluation = results.diagnostics, results.evaluation
+    return ReportInput(
         name=title_of(config) or folder,
         config=as_json(config.model_dump(exclude_none=True)),
         stars=found.sample,
         exposures=found.sums.exposures,
         fit=fit,
         posterior=posterior,
-        chips=_chip_results(session, evaluation),
-        coefficients=coefficient_table(fit, session.solution),
+        chips=_chip_results(results, evaluation),
+        coefficients=coefficient_table(fit, results.solution),
         budget=evaluation.budget,
         surface=evaluation.surface,
         margins=evaluation.margins,
@@ -89,16 +86,14 @@ def _inputs(session: Session) -> ReportInput:
         score_tests=found.score_tests,
         periods=found.periods,
         held_out=found.holdout,
-        magnitude_errors=session.magnitude_errors,
-        added_errors=session.grouped_errors,
+        magnitude_errors=fitted.errors.by_magnitude,
+        added_errors=fitted.grouped,
         flagged=found.flagged,
-        campaign=campaign,
+        campaign=None if fitted.scatter is None else campaign_results(results),
+        selfcal=None if fitted.solved is None else selfcal_results(results),
         provenance={"folder": folder}
         | {k: record[k] for k in ("command", "created", "seed", "inputs", "versions", "stages")},
     )
-    if isinstance(session, SelfcalSession):
-        inputs = replace(inputs, selfcal=selfcal_results(session))
-    return inputs
 
 
 def title_of(config: Config) -> str:
@@ -108,8 +103,8 @@ def title_of(config: Config) -> str:
     return ", ".join(part for part in (detector, band) if part)
 
 
-def _chip_results(session: Session, evaluation: Evaluation) -> tuple[ChipResults, ...]:
-    posterior, epoch = session.solution, session.epoch
+def _chip_results(results: Results, evaluation: Evaluation) -> tuple[ChipResults, ...]:
+    posterior, epoch = results.solution, results.epoch
     relative = evaluation.relative or (None,) * len(evaluation.maps)
     return tuple(
         ChipResults(
@@ -126,7 +121,7 @@ def _chip_results(session: Session, evaluation: Evaluation) -> tuple[ChipResults
         for chip, place, sums, formal, with_errors, area, of_pairs in zip(
             posterior.model.chips,
             chip_places(posterior, epoch=epoch),
-            session.diagnostics.shown,
+            results.diagnostics.shown,
             evaluation.formal,
             evaluation.maps,
             evaluation.areas,

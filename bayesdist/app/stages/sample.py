@@ -1,12 +1,13 @@
-"""Stage 2: the posterior."""
+"""Stage 'sample': the posterior."""
 
 from __future__ import annotations
 
 import logging
 
-from bayesdist.app.kinds.stars import sample_stars
+from bayesdist.app.checks import in_circle
 from bayesdist.app.kinds.summary import sample_sections
-from bayesdist.app.session import Session
+from bayesdist.app.results import Results
+from bayesdist.app.screen import progress_bar
 from bayesdist.app.star_files import FOLDER, write_star_files
 from bayesdist.data import MatchTable
 from bayesdist.infer import Posterior, save_posterior
@@ -16,30 +17,24 @@ __all__ = ["run_sample", "save_sampled"]
 log = logging.getLogger("bayesdist")
 
 
-def run_sample(session: Session) -> None:
+def run_sample(results: Results) -> Results:
     """Sample the posterior of the fit, and write it."""
-    posterior = sample_stars(
-        session.fitted,
-        session.shards,
-        session.config,
-        folder=session.run.path,
-        progress=session.progress,
-    )
-    save_sampled(session, posterior)
+    data, config, folder = results.data, results.config, results.run.path
+    with progress_bar("sample") as progress:
+        posterior = results.kind.sample(data, config, folder=folder, progress=progress)
+    return save_sampled(results, posterior)
 
 
-def save_sampled(session: Session, posterior: Posterior) -> None:
+def save_sampled(results: Results, posterior: Posterior) -> Results:
     """Take another posterior, and write it, its memberships and its part of summary.json."""
-    run = session.run
-    session.renew("posterior", posterior)
+    run, data, gauge = results.run, results.data, results.gauge_words
     record = run.record
     provenance = {k: record[k] for k in ("inputs", "seed", "versions", "created")}
-    provenance |= {"gauge": session.gauge_words} if session.gauge_words else {}
-    matches = session.matches
-    table = matches if isinstance(matches, MatchTable) else None
+    provenance |= {"gauge": gauge} if gauge else {}
+    table = data.stars if isinstance(data.stars, MatchTable) else None
     save_posterior(posterior, table, run / "posterior.nc", provenance=provenance)
-    write_star_files(matches, session.fit, posterior, run / FOLDER)
-    run.summarise(**sample_sections(posterior, in_circle=session.in_circle))
+    write_star_files(data.stars, data.fit, posterior, run / FOLDER)
+    run.summarise(**sample_sections(posterior, in_circle=in_circle(data, results.config)))
     c, n = posterior.convergence, posterior.sampler
     if posterior.approximation:
         log.warning("sample: %s", posterior.approximation)
@@ -47,3 +42,4 @@ def save_sampled(session: Session, posterior: Posterior) -> None:
         log.info("sample: converged after %d steps, %d passes", n.steps, n.passes)
     else:
         log.warning("sample: NOT CONVERGED after %d steps: %s", n.steps, "; ".join(c.reasons))
+    return results.having(posterior=posterior)

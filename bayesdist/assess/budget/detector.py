@@ -90,23 +90,9 @@ def detector_budget(
 ) -> ErrorBudget:
     """The error budget of a solution over its chips, the same grid on each.
 
-    Parameters
-    ----------
-    solution : LinearFit or Posterior
-    chips : sequence of int, optional
-        Chip numbers; all by default.
-    terms, aligned, grid, epoch, n_draws, rng, pixel_scale
-        As in `error_budget`.
-
-    Returns
-    -------
-    ErrorBudget
-        In the unit of u, v.
-
-    Raises
-    ------
-    InputError
-        As `error_budget`.
+    `chips`: chip numbers; all by default. `terms`, `aligned`, `grid`, `epoch`, `n_draws`, `rng`,
+    `pixel_scale`: as in `error_budget`. The result is in the unit of u, v. InputError as
+    `error_budget`.
     """
     if pixel_scale is None:
         pixel_scale = pixel_scale_of(solution, None if chips is None else chips[0])

@@ -21,29 +21,18 @@ __all__ = ["Monitored", "change_maps", "is_late"]
 
 @dataclass(frozen=True, eq=False)
 class Monitored:
-    """What new matches say of a release.
-
-    Parameters
-    ----------
-    change : Change
-    maps : tuple of Comparison
-        New minus released, one for each chip, in pixels: the mean change, or that from its date on.
-    date : ChangeDate, optional
-        None for matches without epochs.
-    misfit : Misfit
-        Structure that even the fit of the new matches leaves.
-    pixel_mas : float, optional
-    """
+    """Change of a release that new matches show."""
 
     change: Change
+    # new minus released, one for each chip, in pixels: the mean change, or that from its date on
     maps: tuple[Comparison, ...]
-    date: ChangeDate | None
-    misfit: Misfit
+    date: ChangeDate | None  # None for matches without epochs
+    misfit: Misfit  # structure that even the fit of the new matches leaves
     pixel_mas: float | None = None
 
     @property
     def scatters(self) -> bool:
-        """Whether periods scatter more than their errors, so that these are not independent."""
+        """True if periods scatter more than their errors, which then are not independent."""
         return self.date is not None and self.date.p_scatter < DIFFERENCE.value
 
     @property
@@ -78,12 +67,12 @@ class Monitored:
 
     @property
     def changed(self) -> bool:
-        """Whether the release no longer describes the matches."""
+        """True if the release no longer describes the matches."""
         return self.p_either < DIFFERENCE.value
 
     @property
     def since_a_date(self) -> bool:
-        """Whether the change is told from a date on, which is more significant than the mean."""
+        """True if the change from a date on is given, which is more significant than the mean."""
         return is_late(self.change, self.date)
 
     @property
@@ -132,7 +121,7 @@ class Monitored:
 
     @property
     def doubts(self) -> list[str]:
-        """What else a reader has to know."""
+        """Sentences on reasons for doubt."""
         out = []
         if self.scatters and self.date is not None:
             out.append(
@@ -145,7 +134,7 @@ class Monitored:
 
 
 def is_late(change: Change, date: ChangeDate | None) -> bool:
-    """Whether a change within the new matches is significant, and more so than the mean change."""
+    """True if a change within the new matches is significant, and more so than the mean one."""
     if date is None or not np.isfinite(date.after):
         return False
     return date.p_value < min(DIFFERENCE.value / 2, change.test.p_value)
@@ -160,18 +149,8 @@ def change_maps(
 ) -> tuple[Comparison, ...]:
     """The change of each chip over its grid.
 
-    Parameters
-    ----------
-    change : Change
-    rng : numpy.random.Generator
-    names : tuple of str
-        Of the new matches and of the release.
-    grid : tuple of int
-
-    Returns
-    -------
-    tuple of Comparison
-        New minus released; whose errors are both in the covariance of the first.
+    `names`: of the new matches and of the release. Returns new minus released; whose errors are
+    both in the covariance of the first.
     """
     model, out = change.model, []
     size = 2 * model.n_terms

@@ -26,7 +26,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What remains between two calibrations, in pixels of A without distortion.
+    """Difference that remains between two calibrations, in pixels of A without distortion.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ class Comparison:
 
     @property
     def differs(self) -> bool | None:
-        """Whether the difference is more than the errors; None where these are not known."""
+        """True if the difference is more than the errors; None where these are not known."""
         return None if self.field is None else self.field.p_value < DIFFERENCE.value
 
 

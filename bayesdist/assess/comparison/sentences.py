@@ -23,15 +23,7 @@ def probability(p: float) -> str:
 def verdict(found: Comparison, pixel_mas: float | None = None) -> str:
     """One sentence: whether the calibrations differ, by how much, and how sure that is.
 
-    Parameters
-    ----------
-    found : Comparison
-    pixel_mas : float, optional
-        Size of a pixel, where neither side tells it.
-
-    Returns
-    -------
-    str
+    `pixel_mas`: size of a pixel, where neither side tells it.
     """
     size = (
         f"{_length(found.rms, found, pixel_mas)} rms, at most "
@@ -55,16 +47,7 @@ def verdict(found: Comparison, pixel_mas: float | None = None) -> str:
 
 
 def comparison_lines(found: Comparison) -> list[str]:
-    """What stands below the verdict.
-
-    Parameters
-    ----------
-    found : Comparison
-
-    Returns
-    -------
-    list of str
-    """
+    """Lines below the verdict."""
     kept = not found.frame.taken.shape[1]
     lines = [
         f"{letter}  {c.name}: order {c.basis.order}, in {c.unit}"
@@ -147,16 +130,7 @@ def _measured(value: float, sigma: float | None) -> str:
 
 
 def gap_verdict(gap: GapDifference) -> str:
-    """One sentence: whether a chip lies elsewhere against the reference chip.
-
-    Parameters
-    ----------
-    gap : GapDifference
-
-    Returns
-    -------
-    str
-    """
+    """One sentence: whether a chip lies elsewhere against the reference chip."""
     chips, d = f"against chip {gap.reference}", float(np.hypot(*gap.values[:2]))
     if np.abs(gap.values).max() < IDENTICAL:
         return f"Chip {gap.chip} lies alike {chips}, to rounding."
@@ -175,16 +149,7 @@ def gap_verdict(gap: GapDifference) -> str:
 
 
 def gap_lines(gap: GapDifference) -> list[str]:
-    """What stands below it: A minus B, the reference chips laid on each other.
-
-    Parameters
-    ----------
-    gap : GapDifference
-
-    Returns
-    -------
-    list of str
-    """
+    """Lines below this verdict: A minus B, the reference chips laid on each other."""
     sigma = [None] * 4 if gap.sigma is None else gap.sigma.tolist()
     shift_x, shift_y, scale, turn = zip(gap.values.tolist(), sigma, strict=True)
     degrees = [None if part is None else float(np.degrees(part)) for part in turn]

@@ -13,11 +13,7 @@ from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.error_model import error_model
 from bayesdist.assess.requirements.remedy import Remedy, find_remedy
 from bayesdist.assess.requirements.requirement import Requirement
-from bayesdist.assess.requirements.verdict import (
-    counting_error,
-    effective_draws,
-    verdict_of,
-)
+from bayesdist.assess.requirements.verdict import counting_error, effective_draws, verdict_of
 from bayesdist.assess.solution import Solution, place_of
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.units import convert, pixel_scale_of
@@ -36,7 +32,7 @@ EPOCHS = 9  # of a range that are judged, its ends and what lies evenly between
 
 @dataclass(frozen=True, eq=False)
 class Margin:
-    """How a solution stands against a requirement.  All lengths are in `unit`.
+    """Margin of a solution against a requirement.  All lengths are in `unit`.
 
     Parameters
     ----------
@@ -190,22 +186,8 @@ def judge(
 ) -> tuple[Margin, ...]:
     """Judge requirements on draws that are there.
 
-    Parameters
-    ----------
-    errors : DrawnErrors
-    requirements, grid, epoch, chip, pixel_scale
-        As `check_requirements`.
-    checks : sequence of Check
-        That of convergence among them.
-
-    Returns
-    -------
-    tuple of Margin
-
-    Raises
-    ------
-    InputError
-        As `check_requirements`.
+    `requirements`, `grid`, `epoch`, `chip`, `pixel_scale`: as `check_requirements`. `checks`: that
+    of convergence among them. InputError as `check_requirements`.
     """
     if not requirements:
         return ()
@@ -253,27 +235,12 @@ def domains_of(
     epoch: float | None = None,
     chip: int | None = None,
 ) -> tuple[EvaluationDomain, ...]:
-    """Where and when a requirement is judged: one for each epoch.
+    """Domains in which a requirement is judged: one for each epoch.
 
-    Parameters
-    ----------
-    requirement : Requirement
-    model : DistortionModel
-    grid : tuple of int
-        Points on x and y of a chip.
-    epoch, chip
-        For a requirement that names none.
-
-    Returns
-    -------
-    tuple of EvaluationDomain
-
-    Raises
-    ------
-    InputError
-        For an unknown chip, a missing epoch, a range of epochs where nothing depends on time, a
-        polygon that is not said to lie on one of several chips, and a region that holds fewer than
-        four points of the grid.
+    `grid`: points on x and y of a chip. `epoch`, `chip`: for a requirement that names none.
+    InputError for an unknown chip, a missing epoch, a range of epochs where nothing depends on
+    time, a polygon that is not said to lie on one of several chips, and a region that holds fewer
+    than four points of the grid.
     """
     r = requirement
     epochs: list[float | None] = [r.epoch if r.epoch is not None else epoch]
@@ -354,8 +321,8 @@ def _of_extremes(
 
 
 def _convergence(solution: Solution) -> tuple[Check, ...]:
-    """Whether the draws can be relied on, of a solution that has draws of its own."""
-    convergence = getattr(solution, "convergence", None)
+    """Check that draws can be relied on, of a solution that has draws of its own."""
+    convergence = solution.convergence
     return () if convergence is None else (convergence_check(convergence),)
 
 

@@ -117,12 +117,12 @@ class Requirement:
 
     @property
     def where(self) -> str:
-        """How messages name it."""
+        """Name in messages."""
         return f"requirement {self.name!r}"
 
     @property
     def scope(self) -> str:
-        """What the statistic is taken of, beside chip and epoch, in words; may be empty."""
+        """Words on the scope of the statistic beside chip and epoch; may be empty."""
         words = region_words(self.region)
         if self.relative:
             apart = "" if self.separation is None else f" up to {self.separation:g} px apart"
@@ -132,7 +132,7 @@ class Requirement:
         return words.strip()
 
     def reaches_beyond(self, covered: Coverage, grid: tuple[int, int]) -> bool:
-        """Whether the requirement is judged on a chip where there are no stars.
+        """True if the requirement is judged on a chip where there are no stars.
 
         Parameters
         ----------

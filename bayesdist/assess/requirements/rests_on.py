@@ -1,4 +1,4 @@
-"""What a verdict takes for granted, or has measured."""
+"""Assumptions of a verdict, and the measurements that it rests on."""
 
 from __future__ import annotations
 
@@ -27,24 +27,10 @@ def rests_on(
     single: bool = False,
     dates: Float,
 ) -> tuple[str, ...]:
-    """What a verdict at an epoch takes for granted, or has measured, as clauses.
+    """Clauses on what a verdict at an epoch assumes, or has measured.
 
-    Parameters
-    ----------
-    model : DistortionModel
-    diagnostics : Diagnostics
-    epoch : float or None
-        Decimal years.
-    given : sequence of str
-        Names of the errors that the user gives.
-    aligned, single : bool
-        As of `error_model`.
-    dates : ndarray
-        Of the matches, decimal years.
-
-    Returns
-    -------
-    tuple of str
+    `epoch`: decimal years. `given`: names of the errors that the user gives. `aligned`, `single`:
+    as of `error_model`. `dates`: of the matches, decimal years.
     """
     out, correlated = [f"a polynomial of order {model.order}"], diagnostics.correlated
     if correlated is not None:
@@ -74,7 +60,7 @@ def rests_on(
 
 
 def _structure(correlated: Discrepancy, unit: str) -> str:
-    """Which structure beyond the polynomial counts."""
+    """Clause on the structure beyond the polynomial that counts."""
     rows = correlated.facts.get("structure", [])
     if not rows:
         return "look-up tables, with their errors"

@@ -28,22 +28,14 @@ def effective_draws(solution: Solution, n_draws: int) -> float:
     Drawing n rows from a chain worth `ess` independent samples adds the chain's own Monte-Carlo
     variance to that of the drawing: 1 / n_eff = 1 / n + 1 / ess.
 
-    Parameters
-    ----------
-    solution : LinearFit or Posterior
-        Draws of a fit are independent; a posterior is worth the smaller of its bulk and tail
-        effective sample sizes (a probability far from a half is a matter of the tails).
-    n_draws : int
-
-    Returns
-    -------
-    float
-        At least 1.
+    `solution`: draws of a fit are independent; a posterior is worth the smaller of its bulk and
+    tail effective sample sizes (a probability far from a half is a matter of the tails). The result
+    is at least 1.
     """
-    convergence = getattr(solution, "convergence", None)
+    convergence = solution.convergence
     if convergence is None:
         return float(n_draws)
-    sizes = [float(convergence.ess_bulk_min), float(getattr(convergence, "ess_tail_min", math.inf))]
+    sizes = [convergence.ess_bulk_min, convergence.ess_tail_min]
     ess = 1.0 if any(math.isnan(s) for s in sizes) else max(min(sizes), 1.0)
     return max(1.0 / (1.0 / n_draws + 1.0 / ess), 1.0)
 
@@ -87,25 +79,12 @@ def verdict_of(
 ) -> tuple[str, str]:
     """Verdict on the probability of meeting a limit, and its reason.
 
-    Parameters
-    ----------
-    fraction : float
-        Of draws that meet the limit.
-    n : float
-        Effective number of draws.
-    asked : float
-        The probability asked for.
-    checks : sequence of Check
-        Nothing is met while one of them is a doubt.
-
-    Returns
-    -------
-    verdict : str
-        'met' or 'missed' where the 99 % Clopper-Pearson interval lies wholly above or below the
-        probability asked for, else 'undecided'.  With doubts 'missed' where the interval says so
-        and all of them make errors larger, else 'undecided'.
-    reason : str
-        What decided, and with doubts what the draws alone point to.
+    `fraction`: of draws that meet the limit. `n`: effective number of draws. `asked`: the
+    probability asked for. `checks`: nothing is met while one of them is a doubt. Returns `verdict`:
+    'met' or 'missed' where the 99 % Clopper-Pearson interval lies wholly above or below the
+    probability asked for, else 'undecided'.  With doubts 'missed' where the interval says so and
+    all of them make errors larger, else 'undecided'. `reason`: what decided, and with doubts what
+    the draws alone point to.
     """
     low, high = clopper_pearson(fraction, n)
     interval = f"the probability is {low:.4g} to {high:.4g} (99 % Monte-Carlo interval)"

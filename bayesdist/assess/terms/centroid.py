@@ -25,21 +25,9 @@ def centroid_errors(
 ) -> MagnitudeErrors:
     """Scatter of residuals by magnitude, less other errors that are in it.
 
-    Parameters
-    ----------
-    scatter : MagnitudeErrors
-    contained : sequence of (name, sigma_u, sigma_v)
-        Errors that the residuals hold beside those of the centroids, in their unit.
-
-    Returns
-    -------
-    MagnitudeErrors
-        At least a quarter of the scatter: the other errors are not that well known.
-
-    Raises
-    ------
-    InputError
-        Where an error that is said to be in the residuals is larger than these.
+    `contained`: errors that the residuals hold beside those of the centroids, in their unit. The
+    result is at least a quarter of the scatter: the other errors are not that well known.
+    InputError where an error that is said to be in the residuals is larger than these.
     """
     left = {}
     for axis, name in ((1, "sigma_u"), (2, "sigma_v")):
@@ -62,16 +50,7 @@ def centroid_errors(
 def without(errors: MagnitudeErrors, sigma_u: float, sigma_v: float) -> MagnitudeErrors:
     """Errors by magnitude, less an error that all of them hold.
 
-    Parameters
-    ----------
-    errors : MagnitudeErrors
-    sigma_u, sigma_v : float
-        In their unit.
-
-    Returns
-    -------
-    MagnitudeErrors
-        At least a quarter of what they were.
+    `sigma_u`, `sigma_v`: in their unit. The result is at least a quarter of what they were.
     """
     left = {
         name: np.sqrt(np.maximum(sigma**2 - known**2, (MIN_CENTROID_FRACTION * sigma) ** 2))
@@ -91,21 +70,8 @@ def centroids_of(
     Of structure that is among the residuals the median of its size is taken off: a prior's tail is
     in no residual.
 
-    Parameters
-    ----------
-    diagnostics : Diagnostics
-    contained : sequence of (name, sigma_u, sigma_v)
-        As `centroid_errors`.
-
-    Returns
-    -------
-    MagnitudeErrors or None
-        None where the stars have no magnitudes.
-
-    Raises
-    ------
-    InputError
-        As `centroid_errors`.
+    `contained`: as `centroid_errors`. Returns None where the stars have no magnitudes. InputError
+    as `centroid_errors`.
     """
     if diagnostics.centroid is None:
         return None

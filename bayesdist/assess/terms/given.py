@@ -39,7 +39,7 @@ BEYOND = 0.5  # magnitudes by which the outermost bins may be left
 
 
 def said_by_user(source: str) -> str:
-    """What a user says of where a number comes from, as a source of a budget's row.
+    """Source of a budget's row, as a user gives it.
 
     It begins with one of the three kinds of source: a publication that is named so stays one.
     """
@@ -103,7 +103,7 @@ class UserTerm:
         return float(su), float(sv)
 
     def in_unit(self, unit: str, pixel_scale: float | None = None) -> UserTerm:
-        """The same with its standard deviations in another unit."""
+        """Term with its standard deviations in another unit."""
         su, sv = self.sigma(unit, pixel_scale)
         return replace(self, sigma_u=su, sigma_v=sv, unit=unit)
 
@@ -154,19 +154,11 @@ class SmoothTerm:
     """A user's error as a smooth field over each chip, larger at the edges than inside.
 
     As the distortion of a catalogue, or of another camera, would be.
-
-    Parameters
-    ----------
-    term : UserTerm
-        In the unit of the model.
-    model : DistortionModel
-    grid : tuple of int
-        Points of each chip over which the mean square is that of the term.
     """
 
-    term: UserTerm
+    term: UserTerm  # in the unit of the model
     model: DistortionModel
-    grid: tuple[int, int]
+    grid: tuple[int, int]  # points of each chip over which the mean square is that of the term
 
     @property
     def rows(self) -> tuple[Row, ...]:
@@ -193,15 +185,9 @@ class SmoothTerm:
 
 @dataclass(frozen=True, eq=False)
 class Centroids:
-    """Errors of the centroids of stars of a stated magnitude.
+    """Errors of the centroids of stars of a stated magnitude."""
 
-    Parameters
-    ----------
-    errors : MagnitudeErrors or None
-        In the unit of the solution; None where none are known.
-    """
-
-    errors: MagnitudeErrors | None
+    errors: MagnitudeErrors | None  # in the unit of the solution; None where none are known
 
     @property
     def rows(self) -> tuple[Row, ...]:
@@ -221,10 +207,7 @@ class Centroids:
     def at(self, magnitude: float) -> Float:
         """Errors (2,) of the centroid of a star.
 
-        Raises
-        ------
-        InputError
-            Where no errors by magnitude are known, or none near this one.
+        InputError where no errors by magnitude are known, or none near this one.
         """
         if self.errors is None:
             raise InputError(

@@ -14,17 +14,7 @@ __all__ = ["generators"]
 
 
 def generators(terms: Sequence[ErrorTerm], seed: int) -> list[np.random.Generator]:
-    """A generator for each term, by the name of its first row and how often that came before.
-
-    Parameters
-    ----------
-    terms : sequence of ErrorTerm
-    seed : int
-
-    Returns
-    -------
-    list of numpy.random.Generator
-    """
+    """A generator for each term, by the name of its first row and how often that came before."""
     seen: Counter[str] = Counter()
     out = []
     for term in terms:

@@ -36,18 +36,12 @@ class SolutionErrors:
 
     The parts add up to the joint error (to first order) along the axes of the polynomials, however
     the field turned between exposures.  They are correlated.
-
-    Parameters
-    ----------
-    solution : Solution
-    without : Solution, optional
-        The solution that lacks the errors of the catalogue, and shows the rows of the parts.
-    catalogue : tuple of CatalogueErrors
-        What the errors of the catalogue do, which the solution's draws hold: shown beside.
     """
 
     solution: Solution
+    # the solution that lacks the errors of the catalogue, and shows the rows of the parts
     without: Solution | None = None
+    # what the errors of the catalogue do, which the solution's draws hold: shown beside
     catalogue: tuple[CatalogueErrors, ...] = ()
 
     @property

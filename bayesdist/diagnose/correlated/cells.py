@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.posterior.likelihood import Scores
+from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import Stars, cell_of
-from bayesdist.model import Groups, merge_groups
+from bayesdist.infer.stars.sums import Sums
+from bayesdist.model import Groups
 
 __all__ = ["CellSums", "cell_sums", "cells_per_side"]
 
@@ -26,8 +27,8 @@ COLUMNS = 9  # n, g_u, g_v, h_uu, h_uv, h_vv, g_u^2, g_u g_v, g_v^2
 
 
 @dataclass(frozen=True, eq=False)
-class CellSums:
-    """Sums over the stars of each group and cell, which add over chunks of the data."""
+class CellSums(Sums):
+    """Sums over the stars of each group and cell."""
 
     groups: Groups
     side: int  # cells on each side of a chip
@@ -36,16 +37,8 @@ class CellSums:
     sums: Float
     position: Float  # (chips, C, 3) number of stars and sums of their scaled positions X and Y
 
-    def __add__(self, other: CellSums) -> CellSums:
-        groups, sums = self.groups, self.sums
-        if groups.same(other.groups):
-            sums = sums + other.sums
-        else:
-            groups, *index = merge_groups(self.groups, other.groups)
-            sums = np.zeros((len(groups), *self.sums.shape[1:]))
-            for part, at in zip((self, other), index, strict=True):
-                sums[at] += part.sums
-        return CellSums(groups, self.side, sums, self.position + other.position)
+    BY_GROUP = ("sums",)
+    SAME = ("side",)
 
     def centres(self, chip: int) -> tuple[Int, Float, Float]:
         """Cells of a chip (by code) with stars, and the mean scaled position X, Y in each."""
@@ -59,9 +52,9 @@ def cells_per_side(n_groups: int) -> int:
     return next(side for most, side in SIDES if n_groups <= most)
 
 
-def cell_sums(stars: Stars, scores: Scores, side: int) -> CellSums:
+def cell_sums(stars: Stars, likelihood: Likelihood, side: int) -> CellSums:
     """Sums over some stars with `side` cells on each side of a chip, as a task for `Shards.sum`."""
-    g_u, g_v, h_uu, h_uv, h_vv = scores.of(stars)
+    g_u, g_v, h_uu, h_uv, h_vv = likelihood.scores(stars)
     # Where a star may or may not be a false match its curvature is negative.  Such stars are left
     # out, so that every sum of curvatures is that of a possible likelihood.
     good = (h_uu > 0) & (h_vv > 0)

@@ -24,10 +24,10 @@ from bayesdist.diagnose.correlated.structure import chip_structure
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
-from bayesdist.infer.posterior.likelihood import Scores, scores_of
+from bayesdist.infer.solution import Solution, likelihood_of
+from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
 from bayesdist.infer.stars.stars import cell_of, prepare
-from bayesdist.infer.transforms import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["estimate_discrepancy"]
@@ -90,29 +90,30 @@ def estimate_discrepancy(
     InputError
         For a view of a solution.
     """
-    model, scores = solution.model, scores_of(solution)
+    model, likelihood = solution.model, likelihood_of(solution)
     priors = priors or DiscrepancyPriors()
     if exposures and stars is not None and model.frames == "none" and _several(stars):
-        sums = _by_exposure(stars, scores, model)
+        sums = _by_exposure(stars, likelihood, model)
     else:
         with opened(model, matches, compute) as shards:
-            sums = shards.sum(cell_sums, scores, cells_per_side(len(shards.groups)))
-    working = Information(model, scores.theta, sums, parameter_priors or GaussianPriors.none(model))
-    pixel = model.pixel_size(scores.theta)
+            sums = shards.sum(cell_sums, likelihood, cells_per_side(len(shards.groups)))
+    mean = likelihood.theta
+    working = Information(model, mean, sums, parameter_priors or GaussianPriors.none(model))
+    pixel = model.pixel_size(mean)
     repeated = None
     if stars is not None and stars.star is not None:
-        repeated = shared_stars(stars, scores, model, priors.star * pixel)
+        repeated = shared_stars(stars, likelihood, model, priors.star * pixel)
     excess = score_excess(working) * (1.0 if repeated is None else repeated.repetition)
     information = working.with_excess(excess)
     chips = range(len(model.chips)) if structure else ()
-    near = {} if sample is None or not structure else shared_variances(sample, scores, model)
+    near = {} if sample is None or not structure else shared_variances(sample, likelihood, model)
     found, theta, facts = _structures(
         information, working, chips, near, priors, pixel, n_draws, rng
     )
     linear = linear_deviations(information, working, priors, n_draws, rng, exposures=exposures)
     formal, noise = working.covariance, working.sandwich()
     if repeated is not None:
-        noise = noise + repeated.covariance(model, scores.theta, formal)
+        noise = noise + repeated.covariance(model, mean, formal)
         facts["star_rms"] = repeated.rms
     noise, ratio = not_narrower(noise, formal)
     if settling is not None:
@@ -124,7 +125,7 @@ def estimate_discrepancy(
     if linear is not None:
         facts["exposures"] = linear.n_exposures
         facts["scatter"] = {k: float(np.median(v)) for k, v in linear.scatter.items()}
-    return Discrepancy(model, np.asarray(scores.theta), formal, noise, found, theta, linear, facts)
+    return Discrepancy(model, mean, formal, noise, found, theta, linear, facts)
 
 
 def _several(stars: MatchTable) -> bool:
@@ -132,14 +133,14 @@ def _several(stars: MatchTable) -> bool:
     return 1 < len(stars.exposure_names) <= MAX_EXPOSURES
 
 
-def _by_exposure(stars: MatchTable, scores: Scores, model: DistortionModel) -> CellSums:
+def _by_exposure(stars: MatchTable, likelihood: Likelihood, model: DistortionModel) -> CellSums:
     """Sums with separate groups for exposures that have no frames of their own."""
     side = cells_per_side(len(stars.exposure_names) * len(model.chips))
     parts = []
     for code in range(len(stars.exposure_names)):
         rows = np.flatnonzero(stars.exposure == code)
         if rows.size:
-            part = cell_sums(prepare(model, stars.select(rows))[0], scores, side)
+            part = cell_sums(prepare(model, stars.select(rows))[0], likelihood, side)
             of = np.full(len(part.groups), code)
             parts.append(replace(part, groups=replace(part.groups, exposure=of)))
     return reduce(add, parts)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.infer.posterior.likelihood import Scores
+from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
 
@@ -66,16 +66,16 @@ def _matern(separation: Float) -> Float:
 
 
 def shared_variances(
-    table: MatchTable, scores: Scores, model: DistortionModel
+    table: MatchTable, likelihood: Likelihood, model: DistortionModel
 ) -> dict[int, tuple[SharedVariance | None, SharedVariance | None]]:
     """Evidence of neighbouring stars on the two axes of each chip, by its code.
 
-    The matches are those of the solution with these scores, or some of them.  A star that is
+    The matches are those of the solution with this likelihood, or some of them.  A star that is
     matched several times is no neighbour of itself: its catalogue position has one error.  None for
     an axis with too few pairs.
     """
     stars, order = prepare(model, table)
-    g_u, g_v, h_uu, h_uv, h_vv = scores.of(stars)
+    g_u, g_v, h_uu, h_uv, h_vv = likelihood.scores(stars)
     code = np.arange(len(order)) if table.star is None else table.star[order]
     g = np.stack([g_u, g_v], axis=1)
     h = np.stack([h_uu, h_uv, h_uv, h_vv], axis=1).reshape(-1, 2, 2)
@@ -83,7 +83,7 @@ def shared_variances(
     chip = np.full(len(order), -1)
     for k, (c, exposure) in enumerate(zip(stars.groups.chip, stars.groups.exposure, strict=True)):
         rows = slice(stars.starts[k], stars.starts[k + 1])
-        frame = np.asarray(model.frame(scores.theta, int(exposure))[0])
+        frame = np.asarray(model.frame(likelihood.theta, int(exposure))[0])
         g[rows] = g[rows] @ frame
         h[rows] = frame.T @ h[rows] @ frame
         chip[rows] = c

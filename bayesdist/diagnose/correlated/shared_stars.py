@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.correlated.priors import log_half_cauchy
 from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
-from bayesdist.infer.posterior.likelihood import Scores
+from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import DistortionModel
 
@@ -53,7 +53,7 @@ class SharedStars:
 
 
 def shared_stars(
-    table: MatchTable, scores: Scores, model: DistortionModel, median: float
+    table: MatchTable, likelihood: Likelihood, model: DistortionModel, median: float
 ) -> SharedStars | None:
     """Size of the errors that stars have in all of their matches; None where none is repeated.
 
@@ -73,7 +73,7 @@ def shared_stars(
     repeated = n_matches > 1
     if repeated.sum() < 2:
         return None
-    g_u, g_v, h_uu, h_uv, h_vv = scores.of(stars)
+    g_u, g_v, h_uu, h_uv, h_vv = likelihood.scores(stars)
     good = (h_uu > 0) & (h_vv > 0)
     size = np.geomspace(median / RANGE, median * RANGE, STEPS)
     log_density = log_half_cauchy(size, median)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.sample import ScoredSample, scored_sample
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.solution import Solution
 from bayesdist.limits import EPOCH_SHIFT
 from bayesdist.model.basis import polynomial_terms
 

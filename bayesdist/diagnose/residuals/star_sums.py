@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from bayesdist.diagnose.residuals.binned import BinnedSums, binned_sums
 from bayesdist.infer.kernel import Constants
-from bayesdist.infer.linear import Clip
 from bayesdist.infer.posterior import Posterior
-from bayesdist.infer.posterior.memberships import averaged_draws, star_averages
+from bayesdist.infer.posterior.memberships import averaged_draws
+from bayesdist.infer.stars.likelihood import Clip, star_averages
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars
 

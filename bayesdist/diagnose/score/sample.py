@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.infer.posterior.likelihood import scores_of
-from bayesdist.infer.posterior.memberships import star_averages
+from bayesdist.infer.solution import Solution, likelihood_of
 from bayesdist.infer.stars.stars import Stars, prepare
-from bayesdist.infer.transforms import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["SAMPLE", "Block", "ScoredSample", "scored_sample"]
@@ -113,17 +111,10 @@ def scored_sample(table: MatchTable, solution: Solution) -> ScoredSample:
     """
     table = table.sample(SAMPLE)
     by_exposure = np.argsort(table.exposure, kind="stable")
-    scores = scores_of(solution)
+    likelihood = likelihood_of(solution)
     stars, order = prepare(solution.model, table.select(by_exposure))
     rows = by_exposure[order]
-    columns = scores.of(stars)
-    residual = stars.residuals(scores.theta).T
-    variance = np.stack([stars.var_u, stars.var_v])
-    if scores.constants is None:
-        inlier = (columns[2] > 0).astype(float)
-    else:
-        inlier = 1.0 - star_averages(stars, scores.theta[None], scores.constants)[0]
-        variance = variance + scores.constants.j2[0]
+    columns = likelihood.scores(stars)
     codes = np.arange(len(rows)) if table.star is None else table.star[rows]
     return ScoredSample(
         model=solution.model,
@@ -131,14 +122,14 @@ def scored_sample(table: MatchTable, solution: Solution) -> ScoredSample:
         Y=stars.Y,
         score=columns[:2],
         curvature=columns[2:],
-        residual=residual,
-        variance=variance,
-        inlier=inlier,
+        residual=stars.residuals(likelihood.theta).T,
+        variance=likelihood.variances(stars),
+        inlier=likelihood.inliers(stars),
         mag=None if table.mag is None else table.mag[rows],
         colour=None if table.colour is None else table.colour[rows],
         epoch=None if table.epoch is None else table.epoch[rows],
         star=np.unique(codes, return_inverse=True)[1],
-        blocks=_blocks(stars, table.exposure[rows], scores.theta),
+        blocks=_blocks(stars, table.exposure[rows], likelihood.theta),
         motion=_both(table.pm_u, table.pm_v, rows),
         motion_sigma=_both(table.sigma_pm_u, table.sigma_pm_v, rows),
     )

@@ -20,7 +20,7 @@ from bayesdist.diagnose.score.result import Outcome, ScoreTest, corrected
 from bayesdist.diagnose.score.sample import scored_sample
 from bayesdist.diagnose.score.truncation import truncation_test
 from bayesdist.infer.equations.priors import GaussianPriors
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.solution import Solution
 from bayesdist.limits import SCORE_TESTS
 
 __all__ = ["score_tests"]

@@ -68,7 +68,9 @@ class _Radii:
     relative: float  # relative error of that factor
     radius2: Float  # (N,) squared residuals of both axes, in the unit of u and v
     part: Int  # (N,) stars of about equal quoted errors
-    variance: Float  # (2, P) of the residuals along each axis, in each part
+    # (2, P) of the residuals along each axis, in each part, given back what the fit has taken
+    variance: Float
+    left: Float  # (2, P) as the fit has left it
     relative_of: Float  # (P,) its relative error
 
     @classmethod
@@ -81,7 +83,10 @@ class _Radii:
         count = np.bincount(part, inlier)
         # not by the quoted errors of single stars: where they are wrong, those with large ones
         # would be expected far out
-        variance = np.stack([np.bincount(part, inlier * one) / count for one in square])
+        variance, left = (
+            np.stack([np.bincount(part, inlier * one) / count for one in both])
+            for both in (square, sample.residual**2)
+        )
         excess = square.sum(axis=0) / variance.sum(axis=0)[part] - 1.0
         square = square / sample.variance
         t = square.mean(axis=0)
@@ -93,6 +98,7 @@ class _Radii:
             radius2=(sample.residual**2).sum(axis=0),
             part=part,
             variance=variance,
+            left=left,
             relative_of=np.sqrt(np.bincount(part, inlier * excess**2)) / count,
         )
 
@@ -193,9 +199,9 @@ def _in_units(radii: _Radii, unit: str, match_radius: float | None) -> list[_Def
         ends.append((outside, match_radius**2))
     out = []
     for k, end in ends:
-        expected = np.bincount(radii.part, radii.inlier) * _tail(radii.variance, end)
+        expected = np.bincount(radii.part, radii.inlier) * _tail(radii.left, end)
         # by how much the logarithm goes with that of the variance
-        slope = end / radii.variance.sum(axis=0)
+        slope = end / radii.left.sum(axis=0)
         spread = np.sqrt(((expected * slope * radii.relative_of) ** 2).sum())
         total = float(expected.sum())
         out.append(_Deficit(total, k, np.sqrt(end), unit, float(spread) / max(total, 1e-300)))

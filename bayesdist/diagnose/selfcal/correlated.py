@@ -25,8 +25,8 @@ from bayesdist.diagnose.selfcal.eliminated import (
 from bayesdist.diagnose.selfcal.sandwich import sandwich
 from bayesdist.diagnose.selfcal.scores import DetectionScores, score_excess, scores_of_detections
 from bayesdist.infer.equations.scaled import one_thread
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
-from bayesdist.infer.selfcal.solve import Solution
 
 __all__ = ["MAX_EXPOSURES", "selfcal_discrepancy"]
 
@@ -41,7 +41,7 @@ MAX_SINES = 700  # of all axes and chips: their information is decomposed
 
 @one_thread
 def selfcal_discrepancy(
-    solution: Solution,
+    solution: SelfCalibrationMode,
     *,
     rng: np.random.Generator,
     priors: DiscrepancyPriors | None = None,
@@ -101,7 +101,7 @@ def selfcal_discrepancy(
     return Discrepancy(model, solution.theta, cov, noise, found, theta, linear, facts)
 
 
-def _noise(solution: Solution, scores: DetectionScores) -> tuple[Float, float]:
+def _noise(solution: SelfCalibrationMode, scores: DetectionScores) -> tuple[Float, float]:
     """Covariance (D, D) by the stars' scatter, and its ratio to the formal one."""
     inner = np.ix_(solution.free, solution.free)
     narrow, ratio = not_narrower(sandwich(solution, scores)[inner], solution.cov[inner])
@@ -128,7 +128,7 @@ def _functions(problem: Problem) -> dict[int, StructureFunctions]:
 
 
 def _structure(
-    solution: Solution,
+    solution: SelfCalibrationMode,
     functions: dict[int, StructureFunctions],
     sums: tuple[Float, Float, Float],
     priors: DiscrepancyPriors,

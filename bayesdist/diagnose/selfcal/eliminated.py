@@ -25,9 +25,9 @@ from bayesdist.diagnose.correlated.deviations import DeviationColumns
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.selfcal.leverage import places_by_star
 from bayesdist.diagnose.selfcal.scores import DetectionScores
-from bayesdist.infer.selfcal.normal import Structure
+from bayesdist.infer.selfcal.elimination import PlaceDerivatives
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
-from bayesdist.infer.selfcal.solve import Solution
 
 __all__ = [
     "Columns",
@@ -63,9 +63,9 @@ class Columns:
     deviations: DeviationColumns | None = None
 
     @cached_property
-    def structure(self) -> Structure:
+    def structure(self) -> PlaceDerivatives:
         """Dependence of positions on the parameters."""
-        return Structure.at(self.problem, self.theta)
+        return PlaceDerivatives.at(self.problem, self.theta)
 
     @property
     def n_params(self) -> int:
@@ -233,12 +233,12 @@ class Remainder:
     gain: Float  # response (D, n) of the parameters to the columns; zero for fixed ones
 
 
-def without_parameters(solution: Solution, N: Float, score: Float) -> Remainder:
+def without_parameters(solution: SelfCalibrationMode, N: Float, score: Float) -> Remainder:
     """Columns other than the parameters, these eliminated as free in the solution, with its priors.
 
     N and `score` are those of `eliminated`.
     """
-    D, free, known = len(solution.theta), solution.free, solution.information
+    D, free, known = len(solution.theta), solution.free, solution.prior
     A = N[np.ix_(free, free)] + known.precision[np.ix_(free, free)]
     pull = (score[:D] + known.pull(solution.theta))[free]
     scale = np.sqrt(np.maximum(np.diag(A), 1e-300))

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.selfcal.errors import MOST_TAKEN
-from bayesdist.infer.selfcal.normal import STARS, memberships
+from bayesdist.infer.selfcal.calibrate import MOST_TAKEN
+from bayesdist.infer.selfcal.elimination import STARS, memberships
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
-from bayesdist.infer.selfcal.solve import Solution
 
 __all__ = ["StarBlock", "places_by_star", "star_blocks", "taken_by_stars"]
 
@@ -35,7 +35,7 @@ class StarBlock:
     ties: Float
 
 
-def star_blocks(solution: Solution) -> Iterator[StarBlock]:
+def star_blocks(solution: SelfCalibrationMode) -> Iterator[StarBlock]:
     """Iterator over the stars of a solution, some at a time, with their detections."""
     p, theta, mixture = solution.problem, solution.theta, solution.mixture
     members = memberships(p, theta, mixture, solution.stars)
@@ -55,7 +55,7 @@ def star_blocks(solution: Solution) -> Iterator[StarBlock]:
         yield StarBlock(rows, star, members[rows], w, residual, ties)
 
 
-def taken_by_stars(solution: Solution) -> Float:
+def taken_by_stars(solution: SelfCalibrationMode) -> Float:
     """Fraction (N,) of each detection's variance that its star absorbs, at most `MOST_TAKEN`."""
     out = np.empty(len(solution.problem))
     for some in star_blocks(solution):

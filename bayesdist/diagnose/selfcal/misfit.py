@@ -23,7 +23,7 @@ from scipy.stats import f as f_distribution
 
 from bayesdist.diagnose.residuals.misfit import Misfit, bin_means, partitions_for, worst_misfit
 from bayesdist.diagnose.selfcal.leverage import StarBlock, star_blocks
-from bayesdist.infer.selfcal import Solution
+from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.model.grid import cell_index
@@ -38,7 +38,7 @@ MAX_CELLS = 512  # of all chips: the matrix of all shifts is decomposed
 MIN_INFORMATION = 0.05  # of a direction, relative to that with known stars
 
 
-def dithered_misfit(solution: Solution) -> Misfit:
+def dithered_misfit(solution: SelfCalibrationMode) -> Misfit:
     """Misfit of a self-calibration: structure over the detector, of all chips together."""
     model, unit = solution.problem.model, solution.problem.model.pixel_size(solution.theta)
     partitions = _partitions(len(solution.problem), len(model.chips))
@@ -75,7 +75,7 @@ class _Shifts:
     dof: float = 1.0
 
 
-def _shifts(solution: Solution, partitions: Sequence[tuple[int, int]]) -> list[_Shifts]:
+def _shifts(solution: SelfCalibrationMode, partitions: Sequence[tuple[int, int]]) -> list[_Shifts]:
     """Gradients and curvatures by shifts of the cells of each partition, in one pass."""
     p, expansion = solution.problem, solution.expansion
     out = []

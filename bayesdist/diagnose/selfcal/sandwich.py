@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from bayesdist.diagnose.selfcal.eliminated import Columns, Piece, pieces, star_sums
 from bayesdist.diagnose.selfcal.scores import DetectionScores
-from bayesdist.infer.selfcal.solve import Solution
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 
 __all__ = ["sandwich", "star_scores"]
 
@@ -17,7 +17,7 @@ Float = NDArray[np.float64]
 MIN_FREE = 0.1
 
 
-def sandwich(solution: Solution, scores: DetectionScores) -> Float:
+def sandwich(solution: SelfCalibrationMode, scores: DetectionScores) -> Float:
     """Covariance (D, D) of the parameters, valid for any errors of single stars; 0 for fixed ones.
 
     The detections of a star share its position, so that their scores are added up.  Each sum is
@@ -31,7 +31,7 @@ def sandwich(solution: Solution, scores: DetectionScores) -> Float:
     root[free] = np.linalg.inv(np.linalg.cholesky(solution.precision)).T
     inside = np.empty_like(root)
     inside[columns.order] = root
-    meat = np.array(solution.information.precision)
+    meat = np.array(solution.prior.precision)
     pull = np.einsum("skq,sq->sk", p.priors.precision, p.priors.centre - solution.stars)
     for piece in pieces(columns):
         here = scores.at(piece.rows)

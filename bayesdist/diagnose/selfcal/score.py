@@ -33,8 +33,8 @@ from bayesdist.diagnose.selfcal.leverage import taken_by_stars
 from bayesdist.diagnose.selfcal.sandwich import star_scores
 from bayesdist.diagnose.selfcal.scores import scores_of_detections
 from bayesdist.diagnose.significance import hotelling_p
-from bayesdist.infer.selfcal.normal import memberships
-from bayesdist.infer.selfcal.solve import Solution
+from bayesdist.infer.selfcal.elimination import memberships
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 
 __all__ = ["selfcal_score_tests"]
 
@@ -68,7 +68,7 @@ class _Sums:
 
 
 def selfcal_score_tests(
-    solution: Solution, *, mag: Float | None = None, epoch: Float | None = None
+    solution: SelfCalibrationMode, *, mag: Float | None = None, epoch: Float | None = None
 ) -> tuple[ScoreTest, ...]:
     """Targeted tests of a self-calibration for what its model lacks, and for its noise.
 
@@ -76,7 +76,7 @@ def selfcal_score_tests(
 
     Parameters
     ----------
-    solution : Solution
+    solution : SelfCalibrationMode
     mag, epoch : ndarray, shape (N,), optional
         Of each detection of its problem; decimal years.
 
@@ -108,7 +108,7 @@ def selfcal_score_tests(
 
 
 def _summed(
-    solution: Solution, columns: AddedColumns, rows: NDArray[np.bool_], stars: Float
+    solution: SelfCalibrationMode, columns: AddedColumns, rows: NDArray[np.bool_], stars: Float
 ) -> _Sums:
     """Sums over some of the detections of a solution."""
     p, scores = columns.problem, scores_of_detections(solution).at(rows)
@@ -133,7 +133,7 @@ def _summed(
     # given back what the parameters have taken: a little, and much the same everywhere
     numbers = 2 * float((scores.curvature[:, 0, 0] > 0).sum()) - p.n_star * p.n_stars
     free = max(1 - len(solution.free) / max(numbers, 1.0), 0.1)
-    covariance = own.T @ own / free + left.gain.T @ solution.information.precision @ left.gain
+    covariance = own.T @ own / free + left.gain.T @ solution.prior.precision @ left.gain
     further = np.ix_(columns.order[D:], columns.order[D:])
     return _Sums(
         known[further],
@@ -175,7 +175,7 @@ def _family(name: str, order: int) -> Family:
     return replace(FAMILIES[name], remedy=REMEDIES.get(name, FAMILIES[name].remedy))
 
 
-def _motions(solution: Solution, epoch: Float) -> Outcome | None:
+def _motions(solution: SelfCalibrationMode, epoch: Float) -> Outcome | None:
     """Test for stars that move."""
     p, scores = solution.problem, scores_of_detections(solution)
     family = replace(
@@ -188,7 +188,7 @@ def _motions(solution: Solution, epoch: Float) -> Outcome | None:
 
 
 def _noise_sample(
-    solution: Solution, some: Int, rows: NDArray[np.bool_], mag: Float | None
+    solution: SelfCalibrationMode, some: Int, rows: NDArray[np.bool_], mag: Float | None
 ) -> ScoredSample:
     """Sample of detections along the axes of the detector, in the unit of u and v.
 

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from bayesdist.diagnose.correlated.noise import MAX_BLOCKS, STARS_PER_BLOCK, block_ratios
 from bayesdist.diagnose.selfcal.leverage import taken_by_stars
-from bayesdist.infer.selfcal.normal import memberships
+from bayesdist.infer.selfcal.elimination import memberships
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
-from bayesdist.infer.selfcal.solve import Solution
 from bayesdist.model.grid import cell_index
 
 __all__ = ["DetectionScores", "score_excess", "scores_of_detections"]
@@ -39,7 +39,7 @@ class DetectionScores:
         )
 
 
-def scores_of_detections(solution: Solution) -> DetectionScores:
+def scores_of_detections(solution: SelfCalibrationMode) -> DetectionScores:
     """Scores of all detections of a solution, their stars at their modes."""
     p, mixture = solution.problem, solution.mixture
     member = memberships(p, solution.theta, mixture, solution.stars)
@@ -54,7 +54,7 @@ def scores_of_detections(solution: Solution) -> DetectionScores:
     return DetectionScores(-member[:, None] * pulled, np.where(good[:, None, None], H, 0.0))
 
 
-def score_excess(solution: Solution, scores: DetectionScores) -> Float:
+def score_excess(solution: SelfCalibrationMode, scores: DetectionScores) -> Float:
     """Ratio (N,) of the variance of the scores to their curvature, by blocks of the detector.
 
     Stars absorb a part of the residuals of their detections, for which the ratios are corrected;

@@ -22,8 +22,8 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
 from bayesdist.infer.equations.scaled import one_thread
+from bayesdist.infer.solution import Solution
 from bayesdist.infer.stars.stars import prepare
-from bayesdist.infer.transforms import Solution
 
 __all__ = ["StarCovariance", "star_covariance"]
 
@@ -127,8 +127,7 @@ def star_covariance(
         variances.append(np.stack(moving, axis=1) ** 2)
         levers.append(matches.epoch - _by_star(epoch0, n_stars, "epoch0", signed=True)[code])
     if weight is None:
-        uses = getattr(solution, "uses", None)
-        weight = np.ones(len(matches)) if uses is None else uses(matches)
+        weight = solution.uses(matches)
     weight = np.broadcast_to(np.asarray(weight, float), (len(matches),))
 
     if included:

@@ -27,9 +27,10 @@ from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.infer.exposures.hierarchy import held_in_reference
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
+from bayesdist.infer.solution import Solution, TransformedSolution
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Matches, load
-from bayesdist.infer.transforms import Solution, View, without_frames
+from bayesdist.infer.transforms import without_frames
 from bayesdist.model import DistortionModel
 
 __all__ = ["Change", "NewFit", "change_of", "fit_new", "new_model", "with_star_errors_of"]
@@ -42,43 +43,21 @@ HELD = 1e-4  # sigma of a fixed rate, in units of its released sigma
 
 @dataclass(frozen=True, eq=False)
 class NewFit:
-    """Independent fit of the new matches.
+    """Independent fit of the new matches."""
 
-    Parameters
-    ----------
-    released : View
-        The released polynomials and their drift, without frames.
-    fit : LinearFit
-        Least squares of the new matches, which starts the mixture.
-    theta : ndarray, shape (D,)
-        Mode of the mixture, in the model of `fit`.
-    cov : ndarray, shape (D, D)
-    hyper : dict of str to float
-        'j', 'f', 's_out' at the mode, as far as the mixture has them.
-    target : Target
-        Density of the new matches.
-    psi : ndarray
-        The mode in sampled coordinates.
-    epoch : float or None
-        Mean date of the matches, where the model depends on time.
-    scatter : ndarray, shape (q,)
-        Inverse variances of the parameters of an exposure; zero for those that are free.
-    extra : ndarray, shape (n, n) or None
-        Added to the covariance of the polynomials for errors that all matches of a star share.
-    common : ndarray, shape (n_distortion, n) or None
-        Covariance of the release with these polynomials, by stars in both.
-    """
-
-    released: View
-    fit: LinearFit
-    theta: Float
-    cov: Float
-    hyper: dict[str, float]
-    target: Target
-    psi: Float
-    epoch: float | None
+    released: TransformedSolution  # the released polynomials and their drift, without frames
+    fit: LinearFit  # least squares of the new matches, which starts the mixture
+    theta: Float  # mode (D,) of the mixture, in the model of `fit`
+    cov: Float  # (D, D)
+    hyper: dict[str, float]  # 'j', 'f', 's_out' at the mode, as far as the mixture has them
+    target: Target  # density of the new matches
+    psi: Float  # the mode in sampled coordinates
+    epoch: float | None  # mean date of the matches, where the model depends on time
+    # inverse variances (q,) of the parameters of an exposure; zero for those that are free
     scatter: Float = field(default_factory=lambda: np.zeros(0))
+    # added to the covariance (n, n) of the polynomials for errors common to all matches of a star
     extra: Float | None = None
+    # covariance (n_distortion, n) of the release with these polynomials, by stars in both
     common: Float | None = None
 
     @property
@@ -102,39 +81,19 @@ class NewFit:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """Difference of the new matches' polynomials from the released ones.
+    """Difference of the new matches' polynomials from the released ones."""
 
-    Parameters
-    ----------
-    model : DistortionModel
-        Released structure without frames.
-    epoch : float or None
-        Date at which the solutions are compared.
-    released : ndarray, shape (chips, 2, K)
-        Released polynomials at that date.
-    difference : ndarray, shape (chips, 2, K)
-        New minus released, in the frame of the release, without what frames could absorb.
-    cov : ndarray, shape (n, n)
-        Of the difference, n = 2 K chips.
-    released_cov : ndarray, shape (n, n)
-        Of the released polynomials at that date, and of all other errors common to the new matches.
-    taken : ndarray, shape (n, q)
-        Fields that frames absorb.
-    test : FieldTest
-        Of the whole difference.
-    frame : tuple of ndarray
-        Matrix (2, 2) and shift (2,) from the release to the first new exposure.
-    """
-
-    model: DistortionModel
-    epoch: float | None
-    released: Float
+    model: DistortionModel  # released structure without frames
+    epoch: float | None  # date at which the solutions are compared
+    released: Float  # released polynomials (chips, 2, K) at that date
+    # new minus released (chips, 2, K), in the release's frame, without what frames could absorb
     difference: Float
-    cov: Float
+    cov: Float  # of the difference (n, n), n = 2 K chips
+    # of the released polynomials (n, n), and of all other errors common to the new matches
     released_cov: Float
-    taken: Float
-    test: FieldTest
-    frame: tuple[Float, Float]
+    absorbed: Float  # fields (n, q) that frames absorb
+    test: FieldTest  # of the whole difference
+    frame: tuple[Float, Float]  # matrix (2, 2), shift (2,) from the release to the first exposure
 
 
 def fit_new(
@@ -146,33 +105,15 @@ def fit_new(
     compute: Compute | None = None,
     scatter: Mapping[str, float] | None = None,
 ) -> NewFit:
-    """Fit new matches independently of the release.
+    """Fit of new matches, independent of the release.
 
-    Parameters
-    ----------
-    released : Solution
-        A fit or a posterior; only the kind of its frames matters, not the frames of its exposures.
-    matches : MatchTable or PartitionedMatches
-        With errors.
-    mixture : OutlierMixture, optional
-        That of a released posterior by default, else Gaussian outliers.
-    rejection : Rejection
-        As of `fit_linear`.
-    compute : Compute, optional
-    scatter : mapping of str to float, optional
-        Standard deviations of a campaign's exposures, by the name of the parameter: 'scale', ...
-        Required for such a release.
+    Only the kind of the release's frames matters, not the frames of its exposures.  The mixture is
+    that of a released posterior by default, else Gaussian outliers.  `scatter` gives the standard
+    deviations of a campaign's exposures by the name of the parameter ('scale', ...), and is
+    required for such a release.
 
-    Returns
-    -------
-    NewFit
-
-    Raises
-    ------
-    InputError
-        For matches in another unit, or without the epochs that the release needs.
-    DegenerateError
-        When the matches do not determine polynomials of the released order.
+    InputError for matches in another unit, or without the epochs that the release needs;
+    DegenerateError when the matches do not determine polynomials of the released order.
     """
     bare = without_frames(released)
     model = new_model(released.model, matches)
@@ -183,7 +124,7 @@ def fit_new(
         names = model.free_frame_names(1)
         scattering = np.array([scatter[k] ** -2.0 if k in scatter else 0.0 for k in names])
     shards = load(model, matches, compute)
-    mixture = mixture or getattr(released, "mixture", None) or OutlierMixture()
+    mixture = mixture or released.mixture or OutlierMixture()
     priors = _with_scatter(_held_drift(bare, model), model, scatter or {})
     fit = fit_linear(shards, model, rejection=rejection, priors=priors)
     target = Target(shards, mixture, priors)
@@ -207,10 +148,7 @@ def fit_new(
 def new_model(released: DistortionModel, matches: Matches) -> DistortionModel:
     """Released structure with the exposures of new matches.
 
-    Raises
-    ------
-    InputError
-        For matches in another unit, of an unknown chip, or without epochs that are needed.
+    InputError for matches in another unit, of an unknown chip, or without epochs that are needed.
     """
     where = ", ".join(matches.sources)
     if matches.unit != released.unit:
@@ -239,16 +177,8 @@ def new_model(released: DistortionModel, matches: Matches) -> DistortionModel:
 def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
     """Difference of the new matches' polynomials from the release.
 
-    Parameters
-    ----------
-    new : NewFit
-    draws : float
-        Effective draws from which the released covariance was estimated; they are worth the more,
-        the smaller its fraction of the whole is (Welch and Satterthwaite).
-
-    Returns
-    -------
-    Change
+    `draws` are the effective draws from which the released covariance was estimated; they are worth
+    the more, the smaller its fraction of the whole is (Welch and Satterthwaite).
     """
     released, model = new.released, new.released.model
     n, K, C = model.n_polynomial, model.n_terms, len(model.chips)
@@ -273,15 +203,15 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
         common = at @ new.common @ turn.T
         released_cov = released_cov - common - common.T
     cov = turn @ own @ turn.T + released_cov
-    taken = frame_fields(model, new.open.frames, old, origin)
+    absorbed = frame_fields(model, new.open.frames, old, origin)
     norm = mean_squares(model)
     difference = (moved - old).ravel()
-    projector = without(taken, norm)
+    projector = without(absorbed, norm)
     rest = projector @ difference
     variance = np.einsum("ij,jk,ik->i", projector, cov, projector)
     of_release = np.einsum("ij,jk,ik->i", projector, released_cov, projector)
     known = variance > 1e-16 * np.diag(cov)
-    share = float(np.mean(of_release[known] / variance[known]))
+    fraction = float(np.mean(of_release[known] / variance[known]))
     return Change(
         model=model,
         epoch=new.epoch,
@@ -289,13 +219,15 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
         difference=rest.reshape(C, 2, K),
         cov=projector @ cov @ projector.T,
         released_cov=released_cov,
-        taken=taken,
-        test=chi_square(rest, cov, without=taken, norm=norm, draws=draws / max(share, 1e-3) ** 2),
+        absorbed=absorbed,
+        test=chi_square(
+            rest, cov, without=absorbed, norm=norm, draws=draws / max(fraction, 1e-3) ** 2
+        ),
         frame=(M, d),
     )
 
 
-def _held_drift(released: View, model: DistortionModel) -> GaussianPriors:
+def _held_drift(released: TransformedSolution, model: DistortionModel) -> GaussianPriors:
     """Priors that fix the drift at its released values."""
     priors = GaussianPriors.none(model)
     rows = slice(released.model.n_polynomial, released.model.n_distortion)
@@ -342,24 +274,12 @@ def with_star_errors_of(
     matches: MatchTable,
     released: tuple[LinearFit, MatchTable] | None = None,
 ) -> NewFit:
-    """New fit whose covariance includes the catalogue errors that the matches of a star share.
+    """New fit whose covariance includes the catalogue errors that all matches of a star have.
 
-    A star has one error in all of its new exposures.  Where the release was made with the same
-    catalogue, that error has moved both sides, and what it moved alike is no change.
-
-    Parameters
-    ----------
-    errors : StarErrors
-        Of the catalogue, by code of the star; the quoted errors contain them.
-    new : NewFit
-    matches : MatchTable
-        Those of `new`, with codes of the stars.
-    released : tuple of LinearFit and MatchTable, optional
-        The release and its matches, where they have the same catalogue and codes.
-
-    Returns
-    -------
-    NewFit
+    `errors` are those of the catalogue by code of the star, which the quoted errors contain, and
+    `matches` those of `new`.  A star has one error in all of its new exposures.  Where the release
+    was made with the same catalogue, that error has moved both sides, and what it moved alike is no
+    change: `released` are then the release and its matches, with the same codes.
     """
     n = new.model.n_polynomial
     motion_u, motion_v = (0.0, 0.0) if errors.motion is None else errors.motion.T

@@ -9,13 +9,15 @@ means of the lots, without the data.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer import kernel
-from bayesdist.infer.linear import Clip
+from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.stars import Stars, cell_of
+from bayesdist.infer.stars.sums import Sums
 
 __all__ = ["LotSums", "bin_sums", "departures", "held_out_gain", "share_sums", "truncated"]
 
@@ -24,29 +26,22 @@ Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class LotSums:
-    """Sums over the stars of each lot, about one polynomial; sums of chunks of the data add up."""
+class LotSums(Sums):
+    """Sums over the stars of each lot, about one polynomial."""
 
     count: Int  # number (L,) of stars, including clipped ones
     weight: Float  # sum (L, 2, K, K) of w phi phi^T of u and of v
     right: Float  # sum (L, 2, K) of w r phi, r the residual
 
-    def __add__(self, other: LotSums) -> LotSums:
-        return LotSums(
-            self.count + other.count, self.weight + other.weight, self.right + other.right
-        )
-
     def joined(self, code: Int, n: int) -> LotSums:
         """Sums of `n` larger lots; `code` (L,) is the larger lot of each."""
-        out = LotSums(
-            np.zeros(n, np.int64),
-            np.zeros((n, *self.weight.shape[1:])),
-            np.zeros((n, *self.right.shape[1:])),
-        )
-        np.add.at(out.count, code, self.count)
-        np.add.at(out.weight, code, self.weight)
-        np.add.at(out.right, code, self.right)
-        return out
+
+        def joined(column: NDArray[Any]) -> NDArray[Any]:
+            out = np.zeros((n, *column.shape[1:]), column.dtype)
+            np.add.at(out, code, column)
+            return out
+
+        return LotSums(joined(self.count), joined(self.weight), joined(self.right))
 
     def filled(self) -> LotSums:
         """Sums of the lots that have weight."""

@@ -33,6 +33,7 @@ from bayesdist.infer.equations.rank import require_full_rank
 from bayesdist.infer.equations.scaled import FieldTest, chi_square, scaled_inverse
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.stars.stars import Stars
+from bayesdist.infer.stars.sums import Sums
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = [
@@ -47,48 +48,25 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class PeriodSums:
-    """Sums over the matches of one period, which add over chunks of the data.
+class PeriodSums(Sums):
+    """Sums over the matches of one period."""
 
-    Parameters
-    ----------
-    equations : NormalEquations
-        About the mean of the fit of all data, with the matches that it uses.
-    squares : NormalEquations or None
-        With squared weights, where extra weights make the sandwich necessary.
-    n : int
-        Number of matches used.
-    """
-
-    equations: NormalEquations
+    equations: NormalEquations  # about the mean of the fit of all data, with the matches it uses
+    # with squared weights, where extra weights make the sandwich necessary
     squares: NormalEquations | None
-    n: int
-
-    def __add__(self, other: PeriodSums) -> PeriodSums:
-        squares = None
-        if self.squares is not None and other.squares is not None:
-            squares = self.squares + other.squares
-        return PeriodSums(self.equations + other.equations, squares, self.n + other.n)
+    n: int  # matches used
 
 
 def sums_of_stars(stars: Stars, fit: LinearFit, radial_weight: float = 1.0) -> PeriodSums:
     """Sums over some matches of one period.
 
-    Parameters
-    ----------
-    stars : Stars
-    fit : LinearFit
-        Of all data: its model, and its rule for leaving matches out, which is then one for all.
-    radial_weight : float
-        As the fit's.
-
-    Returns
-    -------
-    PeriodSums
+    The fit is that of all data, whose rule for leaving matches out is then one for all, with
+    `radial_weight` in its corners.
     """
-    rule = (fit.clip.theta, fit.clip.chi2_limit, fit.clip.abs_limit, radial_weight)
-    equations = least_squares(stars, fit.mean, *rule)
-    squares = least_squares(stars, fit.mean, *rule, 2) if radial_weight != 1.0 else None
+    equations = least_squares(stars, fit.mean, fit.clip, radial_weight)
+    squares = None
+    if radial_weight != 1.0:
+        squares = least_squares(stars, fit.mean, fit.clip, radial_weight, 2)
     return PeriodSums(equations, squares, int(equations.scalars[0]))
 
 
@@ -106,32 +84,17 @@ def _check_model(model: DistortionModel) -> None:
 def compare_periods(
     fit: LinearFit, sums: Mapping[str, PeriodSums], *, rescale: bool = True
 ) -> PeriodComparison:
-    """Model of each period, and the differences from the combined one.
+    """Model of each of two or more periods, and the differences from the combined one.
 
-    Parameters
-    ----------
-    fit : LinearFit
-        Of all data, as given to `sums_of_stars`.
-    sums : mapping of str to PeriodSums
-        Two or more periods.  Together they are the combined data set, of which `fit` need not be
-        the fit: where matches lie outside all periods it is not.
-    rescale : bool
-        True to multiply all errors by one factor, the root of chi-square per degree of freedom
-        about the models of the periods.  Otherwise quoted errors that are too small make a change
-        of noise.
+    The periods' `sums_of_stars` of `fit` together are the combined data set, of which `fit` need
+    not be the fit: where matches lie outside all periods it is not.  With `rescale` all errors are
+    multiplied by one factor, the root of chi-square per degree of freedom about the models of the
+    periods; otherwise quoted errors that are too small make a change of noise.  Residual structure
+    that is the same in all periods cancels in the differences as far as the periods cover the array
+    alike.
 
-    Returns
-    -------
-    PeriodComparison
-        Residual structure that is the same in all periods cancels in the differences as far as
-        the periods cover the array alike.
-
-    Raises
-    ------
-    InputError
-        For fewer than two periods, and for a model with frames or time dependence.
-    DegenerateError
-        When a period does not determine the model, naming the parameters.
+    InputError for fewer than two periods, and for a model with frames or time dependence;
+    DegenerateError when a period does not determine the model, naming the parameters.
     """
     if len(sums) < 2:
         raise InputError(f"{len(sums)} periods are given", do="give two or more")
@@ -162,14 +125,14 @@ def compare_periods(
             covs.append(inverse)
         normals.append(normal)
     all_inverse = scaled_inverse(np.sum(normals, axis=0))
-    shares = np.array([all_inverse @ normal for normal in normals])
+    fractions = np.array([all_inverse @ normal for normal in normals])
     scale = _error_scale(sums.values(), rights, steps) if rescale else 1.0
     return PeriodComparison(
         model=model,
         names=tuple(sums),
         means=fit.mean + np.array(steps),
         covs=np.array(covs) * scale**2,
-        shares=shares,
+        fractions=fractions,
         counts=tuple(one.n for one in sums.values()),
         error_scale=scale,
     )
@@ -192,18 +155,11 @@ def _error_scale(
 
 @dataclass(frozen=True, eq=False)
 class CoefficientChange:
-    """Differences of all coefficients between two models.
+    """Differences of all coefficients between two models."""
 
-    Parameters
-    ----------
-    names : tuple of str, length D
-    difference, sigma : ndarray, shape (D,)
-        Difference and its standard error.
-    """
-
-    names: tuple[str, ...]
-    difference: Float
-    sigma: Float
+    names: tuple[str, ...]  # of D coefficients
+    difference: Float  # (D,)
+    sigma: Float  # standard errors (D,)
 
     @property
     def z(self) -> Float:
@@ -218,36 +174,20 @@ class CoefficientChange:
 
 @dataclass(frozen=True, eq=False)
 class PeriodComparison:
-    """Models of several periods and the combined one.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    names : tuple of str, length P
-        Periods.
-    means : ndarray, shape (P, D)
-    covs : ndarray, shape (P, D, D)
-        Covariance of each, independent of the others.
-    shares : ndarray, shape (P, D, D)
-        A_p = N^-1 N_p; their sum is the identity.
-    counts : tuple of int
-        Number of matches in each.
-    error_scale : float
-        Factor on the quoted errors.
-    """
+    """Models of several periods and the combined one."""
 
     model: DistortionModel
-    names: tuple[str, ...]
-    means: Float
-    covs: Float
-    shares: Float
-    counts: tuple[int, ...]
-    error_scale: float
+    names: tuple[str, ...]  # of P periods
+    means: Float  # (P, D)
+    covs: Float  # covariance (P, D, D) of each, independent of the others
+    fractions: Float  # A_p = N^-1 N_p (P, D, D); their sum is the identity
+    counts: tuple[int, ...]  # matches in each
+    error_scale: float  # factor on the quoted errors
 
     @cached_property
     def combined(self) -> Float:
         """Parameters (D,) of the model of all periods."""
-        return np.einsum("pij,pj->i", self.shares, self.means)
+        return np.einsum("pij,pj->i", self.fractions, self.means)
 
     def _code(self, period: str) -> int:
         if period not in self.names:
@@ -267,29 +207,15 @@ class PeriodComparison:
                 raise InputError(f"period {period} is compared with itself", do="name another")
             out[p], out[q] = np.eye(D), -np.eye(D)
             return out
-        out[:] = -self.shares
+        out[:] = -self.fractions
         # 1 - A_p without the cancellation that occurs for a period with most of the data
-        out[p] = np.delete(self.shares, p, axis=0).sum(axis=0)
+        out[p] = np.delete(self.fractions, p, axis=0).sum(axis=0)
         return out
 
     def difference(self, period: str, against: str | None = None) -> tuple[Float, Float]:
-        """Parameters of a period minus those of the combined model, or of another period.
+        """Parameters (D,) of a period minus those of another, or of the combined model; covariance.
 
-        Parameters
-        ----------
-        period : str
-        against : str, optional
-            Another period; the combined model by default.
-
-        Returns
-        -------
-        difference : ndarray, shape (D,)
-        cov : ndarray, shape (D, D)
-
-        Raises
-        ------
-        InputError
-            For an unknown period, or one against itself.
+        InputError for an unknown period, or one against itself.
         """
         contrast = self._contrast(period, against)
         # differences of the means: large constants cancel before they meet rounding errors
@@ -301,16 +227,8 @@ class PeriodComparison:
     ) -> CoefficientChange:
         """Difference of each coefficient with its error.
 
-        Parameters
-        ----------
-        period, against
-            As `difference`.
-        monomial : bool
-            True for coefficients of pixel offsets, as in SIP, in place of Legendre ones.
-
-        Returns
-        -------
-        CoefficientChange
+        With `monomial` coefficients are those of pixel offsets, as in SIP, in place of Legendre
+        ones; `against` is as of `difference`.
         """
         difference, cov = self.difference(period, against)
         if monomial:
@@ -319,11 +237,6 @@ class PeriodComparison:
             to_monomials = block_diag(*(m for m in both for _ in (0, 1)))
             difference, cov = to_monomials @ difference, to_monomials @ cov @ to_monomials.T
         return CoefficientChange(self.model.names, difference, np.sqrt(np.diag(cov)))
-
-    def joint(self, period: str, against: str | None = None) -> FieldTest:
-        """Chi-square of all coefficients together."""
-        difference, cov = self.difference(period, against)
-        return chi_square(difference, cov)
 
     def positions(
         self,
@@ -336,20 +249,9 @@ class PeriodComparison:
     ) -> PositionChange:
         """Largest difference over the array with its significance.
 
-        Parameters
-        ----------
-        period, against
-            As `difference`.
-        rng : numpy.random.Generator
-        grid : int
-            Points along each axis, from edge to edge of the detector.
-        n_draws : int
-            Fields of noise that the largest difference is compared with; its probability is at
-            least 1 / (n_draws + 1).
-
-        Returns
-        -------
-        PositionChange
+        It is searched on `grid` points along each axis, from edge to edge of the detector, and
+        compared with that of `n_draws` fields of noise: its probability is at least 1 / (n_draws +
+        1).
         """
         difference, cov = self.difference(period, against)
         return largest_difference(self.model, difference, cov, rng=rng, grid=grid, n_draws=n_draws)
@@ -362,21 +264,7 @@ class PeriodComparison:
         chip: Chip | None = None,
         grid: tuple[int, int] = (17, 17),
     ) -> DifferenceField:
-        """Difference of the positions over a chip.
-
-        Parameters
-        ----------
-        period, against
-            As `difference`.
-        chip : Chip, optional
-            The first chip by default.
-        grid : tuple of int
-            Points on x and on y.
-
-        Returns
-        -------
-        DifferenceField
-        """
+        """Difference of the positions over a chip, the first by default, at `grid` points x, y."""
         chip = chip or self.model.chips[0]
         return difference_field(self.model, *self.difference(period, against), chip, grid)
 

@@ -9,12 +9,16 @@ from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
 from bayesdist.errors import InputError
-from bayesdist.infer.nodes.evidence import Evidence, fitted_field, refined_field
 from bayesdist.infer.nodes.grid import STEP, NodeGrid
-from bayesdist.infer.nodes.jitter import jitter_variance
-from bayesdist.infer.nodes.matern import SMOOTHNESS
+from bayesdist.infer.nodes.hyperparameters import (
+    SMOOTHNESS,
+    Evidence,
+    fitted_field,
+    refined_field,
+)
+from bayesdist.infer.nodes.mixture import jitter_variance
 from bayesdist.infer.nodes.posterior import TablePosterior, axis_posterior
-from bayesdist.infer.nodes.sums import BLOCK, NodeSums, interpolation, node_sums
+from bayesdist.infer.nodes.sums import BLOCK, NodeSums, node_sums
 from bayesdist.model import Chip
 
 __all__ = ["checked_stars", "field_table"]
@@ -200,7 +204,7 @@ def _residual(
     out = np.empty_like(shift)
     for start in range(0, len(x), BLOCK):
         rows = slice(start, start + BLOCK)
-        fitted = interpolation(grid, x[rows], y[rows]) @ values
+        fitted = grid.interpolation(x[rows], y[rows]) @ values
         fitted += grid.basis.evaluate(x[rows], y[rows]) @ polynomial
         out[rows] = shift[rows] - fitted
     return out

@@ -19,11 +19,11 @@ __all__ = [
     "EFFICIENT",
     "FIRST_CHECK",
     "Plan",
-    "Stretch",
-    "boundaries",
+    "StepRange",
+    "block_schedule",
+    "doubling_schedule",
     "expected_passes",
     "first_check",
-    "ladder",
     "next_check",
     "pilot_steps",
     "plan_moves",
@@ -114,7 +114,7 @@ def pilot_steps(ensembles: int, walkers: int) -> int:
 
 
 @dataclass(frozen=True)
-class Stretch:
+class StepRange:
     """Steps from `begin` to `end`; without the limit `max_steps` they would end at `full`."""
 
     begin: int
@@ -122,7 +122,7 @@ class Stretch:
     full: int
 
 
-def ladder(pilot: int, every: int, max_steps: int, n_stars: int) -> Iterator[Stretch]:
+def block_schedule(pilot: int, every: int, max_steps: int, n_stars: int) -> Iterator[StepRange]:
     """Blocks of the independence plan, independent of the targets.
 
     The pilot is cut into pieces of `every` steps at most; then blocks grow with the steps made, by
@@ -133,7 +133,7 @@ def ladder(pilot: int, every: int, max_steps: int, n_stars: int) -> Iterator[Str
     while begin < max_steps:
         step = pilot - begin if begin < pilot else int(np.ceil(growth * begin))
         full = begin + min(step, every)
-        yield Stretch(begin, min(full, max_steps), full)
+        yield StepRange(begin, min(full, max_steps), full)
         begin = full
 
 
@@ -187,13 +187,14 @@ def expected_passes(n_params: int, n_stars: int, limits: Limits, ensembles: int 
 # -- state-dependent moves ------------------------------------------------------------------------
 
 
-def boundaries(every: int, max_steps: int, thin: int = 1) -> Iterator[int]:
-    """Steps at which blocks end: 50, 100, 200, ... then every `every` steps up to `max_steps`.
+def doubling_schedule(begin: int, every: int, max_steps: int, thin: int = 1) -> Iterator[StepRange]:
+    """Blocks that end 50, 100, 200, ... then every `every` steps after `begin`, up to `max_steps`.
 
-    All are multiples of `thin`, so that every stored row represents as many steps.
+    All have a multiple of `thin` steps, so that every stored row represents as many.
     """
-    last, end = max_steps - max_steps % thin, 0
-    while end < last:
-        step = min(max(end, FIRST_CHECK), every)
-        end = min(end + step + -step % thin, last)
-        yield end
+    last, made = (max_steps - begin) // thin * thin, 0
+    while made < last:
+        step = min(max(made, FIRST_CHECK), every)
+        end = min(made + step + -step % thin, last)
+        yield StepRange(begin + made, begin + end, begin + end)
+        made = end

@@ -41,7 +41,7 @@ from bayesdist.errors import InputError, NotConvergedError
 from bayesdist.infer.convergence import importance_efficiency
 from bayesdist.infer.convergence import pareto_k as tail_shape
 from bayesdist.infer.density.proposal import Random
-from bayesdist.infer.posterior.certificate import Certificate
+from bayesdist.infer.posterior import Certificate
 from bayesdist.infer.sampler.move_schedule import EFFICIENT
 from bayesdist.limits import PARETO_K
 

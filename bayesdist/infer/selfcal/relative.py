@@ -7,10 +7,7 @@ removed (an S-transformation: Baarda 1973; Teunissen 1985); the rest is common t
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
 from bayesdist.infer.linear import LinearFit
@@ -32,18 +29,13 @@ def gauge_free_matrix(model: DistortionModel, theta: Float, null: Float) -> Floa
     D = model.n_params
     if not null.shape[1]:
         return np.eye(D)
-    nodes, weights = leggauss(model.order + 1)  # exact for squares of the polynomials
     rows = []
     for chip in model.chips:
-        nx, ny = chip.size
-        x, y = (
-            a.ravel() for a in np.meshgrid((nx + 1 + nx * nodes) / 2, (ny + 1 + ny * nodes) / 2)
-        )
+        x, y, area = chip.quadrature(model.order + 1)  # exact for squares of the polynomials
         where = {"exposure": np.zeros(len(x), np.int64), "chip": np.full(len(x), chip.number)}
         if model.time is not None:
             where["epoch"] = np.full(len(x), model.time.epoch0[0])
         J = model.jacobian(theta, x, y, **where)
-        area = nx * ny * np.outer(weights, weights).ravel()
         rows.append((np.sqrt(area)[:, None, None] * J).reshape(-1, D))
     J = np.concatenate(rows)
     return np.asarray(np.eye(D) - null @ np.linalg.pinv(J @ null) @ J)
@@ -63,8 +55,4 @@ def gauge_free(solution: LinearFit | Posterior, null: Float) -> LinearFit | Post
     LinearFit or Posterior
         With the same mean.
     """
-    S = gauge_free_matrix(solution.model, solution.mean, null)
-    if isinstance(solution, LinearFit):
-        return replace(solution, cov=S @ solution.cov @ S.T)
-    mean = solution.mean
-    return replace(solution, theta=mean + (solution.theta - mean) @ S.T)
+    return solution.mapped(gauge_free_matrix(solution.model, solution.mean, null))

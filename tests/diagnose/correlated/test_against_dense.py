@@ -10,7 +10,7 @@ from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.information import Information
 from bayesdist.diagnose.correlated.structure import chip_structure
 from bayesdist.infer import GaussianPriors
-from bayesdist.infer.posterior.likelihood import scores_of
+from bayesdist.infer.solution import likelihood_of
 from bayesdist.infer.stars.stars import prepare
 from tests.diagnose.correlated.skies import SIGMA, matched
 
@@ -27,7 +27,7 @@ def lone():
     rows = np.sort(np.unique(cell, return_index=True)[1])[:150]
     table = table.select(rows)
     stars, _ = prepare(fit.model, table)
-    sums = cell_sums(stars, scores_of(fit), SIDE)
+    sums = cell_sums(stars, likelihood_of(fit), SIDE)
     information = Information(fit.model, np.asarray(fit.mean), sums, GaussianPriors.none(fit.model))
     J = fit.model.jacobian(fit.mean, table.x, table.y).reshape(-1, fit.model.n_params)
     r = np.column_stack([table.u, table.v]) - fit.model.predict(fit.mean, table.x, table.y)

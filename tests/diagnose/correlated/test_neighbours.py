@@ -10,7 +10,7 @@ import pytest
 from bayesdist.diagnose.correlated import estimate_discrepancy
 from bayesdist.diagnose.correlated.neighbours import EDGES, shared_variances
 from bayesdist.infer import fit_linear
-from bayesdist.infer.posterior.likelihood import scores_of
+from bayesdist.infer.solution import likelihood_of
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
 
@@ -42,7 +42,7 @@ def test_stars_that_err_independently_have_nothing_in_common(model):
     pulls = []
     for seed in range(12):
         matches, fit = fitted(model, seed)
-        for one in shared_variances(matches, scores_of(fit), model)[0]:
+        for one in shared_variances(matches, likelihood_of(fit), model)[0]:
             pulls.append(one.covariance / np.sqrt(one.variance))
     assert abs(np.mean(pulls)) < 3 / np.sqrt(np.size(pulls) / 2)  # bins share the pairs farther off
     assert np.sqrt(np.mean(np.square(pulls))) == pytest.approx(1, abs=0.25)
@@ -51,7 +51,7 @@ def test_stars_that_err_independently_have_nothing_in_common(model):
 def test_stripes_have_their_covariance_by_separation(model):
     size, period = 0.02, 60.0
     matches, fit = fitted(model, 1, size, period)
-    u, v = shared_variances(matches, scores_of(fit), model)[0]
+    u, v = shared_variances(matches, likelihood_of(fit), model)[0]
     assert np.all(np.abs(v.covariance) < 4 * np.sqrt(v.variance))
     # a star and another one at that distance in any direction, by drawing them
     rng = np.random.default_rng(0)
@@ -68,7 +68,7 @@ def test_stripes_have_their_covariance_by_separation(model):
 def test_matches_of_one_star_are_no_neighbours(model):
     matches, fit = fitted(model, 2)
     same = type(matches)(**{**vars(matches), "star": np.zeros(len(matches), np.int64)})
-    assert shared_variances(same, scores_of(fit), model)[0] == (None, None)
+    assert shared_variances(same, likelihood_of(fit), model)[0] == (None, None)
 
 
 @pytest.mark.parametrize("size", [0.0, 0.02])

@@ -12,28 +12,29 @@ from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.selfcal.eliminated import Columns, eliminated, without_parameters
 from bayesdist.diagnose.selfcal.sandwich import sandwich
 from bayesdist.diagnose.selfcal.scores import DetectionScores, scores_of_detections
-from bayesdist.infer.selfcal.information import Information
-from bayesdist.infer.selfcal.normal import Mixture, expand
+from bayesdist.infer.selfcal.elimination import Mixture, expand
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode, gauge_of, solve
+from bayesdist.infer.selfcal.prior import Prior
 from bayesdist.infer.selfcal.problem import Problem
-from bayesdist.infer.selfcal.settled import gauge_of
-from bayesdist.infer.selfcal.solve import Solution, solve
 from bayesdist.model import TimeDependence
 from tests.infer.selfcal.fields import field, problem_of
 
 NO_FALSE = Mixture(0.0, 1e-300)
 
 
-def solution_of(simulated, *, motion="none", mixture=NO_FALSE) -> Solution:
+def solution_of(simulated, *, motion="none", mixture=NO_FALSE) -> SelfCalibrationMode:
     """The truth as a solution in the gauge of convention, its stars at their modes."""
     theta, n_exposures = simulated.theta, len(simulated.model.exposures)
     factors = np.random.default_rng(0).normal(size=(n_exposures, 2))
     least = 5 if motion != "none" else 2
-    problem, stars = problem_of(simulated, motion=motion, parallax_factors=factors, least=least)
-    information = Information.none(theta)
+    problem, stars = problem_of(
+        simulated, motion=motion, parallax_factors=factors, min_detections=least
+    )
+    information = Prior.none(theta)
     held = gauge_of(problem, theta, information).held
     free = np.setdiff1d(np.arange(problem.model.n_params), held)
     found = expand(problem, theta, mixture, stars)
-    return Solution(problem, theta, found.stars, mixture, free, found, information)
+    return SelfCalibrationMode(problem, theta, found.stars, mixture, free, found, information)
 
 
 def star_design(p: Problem) -> np.ndarray:
@@ -166,7 +167,7 @@ def test_sandwich_is_a_jackknife_over_stars():
     """Left-out stars one by one, each with the normal equations of the others."""
     start = solution_of(field(5, 6, 60, sigma=0.02))
     solution = solve(
-        start.problem, start.theta, start.free, start.information, mixture=NO_FALSE, jitter=0.0
+        start.problem, start.theta, start.free, start.prior, mixture=NO_FALSE, jitter=0.0
     )
     p, free = solution.problem, solution.free
     scores = scores_of_detections(solution)

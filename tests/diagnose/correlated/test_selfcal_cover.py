@@ -9,10 +9,9 @@ import pytest
 
 from bayesdist.diagnose.selfcal.correlated import selfcal_discrepancy
 from bayesdist.diagnose.selfcal.score import selfcal_score_tests
-from bayesdist.infer.selfcal.information import Information
-from bayesdist.infer.selfcal.problem import prepared
-from bayesdist.infer.selfcal.settled import gauge_of
-from bayesdist.infer.selfcal.solve import solve
+from bayesdist.infer.selfcal.mode import gauge_of, solve
+from bayesdist.infer.selfcal.prior import Prior
+from bayesdist.infer.selfcal.problem import prepare
 from tests.infer.selfcal.fields import SIZE, field
 
 pytestmark = pytest.mark.slow
@@ -44,8 +43,8 @@ def solved(seed: int, rms: float):
     # the map has the structure in addition, so that a star falls on another pixel
     detections = replace(d, x=d.x - moved[:, 0], y=d.y - moved[:, 1])
     theta = simulated.theta
-    problem = prepared(simulated.model, detections, theta, match_radius=1.0)
-    information = Information.none(theta)
+    problem = prepare(simulated.model, detections, theta, match_radius=1.0)
+    information = Prior.none(theta)
     held = gauge_of(problem, theta, information).held
     free = np.setdiff1d(np.arange(problem.model.n_params), held)
     solution = solve(problem, theta, free, information)

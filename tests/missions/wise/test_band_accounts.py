@@ -21,7 +21,9 @@ PRINT = 0.005  # the report does not say where it looked for maxima: a pixel mor
 
 
 def solution(model: DistortionModel, theta: np.ndarray) -> SimpleNamespace:
-    return SimpleNamespace(model=model, mean=theta, cov=np.zeros((theta.size,) * 2))
+    return SimpleNamespace(
+        model=model, mean=theta, cov=np.zeros((theta.size,) * 2), convergence=None
+    )
 
 
 def field(band: str):

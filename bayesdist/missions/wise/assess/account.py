@@ -1,4 +1,4 @@
-"""What the sigma of a residual table is made of, and why it is not the printed one.
+"""Parts of the sigma of a residual table, and why it is not the printed one.
 
 sigma^2 of means of bins is noise^2 + partition^2 + rest^2: the errors of single stars, blocks of
 the array that stand apart, and what is left.  Of a printed sigma the noise alone can be told, from
@@ -57,25 +57,16 @@ def _range(low: float, high: float) -> str:
 
 @dataclass(frozen=True)
 class RowAccount:
-    """The parts of one row's sigma, and the printed row beside it.
-
-    Parameters
-    ----------
-    row : StatisticsRow
-    partition : float or None
-        Rms that blocks of the array add, their noise subtracted; None where none were found, or
-        the row is not of what blocks act on.
-    printed : PrintedRow or None
-    printed_noise : tuple of float or None
-        Least and most noise that the printed sigma holds.
-    contradictions : tuple of str
-        What the printed numbers contradict in themselves or in each other.
-    """
+    """The parts of one row's sigma, and the printed row beside it."""
 
     row: StatisticsRow
+    # rms that blocks of the array add, their noise subtracted; None where none were found, or the
+    # row is not of what blocks act on
     partition: float | None
     printed: PrintedRow | None = None
+    # least and most noise that the printed sigma holds
     printed_noise: tuple[float, float] | None = None
+    # what the printed numbers contradict in themselves or in each other
     contradictions: tuple[str, ...] = ()
 
     @property
@@ -176,22 +167,9 @@ def accounts(
     How much noise a printed sigma holds follows from the printed mean length of single residuals
     and their distribution.  That is not printed: it may be normal, or as it is here.
 
-    Parameters
-    ----------
-    tables : mapping of str to StatisticsTable
-        By '5-1', '5-2' and '5-3'.
-    parts : mapping
-        Rms of the partition by table and label, as of `partition_parts`.
-    arcsec : mapping of str to float
-        Arcsec per pixel of each band.
-    n_used : mapping of str to int
-        Pairs of each band in the bins.
-    published : bool
-        Whether the bands are those of WSDC D-T033 in as many bins.
-
-    Returns
-    -------
-    dict of str to tuple of RowAccount
+    `tables`: by '5-1', '5-2' and '5-3'. `parts`: rms of the partition by table and label, as of
+    `partition_parts`. `arcsec`: arcsec per pixel of each band. `n_used`: pairs of each band in the
+    bins. `published`: True if the bands are those of WSDC D-T033 in as many bins.
     """
     out = {
         name: tuple(RowAccount(row, parts.get((name, row.label))) for row in table.rows)

@@ -1,4 +1,4 @@
-"""What partitions found in the residuals of bands add to the sigmas of their tables."""
+"""Parts of the sigmas of residual tables that partitions of the array make."""
 
 from __future__ import annotations
 
@@ -14,19 +14,11 @@ __all__ = ["partition_parts"]
 def partition_parts(
     partitions: Mapping[str, ResidualPartition], arcsec: Mapping[str, float]
 ) -> dict[tuple[str, str], float]:
-    """What found partitions add to the sigma of each row.
+    """Rms that significant partitions add to the sigma of each row.
 
-    Parameters
-    ----------
-    partitions : mapping of str to ResidualPartition
-        By band, of residuals in pixels; bands without one that is significant count as having none.
-    arcsec : mapping of str to float
-
-    Returns
-    -------
-    dict
-        By table and label: rms over the array without the noise of the fitted blocks, in the unit
-        of the table.
+    `partitions`: by band, of residuals in pixels; bands without one that is significant count as
+    having none. The result is by table and label: rms over the array without the noise of the
+    fitted blocks, in the unit of the table.
     """
     found = {name: p for name, p in partitions.items() if p.significant}
     out: dict[tuple[str, str], float] = {}

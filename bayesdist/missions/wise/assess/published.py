@@ -75,38 +75,18 @@ JD412.5/Y 0.00544 0.01675 -0.04477 0.07794 0.00426 -0.03108 0.04950
 
 @dataclass(frozen=True)
 class PrintedRow:
-    """A row as printed.
-
-    Parameters
-    ----------
-    label : str
-    value : mapping of str to float
-        By the names in `STATISTICS`.
-    rounding : mapping of str to float
-        Half a unit of the last digit printed.
-    """
+    """A row as printed."""
 
     label: str
-    value: Mapping[str, float]
-    rounding: Mapping[str, float]
+    value: Mapping[str, float]  # by the names in `STATISTICS`
+    rounding: Mapping[str, float]  # half a unit of the last digit printed
 
 
 def printed_rows(text: str) -> dict[str, PrintedRow]:
     """Rows of a printed table, by label.
 
-    Parameters
-    ----------
-    text : str
-        One row on a line: the label, then seven numbers in the order of `STATISTICS`.
-
-    Returns
-    -------
-    dict of str to PrintedRow
-
-    Raises
-    ------
-    InputError
-        For a row that has not seven numbers.
+    `text`: one row on a line: the label, then seven numbers in the order of `STATISTICS`.
+    InputError for a row that has not seven numbers.
     """
     out = {}
     for k, line in enumerate(text.strip().splitlines(), 1):
@@ -135,17 +115,7 @@ def noise_of_bins(mean_length: float, n_pairs: float, n_bins: int = 31 * 31) -> 
     A residual of normal errors s on each axis has the mean length sqrt(pi / 2) s, which the radial
     rows of Table 5-1 give; a bin's mean has the noise s / sqrt(pairs in the bin).
 
-    Parameters
-    ----------
-    mean_length : float
-        Mean of a radial row.
-    n_pairs : float
-        Pairs of the band (section 4 gives them), evenly over the bins.
-    n_bins : int
-
-    Returns
-    -------
-    float
-        Of each axis, in the unit of `mean_length`.
+    `mean_length`: mean of a radial row. `n_pairs`: pairs of the band (section 4 gives them), evenly
+    over the bins. The result is of each axis, in the unit of `mean_length`.
     """
     return float(mean_length / np.sqrt(np.pi / 2) / np.sqrt(n_pairs / n_bins))

@@ -77,7 +77,7 @@ def differences(inputs: BandsInput) -> Plot:
     "vectors", when=lambda inputs: any(b.minus_optical for b in inputs.bands), printed=True
 )
 def minus_optical(inputs: BandsInput) -> Plot:
-    """What an optical model leaves of the distortion of each band."""
+    """Distortion of each band less an optical model."""
     found = {b.name: (b.minus_optical, b.arcsec) for b in inputs.bands}
     maps = {f"{name} − optical": v for name, (v, _) in found.items() if v is not None}
     arcsec = {f"{name} − optical": size for name, (_, size) in found.items()}

@@ -76,7 +76,7 @@ def _structure(b: BandResult) -> str:
 
 
 def _counted_out(b: BandResult) -> bool:
-    """Whether no noise field reached the correlation: as little as draws can tell."""
+    """True if no noise field reached the correlation: as little as draws can tell."""
     return chance_of(b.correlation.p_value).startswith("p <")
 
 
@@ -250,5 +250,5 @@ def formal_table(inputs: BandsInput) -> TextTable:
 
 @BANDS.table("provenance")
 def provenance_table(inputs: BandsInput) -> TextTable:
-    """What made the page."""
+    """Table of what made the page."""
     return listing("", {key: str(value) for key, value in inputs.provenance.items()})

@@ -17,32 +17,15 @@ __all__ = ["draw_bands", "render_bands", "write_bands"]
 
 
 def draw_bands(inputs: BandsInput) -> dict[str, Drawing]:
-    """All figures of the page as files, by name, in its order.
-
-    Parameters
-    ----------
-    inputs : BandsInput
-
-    Returns
-    -------
-    dict of str to Drawing
-    """
+    """All figures of the page as files, by name, in its order."""
     return draw_all(BANDS, inputs)
 
 
 def render_bands(inputs: BandsInput, drawings: Mapping[str, Drawing]) -> str:
     """The page as text.
 
-    Parameters
-    ----------
-    inputs : BandsInput
-    drawings : mapping of str to Drawing
-        As of `draw_bands`.
-
-    Returns
-    -------
-    str
-        A whole HTML document without scripts and without links to other files.
+    `drawings`: as of `draw_bands`. Returns a whole HTML document without scripts and without links
+    to other files.
     """
     overview, *parts = parts_of(BANDS, inputs, drawings)
     return template("bands.html.jinja").render(run=inputs, overview=overview, parts=parts)
@@ -51,16 +34,7 @@ def render_bands(inputs: BandsInput, drawings: Mapping[str, Drawing]) -> str:
 def write_bands(path: Path, inputs: BandsInput, drawings: Mapping[str, Drawing]) -> None:
     """Write the page.
 
-    Parameters
-    ----------
-    path : pathlib.Path
-    inputs : BandsInput
-    drawings : mapping of str to Drawing
-
-    Raises
-    ------
-    InputError
-        When the file cannot be written.
+    InputError when the file cannot be written.
     """
     text = render_bands(inputs, drawings)
     with atomic_path(path) as temporary:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.session import write_table
+from bayesdist.app.output import write_table
 from bayesdist.missions.wise.assess.account import RowAccount
 from bayesdist.missions.wise.assess.histograms import ResidualHistogram
 from bayesdist.missions.wise.bands.context import BandResult, BandsInput
@@ -19,16 +19,7 @@ SCHEMA = 1
 
 
 def record_of(inputs: BandsInput) -> dict[str, Any]:
-    """Content of bands.json.
-
-    Parameters
-    ----------
-    inputs : BandsInput
-
-    Returns
-    -------
-    dict
-    """
+    """Content of bands.json."""
     return {
         "schema": SCHEMA,
         "converged": not inputs.provisional,
@@ -162,15 +153,7 @@ def _row(one: RowAccount) -> dict[str, Any]:
 def write_tables(inputs: BandsInput, folder: Path) -> tuple[str, ...]:
     """Write table_5_1.ecsv and so on, and return their names.
 
-    Parameters
-    ----------
-    inputs : BandsInput
-    folder : pathlib.Path
-
-    Raises
-    ------
-    InputError
-        When a file cannot be written.
+    InputError when a file cannot be written.
     """
     names = []
     for name, table in inputs.tables.items():

@@ -62,7 +62,7 @@ def as_printed(row: PrintedRow, statistic: str) -> str:
 
 
 def account_table(name: str, inputs: BandsInput) -> TextTable:
-    """What each sigma is made of, and how the printed one differs."""
+    """Table of the parts of each sigma, and how the printed one differs."""
     unit = inputs.tables[name].unit
     several = inputs.accounts[name]
     printed = any(one.printed is not None for one in several)
@@ -119,7 +119,7 @@ def _why(one: RowAccount) -> str:
 
 @BANDS.table("tables")
 def contradiction_table(inputs: BandsInput) -> TextTable | None:
-    """Where printed rows contradict themselves or each other; None where nothing is printed."""
+    """Table of contradictions within and between printed rows; None where nothing is printed."""
     rows = [
         (f"Table {name}", sentence)
         for name, several in inputs.accounts.items()

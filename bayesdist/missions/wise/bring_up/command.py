@@ -10,18 +10,19 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.folder import atomic_directory
+from bayesdist.app.output import write_table
 from bayesdist.app.screen import table_text
-from bayesdist.app.session import write_table
-from bayesdist.data import RadialLimit, RvbPairs
 from bayesdist.data.frame_stars import FrameStars
-from bayesdist.data.rvb_files import ARRAY_SIZE, RVB_ALIASES, band_name
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bands.optical import optical_models
 from bayesdist.missions.wise.bring_up.iterate import BringUp, bring_up
-from bayesdist.missions.wise.rvb.write import write_rvb
+from bayesdist.missions.wise.pairs.files import ARRAY_SIZE, RVB_ALIASES, band_name
+from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
+from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
+from bayesdist.missions.wise.pairs.write import write_rvb
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["bring_up_files"]
@@ -51,32 +52,13 @@ def bring_up_files(
 ) -> str:
     """Write the pairs that matching and fitting in turn arrive at, and a table of the rounds.
 
-    Parameters
-    ----------
-    detections, reference : path
-        Tables with columns x, y, sigma and frame: detections in pixels, reference stars where an
-        array without distortion would see them in the frame, in pixels too.
-    output : path
-        New folder: pairs/ for `format = "rvb"`, rounds.ecsv.
-    band : str
-    radius, corner_radius : float
-        Within which pairs are accepted, in the array's centre and in its corners; pixels.
-    order : int
-        Of the polynomial in the end.
-    optical : path, optional
-        SIP header or WISE meta-data to begin with; by default no distortion.
-    rotation : float
-        Degrees by which that is turned, from x towards y.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For what cannot be read or written, and as `bring_up`.
+    `detections`, `reference`: Tables with columns x, y, sigma and frame: detections in pixels,
+    reference stars where an array without distortion would see them in the frame, in pixels too.
+    `output`: new folder: pairs/ for `format = "rvb"`, rounds.ecsv. `radius`, `corner_radius`:
+    within which pairs are accepted, in the array's centre and in its corners; pixels. `order`: of
+    the polynomial in the end. `optical`: SIP header or WISE meta-data to begin with; by default no
+    distortion. `rotation`: degrees by which that is turned, from x towards y. Returns the text to
+    print. InputError for what cannot be read or written, and as `bring_up`.
     """
     band = band_name(band)
     size = ARRAY_SIZE[band]

@@ -9,14 +9,15 @@ from math import radians
 from operator import add
 from pathlib import Path
 
-from bayesdist.data import MatchTable, RvbPairs, stream_rvb
-from bayesdist.data.rvb import chosen_band
-from bayesdist.data.rvb_files import ARRAY_SIZE, open_rvb_files
+from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
+from bayesdist.missions.wise.pairs.files import ARRAY_SIZE, open_rvb_files
+from bayesdist.missions.wise.pairs.read import chosen_band, stream_rvb
+from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
+from bayesdist.missions.wise.pairs.write import write_rvb
 from bayesdist.missions.wise.rvb.linear import fit_transform, linear_moments
 from bayesdist.missions.wise.rvb.solutions import read_solutions
 from bayesdist.missions.wise.rvb.transform import RvbTransform, rereference, transformed
-from bayesdist.missions.wise.rvb.write import write_rvb
 
 __all__ = ["rereference_files", "transform_files"]
 
@@ -36,35 +37,11 @@ def transform_files(
 ) -> str:
     """Pairs with all reference positions moved by one linear transformation.
 
-    Parameters
-    ----------
-    files : sequence of path
-    output : path
-        New folder.
-    band : str, optional
-        Needed where the files hold several.
-    columns : mapping of str to str, optional
-        As `stream_rvb`.
-    dx, dy : float
-        Pixels.
-    rotation : float
-        Degrees, from x towards y.
-    scale_x, scale_y : float
-        Relative to one.
-    fit : bool
-        The five parameters are those that bring reference positions to the detections, by least
-        squares.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For no transformation, one that is both given and to be fitted, and as `stream_rvb`,
-        `transformed` and `write_rvb`.
+    `output`: new folder. `band`: needed where the files hold several. `columns`: as `stream_rvb`.
+    `dx`, `dy`: pixels. `rotation`: degrees, from x towards y. `scale_x`, `scale_y`: relative to
+    one. `fit`: the five parameters are those that bring reference positions to the detections, by
+    least squares. Returns the text to print. InputError for no transformation, one that is both
+    given and to be fitted, and as `stream_rvb`, `transformed` and `write_rvb`.
     """
     transform = RvbTransform(dx, dy, radians(rotation), scale_x, scale_y)
     if (transform == RvbTransform()) != fit:
@@ -103,25 +80,9 @@ def rereference_files(
 ) -> str:
     """Pairs brought from the frame solutions that they were made with to others.
 
-    Parameters
-    ----------
-    files : sequence of path
-    output : path
-        New folder.
-    free, fixed : path
-        Tables of solutions: those of the pairs, and those that they are brought to.
-    band, columns
-        As of `transform_files`.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        As `stream_rvb`, `read_solutions`, `rereference` and `write_rvb`.
+    `output`: new folder. `free`, `fixed`: Tables of solutions: those of the pairs, and those that
+    they are brought to. `band`, `columns`: as of `transform_files`. Returns the text to print.
+    InputError as `stream_rvb`, `read_solutions`, `rereference` and `write_rvb`.
     """
     columns = columns or {}
     band = _band(files, band, columns)

@@ -1,7 +1,6 @@
 """WISE: matched pairs of band-frame and 2MASS positions, from the published distortion."""
 
 from bayesdist.missions.wise.simulate.files import write_wise_set
-from bayesdist.missions.wise.simulate.partitioned import simulate_wise_partitioned
 from bayesdist.missions.wise.simulate.published import (
     FORMAL_RADII,
     LARGEST_CORRECTIONS,
@@ -14,7 +13,11 @@ from bayesdist.missions.wise.simulate.published import (
     WISE_COEFFICIENTS,
 )
 from bayesdist.missions.wise.simulate.sets import PairChunk, WiseSet, wise_set
-from bayesdist.missions.wise.simulate.solution import simulate_wise, wise_solution
+from bayesdist.missions.wise.simulate.solution import (
+    simulate_wise,
+    simulate_wise_partitioned,
+    wise_solution,
+)
 from bayesdist.missions.wise.simulate.stars import POPULATIONS
 
 __all__ = [

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import InputError
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.solution import Solution
 from bayesdist.products.formats.common.cards import convergence_cards, number_card, text_card
 from bayesdist.products.formats.common.content import hdus_of
 from bayesdist.products.formats.idctab.cards import closure_cards, provenance_cards, tdd_cards

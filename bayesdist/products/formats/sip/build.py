@@ -15,7 +15,7 @@ from bayesdist.calibration.inverse import fit_inverse
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.calibration.sky import reprojected
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.solution import Solution
 from bayesdist.products.formats.common.cards import convergence_cards, number_card, text_card
 from bayesdist.products.formats.common.coefficients import largest_magnitude
 from bayesdist.products.formats.sip.families import offset_ranges
