@@ -43,9 +43,7 @@ Int = NDArray[np.int64]
 
 MAX_DETECTIONS = 60_000  # that are looked at
 STARS_PER_DIRECTION = 2  # below, a covariance of the scores says nothing
-MIN_INFORMATION = (
-    0.02  # of what known stars would say of a direction: less is not told from their places
-)
+MIN_INFORMATION = 0.02  # of a direction, relative to that with known stars
 REMEDIES = {
     "magnitude": "cut the faint stars, or correct the charge-transfer efficiency",
     "exposures": "give selfcal.frames a scale where it has none, or leave out exposures",
