@@ -103,14 +103,13 @@ def _parts_of(projection: Projection, chips: list[int]) -> Iterator[tuple[str, _
         if one.q:
             tried.append(one)
     sums = _star_sums(projection, chips, tried)
-    for one, (V, spread, taken) in zip(tried, sums, strict=True):
-        if taken > MAX_TAKEN:
+    for one, (V, spreads, taken) in zip(tried, sums, strict=True):
+        # as Wishart matrices that scatter as much
+        quoted, found = one.q * (one.q + 1) / spreads - one.q + 1
+        if taken > MAX_TAKEN or quoted < MIN_DOF:
             continue
-        # as a Wishart matrix that scatters as much
-        dof = one.q * (one.q + 1) / spread
-        dof_residual = dof - one.q + 1
-        if dof_residual < MIN_DOF:
-            continue
+        dof_residual = float(np.clip(found, MIN_DOF, quoted))
+        dof = dof_residual + one.q - 1
         T = dof_residual / dof * float(one.score @ np.linalg.solve(V, one.score))
         p = float(stats.f.sf(T / one.q, one.q, dof_residual))
         square = np.repeat(projection.functions.mean_square[one.regressors.every], 2)
@@ -152,11 +151,11 @@ class _Directions:
 
 def _star_sums(
     projection: Projection, chips: list[int], tried: Sequence[_Directions]
-) -> list[tuple[Float, float, float]]:
+) -> list[tuple[Float, Float, float]]:
     """Covariance of the scores of each family, from those of single stars.
 
-    Also how it scatters, and the fraction of the noise that fit and step have taken from the stars
-    that it is made of.
+    Also how it scatters (2,), by quoted errors and by the scores, and the fraction of the noise
+    that fit and step have taken from the stars that it is made of.
     """
     if not tried:
         return []
@@ -203,13 +202,13 @@ def _star_sums(
             V[k] += projection.score_ratio * (np.eye(one.q) - seen[k])
     if not single:
         size2 = np.add.reduceat(by_star**2, together.starts, axis=1)
-    spread = _spread(trace, norm, size2, np.array([np.trace(one) / len(one) for one in V]))
+    spreads = _spreads(trace, norm, size2, np.array([np.trace(one) / len(one) for one in V]))
     taken /= trace.sum(axis=0)
-    return [(one, float(a), float(b)) for one, a, b in zip(V, spread, taken, strict=True)]
+    return [(one, a, float(b)) for one, a, b in zip(V, spreads, taken, strict=True)]
 
 
-def _spread(trace: Float, norm: Float, size2: Float, scale: Float) -> Float:
-    """Scatter (families,) of the covariances of scores, as quoted errors or as scores have it.
+def _spreads(trace: Float, norm: Float, size2: Float, scale: Float) -> Float:
+    """Scatter (families, 2) of the covariances of scores, as quoted errors and as scores have it.
 
     From trace and norm (stars, families) of each star's information, squares of its scores
     (stars, families) and the covariance (families,) of the scores of one direction.
@@ -218,7 +217,7 @@ def _spread(trace: Float, norm: Float, size2: Float, scale: Float) -> Float:
     # what normal scores of these covariances have of their fourth moment
     part = quoted / np.maximum(trace**2 + 2 * norm**2, 1e-300)
     found = (part * size2**2).sum(axis=0) / scale**2
-    return np.asarray(np.maximum(quoted.sum(axis=0), found))
+    return np.stack([quoted.sum(axis=0), found], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
