@@ -126,5 +126,5 @@ def _misfit_summary(found: Diagnostics) -> dict[str, Any]:
 
 def _misfit_row(m: Misfit) -> dict[str, Any]:
     row = {"p_value": m.p_value, "partition": m.partition, "structure": m.structure}
-    row["power"] = m.told
+    row["power"] = m.power
     return row if m.chip is None else row | {"chip": m.chip.number}

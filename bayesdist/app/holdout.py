@@ -14,7 +14,7 @@ from bayesdist.assess.error_model import ErrorModel, solution_with_errors
 from bayesdist.assess.evaluation import EvaluationSettings
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
-from bayesdist.diagnose.holdout.validation import HeldOutTruth
+from bayesdist.diagnose.holdout.validation import HoldoutValidation
 from bayesdist.infer import Posterior
 
 __all__ = [
@@ -57,7 +57,7 @@ def predictive_of_run(
     return replace(out, local=local, cell=(side, side), local_in_noise=True)
 
 
-def holdout_table(found: HeldOutTruth) -> Table:
+def holdout_table(found: HoldoutValidation) -> Table:
     """All tests, the most telling first."""
     names = (
         "name",
@@ -89,7 +89,7 @@ def holdout_table(found: HeldOutTruth) -> Table:
     return table
 
 
-def holdout_summary(found: HeldOutTruth) -> dict[str, Any]:
+def holdout_summary(found: HoldoutValidation) -> dict[str, Any]:
     """Section 'holdout' of summary.json."""
     return {
         "n": found.n,
@@ -113,7 +113,7 @@ def holdout_summary(found: HeldOutTruth) -> dict[str, Any]:
             {
                 "name": t.name,
                 "part": t.part,
-                "is_omnibus": t.together,
+                "is_omnibus": t.is_omnibus,
                 "where": t.where,
                 "n": t.n,
                 "value": t.value,

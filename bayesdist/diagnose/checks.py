@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from bayesdist.checks import LARGER, Check
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.correlated.deviations import CURVATURE
-from bayesdist.diagnose.holdout.validation import HeldOutTruth
+from bayesdist.diagnose.holdout.validation import HoldoutValidation
 from bayesdist.diagnose.residuals.misfit import Misfit, worst_misfit
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.limits import HELD_OUT_DOUBTFUL, STRUCTURE, STRUCTURE_IN_BUDGET
@@ -26,16 +26,10 @@ OF_EXPOSURES, OF_CURVATURE = "exposures", "curvature in time"
 def structure_checks(
     misfits: Sequence[Misfit], correlated: Discrepancy | None = None, *, fit: str = "the fit"
 ) -> Iterator[Check]:
-    """Whether a fit leaves structure in the residuals, and whether it could have been seen.
+    """Checks of the structure that a fit leaves in the residuals.
 
-    Parameters
-    ----------
-    misfits : sequence of Misfit
-        One for each chip; nothing is checked where there is none.
-    correlated : Discrepancy, optional
-        Correlated errors of the solution, which hold some of it.
-    fit : str
-        Which fit, in words.
+    There is one misfit for each chip, or none; `correlated` errors of the solution hold some of the
+    structure; `fit` says which fit, in words.
     """
     if not misfits:
         return
@@ -43,8 +37,8 @@ def structure_checks(
     chip = "" if one.chip is None else f" of {one.chip.name}"
     size = size_of(one.structure, one.unit, 2)
     found = f"{size} rms in {one.partition}{chip}" if one.structure > 0 else "none"
-    if one.told < 1:
-        found += f" ({percent(one.told, 2)} of all patterns can be told from places of stars)"
+    if one.power < 1:
+        found += f" ({percent(one.power, 2)} of all patterns can be told from places of stars)"
     held = None if correlated is None else correlated.structure_rms
     sentence = doubt = ""
     if one.significant:
@@ -59,14 +53,14 @@ def structure_checks(
         f"Structure in the residuals of {fit}, beyond noise",
         f"{found}, {probability(one.p_value)}",
         f"p at least {number(STRUCTURE.value, 1)}",
-        "warn" if one.significant or one.hidden else "pass",
+        "warn" if one.significant or one.underpowered else "pass",
         sentence,
         doubt,
     )
     for one in misfits:
-        if one.hidden:
+        if one.underpowered:
             sentence = (
-                f"{100 * (1 - one.told):.0f} % of the structure that the model might leave is "
+                f"{100 * (1 - one.power):.0f} % of the structure that the model might leave is "
                 "hidden: places of stars take it up where dithers are small"
             )
             yield Check(FIT, level="warn", sentence=sentence)
@@ -75,13 +69,9 @@ def structure_checks(
 def score_checks(
     tests: Sequence[ScoreTest], correlated: Discrepancy | None = None
 ) -> Iterator[Check]:
-    """What targeted tests have found, each as a remark.
+    """Checks of what targeted tests have found, each as a remark.
 
-    Parameters
-    ----------
-    tests : sequence of ScoreTest
-    correlated : Discrepancy, optional
-        Correlated errors: verdicts stand where these hold what a test has found.
+    Verdicts stand where correlated errors hold what a test has found.
     """
     for test in tests:
         if test.significant:
@@ -91,7 +81,7 @@ def score_checks(
 
 
 def _held(correlated: Discrepancy | None, test: str) -> bool:
-    """Whether correlated errors hold what a test has found."""
+    """True where correlated errors hold what a test has found."""
     if correlated is None:
         return False
     scatter = set() if correlated.linear is None else set(correlated.linear.scatter)
@@ -103,13 +93,8 @@ def _held(correlated: Discrepancy | None, test: str) -> bool:
     )
 
 
-def holdout_checks(found: HeldOutTruth | None) -> Iterator[Check]:
-    """The verdict of held-out stars; nothing where there are none.
-
-    Parameters
-    ----------
-    found : HeldOutTruth or None
-    """
+def holdout_checks(found: HoldoutValidation | None) -> Iterator[Check]:
+    """Check of held-out stars; nothing where there are none."""
     if found is None:
         return
     agrees = found.level == "pass"

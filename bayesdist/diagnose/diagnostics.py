@@ -1,4 +1,4 @@
-"""What residuals say of a solution, as one value: made by a function of its arguments."""
+"""Diagnostics of a solution by its residuals: one value, made by a function of its arguments."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bayesdist.diagnose.checks import holdout_checks, score_checks, structure_ch
 from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors, estimate_discrepancy
 from bayesdist.diagnose.correlated.storage import as_stored
 from bayesdist.diagnose.holdout.predictive import Predictive
-from bayesdist.diagnose.holdout.validation import HeldOutTruth, held_out_truth
+from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_validation
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, time_variation
 from bayesdist.diagnose.residuals.binned import BinnedSums
@@ -25,7 +25,7 @@ from bayesdist.diagnose.residuals.coverage import Coverage, coverage_of
 from bayesdist.diagnose.residuals.epoch_shift import EpochShift, epoch_shift
 from bayesdist.diagnose.residuals.majority import majority_sentence
 from bayesdist.diagnose.residuals.misfit import (
-    MOST_BINS,
+    MAX_BINS,
     STARS_PER_BIN,
     Misfit,
     misfit_of,
@@ -67,7 +67,7 @@ log = logging.getLogger("bayesdist")
 
 @dataclass(frozen=True, eq=False)
 class Diagnostics:
-    """What residuals say of a solution.
+    """Misfit, score tests, correlated errors and further results by the residuals of a solution.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class Diagnostics:
     coverage : tuple of Coverage
         The area of each chip that its stars cover.
     sample : StarSample
-        Some stars, or all of them, and what fit and posterior say of each.
+        Some stars, or all of them, and what residuals and probabilities of each.
     majority : str
         What it means that most pairs are false; empty where they are not.
     epoch_shift : EpochShift or None
@@ -91,13 +91,13 @@ class Diagnostics:
         Stars of each exposure that are more likely false than not; None for one exposure.
     score_tests : tuple of ScoreTest
     correlated : Discrepancy or None
-        Errors that stars have in common; None where they have not been estimated.
+        Correlated errors; None where they have not been estimated.
     catalogue : StarCovariance or None
-        What the errors of the catalogue do to the parameters, where these are known by star.
+        Covariance of the parameters by errors of the catalogue, where these are known by star.
     periods : TimeVariation or None
         Models of several periods compared, where that was asked for.
-    holdout : HeldOutTruth or None
-        What stars say that were set aside before the fit, where there are any.
+    holdout : HoldoutValidation or None
+        Results of stars that were set aside before the fit, where there are any.
     overlap : OverlapTest or None
         Two exposures far apart in time laid on each other, of a campaign.
     """
@@ -115,12 +115,12 @@ class Diagnostics:
     correlated: Discrepancy | None = None
     catalogue: StarCovariance | None = None
     periods: TimeVariation | None = None
-    holdout: HeldOutTruth | None = None
+    holdout: HoldoutValidation | None = None
     overlap: OverlapTest | None = None
 
     @property
     def misfit(self) -> Misfit:
-        """The worst of the misfits, its probability corrected for their number."""
+        """Worst of the misfits, its probability corrected for their number."""
         return worst_misfit(self.misfits)
 
     @property
@@ -130,7 +130,7 @@ class Diagnostics:
 
     @property
     def checks(self) -> tuple[Check, ...]:
-        """What a reader of the numbers has to know of them."""
+        """Checks that a reader of the numbers has to know."""
         out = [
             *holdout_checks(self.holdout),
             *score_checks(self.score_tests, self.correlated),
@@ -142,7 +142,7 @@ class Diagnostics:
         out += [Check("Fit", level="warn", sentence=text) for text in texts]
         if self.majority:
             out.append(Check("Fit", level="warn", sentence=self.majority, doubt=EITHER))
-        if self.periods is not None and self.periods.matters:
+        if self.periods is not None and self.periods.is_material:
             verdict = self.periods.verdict.rstrip(".")
             out.append(Check("Periods", level="warn", sentence=verdict))
         return tuple(out)
@@ -159,7 +159,7 @@ def diagnose_fit(
     centroid: MagnitudeErrors | Literal["residuals"] | None = "residuals",
     things: str = "pairs",
 ) -> Diagnostics:
-    """What residuals say of a fit, and of a posterior where there is one; nothing is estimated.
+    """Diagnostics of a fit, and of a posterior where there is one; nothing is estimated.
 
     Parameters
     ----------
@@ -215,16 +215,12 @@ def diagnose_fit(
 def residual_sums(fit: LinearFit, shards: Shards) -> tuple[dict[int, dict[str, Bins]], StarSums]:
     """Bins of each chip by the name of the partition, and sums of residuals in them.
 
-    Parameters
-    ----------
-    fit : LinearFit
-    shards : Shards
-        All stars that were fitted.
+    `shards` has all stars that were fitted.
     """
     partitions = {}
     for chip, found in zip(fit.model.chips, shards.survey.chips, strict=True):
         n = round(fit.n_used * found.n / len(shards))
-        side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 4, MOST_BINS))
+        side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 4, MAX_BINS))
         partitions[chip.number] = partitions_for(n) | {SHOWN: (side, side)}
     wanted = {chip: tuple(dict.fromkeys(bins.values())) for chip, bins in partitions.items()}
     return partitions, shards.sum(star_sums, fit.mean, fit.clip, wanted)
@@ -235,11 +231,7 @@ def misfits_of(
 ) -> tuple[Misfit, ...]:
     """Structure in the residuals of each chip.
 
-    Parameters
-    ----------
-    fit : LinearFit
-    partitions, sums
-        As of `residual_sums`.
+    `partitions` and `sums` are those of `residual_sums`.
     """
     out = []
     for chip, bins in zip(fit.model.chips, partitions.values(), strict=True):
@@ -280,7 +272,7 @@ def diagnose(
     periods: PeriodSettings | None = None,
     things: str = "pairs",
 ) -> Diagnostics:
-    """What residuals say of a posterior.
+    """Diagnostics of a posterior.
 
     Parameters
     ----------
@@ -377,23 +369,14 @@ def _column(stars: Matches, name: str) -> NDArray[np.float64] | None:
 def catalogue_covariance(
     fit: LinearFit, stars: MatchTable | None, errors: StarErrors | None
 ) -> StarCovariance | None:
-    """What the errors of the catalogue do to the parameters.
+    """Covariance of the parameters by the errors of the catalogue.
 
     It is computed for the linear fit, whose covariance has no noise of sampling: with hundreds of
     parameters a few thousand draws leave factors of several in the eigenvalues of theirs.
     Polynomials and drift are followed exactly, frames as far as they are correlated with these.
 
-    Parameters
-    ----------
-    fit : LinearFit
-    stars : MatchTable or None
-        With errors that contain the catalogue's, and codes of the stars.
-    errors : StarErrors or None
-
-    Returns
-    -------
-    StarCovariance or None
-        None where the catalogue has no errors, or the matches no codes of stars.
+    `stars` have errors that contain the catalogue's, and codes. None where the catalogue has no
+    errors, or the matches no codes.
     """
     if errors is None or stars is None or stars.star is None:
         return None
@@ -434,4 +417,4 @@ def hold_out(
     InputError
         For too few stars.
     """
-    return replace(diagnostics, holdout=held_out_truth(predictive, held, whole=whole))
+    return replace(diagnostics, holdout=holdout_validation(predictive, held, whole=whole))

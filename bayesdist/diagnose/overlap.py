@@ -23,42 +23,30 @@ __all__ = ["OverlapTest", "chosen_exposures", "overlap_test"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-WELL = 0.5  # of the stars of the exposure that has fewer: what "overlap well" means
-FEWEST = 100  # shared stars below which there is no map to be drawn
-IN_CELL = 12  # stars in a cell, on average
-MOST_CELLS = 24  # along an axis
+MIN_OVERLAP = 0.5  # of the stars of the exposure that has fewer: what "overlap well" means
+MIN_SHARED_STARS = 100  # shared stars below which there is no map to be drawn
+STARS_PER_CELL = 12  # stars in a cell, on average
+MAX_CELLS = 24  # along an axis
 
 
 @dataclass(frozen=True, eq=False)
 class OverlapTest:
-    """Two exposures of the run laid on each other, through the old files and the new ones.
-
-    Parameters
-    ----------
-    names : tuple of str
-    epochs : tuple of float
-    pa_v3 : tuple of float
-        NaN where it is not known.
-    old, new : Alignment
-        Of the same stars: through the known distortion of the start, and through the solution.
-    binned_old, binned_new : BinnedResiduals
-        Over the area that both exposures see; axes (xi, eta), pixels.
-    corner : tuple of float
-        (xi, eta) of the area's corner, which the cells count from, pixels.
-    pixel_mas : float
-    with_motions : bool
-        Whether the catalogue's proper motions between the two epochs were taken out.
-    """
+    """Two exposures of the run laid on each other, through the old files and the new ones."""
 
     names: tuple[str, str]
     epochs: tuple[float, float]
-    pa_v3: tuple[float, float]
+    pa_v3: tuple[float, float]  # NaN where it is not known
+    # old, new: of the same stars: through the known distortion of the start, and through the
+    # solution
     old: Alignment
     new: Alignment
+    # binned_old, binned_new: over the area that both exposures see; axes (xi, eta), pixels
     binned_old: BinnedResiduals
     binned_new: BinnedResiduals
+    # (xi, eta) of the area's corner, which the cells count from, pixels
     corner: tuple[float, float]
     pixel_mas: float
+    # True where the catalogue's proper motions between the two epochs were taken out
     with_motions: bool
 
     @property
@@ -79,26 +67,10 @@ def overlap_test(
 ) -> OverlapTest | None:
     """Lay the two exposures that are farthest apart in time on each other.
 
-    Parameters
-    ----------
-    pairs : MatchTable
-        Raw pixels beside positions of the catalogue.
-    solution : Solution
-    known : Calibration
-        The known distortion of the start.
-    tables : sequence of LookupTable
-        That go with the solution.
-    unit_arcsec : float
-        Size of the unit of u and v.
-    pixel : float
-        Size of a pixel, arcsec.
-    rolls : mapping of str to float
-        PA_V3 of the exposures, where it is known.
-
-    Returns
-    -------
-    OverlapTest or None
-        None where no two exposures share enough stars.
+    `pairs` have raw pixels beside positions of the catalogue, `known` is the distortion of the
+    start, `tables` go with the solution, `unit_arcsec` is the size of the unit of u and v, `pixel`
+    that of a pixel in arcsec, `rolls` the PA_V3 of exposures where it is known. None where no two
+    exposures share enough stars.
     """
     chosen = chosen_exposures(pairs)
     if chosen is None:
@@ -139,15 +111,8 @@ def overlap_test(
 def chosen_exposures(pairs: MatchTable) -> tuple[int, int] | None:
     """Codes of the two exposures farthest apart in time that share half of their stars.
 
-    Parameters
-    ----------
-    pairs : MatchTable
-        With codes of the catalogue's stars and epochs.
-
-    Returns
-    -------
-    tuple of int, or None
-        The earlier one first; None where no two share enough.
+    `pairs` have codes of the catalogue's stars, and epochs. The earlier exposure comes first; None
+    where no two share enough.
     """
     if pairs.star is None or pairs.epoch is None:
         return None
@@ -157,7 +122,7 @@ def chosen_exposures(pairs: MatchTable) -> tuple[int, int] | None:
     common = (seen @ seen.T).toarray()
     own = np.diag(common)
     epoch = np.bincount(pairs.exposure, pairs.epoch, n) / np.maximum(own, 1)
-    enough = (common >= WELL * np.minimum.outer(own, own)) & (common >= FEWEST)
+    enough = (common >= MIN_OVERLAP * np.minimum.outer(own, own)) & (common >= MIN_SHARED_STARS)
     apart = np.where(enough, np.abs(np.subtract.outer(epoch, epoch)), -1.0)
     a, b = (int(k) for k in np.unravel_index(int(apart.argmax()), apart.shape))
     if a == b or apart[a, b] <= 0:
@@ -239,8 +204,8 @@ def _binned(
     """Residuals in square cells over the area that both exposures see."""
     corner = new.position.min(axis=0)
     width, height = np.ptp(new.position, axis=0) + 1e-6
-    cell = np.sqrt(width * height * IN_CELL / len(new.position))
-    cell = max(cell, max(width, height) / MOST_CELLS)
+    cell = np.sqrt(width * height * STARS_PER_CELL / len(new.position))
+    cell = max(cell, max(width, height) / MAX_CELLS)
     bins = (max(1, round(width / cell)), max(1, round(height / cell)))
     # cells count from 0.5, as pixels do
     x, y = (new.position - corner + 0.5).T

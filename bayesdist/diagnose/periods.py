@@ -48,54 +48,31 @@ __all__ = [
 
 Int = NDArray[np.int64]
 
-MOST_BINS = 45  # along each side, as in Appendix C
+MAX_BINS = 45  # along each side, as in Appendix C
 COMBINED = "combined"
 
 
 @dataclass(frozen=True)
 class PeriodSettings:
-    """Which periods are compared, and how.
+    """Periods that are compared, and the limits of the comparison."""
 
-    Parameters
-    ----------
-    spans : mapping of str to tuple of float
-        Begin and end of each period, decimal years, as `sum_by_period`.
-    bins : int
-        On each axis, for the residuals.
-    radial_weight : float
-        As the fit's.
-    tolerance : float or None
-        Difference of positions that does not matter, in the unit of u, v.
-    unit_arcsec : float or None
-        The unit of u, v in arcsec.
-    """
-
+    # begin and end of each period, decimal years, as `sum_by_period`
     spans: Mapping[str, tuple[float, float]]
-    bins: int
-    radial_weight: float = 1.0
+    bins: int  # on each axis, for the residuals
+    radial_weight: float = 1.0  # as the fit's
+    # difference of positions that does not matter, in the unit of u, v
     tolerance: float | None = None
-    unit_arcsec: float | None = None
+    unit_arcsec: float | None = None  # the unit of u, v in arcsec
 
 
 @dataclass(frozen=True, eq=False)
 class PeriodPart:
-    """What some pairs of one period say; parts of pieces of the data add.
-
-    Parameters
-    ----------
-    sums : PeriodSums
-    bins : tuple of BinnedSums
-        Residuals about the fit of all data, of each chip.
-    n_rows : int
-        Pairs, those included that the fit leaves out.
-    stars : ndarray of int
-        Sorted codes of the reference stars, each once; empty where they are not known.
-    """
+    """Sums over some pairs of one period; parts of batches of the data add."""
 
     sums: PeriodSums
-    bins: tuple[BinnedSums, ...]
-    n_rows: int
-    stars: Int
+    bins: tuple[BinnedSums, ...]  # residuals about the fit of all data, of each chip
+    n_rows: int  # pairs, those included that the fit leaves out
+    stars: Int  # sorted codes of the reference stars, each once; empty where they are not known
 
     def __add__(self, other: PeriodPart) -> PeriodPart:
         return PeriodPart(
@@ -108,63 +85,42 @@ class PeriodPart:
 
 @dataclass(frozen=True, eq=False)
 class TimeVariation:
-    """What the periods say of a change with time.
-
-    Parameters
-    ----------
-    comparison : PeriodComparison
-    spans : mapping of str to tuple of float
-        Begin and end of each period, decimal years.
-    changes : mapping of str to PositionChange
-        Of each period against the combined model.
-    first, last : str
-        The earliest and the latest period.
-    ends : PositionChange
-        The latest against the earliest.
-    residuals : tuple of StatisticsTable
-        As Table C-1, of each chip: all periods together, then each; in arcsec where the size of a
-        pixel is known, else in the unit of u, v.
-    patterns : tuple of tuple of PatternChange
-        Of each chip, in the unit of u, v.
-    tolerance : float or None
-        Difference of positions that does not matter, in the unit of u, v.
-    n_outside : int
-        Pairs outside all periods.
-    n_repeated : int
-        Reference stars that several periods have; 0 where stars are not told apart.
-    """
+    """Comparison of models and residuals of several periods."""
 
     comparison: PeriodComparison
-    spans: Mapping[str, tuple[float, float]]
-    changes: Mapping[str, PositionChange]
+    spans: Mapping[str, tuple[float, float]]  # begin and end of each period, decimal years
+    changes: Mapping[str, PositionChange]  # of each period against the combined model
+    # first, last: the earliest and the latest period
     first: str
     last: str
-    ends: PositionChange
+    ends: PositionChange  # the latest against the earliest
+    # as Table C-1, of each chip: all periods together, then each; in arcsec where the size of a
+    # pixel is known, else in the unit of u, v
     residuals: tuple[StatisticsTable, ...]
-    patterns: tuple[tuple[PatternChange, ...], ...]
-    tolerance: float | None
-    n_outside: int
-    n_repeated: int
+    patterns: tuple[tuple[PatternChange, ...], ...]  # of each chip, in the unit of u, v
+    tolerance: float | None  # difference of positions that does not matter, in the unit of u, v
+    n_outside: int  # pairs outside all periods
+    n_repeated: int  # reference stars that several periods have; 0 where stars have no codes
 
     @property
     def significant(self) -> bool:
-        """Whether one model of all periods is refuted."""
+        """True where one model of all periods is refuted."""
         return self.comparison.homogeneity[2] < DIFFERENCE.value
 
     @property
-    def matters(self) -> bool:
-        """Whether one model is refuted, and not known to do all the same."""
+    def is_material(self) -> bool:
+        """True where one model is refuted, and not known to be good enough all the same."""
         harmless = self.tolerance is not None and all_below(self.changes, self.tolerance)
         return self.significant and not harmless
 
     @property
     def verdict(self) -> str:
-        """Whether the distortion changes, and whether that matters."""
+        """Verdict on a change of the distortion, and on its size."""
         return period_verdict(self.comparison, self.changes, self.tolerance)
 
     @property
     def pattern_sentence(self) -> str:
-        """Whether the residuals have the same pattern in all periods."""
+        """Verdict on the pattern of the residuals in all periods, as a sentence."""
         found = [one for chip in self.patterns for one in chip]
         least = min(found, key=lambda one: one.p_value)
         p = min(1.0, len(found) * least.p_value)
@@ -181,7 +137,7 @@ class TimeVariation:
 
     @property
     def cautions(self) -> tuple[str, ...]:
-        """What a reader of the comparison has to know, as sentences."""
+        """Sentences that a reader of the comparison has to know."""
         out = []
         if self.n_outside:
             out.append(
@@ -198,7 +154,7 @@ class TimeVariation:
 
 def bins_for(n: int) -> int:
     """Bins on each axis for so many pairs of the smallest period on a chip."""
-    return int(np.clip(np.sqrt(n / STARS_PER_BIN), 2, MOST_BINS))
+    return int(np.clip(np.sqrt(n / STARS_PER_BIN), 2, MAX_BINS))
 
 
 def period_part(
@@ -206,20 +162,8 @@ def period_part(
 ) -> PeriodPart:
     """A task for `sum_by_period`.
 
-    Parameters
-    ----------
-    matches : MatchTable
-        Of one period.
-    fit : LinearFit
-        Of all data.
-    bins : int
-        On each axis.
-    radial_weight : float
-        As the fit's.
-
-    Returns
-    -------
-    PeriodPart
+    `matches` are those of one period, `fit` is that of all data; `bins` are those on each axis,
+    `radial_weight` is the fit's.
     """
     stars, _ = prepare(fit.model, matches)
     used = fit.clip.keeps_of(stars)
@@ -243,27 +187,11 @@ def time_variation(
     *,
     rng: np.random.Generator,
 ) -> TimeVariation:
-    """Compare periods: one pass over the data.
+    """Comparison of periods, in one pass over the data.
 
-    Parameters
-    ----------
-    fit : LinearFit
-        Of all data, without frames and time dependence.
-    matches : MatchTable or PartitionedMatches
-        With errors and epochs.
-    settings : PeriodSettings
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    TimeVariation
-
-    Raises
-    ------
-    InputError
-        As `sum_by_period` and `compare_periods`.
-    DegenerateError
-        For a period with too few pairs.
+    `fit` is that of all data, without frames and time dependence; `matches` have errors and epochs.
+    Raises InputError as `sum_by_period` and `compare_periods`, DegenerateError for a period with
+    too few pairs.
     """
     periods, unit_arcsec = settings.spans, settings.unit_arcsec
     task = partial(period_part, fit=fit, bins=settings.bins, radial_weight=settings.radial_weight)

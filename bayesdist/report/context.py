@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from bayesdist.assess.requirements.validity import Horizon
     from bayesdist.data import MagnitudeErrors
     from bayesdist.diagnose import ScoreTest
-    from bayesdist.diagnose.holdout.validation import HeldOutTruth
+    from bayesdist.diagnose.holdout.validation import HoldoutValidation
     from bayesdist.diagnose.periods import TimeVariation
     from bayesdist.infer import LinearFit, Posterior
     from bayesdist.infer.catalogue.added_errors import GroupedErrors
@@ -155,7 +155,7 @@ class ReportInput:
     provenance: Mapping[str, Any] = field(default_factory=dict)  # nested
     campaign: CampaignResults | None = None  # of a run on star lists
     periods: TimeVariation | None = None  # models of several periods compared
-    held_out: HeldOutTruth | None = None  # stars set aside before the fit
+    held_out: HoldoutValidation | None = None  # stars set aside before the fit
     selfcal: SelfcalResults | None = None  # of a run without a catalogue
 
     @property

@@ -13,7 +13,7 @@ import numpy as np
 from bayesdist.data.holdout import SetAside, Split, split_matches
 from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive
-from bayesdist.diagnose.holdout.validation import HeldOutTruth, held_out_truth
+from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_validation
 from bayesdist.infer import OutlierMixture, Rejection, load
 from bayesdist.infer.catalogue.star_errors import star_covariance
 from bayesdist.infer.catalogue.star_influence import StarErrors, star_influence
@@ -169,8 +169,8 @@ def solved(
     )
 
 
-def judged(one: Field, aside: SetAside, *, mixture: bool = False) -> HeldOutTruth:
+def judged(one: Field, aside: SetAside, *, mixture: bool = False) -> HoldoutValidation:
     """Hold out, solve, predict, judge."""
     split = split_matches(one.matches, aside)
     _, predictive = solved(one, split, aside.exposures, mixture=mixture)
-    return held_out_truth(predictive, split.held, whole=aside.exposures)
+    return holdout_validation(predictive, split.held, whole=aside.exposures)

@@ -8,9 +8,9 @@ from scipy import stats
 
 from bayesdist.diagnose.score.exposures import exposure_test
 from bayesdist.diagnose.score.projection import Projection, projection_of
+from bayesdist.diagnose.score.regressor_tests import regressor_tests
 from bayesdist.diagnose.score.regressors import functions_for
 from bayesdist.diagnose.score.sample import scored_sample
-from bayesdist.diagnose.score.score import regressor_tests
 from bayesdist.infer import GaussianPriors, Rejection, fit_linear
 from bayesdist.infer.solution import likelihood_of
 from bayesdist.infer.stars.stars import in_table_order, prepare

@@ -51,7 +51,7 @@ def test_noise_is_no_structure(more, full):
 def test_a_wave_is_found_with_its_size():
     simulated = _simulated(5)
     found = dithered_misfit(_solved(simulated, _waved(simulated.unlabelled, 0.01)))
-    assert found.significant and found.partition == "columns" and found.told > 0.95
+    assert found.significant and found.partition == "columns" and found.power > 0.95
     # means over columns of 150 / 1024 * 64 bins hold nearly all of the wave
     assert abs(found.structure - 0.01) < 0.0015
 
@@ -81,7 +81,7 @@ def test_what_small_dithers_hide_is_said():
         sigma=(0.01, 0.05),
     )
     found = dithered_misfit(_solved(simulated, _waved(simulated.unlabelled, 0.01)))
-    assert found.told < 0.2 and found.hidden
+    assert found.power < 0.2 and found.underpowered
     assert not found.significant
 
 

@@ -23,7 +23,7 @@ from bayesdist.diagnose.holdout.predictive import (
 )
 from bayesdist.diagnose.holdout.spread import SpreadMoments, sum_tails
 from bayesdist.diagnose.holdout.sums import _beyond
-from bayesdist.diagnose.holdout.validation import held_out_truth
+from bayesdist.diagnose.holdout.validation import holdout_validation
 from bayesdist.diagnose.significance import holm
 from bayesdist.infer import GaussianPriors, OutlierMixture, fit_linear, load
 from bayesdist.infer.density.grid import build_proposal
@@ -97,7 +97,7 @@ def judged(seed, n, model=None, *, fitted=None, aside=None, mixture=None, **opti
     model, matches = stars(seed, n, model, **options)
     split = split_matches(matches, aside or SetAside(0.3, (), seed))
     solution = posterior_of(fitted or model, split.kept, mixture or OutlierMixture(jitter=0.0))
-    return held_out_truth(solution, split.held, whole=aside.exposures if aside else ())
+    return holdout_validation(solution, split.held, whole=aside.exposures if aside else ())
 
 
 def collected(results) -> dict[tuple[str, str], np.ndarray]:
@@ -157,7 +157,7 @@ def test_an_exposure_is_found_whatever_its_roll():
         matches, _ = simulate_matches(model, theta, 2400, rng=rng, **options)
         split = split_matches(matches, SetAside(0.0, ("c",)))
         solution = posterior_of(model, split.kept, OutlierMixture(jitter=0.0))
-        found = held_out_truth(solution, split.held, whole=("c",))
+        found = holdout_validation(solution, split.held, whole=("c",))
         assert found.n == len(split.held) == 800
         return found
 

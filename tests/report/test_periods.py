@@ -92,7 +92,7 @@ def test_the_section_has_what_was_found(converged, drawings, found):
         "Patterns of the residuals",
     ]
     assert [row[0] for row in tables[1].rows] == [*SPANS, "55312.5 against 55212.5"]
-    assert tables[0].rows[0][1] == found.verdict and found.significant and not found.matters
+    assert tables[0].rows[0][1] == found.verdict and found.significant and not found.is_material
     names = [row[k] for k in (0, 5) for row in tables[2].rows]
     assert names == list(MODEL.names)
     page = lxml_html.fromstring(render_report(inputs, drawings))

@@ -16,14 +16,15 @@ as by the stars of a self-calibration, they have one, with amplitudes and a leng
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions
-from bayesdist.diagnose.correlated.priors import log_half_cauchy, log_widths
+from bayesdist.diagnose.correlated.priors import AmplitudeGrid, log_half_cauchy, log_widths
 
 __all__ = ["StructurePosterior", "structure_posterior"]
 
@@ -34,7 +35,6 @@ LENGTHS = np.geomspace(0.08, 0.6, 5)
 STEPS = 8  # of the amplitude, before the grid is refined
 HALVINGS = 2
 NEGLIGIBLE = 12.0  # in log density, below the largest
-TERM_STEPS = 24  # of the amplitude of the higher orders
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,11 +137,10 @@ def structure_posterior(
     decline = np.concatenate([one.decline() for one in blocks])
     tied = information[np.ix_(of, at)] * decline
     terms = (information[np.ix_(at, at)] * np.outer(decline, decline), score[at] * decline)
-    resolved = 1 / np.sqrt(max(float(np.median(np.diag(information)[at])), 1e-300))
-    low = 0.2 * min(higher_order, structure, resolved)
-    high = max(3 * noise, 10 * structure)
-    amplitudes = np.geomspace(low, 3 * high, TERM_STEPS)
-    prior = log_half_cauchy(amplitudes, higher_order) + log_widths(amplitudes)
+    sizes = AmplitudeGrid.of(
+        np.diag(information)[at], noise=noise, higher_order=higher_order, structure=structure
+    )
+    amplitudes = sizes.terms
 
     def at_length(length: float) -> _Field:
         scale = np.sqrt(np.concatenate([one.spectrum(length) for one in blocks]))
@@ -167,18 +166,20 @@ def structure_posterior(
         evidence -= 0.5 * float(np.log1p(field.values * amplitude**2).sum())
         by_terms = 0.5 * (left**2 / (values + amplitudes[:, None] ** -2)).sum(axis=1)
         by_terms -= 0.5 * np.log1p(values * amplitudes[:, None] ** 2).sum(axis=1)
-        density = by_terms + prior + evidence + log_half_cauchy(np.array(amplitude), structure)
+        density = (
+            by_terms + sizes.log_prior + evidence + log_half_cauchy(np.array(amplitude), structure)
+        )
         return _Point(field, amplitude, values, vectors, left, density)
 
     found: list[tuple[_Point, float]] = []
     for length in LENGTHS:
         field = at_length(length)
-        grid = list(np.linspace(np.log(low), np.log(high), STEPS))
+        grid = list(np.linspace(np.log(sizes.low), np.log(sizes.high), STEPS))
         points = [at_point(field, a) for a in grid]
         for _ in range(HALVINGS):
-            tops = [p.log_density.max() for p in points]
+            tops = [float(p.log_density.max()) for p in points]
             best = max([*tops, *(p.log_density.max() for p, _ in found)])
-            grid, points = _refined(grid, points, tops, best - NEGLIGIBLE, field, at_point)
+            grid, points = _refined(grid, points, tops, best - NEGLIGIBLE, partial(at_point, field))
         widths = log_widths(np.exp(grid))
         found += [
             (p, w)
@@ -191,14 +192,20 @@ def structure_posterior(
     return StructurePosterior(tuple(blocks), amplitudes, points_of, weight / weight.sum())
 
 
-def _refined(grid, points, tops, least, field, at_point):  # type: ignore[no-untyped-def]
+def _refined(
+    grid: list[float],
+    points: list[_Point],
+    tops: list[float],
+    least: float,
+    at_point: Callable[[float], _Point],
+) -> tuple[list[float], list[_Point]]:
     """Grid with a point in the middle of each interval that has some of the density."""
     new_grid, new_points = grid[:1], points[:1]
     for k in range(1, len(grid)):
         if max(tops[k - 1], tops[k]) > least and abs(tops[k] - tops[k - 1]) > 0.3:
             middle = 0.5 * (grid[k - 1] + grid[k])
             new_grid.append(middle)
-            new_points.append(at_point(field, middle))
+            new_points.append(at_point(middle))
         new_grid.append(grid[k])
         new_points.append(points[k])
     return new_grid, new_points

@@ -47,7 +47,7 @@ LINEAR = {
 }
 SCATTERS = {"shift": "shift", "rotation": "rotation", "scale": "shape", "shear": "shape"}
 CURVATURE = "curvature"
-MOST_EXPOSURES = 40
+MAX_EXPOSURES = 40
 # steps in each amplitude, by the number of scatters: first to find where the density is, then only
 # there
 COARSE, REFINED = (12, 8, 6, 5), (30, 18, 11, 6)
@@ -153,7 +153,7 @@ def deviation_columns(
     counts: Float,
     *,
     exposures: bool = True,
-    most: int = MOST_EXPOSURES,
+    most: int = MAX_EXPOSURES,
 ) -> DeviationColumns | None:
     """Deviations that the frames of a model do not fit, and curvatures of its drift.
 

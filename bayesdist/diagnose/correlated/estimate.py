@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.correlated.cells import CellSums, cell_sums, cells_per_side
-from bayesdist.diagnose.correlated.deviations import MOST_EXPOSURES, linear_deviations
+from bayesdist.diagnose.correlated.deviations import MAX_EXPOSURES, linear_deviations
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.information import Information
 from bayesdist.diagnose.correlated.neighbours import SharedVariance, shared_variances
@@ -130,7 +130,7 @@ def estimate_discrepancy(
 
 def _several(stars: MatchTable) -> bool:
     """True for matches of several exposures, few enough that each may deviate."""
-    return 1 < len(stars.exposure_names) <= MOST_EXPOSURES
+    return 1 < len(stars.exposure_names) <= MAX_EXPOSURES
 
 
 def _by_exposure(stars: MatchTable, likelihood: Likelihood, model: DistortionModel) -> CellSums:

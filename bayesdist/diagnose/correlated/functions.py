@@ -27,7 +27,7 @@ FALL = 0.5  # rms of an order relative to the one below it
 MARGIN = 0.3  # fraction of the longer half side by which the box is larger than the chip
 SMOOTHNESS = 1.5  # of the Matern field: its slope exists
 FINE = 48  # waves that represent structure finer than the sines
-LEAST_SIDE, MOST_SIDE = 6, 20  # sines along a square chip
+MIN_SIDE, MAX_SIDE = 6, 20  # sines along a square chip
 STARS_PER_SINE = 4.0
 
 
@@ -41,8 +41,8 @@ class StructureFunctions:
 
     @classmethod
     def for_stars(cls, order: int, size: tuple[float, float], n: int) -> StructureFunctions:
-        """As many functions as n stars on the chip can resolve."""
-        side = int(np.clip(np.sqrt(n / STARS_PER_SINE), LEAST_SIDE, MOST_SIDE))
+        """Functions as fine as n stars on the chip can resolve."""
+        side = int(np.clip(np.sqrt(n / STARS_PER_SINE), MIN_SIDE, MAX_SIDE))
         return cls(order, size, side)
 
     @cached_property

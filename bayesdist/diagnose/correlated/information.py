@@ -21,7 +21,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 # A star that alone determines a parameter has no residual: its squared score is uninformative.
-LEAST_FREE = 0.1
+MIN_FREE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +145,7 @@ class Information:
         within = np.einsum("akm,mn,aln->akl", d, cov, d, optimize=True)
         variance = np.einsum("ck,akl,cl->ca", cells.phi, within, cells.phi, optimize=True)
         per_star = np.einsum("caa->ca", cells.curvature) / cells.count[:, None]
-        return np.asarray(np.clip(per_star * variance, 0.0, 1 - LEAST_FREE))
+        return np.asarray(np.clip(per_star * variance, 0.0, 1 - MIN_FREE))
 
     def sandwich(self) -> Float:
         """Covariance (D, D) of the parameters, valid for any variances of single stars.

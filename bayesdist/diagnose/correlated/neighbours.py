@@ -32,9 +32,9 @@ Int = NDArray[np.int64]
 
 # of separations, in pixels; the last bin is of pairs farther apart
 EDGES = np.array([0.0, 6.0, 12.0, 24.0, 48.0, 96.0])
-MOST_PAIRS = 2_000_000
+MAX_PAIRS = 2_000_000
 SHAPE = 0.3  # by which the correlation at a separation may differ: patterns are periodic
-FEWEST_PAIRS = 50  # of a bin; the variance of fewer cannot be estimated
+MIN_PAIRS = 50  # of a bin; the variance of fewer cannot be estimated
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ def shared_variances(
     for c, one in enumerate(model.chips):
         here = np.flatnonzero((chip == c) & good)
         expected = len(here) ** 2 * np.pi * EDGES[-1] ** 2 / (2 * one.size[0] * one.size[1])
-        here = here[:: max(1, round(float(np.sqrt(expected / MOST_PAIRS))))]
+        here = here[:: max(1, round(float(np.sqrt(expected / MAX_PAIRS))))]
         at = np.column_stack([stars.X[here] * one.size[0], stars.Y[here] * one.size[1]]) / 2
         pairs = cKDTree(at).query_pairs(EDGES[-1], output_type="ndarray")
         pairs = pairs[code[here][pairs[:, 0]] != code[here][pairs[:, 1]]]
@@ -113,12 +113,12 @@ def _shared(
         for w in (None, weight, product, separation)
     )
     # without informative pairs there is no comparison
-    if count[-1] < FEWEST_PAIRS or not (total > 0).all():
+    if count[-1] < MIN_PAIRS or not (total > 0).all():
         return None
     mean = together / np.maximum(total, 1e-300)
     scatter = np.bincount(bins, (product - mean[bins] * weight) ** 2, minlength=len(count))
     variance = scatter / np.maximum(total, 1e-300) ** 2
-    some = np.flatnonzero(count[:-1] >= FEWEST_PAIRS)
+    some = np.flatnonzero(count[:-1] >= MIN_PAIRS)
     if not some.size:
         return None
     distance = distance / np.maximum(count, 1) / half

@@ -5,17 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.correlated.information import Information
 from bayesdist.infer.equations.scaled import scaled_inverse
 from bayesdist.infer.stars.stars import cell_of
 
-__all__ = ["not_narrower", "score_excess", "shrunk_ratios"]
+__all__ = ["block_ratios", "not_narrower", "score_excess", "shrunk_ratios"]
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
 STARS_PER_BLOCK = 60
-MOST_BLOCKS = 8  # along each side of a chip
-LEAST, MOST = 0.25, 100.0
+MAX_BLOCKS = 8  # along each side of a chip
+MIN_RATIO, MAX_RATIO = 0.25, 100.0
 
 
 def score_excess(information: Information) -> Float:
@@ -25,32 +27,32 @@ def score_excess(information: Information) -> Float:
     their mean as their own errors and their scatter about it require (a normal model of their
     logarithms, by moments: DerSimonian and Laird 1986, Controlled Clinical Trials 7, 177).
     """
-    sums = information.sums
-    side, n_chips = sums.side, len(information.model.chips)
-    stars = sums.position[:, :, 0].sum(axis=1)
-    blocks = np.clip(np.sqrt(stars / STARS_PER_BLOCK).astype(int), 1, MOST_BLOCKS)
-    squares = np.zeros((n_chips, side * side, 2))
-    curvature = np.zeros_like(squares)
-    count = np.zeros((n_chips, side * side))
+    side, n_chips = information.sums.side, len(information.model.chips)
+    stars = information.sums.position[:, :, 0].sum(axis=1)
+    blocks = np.clip(np.sqrt(stars / STARS_PER_BLOCK).astype(int), 1, MAX_BLOCKS)
+    # squared scores and curvatures along both axes, and the number of stars
+    sums = np.zeros((n_chips, side * side, 5))
     for cells in information.groups():
-        at = cell_of(cells.X, cells.Y, side)
         free = 1 - information.leverage(cells)
-        for a in (0, 1):
-            np.add.at(squares[cells.chip, :, a], at, cells.squares[:, a, a] / free[:, a])
-            np.add.at(curvature[cells.chip, :, a], at, cells.curvature[:, a, a])
-        np.add.at(count[cells.chip], at, cells.count)
-    out = np.ones_like(squares)
+        squares, curvature = (np.einsum("caa->ca", one) for one in (cells.squares, cells.curvature))
+        values = np.column_stack([squares / free, curvature, cells.count])
+        sums[cells.chip] += sums_over(cell_of(cells.X, cells.Y, side), values, side * side)
+    out = np.ones((n_chips, side * side, 2))
     index = np.arange(side)
     for chip in range(n_chips):
         b = int(blocks[chip])
         block = ((index[:, None] * b // side) * b + index * b // side).ravel()
         for a in (0, 1):
-            top, bottom, n = (
-                np.asarray(np.bincount(block, w, minlength=b * b), float)
-                for w in (squares[chip, :, a], curvature[chip, :, a], count[chip])
-            )
-            out[chip, :, a] = shrunk_ratios(top, bottom, n)[block]
+            out[chip, :, a] = block_ratios(block, sums[chip][:, [a, 2 + a, 4]], b * b)
     return out
+
+
+def block_ratios(block: Int, values: Float, n: int) -> Float:
+    """Ratios (N,) of the sums over n blocks of squares and curvatures, shrunk to their mean.
+
+    `block` (N,) is that of each of the values (N, 3): squares, curvatures, numbers.
+    """
+    return shrunk_ratios(*sums_over(block, values, n).T)[block]
 
 
 def not_narrower(noise: Float, formal: Float) -> tuple[Float, float]:
@@ -77,4 +79,4 @@ def shrunk_ratios(top: Float, bottom: Float, n: Float) -> Float:
         q = (w * (ratio - np.average(ratio, weights=w)) ** 2).sum()
         scatter = max(0.0, (q - (len(w) - 1)) / (w.sum() - (w**2).sum() / w.sum()))
         out[good] = mean * np.exp(ratio * scatter / (scatter + own))
-    return np.asarray(np.clip(out, LEAST, MOST))
+    return np.asarray(np.clip(out, MIN_RATIO, MAX_RATIO))

@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 
-__all__ = ["DiscrepancyPriors", "log_half_cauchy", "log_widths"]
+__all__ = ["AmplitudeGrid", "DiscrepancyPriors", "log_half_cauchy", "log_widths"]
 
 Float = NDArray[np.float64]
+
+TERM_STEPS = 24  # of the amplitude of the higher orders
 
 
 @dataclass(frozen=True)
@@ -85,3 +87,26 @@ def log_half_cauchy(value: Float, median: float) -> Float:
     """Log density of log(value), up to a constant."""
     z = np.asarray(value, float) / median
     return np.asarray(np.log(z) - np.log1p(z**2))
+
+
+@dataclass(frozen=True, eq=False)
+class AmplitudeGrid:
+    """Amplitudes over which structure is integrated, in the unit of the positions."""
+
+    low: float  # of the field
+    high: float
+    terms: Float  # (TERM_STEPS,) of the higher orders
+    log_prior: Float  # (TERM_STEPS,) log weight of these in an integral over them
+
+    @classmethod
+    def of(
+        cls, information: Float, *, noise: float, higher_order: float, structure: float
+    ) -> AmplitudeGrid:
+        """Grid about prior medians, and about what the information (T,) of single terms resolves.
+
+        `noise` is the typical error of one star, a few times which limits the amplitudes.
+        """
+        resolved = 1 / np.sqrt(max(float(np.median(information)), 1e-300))
+        low, high = 0.2 * min(higher_order, structure, resolved), max(3 * noise, 10 * structure)
+        terms = np.geomspace(low, 3 * high, TERM_STEPS)
+        return cls(low, high, terms, log_half_cauchy(terms, higher_order) + log_widths(terms))

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions
 from bayesdist.diagnose.correlated.neighbours import SharedVariance
-from bayesdist.diagnose.correlated.priors import log_half_cauchy, log_widths
+from bayesdist.diagnose.correlated.priors import AmplitudeGrid, log_half_cauchy, log_widths
 
 __all__ = ["Structure", "chip_structure"]
 
@@ -36,9 +36,8 @@ HALVINGS = 6  # at most: neighbouring stars may determine an amplitude to some p
 CHANGE = 0.7  # of the log density between two points, below which none is inserted between them,
 WIDEST = 0.4  # or width of their interval in the logarithm, where most of the density is
 NEGLIGIBLE = 10.0  # in log density, below the largest
-MOST_OF_IT = 2.0  # likewise, for most of the density
+NEAR_TOP = 2.0  # likewise, for most of the density
 UNLIKE = 0.2  # prior probability that the field differs on the two axes, by about a factor e
-TERM_STEPS = 24  # of the amplitude of the higher orders
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,11 +136,11 @@ def chip_structure(
     """
     T = functions.n_terms
     scale = functions.decline()
-    resolved = min(1 / np.sqrt(max(float(np.median(np.diag(S)[:T])), 1e-300)) for S in information)
-    low = 0.2 * min(higher_order, structure, resolved)
-    high = max(3 * noise, 10 * structure)
-    amplitudes = np.geomspace(low, 3 * high, TERM_STEPS)
-    prior = log_half_cauchy(amplitudes, higher_order) + log_widths(amplitudes)
+    best_known = max((np.diag(S)[:T] for S in information), key=np.median)
+    amplitudes = AmplitudeGrid.of(
+        best_known, noise=noise, higher_order=higher_order, structure=structure
+    )
+    prior = amplitudes.log_prior
 
     def axis_at(S: Float, s: Float, variance: Float) -> _Axis:
         matrix = S[T:, T:] + np.diag(1 / variance)
@@ -158,7 +157,7 @@ def chip_structure(
         axes, evidence = [], []
         for S, s, known in zip(information, score, shared[length], strict=True):
             axes.append(axis_at(S, s, variance))
-            found = axes[-1].log_evidence(amplitudes) - 0.5 * np.log(variance).sum()
+            found = axes[-1].log_evidence(amplitudes.terms) - 0.5 * np.log(variance).sum()
             evidence.append(found if known is None else found + known(amplitude))
         return _Sized(amplitude, (axes[0], axes[1]), np.stack(evidence))
 
@@ -167,7 +166,7 @@ def chip_structure(
     }
     points, log_weight = list[_Point](), list[Float]()
     for length in LENGTHS:
-        grid = list(np.linspace(np.log(low), np.log(high), STEPS))
+        grid = list(np.linspace(np.log(amplitudes.low), np.log(amplitudes.high), STEPS))
         sized = [at(length, a) for a in grid]
         for _ in range(HALVINGS):
             tops = np.array([(prior + one.views).max(axis=1) for one in sized])
@@ -191,7 +190,7 @@ def chip_structure(
     kept = every.max(axis=1) > every.max() - NEGLIGIBLE
     weight = np.exp(every[kept] - every.max())
     points = [p for p, k in zip(points, kept, strict=True) if k]
-    return Structure(functions, amplitudes, tuple(points), weight / weight.sum())
+    return Structure(functions, amplitudes.terms, tuple(points), weight / weight.sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +231,7 @@ def _middles(grid: Sequence[float], tops: Sequence[float], best: float) -> list[
         top = max(top_a, top_b)
         changes = top > best - NEGLIGIBLE and abs(top_a - top_b) > CHANGE
         # a peak may lie between two points of the same height
-        if changes or (top > best - MOST_OF_IT and b - a > WIDEST):
+        if changes or (top > best - NEAR_TOP and b - a > WIDEST):
             out.append(0.5 * (a + b))
     return out
 

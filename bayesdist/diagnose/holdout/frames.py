@@ -34,29 +34,16 @@ STARS_PER_FRAME = 20
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """The frame of an exposure that was held out whole.
+    """Frame of an exposure that was held out whole."""
 
-    Parameters
-    ----------
-    names : tuple of str, length q
-        Of its parameters, deviations of single chips among them.
-    values : ndarray, shape (q,)
-    spent : ndarray, shape (q, q)
-        Covariance of their errors: inverse of what its stars and the scatter say of it.
-    shared : ndarray, shape (q, n)
-        What its stars say of it and of the solution's polynomials and drift together.
-    precision : ndarray, shape (q,)
-        What the scatter says of each.
-    n : int
-        Stars.
-    """
-
-    names: tuple[str, ...]
-    values: Float
+    names: tuple[str, ...]  # of its parameters, deviations of single chips among them
+    values: Float  # (q,)
+    # (q, q) covariance of their errors: inverse of what its stars and the scatter say of it
     spent: Float
+    # (q, n) what its stars say of it and of the solution's polynomials and drift together
     shared: Float
-    precision: Float
-    n: int
+    precision: Float  # (q,) what the scatter says of each
+    n: int  # stars
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +56,7 @@ class FramedPrediction:
 
 
 def _alone(model: DistortionModel) -> DistortionModel:
-    """The model of one exposure, behind another one that defines the gauge and has no stars."""
+    """Model of one exposure, behind another one that defines the gauge and has no stars."""
     return replace(model, exposures=("(release)", "(held out)"))
 
 
@@ -93,17 +80,8 @@ def frames_for(
 ) -> dict[str, Frame]:
     """Frames of exposures that the solution does not know, fitted to their own stars.
 
-    Parameters
-    ----------
-    predictive : Predictive
-    pieces : sequence of Piece
-        Of the held-out stars; they are gone through once for every step.
-    names : sequence of str
-
-    Returns
-    -------
-    dict of str to Frame
-        Of the exposures that have enough stars.
+    The pieces of the held-out stars are gone through once for every step. Exposures with too few
+    stars are left out.
     """
     unknown = [name for name in names if name not in set(predictive.model.exposures)]
     if not predictive.model.n_frame or not unknown:

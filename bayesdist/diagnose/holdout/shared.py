@@ -33,8 +33,8 @@ Int = NDArray[np.int64]
 class SharedErrors:
     """Matches with the stars and cells that they share errors with.
 
-    `predictive` has errors of the catalogue, of places, or both; predictive probabilities are
-    counted in `n_bins`.
+    `predictive` has errors of the catalogue, of positions on the detector, or both; predictive
+    probabilities are counted in `n_bins`.
     """
 
     def __init__(self, predictive: Predictive, n_bins: int) -> None:
@@ -53,7 +53,7 @@ class SharedErrors:
         size: Float,
         codes: Mapping[str, Int],
     ) -> None:
-        """Some matches, with their scores and the bins that they lie in."""
+        """Add matches, with their scores and the bins that they lie in."""
         stars, index = self._predictive.stars, rows.index
         if stars is None or table.star is None:
             star = -1 - self._n - np.arange(len(index))  # each by itself

@@ -28,65 +28,39 @@ Float = NDArray[np.float64]
 
 AXIS = "axis"  # a part: the stars along one axis
 
-LEAST_STARS = 20  # of a bin that is judged by itself
+MIN_STARS = 20  # of a bin that is judged by itself
 STARS_PER_PIT_BIN = 20
 SINGULAR = 0.05  # of a variance: what is left where frames have taken up nearly all
 
 
 @dataclass(frozen=True)
 class HeldTest:
-    """One question that held-out stars were asked.
+    """One question that held-out stars were asked."""
 
-    Parameters
-    ----------
-    name : str
-        'offset', 'spread', 'distribution', 'tails' or 'deviation'.
-    part : str
-        'all', 'axis', 'region', 'magnitude', 'epoch', 'exposure' or 'place in exposure'.
-    where : str
-        In words.
-    index : int
-        Of the bin in its partition; -1 for all bins together.
-    n : int
-        Stars.
-    value : float
-        Distance from the prediction in the unit of u, v; factor on the predicted errors; largest
-        difference of distribution functions; fraction of stars beyond the limit; deviation of an
-        exposure.
-    expected : float
-        0, 1, 0, the expected fraction, or 0.
-    interval : tuple of float
-        Of a fraction, 95 %; else NaN.
-    p_value : float
-    p_corrected : float
-        For the number of tests (Holm 1979).
-    limit : float
-        Of the tails, in sigma; else NaN.
-    wider : bool
-        Of distributions: whether stars lie farther out than predicted.
-    """
-
-    name: str
-    part: str
-    where: str
-    index: int
-    n: int
+    name: str  # 'offset', 'spread', 'distribution', 'tails' or 'deviation'
+    part: str  # 'all', 'axis', 'region', 'magnitude', 'epoch', 'exposure' or 'place in exposure'
+    where: str  # in words
+    index: int  # of the bin in its partition; -1 for all bins together
+    n: int  # stars
+    # distance from the prediction in the unit of u, v; factor on the predicted errors; largest
+    # difference of distribution functions; fraction of stars beyond the limit; deviation of an
+    # exposure
     value: float
-    expected: float
+    expected: float  # 0, 1, 0, the expected fraction, or 0
     p_value: float
-    p_corrected: float = 1.0
-    interval: tuple[float, float] = (np.nan, np.nan)
-    limit: float = np.nan
-    wider: bool = True
+    p_corrected: float = 1.0  # for the number of tests (Holm 1979)
+    interval: tuple[float, float] = (np.nan, np.nan)  # of a fraction, 95 %; else NaN
+    limit: float = np.nan  # of the tails, in sigma; else NaN
+    wider: bool = True  # of distributions: True where stars lie farther out than predicted
 
     @property
-    def together(self) -> bool:
-        """Whether all bins of the part are tested at once; `where` and `value` are of the worst."""
+    def is_omnibus(self) -> bool:
+        """True where all bins are tested at once; `where` and `value` are of the worst."""
         return self.index < 0
 
     @property
-    def matters(self) -> bool:
-        """Whether errors would be larger than predicted, if it is no chance."""
+    def is_material(self) -> bool:
+        """True where errors would be larger than predicted, if it is no chance."""
         if self.name == "spread":
             return not HELD_OUT_RATIO.met_by(self.value)
         if self.name == "distribution":
@@ -99,28 +73,15 @@ class HeldTest:
 
 @dataclass(frozen=True)
 class AxisCoverage:
-    """How many held-out stars lie in the middle of what is predicted of them along an axis.
+    """Fraction of held-out stars in the middle of their predictions along an axis."""
 
-    Parameters
-    ----------
-    axis : str
-        'u' or 'v'.
-    level : float
-        In sigma of a normal variable.
-    n : int
-        Stars.
-    value, expected : float
-        Fraction of them, and the predicted one.
-    interval : tuple of float
-        Of the fraction, 95 %.
-    """
-
-    axis: str
-    level: float
-    n: int
+    axis: str  # 'u' or 'v'
+    level: float  # in sigma of a normal variable
+    n: int  # stars
+    # value, expected: fraction of them, and the predicted one
     value: float
     expected: float
-    interval: tuple[float, float]
+    interval: tuple[float, float]  # of the fraction, 95 %
 
 
 def coverage_of(sums: HeldSums) -> tuple[AxisCoverage, ...]:
@@ -142,18 +103,7 @@ def coverage_of(sums: HeldSums) -> tuple[AxisCoverage, ...]:
 def all_tests(
     sums: HeldSums, predictive: Predictive, partitions: Sequence[Partition]
 ) -> list[HeldTest]:
-    """Every test that there are enough stars for, without correction.
-
-    Parameters
-    ----------
-    sums : HeldSums
-    predictive : Predictive
-    partitions : sequence of Partition
-
-    Returns
-    -------
-    list of HeldTest
-    """
+    """Tests that there are enough stars for, without correction."""
     out = []
     for partition in partitions:
         found = sums.bins[partition.kind]
@@ -166,7 +116,7 @@ def all_tests(
 def _offsets(
     found: BinSums, sums: HeldSums, predictive: Predictive, partition: Partition
 ) -> list[HeldTest]:
-    """Whether stars lie about their predictions: each bin, then all together."""
+    """Tests of the mean offsets from the predictions: each bin, then all together."""
     # a score of the position is odd: on average the mixture's parameters do not move it
     cov = found.place.covariance(predictive, sums.frames, mixture=False) + found.place_cov
     out, good = [], []
@@ -174,7 +124,7 @@ def _offsets(
         pair = slice(2 * b, 2 * b + 2)
         least = np.linalg.eigvalsh(cov[pair, pair])[0]
         n = found.independent[b]
-        if n < LEAST_STARS or least < 2 * SINGULAR * np.trace(found.place_2[b]):
+        if n < MIN_STARS or least < 2 * SINGULAR * np.trace(found.place_2[b]):
             continue
         good.append(b)
         score = found.offset_scores[b]
@@ -203,11 +153,11 @@ def _offsets(
 
 
 def _spreads(found: BinSums, predictive: Predictive, partition: Partition) -> list[HeldTest]:
-    """Whether true matches scatter as predicted, in each bin."""
+    """Tests of the scatter of true matches, in each bin."""
     return [
         _spread(found.scale, b, predictive, (partition.kind, bin_.words, b, int(found.n[b])))
         for b, bin_ in enumerate(partition.bins)
-        if found.n[b] >= LEAST_STARS
+        if found.n[b] >= MIN_STARS
     ]
 
 
@@ -220,7 +170,7 @@ def _spread(
 
 
 def _axes(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
-    """Whether true matches scatter as predicted along each axis by itself."""
+    """Tests of the scatter of true matches along each axis by itself."""
     return [
         _spread(axis, 0, predictive, (AXIS, f"along {'uv'[a]}", a, sums.n))
         for a, axis in enumerate(sums.axes)
@@ -228,7 +178,7 @@ def _axes(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
 
 
 def _distributions(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
-    """Whether the predictive probabilities are uniform."""
+    """Tests of the predictive probabilities against uniform ones."""
     merge, shared = 1, sums.shared
     n = sums.n if shared is None else shared.n_stars
     while merge < PIT_BINS // 4 and n * merge < STARS_PER_PIT_BIN * PIT_BINS:
@@ -257,7 +207,7 @@ def _distributions(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
 
 
 def _tails(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
-    """Whether as many stars lie far out as predicted, false matches among them."""
+    """Tests of the number of stars that lie far out, false matches among them."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(15)
     weights = weights / weights.sum()
     sd = np.sqrt(np.diag(predictive.free_cov))
@@ -292,7 +242,7 @@ def _tails(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
 
 
 def _interval(seen: int, n: int) -> tuple[float, float]:
-    """Of a fraction, 95 % (Clopper and Pearson 1934)."""
+    """Interval of 95 % of a fraction (Clopper and Pearson 1934)."""
     return (
         float(beta.ppf(0.025, seen, n - seen + 1)) if seen else 0.0,
         float(beta.ppf(0.975, seen + 1, n - seen)) if seen < n else 1.0,

@@ -1,4 +1,4 @@
-"""What is left after the fit: residuals averaged over the detector, and their statistics."""
+"""Residuals averaged over the detector, and their statistics."""
 
 from __future__ import annotations
 
@@ -62,19 +62,12 @@ class BinnedResiduals:
 
 @dataclass(frozen=True, eq=False)
 class BinValues:
-    """Means of one quantity in bins.
+    """Means of one quantity in bins."""
 
-    Parameters
-    ----------
-    mean, sem : ndarray, shape (ny, nx)
-        Means and their standard errors; NaN where there are too few stars.
-    dof : ndarray, shape (ny, nx)
-        Degrees of freedom of the standard errors: stars less one.
-    """
-
+    # mean, sem (ny, nx): means and their standard errors; NaN where there are too few stars
     mean: Float
     sem: Float
-    dof: Float
+    dof: Float  # (ny, nx) degrees of freedom of the standard errors: stars less one
 
     @property
     def good(self) -> NDArray[np.bool_]:
@@ -165,19 +158,7 @@ class BinnedSums:
     def values(self, axis: str) -> BinValues:
         """Means of the bins along one axis, of `band_bins`.
 
-        Parameters
-        ----------
-        axis : str
-            One of `BAND_AXES`.
-
-        Returns
-        -------
-        BinValues
-
-        Raises
-        ------
-        InputError
-            For an unknown axis.
+        `axis` is one of `BAND_AXES`; else InputError.
         """
         require_known(axis, BAND_AXES, "axis")
         k = BAND_AXES.index(axis)
@@ -322,21 +303,8 @@ def band_bins(
 
     The mean length of a bin is that of single stars, not the length of the mean residual.
 
-    Parameters
-    ----------
-    x, y, ru, rv, size, weights
-        As `binned_sums`; residuals in pixels of the band.
-    bins : int or tuple of int
-        31 in section 5 of WSDC D-T033, 45 in its Appendix C.
-
-    Returns
-    -------
-    BinnedSums
-
-    Raises
-    ------
-    InputError
-        As `binned_sums`.
+    Parameters are those of `binned_sums`, residuals in pixels of the band; `bins` are 31 in section
+    5 of WSDC D-T033 and 45 in its Appendix C.
     """
     length = np.hypot(np.asarray(ru, float), np.asarray(rv, float))
     return binned_sums(x, y, ru, rv, length, bins=bins, size=size, weights=weights)

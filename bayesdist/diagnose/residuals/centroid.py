@@ -9,24 +9,16 @@ from bayesdist.diagnose.residuals.sample import StarSample
 
 __all__ = ["centroid_scatter"]
 
-FEWEST = 50  # stars whose scatter says anything by magnitude
+MIN_STARS = 50  # stars whose scatter says anything by magnitude
 CERTAIN = 0.5  # probability of a false match from which on a star is left out
 
 
 def centroid_scatter(stars: StarSample, *, n_params: int = 0) -> MagnitudeErrors | None:
     """Scatter of the residuals by magnitude.
 
-    Parameters
-    ----------
-    stars : StarSample
-        With a posterior its likely false matches are left out, else what the fit rejected.
-    n_params : int
-        Parameters of the fit, for all stars there are.
-
-    Returns
-    -------
-    MagnitudeErrors or None
-        None where the stars have no magnitudes, or too few of them.
+    Of stars with a posterior the likely false matches are left out, else what the fit rejected;
+    `n_params` are the parameters of the fit to all stars. None where the stars have no magnitudes,
+    or too few of them.
     """
     mag = stars.table.mag
     if mag is None:
@@ -34,7 +26,7 @@ def centroid_scatter(stars: StarSample, *, n_params: int = 0) -> MagnitudeErrors
     good = np.isfinite(mag) & (
         stars.used if stars.outlier_probability is None else stars.outlier_probability < CERTAIN
     )
-    if good.sum() < FEWEST:
+    if good.sum() < MIN_STARS:
         return None
     share = round(n_params * len(stars) / max(stars.n_total, 1))
     return estimate(mag[good], *stars.residual[good].T, n_params=share)

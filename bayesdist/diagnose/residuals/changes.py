@@ -22,53 +22,28 @@ _FEWEST_STARS = 5
 
 @dataclass(frozen=True)
 class PatternChange:
-    """Means of bins in one period against those in all other periods.
-
-    Parameters
-    ----------
-    period, axis : str
-    p_value : float
-        Probability of as large differences by chance.
-    rms : float
-        Of the differences, their noise subtracted; 0 where noise alone is larger.
-    correlation : float
-        Between the two patterns, noise included: near 1 where the same structure stays and noise is
-        small.
-    n_bins : int
-        Bins that hold five stars or more in both.
-    """
+    """Means of bins in one period against those in all other periods."""
 
     period: str
     axis: str
-    p_value: float
-    rms: float
+    p_value: float  # probability of as large differences by chance
+    rms: float  # of the differences, their noise subtracted; 0 where noise alone is larger
+    # between the two patterns, noise included: near 1 where the same structure stays and noise is
+    # small
     correlation: float
-    n_bins: int
+    n_bins: int  # bins that hold five stars or more in both
 
 
 def pattern_changes(periods: Mapping[str, BinnedSums]) -> tuple[PatternChange, ...]:
-    """Every period against the rest.
+    """Pattern of every period against that of the rest.
 
     A single period shares its stars with the combined set, the rest does not: differences from the
     rest have independent errors, and those from the combined set are the same, made smaller by the
     share of the rest.
 
-    Parameters
-    ----------
-    periods : mapping of str to BinnedSums
-        Disjoint in their stars, all against one model, in pixels; two or more.
-
-    Returns
-    -------
-    tuple of PatternChange
-        X and Y of each period.
-
-    Raises
-    ------
-    InputError
-        For less than two periods.
-    DegenerateError
-        When fewer than three bins hold five stars in a period and in the rest.
+    Periods are disjoint in their stars, two or more, all against one model in pixels; changes are
+    those in X and Y of each. Raises InputError for less than two periods, DegenerateError when
+    fewer than three bins hold five stars in a period and in the rest.
     """
     names = list(periods)
     if len(names) < 2:
@@ -105,6 +80,6 @@ def _change(period: str, axis: str, one: BinValues, rest: BinValues) -> PatternC
 
 
 def _p_value(t2: Float, dof: Float) -> float:
-    """Of squared t variables together: each through the normal variable of its own probability."""
+    """Probability of larger squared t variables (n,), each by its normal variable."""
     z2 = chi2.isf(f_distribution.sf(t2, 1, dof), 1)
     return float(chi2.sf(z2.sum(), z2.size))

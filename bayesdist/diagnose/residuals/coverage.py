@@ -1,4 +1,4 @@
-"""Which part of a chip the stars cover; beyond it a polynomial is extrapolated.
+"""Part of a chip that the stars cover; beyond it a polynomial is extrapolated.
 
 The formal and the posterior errors hold beyond it only if the model does, and no star says so.
 """
@@ -27,35 +27,22 @@ _FINE = (65, 65)
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """The convex area of a chip that its stars span.
-
-    Parameters
-    ----------
-    chip : Chip
-    several : bool
-        Whether the detector has other chips beside it.
-    sides : ndarray, shape (m, 3)
-        (a, b, c) with a x + b y + c the distance beyond a side of the area.
-    gap : float
-        Share of the chip's area beyond it.
-    by_chance : float
-        The gap that as many stars leave on average when they are scattered evenly.
-    """
+    """The convex area of a chip that its stars span."""
 
     chip: Chip
-    several: bool
-    sides: Float
-    gap: float
-    by_chance: float
+    several: bool  # whether the detector has other chips beside it
+    sides: Float  # (m, 3) (a, b, c) with a x + b y + c the distance beyond a side of the area
+    gap: float  # fraction of the chip's area beyond it
+    by_chance: float  # the gap that as many stars leave on average when they are scattered evenly
 
     @property
     def significant(self) -> bool:
-        """Whether so much is missing that the corners or edges are extrapolated."""
+        """True where so much is missing that the corners or edges are extrapolated."""
         return self.gap > max(UNCOVERED.value, UNCOVERED_BY_CHANCE.value * self.by_chance)
 
     @property
     def sentence(self) -> str:
-        """What it means, as a clause."""
+        """Meaning of the gap, as a clause."""
         part = f"chip {self.chip.name}" if self.several else "the detector"
         (left, right), (bottom, top) = self.extent
         return (
@@ -86,24 +73,11 @@ def coverage_of(sums: BinnedSums, corners: Float, chip: Chip, *, several: bool =
     It lies within the hull of all stars, and within that of the cells that hold more than strays:
     a few false matches in the corners cover nothing.
 
-    Parameters
-    ----------
-    sums : BinnedSums
-        Of the stars used.
-    corners : ndarray, shape (m, 2)
-        Vertices of the convex hull of all stars: `ChipSurvey.corners`.
-    chip : Chip
-    several : bool
-        Whether the detector has other chips.
+    `sums` are those of the stars used, `corners` (m, 2) the vertices of the convex hull of all
+    stars (`ChipSurvey.corners`); `several` chips make the detector, or one.
 
-    Returns
-    -------
-    Coverage
-
-    References
-    ----------
-    The gap that n even stars leave in a rectangle, (8/3) ln n / n of its area: Renyi & Sulanke
-    1963, Z. Wahrscheinlichkeitstheorie 2, 75.
+    The gap that n even stars leave in a rectangle is (8/3) ln n / n of its area (Renyi & Sulanke
+    1963, Z. Wahrscheinlichkeitstheorie 2, 75).
     """
     count, size = sums.count, np.array(chip.size)
     n = int(count.sum())

@@ -22,20 +22,10 @@ def majority_sentence(
     quoted: float | None = None,
     things: str = "pairs",
 ) -> str:
-    """What it means that most pairs are false, as a clause; empty where they are not.
+    """Warning that most pairs are false, as a clause; empty where they are not.
 
-    Parameters
-    ----------
-    fit : LinearFit
-    posterior : Posterior, optional
-    quoted : float, optional
-        Usual quoted error of one axis, in the unit of u, v.
-    things : str
-        What is true or false.
-
-    Returns
-    -------
-    str
+    `quoted` is the usual quoted error of one axis, in the unit of u, v; `things` is the word for
+    the matches.
     """
     if posterior is not None and "f" in posterior.hyper:
         fraction = float(posterior.hyper["f"].mean())

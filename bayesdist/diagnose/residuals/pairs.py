@@ -21,19 +21,9 @@ def pair_statistics(a: Float, b: Float, *, tolerance: float = 0.0) -> dict[str, 
     With b the same as a these are the columns of Table 5-3 of WSDC D-T033, whose n^2 differences
     contain each bin against itself.
 
-    Parameters
-    ----------
-    a : ndarray, shape (n,)
-    b : ndarray, shape (m,)
-        Finite values; both are non-empty.
-    tolerance : float
-        Allowed error of median and percentiles, in the unit of the values; 0 stands for rounding.
-
-    Returns
-    -------
-    dict
-        mean, sigma (about the mean, over n m), min, max, median, p01, p99.  The percentiles
-        interpolate between neighbours as `numpy.percentile` does.
+    `a` (n,) and `b` (m,) are finite and not empty, `tolerance` is the allowed error of median and
+    percentiles, 0 for rounding. By name: mean, sigma (about the mean, over n m), min, max, median,
+    p01, p99; percentiles interpolate between neighbours as `numpy.percentile` does.
     """
     same = a is b
     a = np.sort(a)

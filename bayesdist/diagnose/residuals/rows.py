@@ -31,35 +31,20 @@ _COARSE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class StatisticsRow:
-    """Statistics of means of bins, or of differences between them.
+    """Statistics of means of bins, or of differences between them."""
 
-    Parameters
-    ----------
-    label : str
-        As in the report: 'W1/X', 'W2-W1/Y', 'W1/radial', '25-Day/X'.
-    value : mapping of str to float
-        By the names in `STATISTICS`, of the means as they are: what the report prints.
-    error : mapping of str to float
-        Standard deviation of `value` over the noise of the means.
-    noise_free : mapping of str to float
-        `value` less what noise adds on average to a set of this width and shape.  It takes the
-        widening out; shape finer than the noise, on which a median may hang, does not come back.
-        Min, percentiles, median and max stay in their order: they meet where only noise is left.
-    variance : float
-        What is left of sigma^2 without noise; below zero where chance makes it so.
-    variance_error : float
-        Its standard deviation.
-    n_bins, n_left_out : int
-        Bins used, and those without a standard error; of both bands together where all pairs of
-        two are compared.
-    """
-
-    label: str
+    label: str  # as in the report: 'W1/X', 'W2-W1/Y', 'W1/radial', '25-Day/X'
+    # by the names in `STATISTICS`, of the means as they are: what the report prints
     value: Mapping[str, float]
-    error: Mapping[str, float]
+    error: Mapping[str, float]  # standard deviation of `value` over the noise of the means
+    # `value` less what noise adds on average to a set of this width and shape.  It takes the
+    # widening out; shape finer than the noise, on which a median may hang, does not come back. Min,
+    # percentiles, median and max stay in their order: they meet where only noise is left
     noise_free: Mapping[str, float]
-    variance: float
-    variance_error: float
+    variance: float  # what is left of sigma^2 without noise; below zero where chance makes it so
+    variance_error: float  # its standard deviation
+    # n_bins, n_left_out: bins used, and those without a standard error; of both bands together
+    # where all pairs of two are compared
     n_bins: int
     n_left_out: int
 
@@ -74,23 +59,9 @@ def bin_row(
 ) -> StatisticsRow:
     """A row of Tables 5-1, 5-2 and C-1 of WSDC D-T033.
 
-    Parameters
-    ----------
-    label : str
-    bins : BinValues
-    absorbed : int
-        Coefficients of this axis that the fit took out of the residuals, at least 1: they carry
-        away that many degrees of freedom of the noise.
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    StatisticsRow
-
-    Raises
-    ------
-    DegenerateError
-        When too few bins hold two stars.
+    `absorbed` are the coefficients of this axis that the fit took out of the residuals, at least 1:
+    they carry away that many degrees of freedom of the noise. Raises `DegenerateError` when too few
+    bins hold two stars.
     """
     some = _Bins.of(label, bins, absorbed)
     drawn, calm = _along_last(some.draws(rng)), _along_last(some.centre)
@@ -107,23 +78,8 @@ def pair_row(
 ) -> StatisticsRow:
     """A row of Table 5-3 of WSDC D-T033: differences over all pairs of bins.
 
-    Parameters
-    ----------
-    label : str
-    first : BinValues
-    second : BinValues, optional
-        Bins of another band, which are subtracted; by default those of the same one.
-    absorbed, rng
-        As `bin_row`.
-
-    Returns
-    -------
-    StatisticsRow
-
-    Raises
-    ------
-    DegenerateError
-        As `bin_row`.
+    `second` are bins of another band, which are subtracted; by default those of the same one.
+    `absorbed` and `rng` as of `bin_row`. Raises `DegenerateError` as `bin_row`.
     """
     a = _Bins.of(label, first, absorbed)
     b = a if second is None else _Bins.of(label, second, absorbed)

@@ -36,21 +36,11 @@ WISE_ARCSEC = {"W1": 2.75, "W2": 2.75, "W3": 2.75, "W4": 5.5}  # per pixel; W4 i
 
 @dataclass(frozen=True, eq=False)
 class StatisticsTable:
-    """Rows of statistics.
-
-    Parameters
-    ----------
-    title : str
-    first : str
-        Head of the column of labels.
-    unit : str
-        'pix' or 'arcsec'.
-    rows : tuple of StatisticsRow
-    """
+    """Rows of statistics."""
 
     title: str
-    first: str
-    unit: str
+    first: str  # head of the column of labels
+    unit: str  # 'pix' or 'arcsec'
     rows: tuple[StatisticsRow, ...]
 
     def __getitem__(self, label: str) -> StatisticsRow:
@@ -62,17 +52,9 @@ class StatisticsTable:
     def to_table(self, *, errors: bool = False) -> Table:
         """The table in the report's layout.
 
-        Parameters
-        ----------
-        errors : bool
-            Add for every statistic its error and its value without noise, and the numbers of bins.
-
-        Returns
-        -------
-        astropy.table.Table
-            Columns 'Band/Axis' (or as `first`), Mean, Sigma, Min, Max, Median, 1%-tile, 99%-tile;
-            with errors also 'Mean error', 'Mean noise-free' and so on, 'Sigma noise', 'Bins' and
-            'Bins left out'.
+        Columns are 'Band/Axis' (or as `first`), Mean, Sigma, Min, Max, Median, 1%-tile and
+        99%-tile; with `errors` also 'Mean error', 'Mean noise-free' and so on, 'Sigma noise',
+        'Bins' and 'Bins left out'.
         """
         out = Table(meta={"title": self.title, "unit": self.unit})
         out[self.first] = [row.label for row in self.rows]
@@ -98,24 +80,10 @@ def fitting_table(
 ) -> StatisticsTable:
     """Table 5-1: residuals of the fit in bins, in pixels.
 
-    Parameters
-    ----------
-    bands : mapping of str to BinnedSums
-        By the name of the band, in the order of the table.
-    rng : numpy.random.Generator
-        For the errors.
-    absorbed : int
-        Coefficients of one axis that the fit took out of the residuals: 15 at order 4; 1 where the
-        residuals are of a model that was not fitted to these stars.
-
-    Returns
-    -------
-    StatisticsTable
-
-    Raises
-    ------
-    DegenerateError
-        When too few bins of a band hold two stars.
+    Bands are in the order of the table, `rng` is for the errors. `absorbed` are the coefficients of
+    one axis that the fit took out of the residuals: 15 at order 4; 1 where the residuals are of a
+    model that was not fitted to these stars. Raises DegenerateError when too few bins of a band
+    hold two stars.
     """
     rows = tuple(
         # the scatter of single stars is not what the coefficients are fitted to
@@ -144,23 +112,9 @@ def band_to_band_table(
     frames they are not: the catalogue's errors cancel in the difference, its noise is smaller than
     said here, and its noise-free part larger.
 
-    Parameters
-    ----------
-    bands, rng, absorbed
-        As `fitting_table`; the bins of all bands are as many and cover the same field.
-    arcsec : mapping of str to float
-        Arcsec per pixel of each band.
-
-    Returns
-    -------
-    StatisticsTable
-
-    Raises
-    ------
-    InputError
-        For one band only, for bands whose bins differ in number, or a band without scale.
-    DegenerateError
-        As `fitting_table`.
+    As `fitting_table`; the bins of all bands are as many and cover the same field, `arcsec` are
+    those per pixel of each band. Raises InputError for one band only, for bands whose bins differ
+    in number, or a band without scale.
     """
     values = _in_arcsec(bands, arcsec)
     names = list(bands)
@@ -196,21 +150,7 @@ def multiframe_table(
 ) -> StatisticsTable:
     """Table 5-3: differences over all pairs of bins, in arcsec.
 
-    Parameters
-    ----------
-    bands, rng, absorbed, arcsec
-        As `band_to_band_table`.
-
-    Returns
-    -------
-    StatisticsTable
-
-    Raises
-    ------
-    InputError
-        For a band without scale.
-    DegenerateError
-        As `fitting_table`.
+    As `band_to_band_table`, of one band or more.
     """
     values = _in_arcsec(bands, arcsec)
     rows = tuple(
@@ -230,23 +170,8 @@ def period_table(
 ) -> StatisticsTable:
     """Table C-1: residuals of one band in several periods, in arcsec.
 
-    Parameters
-    ----------
-    periods : mapping of str to BinnedSums
-        By the name of the period, in the order of the table: the combined one and single ones, all
-        against the combined model.
-    rng, absorbed
-        As `fitting_table`; by the name of the period where they differ.
-    arcsec_per_pixel : float
-
-    Returns
-    -------
-    StatisticsTable
-
-    Raises
-    ------
-    DegenerateError
-        As `fitting_table`.
+    Periods are in the order of the table, the combined one among them, all against the combined
+    model; `absorbed` is by the name of the period where it differs. Others as of `fitting_table`.
     """
     rows = tuple(
         bin_row(
@@ -262,7 +187,7 @@ def period_table(
 
 
 def _two_bands(bands: Iterable[str]) -> Iterator[tuple[str, str, str]]:
-    """Every band with every later one, on each axis."""
+    """Iterator over every band with every later one, on each axis."""
     for (earlier, later), axis in product(combinations(bands, 2), _AXES):
         yield earlier, later, axis
 

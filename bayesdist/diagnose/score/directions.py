@@ -11,19 +11,11 @@ Float = NDArray[np.float64]
 
 
 def independent_directions(whole: Float, left: Float, least: float) -> Float:
-    """Directions of regressors that the parameters have left, (n, q).
+    """Directions (n, q) of regressors that the parameters have left.
 
-    Parameters
-    ----------
-    whole, left : ndarray, shape (n, n)
-        Information of the regressors before and after the parameters are projected out.
-    least : float
-        Fraction of it that a direction must have kept.
-
-    Returns
-    -------
-    ndarray, shape (n, q)
-        In units in which `whole` is the unit matrix.
+    `whole` and `left` (n, n) are the information of the regressors before and after the parameters
+    are projected out, `least` the fraction of it that a direction must have kept. Directions are in
+    units in which `whole` is the unit matrix.
     """
     diagonal = np.diag(whole)
     scale = np.zeros(len(diagonal))
@@ -40,18 +32,9 @@ def squares_of(
 ) -> tuple[float, float]:
     """Mean squares of the pattern that a score stands for, and of what noise makes of it.
 
-    Parameters
-    ----------
-    score : ndarray, shape (q,)
-    information, covariance : ndarray, shape (q, q)
-        Of the directions, and of their score.
-    square : ndarray, shape (q, q)
-        Mean products of the directions over the detector.
-
-    Returns
-    -------
-    found, noise : float
-        The first with the second included.
+    The first holds the second. `information` and `covariance` (q, q) are those of the directions
+    and of their `score` (q,), `square` (q, q) the mean products of the directions over the
+    detector.
     """
     inverse = np.linalg.inv(information)
     step = inverse @ score

@@ -33,37 +33,21 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 STARS_PER_DIRECTION = 4  # of an exposure that is tested
-MOST_PRODUCTS = 1e10  # of scores: beyond, those of other exposures count by their mean
+MAX_PRODUCTS = 1e10  # of scores: beyond, those of other exposures count by their mean
 INDEPENDENT = 0.02  # as for time: what the frames' curvature leaves is no deviation
 
 
 @dataclass(frozen=True, eq=False)
 class _Deviations:
-    """One exposure's deviations, all parameters projected out.
+    """One exposure's deviations, all parameters projected out."""
 
-    Parameters
-    ----------
-    score : ndarray, shape (n,)
-    information : ndarray, shape (n, n)
-        Beside all parameters.
-    own : ndarray, shape (n, n)
-        Beside those of the exposure alone.
-    cross : ndarray, shape (n, G)
-        With the global parameters.
-    covariance : ndarray, shape (n, n)
-        Of the score, from those of single detections.
-    square : ndarray, shape (n, n)
-        Mean square of the deviations over the detector.
-    n_stars : float
-        Stars that the covariance is known from, those of other exposures by what they add to it.
-    """
-
-    score: Float
-    information: Float
-    own: Float
-    cross: Float
-    covariance: Float
-    square: Float
+    score: Float  # (n,)
+    information: Float  # (n, n) beside all parameters
+    own: Float  # (n, n) beside those of the exposure alone
+    cross: Float  # (n, G) with the global parameters
+    covariance: Float  # (n, n) of the score, from those of single detections
+    square: Float  # (n, n) mean square of the deviations over the detector
+    # stars that the covariance is known from, those of other exposures by what they add to it
     n_stars: float
 
     @property
@@ -87,18 +71,10 @@ class _Deviations:
 
 @dataclass(frozen=True, eq=False)
 class _Meat:
-    """Scores of the global parameters, by stars.
+    """Scores of the global parameters, by stars."""
 
-    Parameters
-    ----------
-    by_star : ndarray, shape (stars, G)
-        Sums over the detections of each.
-    total : ndarray, shape (G, G)
-        Sum of their squares, and what the priors add.
-    """
-
-    by_star: Float
-    total: Float
+    by_star: Float  # (stars, G) sums over the detections of each
+    total: Float  # (G, G) sum of their squares, and what the priors add
 
     @classmethod
     def of(cls, projection: Projection) -> _Meat:
@@ -118,14 +94,9 @@ class _Meat:
     def covariance(self, nuisance: Float, star: Int, own: Float) -> tuple[Float, Float]:
         """Covariance (n, n) of an exposure's scores: of its own stars, and of all others.
 
-        Parameters
-        ----------
-        nuisance : ndarray, shape (G, n)
-            Parameters that the deviations are taken for.
-        star : ndarray of int, shape (N,)
-            Stars of the exposure's detections.
-        own : ndarray, shape (N, n)
-            Scores of the detections before the parameters are projected out.
+        `nuisance` (G, n) are the parameters that the deviations are taken for, `star` (N,) the
+        stars of the exposure's detections, `own` (N, n) the scores of the detections before the
+        parameters are projected out.
         """
         which, of = np.unique(star, return_inverse=True)
         # a star is one, in this exposure and in all others
@@ -138,15 +109,8 @@ class _Meat:
 def exposure_test(projection: Projection) -> Outcome | None:
     """Test of the exposures' own deviations.
 
-    Parameters
-    ----------
-    projection : Projection
-
-    Returns
-    -------
-    Outcome or None
-        None where there is one exposure, where the frames fit all linear terms, and where no two
-        exposures have stars enough.
+    None where there is one exposure, where the frames fit all linear terms, and where no two
+    exposures have stars enough.
     """
     model = projection.sample.model
     names = [name for name in frame_names("affine") if name not in frame_names(model.frames)]
@@ -186,7 +150,7 @@ def exposure_test(projection: Projection) -> Outcome | None:
 
 
 def _remedy(frames: str) -> str:
-    """What to do about deviations, as a clause, by the kind of the frames."""
+    """Remedy of deviations, as a clause, by the kind of the frames."""
     hierarchy = FAMILIES["exposures"].remedy
     return hierarchy if frames == "affine" else f"set model.frames to 'affine', or {hierarchy}"
 
@@ -194,7 +158,7 @@ def _remedy(frames: str) -> str:
 def _deviations(projection: Projection, names: list[str]) -> Iterator[_Deviations]:
     """Deviations of every exposure with stars enough, along the directions that it has left."""
     meat = None
-    if len(projection.sample) * projection.n_global**2 < MOST_PRODUCTS:
+    if len(projection.sample) * projection.n_global**2 < MAX_PRODUCTS:
         meat = _Meat.of(projection)
     for blocks in projection.sample.blocks_by("exposure"):
         n = sum(int(projection.sample.used[block.rows].sum()) for block in blocks)

@@ -1,4 +1,4 @@
-"""What targeted tests ask for, and what their findings mean: the words of each, once."""
+"""Words of the targeted tests: questions, remedies and findings, once."""
 
 from __future__ import annotations
 
@@ -11,19 +11,11 @@ __all__ = ["FAMILIES", "Family", "order_family"]
 
 @dataclass(frozen=True)
 class Family:
-    """One thing that a model may lack, in words.
-
-    Parameters
-    ----------
-    name : str
-    remedy : str
-        What to do about it, as a clause.
-    present, absent : str
-        Subject and verb of the finding, where there is something and where there is not.
-    """
+    """One thing that a model may lack, in words."""
 
     name: str
-    remedy: str
+    remedy: str  # what to do about it, as a clause
+    # subject and verb of the finding, where there is something and where there is not
     present: str
     absent: str
 

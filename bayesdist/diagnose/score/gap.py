@@ -36,8 +36,8 @@ __all__ = ["gap_test", "visit_codes"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-FEWEST_FREE = 3  # visits beyond those that the line takes
-FEWEST_STARS = 12  # of an exposure on a chip: six linear terms of both axes, and as many beside
+MIN_FREE = 3  # visits beyond those that the line takes
+MIN_STARS = 12  # of an exposure on a chip: six linear terms of both axes, and as many beside
 SHORTEST = 0.1  # years over which a drift is looked for
 VISIT = 1 / 365.25  # years between exposures that deviate together
 
@@ -46,28 +46,16 @@ _WAYS = ("along x", "along y", "in rotation")
 
 @dataclass(frozen=True, eq=False)
 class _Exposure:
-    """Where the chips of one exposure lie against the first one.
-
-    Parameters
-    ----------
-    epoch : float
-    chips : tuple of int
-        Codes of all but the first.
-    value : ndarray, shape (len(chips), 3)
-        Shifts along the axes of the polynomials, and rotation times half a side: unit of u, v.
-    variance : ndarray, shape (len(chips), 3)
-    star : ndarray of int, shape (n,)
-        Stars of the detections.
-    by_star : ndarray, shape (n, len(chips), 3)
-        What each detection has added to `value`.
-    """
+    """Positions of the chips of one exposure against the first one."""
 
     epoch: float
-    chips: tuple[int, ...]
+    chips: tuple[int, ...]  # codes of all but the first
+    # (len(chips), 3) shifts along the axes of the polynomials, and rotation times half a side: unit
+    # of u, v
     value: Float
-    variance: Float
-    star: Int
-    by_star: Float
+    variance: Float  # (len(chips), 3)
+    star: Int  # (n,) stars of the detections
+    by_star: Float  # (n, len(chips), 3) what each detection has added to `value`
 
 
 @dataclass(frozen=True)
@@ -87,21 +75,14 @@ class _Line:
 
     @property
     def p_value(self) -> float:
-        """Of this line by itself."""
+        """Probability of a larger statistic, of this line by itself."""
         return float(stats.f.sf(self.statistic, 1, self.free))
 
 
 def gap_test(projection: Projection) -> Outcome | None:
     """Test for chips that drift against each other.
 
-    Parameters
-    ----------
-    projection : Projection
-
-    Returns
-    -------
-    Outcome or None
-        None for one chip, without dates, and with too few visits for a line.
+    None for one chip, without dates, and with too few visits for a line.
     """
     sample = projection.sample
     model = sample.model
@@ -144,7 +125,7 @@ def _smallest(lines: list[_Line], level: float) -> float:
 
 
 def _drifts(projection: Projection, chip: int, way: int) -> bool:
-    """Whether the model has this drift: a rate that no prior holds."""
+    """True where the model has this drift: a rate that no prior holds."""
     model = projection.sample.model
     if model.time is None or way == 2:
         return False
@@ -185,7 +166,7 @@ def _line(projection: Projection, exposures: list[_Exposure], chip: int, way: in
     design = (segment[:, None] == np.unique(segment)).astype(float)
     design = np.column_stack([design, t - t.mean()])
     free = len(t) - np.linalg.matrix_rank(design)
-    if free < FEWEST_FREE or np.linalg.matrix_rank(design[:, :-1]) == np.linalg.matrix_rank(design):
+    if free < MIN_FREE or np.linalg.matrix_rank(design[:, :-1]) == np.linalg.matrix_rank(design):
         return None
     weight = _weights(design, d, 1 / total)
     root = np.sqrt(weight)[:, None]
@@ -232,7 +213,7 @@ def _exposure(projection: Projection, blocks: list[Block]) -> _Exposure | None:
     for block in blocks:
         n = int(sample.used[block.rows].sum())
         number[block.chip] = number.get(block.chip, 0) + n
-    enough = sorted(chip for chip, n in number.items() if n >= FEWEST_STARS)
+    enough = sorted(chip for chip, n in number.items() if n >= MIN_STARS)
     if len(enough) < 2 or enough[0] != 0:
         return None
     chips = enough[1:]
@@ -275,7 +256,7 @@ def _half(projection: Projection, chip: int) -> float:
 
 
 def _columns(projection: Projection, block: Block, chips: list[int]) -> Float:
-    """What each unknown of an exposure does to the positions of a block, (2, n, unknowns)."""
+    """Derivatives (2, n, unknowns) of the positions of a block by the unknowns of its exposure."""
     model = projection.sample.model
     polynomials = projection.functions.polynomials(block.rows)
     at_centre = block.effective @ model.basis(model.chips[block.chip].number).monomial_matrix[0]

@@ -30,51 +30,29 @@ __all__ = ["StarResiduals", "motion_outcome", "motion_test"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-FEWEST_DETECTIONS = 4  # of a star: of fewer nothing is left
-FEWEST_STARS = 100
+MIN_DETECTIONS = 4  # of a star: of fewer nothing is left
+MIN_STARS = 100
 SHORTEST = 0.1  # years in which motions are looked for
-MOST_TAKEN = 0.95  # of one detection, by position and slope
+MAX_TAKEN = 0.95  # of one detection, by position and slope
 MOVING = 1e-6  # of the determinant of the slope's information, that the position leaves
 
 
 @dataclass(frozen=True, eq=False)
 class StarResiduals:
-    """Gradients and curvatures of detections by the positions of their stars.
+    """Gradients and curvatures of detections by the positions of their stars."""
 
-    Parameters
-    ----------
-    star : ndarray of int, shape (N,)
-    epoch : ndarray, shape (N,)
-    gradient : ndarray, shape (N, 2)
-        Of the log-likelihood by the star's position.
-    curvature : ndarray, shape (N, 2, 2)
-        Minus the second derivatives.
-    precision : ndarray, shape (2, 2), (stars, 2, 2) or ()
-        Of what is known of the positions beforehand.
-    stated : ndarray, shape (stars, 2), or None
-        Errors of the motions that the catalogue has.
-    """
-
-    star: Int
-    epoch: Float
-    gradient: Float
-    curvature: Float
-    precision: Float
-    stated: Float | None = None
+    star: Int  # (N,)
+    epoch: Float  # (N,)
+    gradient: Float  # (N, 2) of the log-likelihood by the star's position
+    curvature: Float  # (N, 2, 2) minus the second derivatives
+    precision: Float  # (2, 2) or (stars, 2, 2) or () of what is known of the positions beforehand
+    stated: Float | None = None  # (stars, 2) errors of the motions that the catalogue has
 
 
 def motion_test(sample: ScoredSample) -> Outcome | None:
     """Test of matched stars for motions that the catalogue does not have.
 
-    Parameters
-    ----------
-    sample : ScoredSample
-        With its leverage.
-
-    Returns
-    -------
-    Outcome or None
-        None without dates, and where too few stars are seen at several of them.
+    None without dates, and where too few stars are seen at several of them.
     """
     if sample.epoch is None or np.ptp(sample.epoch) < SHORTEST:
         return None
@@ -97,17 +75,7 @@ def motion_test(sample: ScoredSample) -> Outcome | None:
 def motion_outcome(data: StarResiduals, unit: str, family: Family) -> Outcome | None:
     """Test of residuals of stars.
 
-    Parameters
-    ----------
-    data : StarResiduals
-    unit : str
-        Of u and v.
-    family : Family
-
-    Returns
-    -------
-    Outcome or None
-        None for too few stars.
+    None for too few stars.
     """
     star, g, H = data.star, data.gradient, data.curvature
     S = int(star.max()) + 1
@@ -116,7 +84,7 @@ def motion_outcome(data: StarResiduals, unit: str, family: Family) -> Outcome | 
     g, H = g * good[:, None], H * good[:, None, None]
     members = sums_over(star, good.astype(float), S)
     A = sums_over(star, H, S) + data.precision
-    many = np.flatnonzero(members >= FEWEST_DETECTIONS)
+    many = np.flatnonzero(members >= MIN_DETECTIONS)
     mean = sums_over(star, good * data.epoch, S) / np.maximum(members, 1)
     t = data.epoch - mean[star]
     cross, square = (sums_over(star, t[:, None, None] ** k * H, S)[many] for k in (1, 2))
@@ -125,7 +93,7 @@ def motion_outcome(data: StarResiduals, unit: str, family: Family) -> Outcome | 
         left = square - np.swapaxes(cross, 1, 2) @ back
         moving = np.linalg.det(left) > MOVING * np.linalg.det(square)
         many, back, left = many[moving], back[moving], left[moving]
-    if len(many) < FEWEST_STARS:
+    if len(many) < MIN_STARS:
         return None
     of = np.full(S, -1)
     of[many] = np.arange(len(many))
@@ -142,7 +110,7 @@ def motion_outcome(data: StarResiduals, unit: str, family: Family) -> Outcome | 
     taken = np.einsum("nab,nba->n", H, follows) / 2
     moved = np.einsum("nab,nb->na", T, step[of]) + place[of]
     psi = np.einsum("nba,nb->na", T, g - np.einsum("nab,nb->na", H, moved))
-    each = np.einsum("na,nab,nb->n", psi, inside[of], psi) / (1 - np.minimum(taken, MOST_TAKEN))
+    each = np.einsum("na,nab,nb->n", psi, inside[of], psi) / (1 - np.minimum(taken, MAX_TAKEN))
     difference = (np.einsum("na,na->n", slope, step) - np.bincount(of, each)) / 2
     if data.stated is not None:
         difference -= np.einsum("naa,na->n", left, data.stated[many] ** 2) / 2

@@ -31,31 +31,21 @@ LARGEST_LEVERAGE = 0.5
 STARS_PER_PART = 40  # of a part of the data; smaller ones are joined
 STARS_PER_CELL = 60
 STARS_PER_BIN = 150  # of magnitudes
-MOST_CELLS = 8  # along each side of a chip
-MOST_MAGNITUDES = 10
+MAX_CELLS = 8  # along each side of a chip
+MAX_MAGNITUDES = 10
 
 
 @dataclass(frozen=True, eq=False)
 class _Squares:
-    """Squared scores and curvatures of the detections that say anything, in units of their errors.
+    """Squared scores and curvatures of detections, in units of their errors."""
 
-    Parameters
-    ----------
-    square, expected : ndarray, shape (2, N)
-        Along u and v.
-    star : ndarray of int, shape (N,)
-    sigma : float
-        Typical standard deviation along an axis.
-    free : float
-        Degrees of freedom of the residuals, over their number: what the fit takes from all of them
-        together makes their squares scatter more than each by itself shows.
-    unit : str
-    """
-
+    # square, expected (2, N): along u and v
     square: Float
     expected: Float
-    star: Int
-    sigma: float
+    star: Int  # (N,)
+    sigma: float  # typical standard deviation along an axis
+    # degrees of freedom of the residuals, over their number: what the fit takes from all of them
+    # together makes their squares scatter more than each by itself shows
     free: float
     unit: str
 
@@ -66,17 +56,7 @@ class _Squares:
 
 
 def noise_tests(sample: ScoredSample) -> list[Outcome]:
-    """Outcomes of the tests by position, magnitude, exposure and axis, as far as the data go.
-
-    Parameters
-    ----------
-    sample : ScoredSample
-        With its leverage.
-
-    Returns
-    -------
-    list of Outcome
-    """
+    """Outcomes of the tests by position, magnitude, exposure and axis, as far as the data go."""
     leverage = np.broadcast_to(sample.leverage, sample.score.shape)
     # what the fit has taken of a residual says nothing of its noise
     rows = np.flatnonzero(sample.used & (leverage.max(axis=0) < LARGEST_LEVERAGE))
@@ -110,17 +90,17 @@ def _cells(sample: ScoredSample, rows: Int) -> Int:
     for c in np.unique(chip):
         here = chip == c
         n = len(np.unique(sample.star[rows[here]]))
-        side = int(np.clip(np.sqrt(n / STARS_PER_CELL), 1, MOST_CELLS))
+        side = int(np.clip(np.sqrt(n / STARS_PER_CELL), 1, MAX_CELLS))
         at = rows[here]
         iy, ix = np.divmod(cell_index(sample.X[at], sample.Y[at], (side, side)), side)
         # boustrophedon: cells with few stars are joined to neighbours
-        code[here] = c * MOST_CELLS**2 + iy * side + np.where(iy % 2, side - 1 - ix, ix)
+        code[here] = c * MAX_CELLS**2 + iy * side + np.where(iy % 2, side - 1 - ix, ix)
     return code
 
 
 def _magnitudes(mag: Float, n_stars: int) -> Int:
     """Bins with equal numbers of detections."""
-    n = int(np.clip(n_stars // STARS_PER_BIN, 1, MOST_MAGNITUDES))
+    n = int(np.clip(n_stars // STARS_PER_BIN, 1, MAX_MAGNITUDES))
     edges = np.quantile(mag, np.linspace(0, 1, n + 1)[1:-1])
     return np.searchsorted(np.unique(edges), mag)
 

@@ -20,7 +20,7 @@ Float = NDArray[np.float64]
 BINS = 256  # along each side of a chip: periods from a hundredth of it are seen
 PADDED = 2  # finer frequencies than the bins', so that none falls between
 SLOWEST = 1.5  # periods beyond the polynomial's own, below which it takes waves for terms
-FEWEST_STARS = 100
+MIN_STARS = 100
 
 
 def pattern_test(sample: ScoredSample) -> Outcome | None:
@@ -31,17 +31,9 @@ def pattern_test(sample: ScoredSample) -> Outcome | None:
     stars.  The longest of all frequencies counts as one of so many walks: at lengths that matter,
     even neighbours of the finer frequencies hardly ever exceed it together.
 
-    Parameters
-    ----------
-    sample : ScoredSample
-        With its leverage.
-
-    Returns
-    -------
-    Outcome or None
-        None for less than `FEWEST_STARS` detections.
+    None for less than `MIN_STARS` detections.
     """
-    if len(sample) < FEWEST_STARS:
+    if len(sample) < MIN_STARS:
         return None
     model = sample.model
     allowed = _frequencies(model.order)

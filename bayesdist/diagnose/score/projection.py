@@ -31,27 +31,13 @@ LARGEST_LEVERAGE = 0.95  # of one detection; it has next to no residual of its o
 
 @dataclass(frozen=True, eq=False)
 class Eliminated:
-    """Parameters of one exposure, as far as the sample knows them.
+    """Parameters of one exposure, as far as the sample knows them."""
 
-    Parameters
-    ----------
-    index : ndarray of int, shape (l,)
-        Which entries of theta.
-    inverse : ndarray, shape (l, l)
-        Inverse of their information, with the priors.
-    gain : ndarray, shape (l, G + q)
-        How they follow a global parameter, or a regressor.
-    score : ndarray, shape (l,)
-        With the pull of the priors.
-    precision : ndarray, shape (l,)
-        Of the priors.
-    """
-
-    index: Int
-    inverse: Float
-    gain: Float
-    score: Float
-    precision: Float
+    index: Int  # (l,) which entries of theta
+    inverse: Float  # (l, l) inverse of their information, with the priors
+    gain: Float  # (l, G + q) how they follow a global parameter, or a regressor
+    score: Float  # (l,) with the pull of the priors
+    precision: Float  # (l,) of the priors
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,27 +46,16 @@ class Projection:
 
     G global parameters, q regressors: each of the functions that the tests add, on both axes of
     every chip.
-
-    Parameters
-    ----------
-    functions : Functions
-    exposures : dict of int to Eliminated
-        By the code of the frame's exposure.
-    information : ndarray, shape (G + q, G + q)
-        Of global parameters and regressors, with the priors, the exposures' parameters eliminated.
-    score : ndarray, shape (G + q,)
-    precision : ndarray, shape (D,)
-        Of the priors.
-    theta : ndarray, shape (D,)
-        Where the scores were taken.
     """
 
     functions: Functions
-    exposures: dict[int, Eliminated]
+    exposures: dict[int, Eliminated]  # by the code of the frame's exposure
+    # (G + q, G + q) of global parameters and regressors, with the priors, the exposures' parameters
+    # eliminated
     information: Float
-    score: Float
-    precision: Float
-    theta: Float
+    score: Float  # (G + q,)
+    precision: Float  # (D,) of the priors
+    theta: Float  # (D,) where the scores were taken
 
     @property
     def sample(self) -> ScoredSample:
@@ -197,16 +172,7 @@ class Projection:
     def regressor_map(self, block: Block, which: Int) -> Float:
         """Coefficients (2, L, n) of projected regressors in a block.
 
-        Parameters
-        ----------
-        block : Block
-        which : ndarray of int, shape (n,)
-            From 0 to q - 1.
-
-        Returns
-        -------
-        ndarray, shape (2, L, n)
-            Of the functions.
+        `which` (n,) are from 0 to q - 1.
         """
         K, nuisance = self.sample.model.n_terms, self.nuisance[:, which]
         by_global, by_local = _parts(block, self.n_global)
@@ -243,17 +209,7 @@ class Projection:
 def projection_of(functions: Functions, theta: Float, priors: GaussianPriors) -> Projection:
     """Sums over the detections of a sample.
 
-    Parameters
-    ----------
-    functions : Functions
-        With the sample.
-    theta : ndarray, shape (D,)
-        Where the scores were taken.
-    priors : GaussianPriors
-
-    Returns
-    -------
-    Projection
+    `theta` (D,) is where the scores were taken.
     """
     try:
         return _summed(functions, theta, priors)
@@ -317,7 +273,7 @@ def _parts(block: Block, n_global: int) -> tuple[Float, Float]:
 
 
 def _added(block: Block, n_added: int, n_terms: int, which: Int) -> Float:
-    """Some regressors (2, L, n) in a block, along the axes of the polynomials."""
+    """Coefficients (2, L, n) of some regressors in a block, along the axes of the polynomials."""
     out = np.zeros((2, n_terms + n_added, len(which)))
     chip, rest = np.divmod(which, 2 * n_added)
     here = np.flatnonzero(chip == block.chip)
@@ -352,10 +308,7 @@ def _ridged(matrix: Float) -> Float:
 def _inverse(matrix: Float) -> Float:
     """Inverse of an information matrix.
 
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        When it is not positive.
+    Raises `numpy.linalg.LinAlgError` when it is not positive.
     """
     root = np.linalg.cholesky(_ridged(matrix))
     return np.asarray(cho_solve((root, True), np.eye(len(matrix))))

@@ -24,7 +24,7 @@ EDGES, EDGES_BESIDE_ORDERS = "edges", "edges beside orders"
 LINEAR = 1  # order of the terms that go with magnitude, colour and time
 HIGHER = 2  # orders above the model's that are tested
 OUTSIDE = 0.5  # per cent of the values at either end that are moved to the others
-FEWEST_AT_EDGES = 200  # detections: some in each margin
+MIN_AT_EDGES = 200  # detections: some in each margin
 NEAR_EDGE = 0.05  # of half a side, over which what is at an edge falls off
 SHORTEST = 0.1  # years over which a drift is looked for
 # information that a direction has kept beside the parameters, over what it had: below, it is theirs
@@ -35,17 +35,10 @@ OWN_OF_TIME = 0.02  # frames take up drifts but for what the curvature of the po
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """A number of each detection that multiplies polynomial terms.
+    """Number of each detection that multiplies polynomial terms."""
 
-    Parameters
-    ----------
-    values : ndarray, shape (N,)
-    order : int
-        Of the terms, 0 included.
-    """
-
-    values: Float
-    order: int
+    values: Float  # (N,)
+    order: int  # of the terms, 0 included
 
     @property
     def n_terms(self) -> int:
@@ -55,50 +48,32 @@ class Factor:
 
 @dataclass(frozen=True, eq=False)
 class Regressors:
-    """What one test adds to the model, on both axes of every chip.
-
-    Parameters
-    ----------
-    family : Family
-    functions : ndarray of int
-        Which `Functions`.
-    least : float
-        Fraction of the information that a direction must have kept beside the model's parameters.
-    beside : ndarray of int
-        Functions that the fit is given as well, so that they do not pass for these.
-    """
+    """Functions that one test adds to the model, on both axes of every chip."""
 
     family: Family
-    functions: Int
+    functions: Int  # which `Functions`
+    # fraction of the information that a direction must have kept beside the model's parameters
     least: float = INDEPENDENT
+    # functions that the fit is given as well, so that they do not pass for these
     beside: Int = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def every(self) -> Int:
-        """All of these functions, the tested ones first."""
+        """Indices of all of these functions, the tested ones first."""
         return np.concatenate([self.functions, self.beside])
 
     @property
     def own(self) -> NDArray[np.bool_]:
-        """Which of them are tested."""
+        """Boolean mask of those that are tested."""
         return np.arange(len(self.functions) + len(self.beside)) < len(self.functions)
 
 
 @dataclass(frozen=True, eq=False)
 class Functions:
-    """Functions of the detections: those of the model, and those that the tests add.
-
-    Parameters
-    ----------
-    sample : ScoredSample
-    order : int
-        Highest total order of the polynomials.
-    factors : tuple of Factor
-    regressors : tuple of Regressors
-    """
+    """Functions of the detections: those of the model, and those that the tests add."""
 
     sample: ScoredSample
-    order: int
+    order: int  # highest total order of the polynomials
     factors: tuple[Factor, ...]
     regressors: tuple[Regressors, ...]
 
@@ -148,16 +123,7 @@ class Functions:
 
 
 def functions_for(sample: ScoredSample) -> Functions:
-    """The functions that the data can be asked for.
-
-    Parameters
-    ----------
-    sample : ScoredSample
-
-    Returns
-    -------
-    Functions
-    """
+    """Functions that the data can be asked for."""
     n = sample.model.order
     regressors = [
         Regressors(order_family(total, n), len(polynomial_terms(total - 1)) + np.arange(total + 1))
@@ -179,7 +145,7 @@ def functions_for(sample: ScoredSample) -> Functions:
         if values is not None:
             add(name, Factor(_standing_out(values), LINEAR))
     edges = [np.exp((s * Z - 1.0) / NEAR_EDGE) for Z in (sample.X, sample.Y) for s in (-1, 1)]
-    if len(sample) >= FEWEST_AT_EDGES:
+    if len(sample) >= MIN_AT_EDGES:
         factors += [Factor(one - one.mean(), 0) for one in edges]
         orders = np.concatenate([one.functions for one in regressors[:HIGHER]])
         alone = Regressors(FAMILIES[EDGES], start + np.arange(len(edges)))

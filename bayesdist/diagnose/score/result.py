@@ -72,23 +72,16 @@ class ScoreTest:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """One test by itself, before it is known how many there are.
-
-    Parameters
-    ----------
-    family : Family
-    statistic, dof, dof_residual, p_value, size, unit
-        As of `ScoreTest`.
-    smallest : callable
-        Size that is found with probability `POWER`, by the level of the test.
-    """
+    """One test by itself, before it is known how many there are."""
 
     family: Family
+    # statistic, dof, dof_residual, p_value, size, unit: as of `ScoreTest`
     statistic: float
     dof: float
     dof_residual: float | None
     p_value: float
     size: float
+    # size that is found with probability `POWER`, by the level of the test
     smallest: Callable[[float], float]
     unit: str
 
@@ -139,19 +132,9 @@ def outcome(
 ) -> Outcome:
     """Outcome of a test that has found a pattern of some mean square.
 
-    Parameters
-    ----------
-    family : Family
-    statistic, dof, dof_residual, p_value, unit
-        As of `ScoreTest`.
-    square, noise : float
-        Mean square of the pattern, noise included, and that of the noise.
-    smallest : callable, optional
-        As of `Outcome`; by default that of a pattern that lies in any direction as noise does.
-
-    Returns
-    -------
-    Outcome
+    `square` and `noise` are the mean square of the pattern, noise included, and that of the noise;
+    `smallest` is by default that of a pattern that lies in any direction as noise does. Others as
+    of `ScoreTest`.
     """
     if smallest is None:
         smallest = partial(smallest_pattern, float(np.sqrt(max(noise, 0.0))), dof, dof_residual)
@@ -160,17 +143,7 @@ def outcome(
 
 
 def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
-    """Tests with their verdicts, corrected for how many there are (Holm 1979).
-
-    Parameters
-    ----------
-    outcomes : sequence of Outcome
-
-    Returns
-    -------
-    tuple of ScoreTest
-        In the same order.
-    """
+    """Tests with their verdicts, corrected for how many there are (Holm 1979)."""
     n = len(outcomes)
     significant = holm([one.p_value for one in outcomes]) <= SCORE_TESTS.value
     # what is alone has to pass the first step
@@ -183,17 +156,7 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
 def noncentrality(level: float, dof: float, dof_residual: float | None = None) -> float:
     """Noncentrality at which a chi-square or F test has the power `POWER`.
 
-    Parameters
-    ----------
-    level : float
-        Of the test.
-    dof : float
-    dof_residual : float, optional
-        Of the F test.
-
-    Returns
-    -------
-    float
+    `dof_residual` is that of an F test.
     """
     if dof_residual is None or dof_residual > 1e5:  # where F and chi-square are alike
         return float(special.chndtrinc(stats.chi2.isf(level, dof), dof, 1 - POWER))
@@ -204,17 +167,7 @@ def noncentrality(level: float, dof: float, dof_residual: float | None = None) -
 def smallest_pattern(noise: float, dof: float, dof_residual: float | None, level: float) -> float:
     """Rms of a pattern that is found with the power `POWER`.
 
-    Parameters
-    ----------
-    noise : float
-        Rms of the pattern that noise makes.
-    dof, dof_residual : float
-        Of the test.
-    level : float
-
-    Returns
-    -------
-    float
-        Of a pattern that lies in any direction as noise does.
+    `noise` is the rms of the pattern that noise makes; the pattern lies in any direction as noise
+    does.
     """
     return float(noise * np.sqrt(noncentrality(level, dof, dof_residual) / dof))

@@ -1,4 +1,4 @@
-"""Detections with their scores: what all tests of one solution look at."""
+"""Detections with their scores: the data of all tests of one solution."""
 
 from __future__ import annotations
 
@@ -24,84 +24,43 @@ LARGEST_BLOCK = 4096  # detections, whose functions stay in the cache
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Detections of one chip, exposure and epoch, or some of them: one polynomial describes them.
-
-    Parameters
-    ----------
-    rows : slice
-    chip : int
-        Code into the model's chips.
-    exposure : int
-        Code into the exposures of the data.
-    frame_exposure : int
-        Code of the exposure whose frame they have.
-    frame : ndarray, shape (2, 2)
-        Linear part of that frame.
-    effective : ndarray, shape (2, K)
-    columns : ndarray of int, shape (m,)
-        Parameters that the polynomial depends on, the global ones first.
-    derivative : ndarray, shape (2, K, m)
-        Of the effective coefficients by them.
-    """
+    """Detections of one chip, exposure and epoch, or some of them, with one polynomial."""
 
     rows: slice
-    chip: int
-    exposure: int
-    frame_exposure: int
-    frame: Float
-    effective: Float
-    columns: Int
-    derivative: Float
+    chip: int  # code into the model's chips
+    exposure: int  # code into the exposures of the data
+    frame_exposure: int  # code of the exposure whose frame they have
+    frame: Float  # (2, 2) linear part of that frame
+    effective: Float  # (2, K)
+    columns: Int  # (m,) parameters that the polynomial depends on, the global ones first
+    derivative: Float  # (2, K, m) of the effective coefficients by them
 
 
 @dataclass(frozen=True, eq=False)
 class ScoredSample:
-    """Detections in the order of their blocks, with gradient and curvature of their likelihood.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    X, Y : ndarray, shape (N,)
-        Scaled detector position.
-    score : ndarray, shape (2, N)
-        Gradient of the log-likelihood by the model's u and v.
-    curvature : ndarray, shape (3, N)
-        Minus the second derivatives uu, uv, vv.
-    residual : ndarray, shape (2, N)
-        Data minus model.
-    variance : ndarray, shape (2, N)
-        Squared errors of true matches along u and v, jitter included.
-    inlier : ndarray, shape (N,)
-        Probability of being a true match; of a least-squares fit, whether it uses the detection.
-    mag, colour, epoch : ndarray, shape (N,), or None
-    star : ndarray of int, shape (N,)
-        Number of the star, from 0: detections of one star share the error of its reference
-        position.
-    blocks : tuple of Block
-    motion : ndarray, shape (2, N), or None
-        Proper motions along u and v, in the unit of u, v per year.
-    motion_sigma : ndarray, shape (2, N), or None
-        Their standard errors, where the table has them.
-    leverage : ndarray, shape (2, N), or float
-        Fraction of the noise of each detection that the fit follows, along u and v; 0 where it is
-        not known.
-    """
+    """Detections in the order of their blocks, with gradient and curvature of their likelihood."""
 
     model: DistortionModel
+    # X, Y (N,): scaled detector position
     X: Float
     Y: Float
-    score: Float
-    curvature: Float
-    residual: Float
-    variance: Float
+    score: Float  # (2, N) gradient of the log-likelihood by the model's u and v
+    curvature: Float  # (3, N) minus the second derivatives uu, uv, vv
+    residual: Float  # (2, N) data minus model
+    variance: Float  # (2, N) squared errors of true matches along u and v, jitter included
+    # (N,) probability of being a true match; of a least-squares fit, whether it uses the detection
     inlier: Float
-    mag: Float | None
+    mag: Float | None  # (N,)
     colour: Float | None
     epoch: Float | None
+    # (N,) number of the star, from 0: detections of one star share the error of its reference
+    # position
     star: Int
     blocks: tuple[Block, ...]
-    motion: Float | None = None
-    motion_sigma: Float | None = None
+    motion: Float | None = None  # (2, N) proper motions along u and v, in the unit of u, v per year
+    motion_sigma: Float | None = None  # (2, N) their standard errors, where the table has them
+    # (2, N) fraction of the noise of each detection that the fit follows, along u and v; 0 where it
+    # is not known
     leverage: Float | float = 0.0
 
     def __len__(self) -> int:
@@ -109,7 +68,7 @@ class ScoredSample:
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """Detections that say anything: all but those that a fit rejects."""
+        """Boolean mask (N,) of the detections that count: all but those that a fit rejects."""
         return np.any(self.curvature != 0, axis=0)
 
     @cached_property
@@ -132,7 +91,7 @@ class ScoredSample:
         return list(found.values())
 
     def with_positive_curvature(self) -> ScoredSample:
-        """The sample with what is concave in the likelihood alone.
+        """Sample with what is concave in the likelihood alone.
 
         Detections between true and false curve the wrong way; where there are many of them, their
         sum is no information matrix.
@@ -145,22 +104,10 @@ class ScoredSample:
 
 
 def scored_sample(table: MatchTable, solution: Solution) -> ScoredSample:
-    """Detections of a table with what a solution says of each.
+    """Sample of the detections of a table, with their scores at a solution.
 
-    Parameters
-    ----------
-    table : MatchTable
-        With errors; of more than `SAMPLE` rows, every k-th is taken.
-    solution : Posterior or LinearFit
-
-    Returns
-    -------
-    ScoredSample
-
-    Raises
-    ------
-    InputError
-        As `prepare` and `likelihood_of`.
+    The table has errors; of more than `SAMPLE` rows, every k-th is taken. Raises InputError where
+    the table does not go with the solution.
     """
     table = table.sample(SAMPLE)
     by_exposure = np.argsort(table.exposure, kind="stable")

@@ -1,4 +1,4 @@
-"""All tests of one solution, corrected for their number."""
+"""Tests of one solution, corrected for their number."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from bayesdist.diagnose.score.motions import motion_test
 from bayesdist.diagnose.score.noise import noise_tests
 from bayesdist.diagnose.score.pattern import pattern_test
 from bayesdist.diagnose.score.projection import projection_of
+from bayesdist.diagnose.score.regressor_tests import regressor_tests
 from bayesdist.diagnose.score.regressors import EDGES, EDGES_BESIDE_ORDERS, functions_for
 from bayesdist.diagnose.score.result import Outcome, ScoreTest, corrected
 from bayesdist.diagnose.score.sample import scored_sample
-from bayesdist.diagnose.score.score import regressor_tests
 from bayesdist.diagnose.score.truncation import truncation_test
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.solution import Solution

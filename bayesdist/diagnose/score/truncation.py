@@ -26,12 +26,12 @@ __all__ = ["truncation_test"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-FEWEST_STARS = 50
+MIN_STARS = 50
 LARGEST_LEVERAGE = 0.5
-ENDS = 0.25  # of the expected number: with more, nothing ends at the match radius
+MAX_FRACTION_BEYOND = 0.25  # of the expected number: with more, nothing ends at the match radius
 STARS_PER_PART = 150  # with errors alike, from which their scatter is measured
-MOST_PARTS = 12
-FEW = 0.5  # expected matches whose absence says nothing
+MAX_PARTS = 12
+MIN_EXPECTED = 0.5  # expected matches whose absence says nothing
 BEYOND = (0, 3)  # stars that may lie beyond a radius: the edge need not be sharp
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
 ANGLES = (np.arange(8) + 0.5) * np.pi / 16  # of a quarter of the circle
@@ -39,28 +39,19 @@ ANGLES = (np.arange(8) + 0.5) * np.pi / 16  # of a quarter of the circle
 
 @dataclass(frozen=True, eq=False)
 class _Deficit:
-    """True matches expected beyond a radius, and detections that are there.
-
-    Parameters
-    ----------
-    expected : float
-    beyond : int
-    radius : float
-    unit : str
-    spread : float
-        Standard deviation of the logarithm of `expected`, as the scale is not known exactly.
-    """
+    """True matches expected beyond a radius, and detections that are there."""
 
     expected: float
     beyond: int
     radius: float
     unit: str
+    # standard deviation of the logarithm of `expected`, as the scale is not known exactly
     spread: float
 
     @property
     def p_value(self) -> float:
         """Probability of so few, over what the scale may be."""
-        if self.expected < FEW or self.beyond > ENDS * self.expected:
+        if self.expected < MIN_EXPECTED or self.beyond > MAX_FRACTION_BEYOND * self.expected:
             return 1.0
         at = self.expected * np.exp(self.spread * NODES)
         chance = special.gammaincc(self.beyond + 1, at)
@@ -69,36 +60,18 @@ class _Deficit:
 
 @dataclass(frozen=True, eq=False)
 class _Radii:
-    """Residuals in units of their own scatter.
+    """Residuals in units of their own scatter."""
 
-    Parameters
-    ----------
-    inlier : ndarray, shape (N,)
-        Probability of being a true match.
-    square : ndarray, shape (2, N)
-        Squared residuals over their quoted variance, by which they scatter as a whole.
-    relative : float
-        Relative error of that factor.
-    radius2 : ndarray, shape (N,)
-        Squared residuals of both axes, in the unit of u and v.
-    part : ndarray of int, shape (N,)
-        Stars of about equal quoted errors.
-    variance : ndarray, shape (2, P)
-        Of the residuals along each axis, in each part, given back what the fit has taken.
-    left : ndarray, shape (2, P)
-        As the fit has left it.
-    relative_of : ndarray, shape (P,)
-        Its relative error.
-    """
-
-    inlier: Float
+    inlier: Float  # (N,) probability of being a true match
+    # (2, N) squared residuals over their quoted variance, by which they scatter as a whole
     square: Float
-    relative: float
-    radius2: Float
-    part: Int
+    relative: float  # relative error of that factor
+    radius2: Float  # (N,) squared residuals of both axes, in the unit of u and v
+    part: Int  # (N,) stars of about equal quoted errors
+    # (2, P) of the residuals along each axis, in each part, given back what the fit has taken
     variance: Float
-    left: Float
-    relative_of: Float
+    left: Float  # (2, P) as the fit has left it
+    relative_of: Float  # (P,) its relative error
 
     @classmethod
     def of(cls, sample: ScoredSample, inlier: Float) -> _Radii:
@@ -146,7 +119,7 @@ def _weights(sample: ScoredSample) -> Float:
 
 def _alike(variance: Float, inlier: Float) -> Int:
     """Parts (N,) with stars of about equal errors."""
-    n = int(np.clip(inlier.sum() // STARS_PER_PART, 1, MOST_PARTS))
+    n = int(np.clip(inlier.sum() // STARS_PER_PART, 1, MAX_PARTS))
     edges = np.unique(np.quantile(variance, np.linspace(0, 1, n + 1)[1:-1]))
     part = np.searchsorted(edges, variance, side="right")
     count = np.bincount(part, inlier, minlength=len(edges) + 1)
@@ -160,21 +133,11 @@ def _alike(variance: Float, inlier: Float) -> Int:
 def truncation_test(sample: ScoredSample, match_radius: float | None = None) -> Outcome | None:
     """Test for true matches missing beyond some radius.
 
-    Parameters
-    ----------
-    sample : ScoredSample
-        With its leverage.
-    match_radius : float, optional
-        In the unit of u and v.
-
-    Returns
-    -------
-    Outcome or None
-        None for less than `FEWEST_STARS` true matches.
+    `match_radius` is in the unit of u and v. None for less than `MIN_STARS` true matches.
     """
     inlier = _weights(sample)
     n = float(inlier.sum())
-    if n < FEWEST_STARS:
+    if n < MIN_STARS:
         return None
     radii = _Radii.of(sample, inlier)
     found = [
@@ -263,10 +226,7 @@ def _tail(variance: Float, radius2: float) -> Float:
 def _lost(end: float) -> float:
     """Scatter along an axis that was cut off, in units of what is left.
 
-    Parameters
-    ----------
-    end : float
-        Half the square of the radius in units of the scatter that is left.
+    `end` is half the square of the radius in units of the scatter that is left.
     """
     # mean of an exponential of scale s cut at `end`: s - end / (exp(end / s) - 1) = 1
     if end <= 2.0:  # as flat a distribution as there is

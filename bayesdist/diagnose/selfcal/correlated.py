@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bayesdist.diagnose.correlated.coupled_structure import structure_posterior
 from bayesdist.diagnose.correlated.deviations import deviation_columns, deviation_draws
-from bayesdist.diagnose.correlated.functions import LEAST_SIDE, StructureFunctions
+from bayesdist.diagnose.correlated.functions import MIN_SIDE, StructureFunctions
 from bayesdist.diagnose.correlated.noise import not_narrower
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
 from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy
@@ -28,15 +28,15 @@ from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 
-__all__ = ["MOST_EXPOSURES", "selfcal_discrepancy"]
+__all__ = ["MAX_EXPOSURES", "selfcal_discrepancy"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 DRAWS = 2000
-MOST_DETECTIONS = 60_000  # from which structure is estimated, at most
-MOST_EXPOSURES = 150  # whose single deviations are estimated
-MOST_SINES = 700  # of all axes and chips: their information is decomposed
+MAX_DETECTIONS = 60_000  # from which structure is estimated, at most
+MAX_EXPOSURES = 150  # whose single deviations are estimated
+MAX_SINES = 700  # of all axes and chips: their information is decomposed
 
 
 @one_thread
@@ -61,7 +61,7 @@ def selfcal_discrepancy(
     noise, ratio = _noise(solution, working)
     facts: dict[str, object] = {"structure": [], "unit": model.unit, "noise_ratio": ratio}
 
-    some = even_stars(solution.problem, MOST_DETECTIONS)
+    some = even_stars(solution.problem, MAX_DETECTIONS)
     problem, stars = solution.problem.of_stars(some), solution.stars[some]
     chosen = np.isin(solution.problem.star, some)
     flat, working = flat.at(chosen), working.at(chosen)
@@ -73,7 +73,7 @@ def selfcal_discrepancy(
         problem.groups,
         counts.astype(float),
         exposures=exposures,
-        most=MOST_EXPOSURES,
+        most=MAX_EXPOSURES,
     )
     columns = Columns(problem, solution.theta, functions, deviations)
     N, score, taken = eliminated(columns, flat, stars, working=working)
@@ -116,13 +116,13 @@ def _functions(problem: Problem) -> dict[int, StructureFunctions]:
     n = np.bincount(problem.groups.chip[problem.groups.index], minlength=len(model.chips))
     used = np.flatnonzero(n)
     # sines in a circle of frequencies: a side squared, times pi / 4
-    side = np.sqrt(MOST_SINES / (2 * len(used)) / (np.pi / 4))
+    side = np.sqrt(MAX_SINES / (2 * len(used)) / (np.pi / 4))
     out = {}
     for code in used:
         size = model.chips[code].size
         wanted = StructureFunctions.for_stars(model.order, size, int(n[code]))
         out[int(code)] = StructureFunctions(
-            model.order, size, int(max(min(wanted.n_side, side), LEAST_SIDE))
+            model.order, size, int(max(min(wanted.n_side, side), MIN_SIDE))
         )
     return out
 

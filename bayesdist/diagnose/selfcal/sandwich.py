@@ -14,7 +14,7 @@ __all__ = ["sandwich", "star_scores"]
 Float = NDArray[np.float64]
 
 # A star that alone determines a parameter has no residual: its squared score is uninformative.
-LEAST_FREE = 0.1
+MIN_FREE = 0.1
 
 
 def sandwich(solution: SelfCalibrationMode, scores: DetectionScores) -> Float:
@@ -44,7 +44,7 @@ def sandwich(solution: SelfCalibrationMode, scores: DetectionScores) -> Float:
         leverage -= np.sum((sums.rows @ inside) ** 2, axis=1).reshape(S, q).sum(axis=1)
         # per degree of freedom of its detections, in excess of the star's own parameters
         number = 2 * np.bincount(piece.star, here.curvature[:, 0, 0] > 0, S) - q
-        mean = np.clip(leverage / np.maximum(number, 1), 0.0, 1 - LEAST_FREE)
+        mean = np.clip(leverage / np.maximum(number, 1), 0.0, 1 - MIN_FREE)
         psi = star_scores(columns, piece, here.gradient) / (1 - mean)[:, None]
         meat += psi.T @ psi
     cov = root @ root.T

@@ -1,6 +1,6 @@
 """Score tests of self-calibrations: what a model lacks, with the stars eliminated.
 
-As for matched stars (`bayesdist.diagnose.score.score`), with the positions of stars among the
+As for matched stars (`diagnose.score.regressor_tests`), with the positions of stars among the
 parameters that are projected out, and with the scores of a star's detections added up.  What stars
 take up cannot be tested: directions in which known stars would say much more are left out.
 """
@@ -21,7 +21,7 @@ from bayesdist.diagnose.score.noise import noise_tests
 from bayesdist.diagnose.score.result import Outcome, ScoreTest, corrected, outcome
 from bayesdist.diagnose.score.sample import Block, ScoredSample
 from bayesdist.diagnose.selfcal.columns import AddedColumns, pointing_terms
-from bayesdist.diagnose.selfcal.correlated import MOST_EXPOSURES
+from bayesdist.diagnose.selfcal.correlated import MAX_EXPOSURES
 from bayesdist.diagnose.selfcal.eliminated import (
     add_products,
     even_stars,
@@ -41,9 +41,9 @@ __all__ = ["selfcal_score_tests"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-MOST_DETECTIONS = 60_000  # that are looked at
+MAX_DETECTIONS = 60_000  # that are looked at
 STARS_PER_DIRECTION = 2  # below, a covariance of the scores says nothing
-TOLD = 0.02  # of what known stars would say of a direction: less is not told from their places
+MIN_INFORMATION = 0.02  # of a direction, relative to that with known stars
 REMEDIES = {
     "magnitude": "cut the faint stars, or correct the charge-transfer efficiency",
     "exposures": "give selfcal.frames a scale where it has none, or leave out exposures",
@@ -53,27 +53,14 @@ OUTSIDE = 0.5  # per cent of the magnitudes at either end that are moved to the 
 
 @dataclass(frozen=True, eq=False)
 class _Sums:
-    """What the detections say of the further columns of a problem.
+    """Information and score of the further columns of a problem."""
 
-    Parameters
-    ----------
-    known : ndarray, shape (n, n)
-        Information if stars and parameters were known.
-    information, score : ndarray, shape (n, n), (n,)
-        With both eliminated.
-    covariance : ndarray, shape (n, n)
-        Of the score, by the scores of single stars.
-    square : ndarray, shape (n, n)
-        Mean products of displacements over the detections.
-    n_stars : int
-    unit : str
-    """
-
-    known: Float
+    known: Float  # (n, n) information if stars and parameters were known
+    # information, score (n, n) or (n,): with both eliminated
     information: Float
     score: Float
-    covariance: Float
-    square: Float
+    covariance: Float  # (n, n) of the score, by the scores of single stars
+    square: Float  # (n, n) mean products of displacements over the detections
     n_stars: int
     unit: str
 
@@ -96,7 +83,7 @@ def selfcal_score_tests(
     tuple of ScoreTest
     """
     whole = solution.problem
-    some = even_stars(whole, MOST_DETECTIONS)
+    some = even_stars(whole, MAX_DETECTIONS)
     rows = np.isin(whole.star, some)
     problem, model = whole.of_stars(some), whole.model
     varied = None
@@ -106,7 +93,7 @@ def selfcal_score_tests(
         varied = inside - inside.mean()
     counts = np.bincount(problem.groups.index, minlength=len(problem.groups)).astype(float)
     deviations = deviation_columns(
-        model, solution.theta, problem.groups, counts, most=MOST_EXPOSURES
+        model, solution.theta, problem.groups, counts, most=MAX_EXPOSURES
     )
     pointed = pointing_terms(problem, solution.theta)
     columns = AddedColumns(problem, solution.theta, {}, deviations, varied, pointed)
@@ -160,7 +147,7 @@ def _summed(
 def _tested(sums: _Sums, name: str, which: Int, order: int) -> Outcome | None:
     """Outcome of one test; None where the data cannot be asked."""
     at = np.ix_(which, which)
-    N = independent_directions(sums.known[at], sums.information[at], TOLD)
+    N = independent_directions(sums.known[at], sums.information[at], MIN_INFORMATION)
     q, n = N.shape[1], sums.n_stars
     if q == 0 or n < STARS_PER_DIRECTION * q + 2:
         return None
@@ -201,7 +188,7 @@ def _motions(solution: SelfCalibrationMode, epoch: Float) -> Outcome | None:
 def _noise_sample(
     solution: SelfCalibrationMode, some: Int, rows: NDArray[np.bool_], mag: Float | None
 ) -> ScoredSample:
-    """Some detections along the axes of the detector, in the unit of u and v.
+    """Sample of detections along the axes of the detector, in the unit of u and v.
 
     Rolls turn the axes of the sky from exposure to exposure, and errors are those of pixels.
     """

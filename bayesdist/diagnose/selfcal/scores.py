@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.diagnose.correlated.noise import MOST_BLOCKS, STARS_PER_BLOCK, shrunk_ratios
+from bayesdist.diagnose.correlated.noise import MAX_BLOCKS, STARS_PER_BLOCK, block_ratios
 from bayesdist.diagnose.selfcal.leverage import taken_by_stars
 from bayesdist.infer.selfcal.elimination import memberships
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.model.grid import cell_index
 
 __all__ = ["DetectionScores", "score_excess", "scores_of_detections"]
 
@@ -71,17 +72,9 @@ def score_excess(solution: SelfCalibrationMode, scores: DetectionScores) -> Floa
         here = np.flatnonzero(chip == code)
         if not len(here) or bottom[here].sum() <= 0:
             continue
-        side = int(np.clip(np.sqrt(len(here) / STARS_PER_BLOCK), 1, MOST_BLOCKS))
-        ix, iy = (
-            np.clip(((z[here] + 1) * (0.5 * side)).astype(np.int64), 0, side - 1)
-            for z in (p.X, p.Y)
-        )
-        block = iy * side + ix
-        sums = [
-            np.asarray(np.bincount(block, w[here], minlength=side * side), float)
-            for w in (top, bottom, 2 * free)
-        ]
-        out[here] = shrunk_ratios(*sums)[block]
+        side = int(np.clip(np.sqrt(len(here) / STARS_PER_BLOCK), 1, MAX_BLOCKS))
+        block = cell_index(p.X[here], p.Y[here], (side, side))
+        out[here] = block_ratios(block, np.stack([top, bottom, 2 * free], axis=1)[here], side**2)
     return out
 
 

@@ -11,7 +11,7 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.patches import Rectangle
 from scipy.stats import binom
 
-from bayesdist.diagnose.holdout.validation import HeldOutTruth
+from bayesdist.diagnose.holdout.validation import HoldoutValidation
 from bayesdist.numbers import count, number
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
@@ -89,7 +89,7 @@ def holdout_table(r: ReportInput) -> TextTable:
 
 def _question(test: HeldTest, unit: str) -> str:
     return {
-        "offset": f"offset, largest [{unit}]" if test.together else f"offset [{unit}]",
+        "offset": f"offset, largest [{unit}]" if test.is_omnibus else f"offset [{unit}]",
         "spread": "residuals / predicted",
         "distribution": "largest difference of distributions",
         "tails": "fraction of stars",
@@ -139,7 +139,7 @@ def holdout(r: ReportInput) -> Plot:
     )
 
 
-def _histogram(ax: Axes, found: HeldOutTruth, k: int) -> None:
+def _histogram(ax: Axes, found: HoldoutValidation, k: int) -> None:
     counts = found.pit[k]
     bins = len(counts)
     low, high = binom.ppf([0.005, 0.995], found.n, 1 / bins) * bins / found.n
@@ -154,7 +154,7 @@ def _histogram(ax: Axes, found: HeldOutTruth, k: int) -> None:
         ax.set_ylabel("stars / predicted")
 
 
-def _limit(found: HeldOutTruth) -> float:
+def _limit(found: HoldoutValidation) -> float:
     """Largest factor that the colours show."""
     good = found.region_scale[found.region_n >= _FEWEST]
     far = np.exp(np.abs(np.log(good)).max()) if good.size else 1.0
@@ -162,7 +162,7 @@ def _limit(found: HeldOutTruth) -> float:
 
 
 def _regions(
-    ax: Axes, found: HeldOutTruth, k: int, size: tuple[float, float], norm: TwoSlopeNorm
+    ax: Axes, found: HoldoutValidation, k: int, size: tuple[float, float], norm: TwoSlopeNorm
 ) -> PatchCollection:
     """Draw regions of one chip: their colour is the factor, their arrow the offset in sigma."""
     chips = list(dict.fromkeys(bin_.chip for bin_ in found.regions))

@@ -35,26 +35,17 @@ __all__ = ["regressor_tests"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-MOST_TAKEN = 0.5  # of the noise, by fit and step: what is left then says nothing of it
+MAX_TAKEN = 0.5  # of the noise, by fit and step: what is left then says nothing of it
 # power of what is left of a star's noise: 1/2 is exact where quoted errors are right (HC2), and 1,
 # the jackknife, too careful there (HC3); where they are not, 1/2 takes heavy stars for better
 # than they are
 GIVEN_BACK = 0.75
-LEAST_DOF = 3  # of the noise: below, its covariance says nothing
-MOST_CHIPS = 4  # that are tested together, with the covariance of all their scores
+MIN_DOF = 3  # of the noise: below, its covariance says nothing
+MAX_CHIPS = 4  # that are tested together, with the covariance of all their scores
 
 
 def regressor_tests(projection: Projection) -> list[Outcome]:
-    """Outcomes of all regressor tests that there are stars enough for.
-
-    Parameters
-    ----------
-    projection : Projection
-
-    Returns
-    -------
-    list of Outcome
-    """
+    """Outcomes of all regressor tests that there are stars enough for."""
     found: dict[str, list[_Part]] = {}
     for chips in _chips_together(projection):
         for name, part in _parts_of(projection, chips):
@@ -65,20 +56,13 @@ def regressor_tests(projection: Projection) -> list[Outcome]:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One test on one chip, or on a few together.
-
-    Parameters
-    ----------
-    statistic, p_value : float
-    dof, dof_residual : float
-    square, noise : float
-        Mean square of the pattern over these chips, noise included, and of the noise.
-    """
+    """One test on one chip, or on a few together."""
 
     statistic: float
     p_value: float
     dof: float
     dof_residual: float
+    # square, noise: mean square of the pattern over these chips, noise included, and of the noise
     square: float
     noise: float
 
@@ -86,7 +70,7 @@ class _Part:
 def _chips_together(projection: Projection) -> list[list[int]]:
     """Codes of the chips that are tested together: all, or each of many by itself."""
     chips = sorted({block.chip for block in projection.sample.blocks})
-    return [chips] if len(chips) <= MOST_CHIPS else [[one] for one in chips]
+    return [chips] if len(chips) <= MAX_CHIPS else [[one] for one in chips]
 
 
 def _outcome(projection: Projection, family: Family, parts: Sequence[_Part]) -> Outcome:
@@ -122,9 +106,9 @@ def _parts_of(projection: Projection, chips: list[int]) -> Iterator[tuple[str, _
     for one, (V, spreads, taken) in zip(tried, sums, strict=True):
         # as Wishart matrices that scatter as much
         quoted, found = one.q * (one.q + 1) / spreads - one.q + 1
-        if taken > MOST_TAKEN or quoted < LEAST_DOF:
+        if taken > MAX_TAKEN or quoted < MIN_DOF:
             continue
-        dof_residual = float(np.clip(found, LEAST_DOF, quoted))
+        dof_residual = float(np.clip(found, MIN_DOF, quoted))
         dof = dof_residual + one.q - 1
         T = dof_residual / dof * float(one.score @ np.linalg.solve(V, one.score))
         p = float(stats.f.sf(T / one.q, one.q, dof_residual))
@@ -136,22 +120,12 @@ def _parts_of(projection: Projection, chips: list[int]) -> Iterator[tuple[str, _
 
 @dataclass(frozen=True, eq=False)
 class _Directions:
-    """Regressors of one family that the parameters have left, in units of their information.
-
-    Parameters
-    ----------
-    regressors : Regressors
-    columns : ndarray of int, shape (n,)
-    basis : ndarray, shape (n, q)
-        With unit information beside all parameters.
-    score : ndarray, shape (q,)
-        Also the step by which the fit would move.
-    """
+    """Regressors of one family that the parameters have left, in units of their information."""
 
     regressors: Regressors
-    columns: Int
-    basis: Float
-    score: Float
+    columns: Int  # (n,)
+    basis: Float  # (n, q) with unit information beside all parameters
+    score: Float  # (q,) also the step by which the fit would move
 
     @property
     def q(self) -> int:
@@ -248,21 +222,12 @@ def _spreads(trace: Float, norm: Float, size2: Float, scale: Float) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class _Together:
-    """Directions of several families, one after the other.
+    """Directions of several families, one after the other."""
 
-    Parameters
-    ----------
-    columns : ndarray of int, shape (n,)
-    basis : ndarray, shape (n, q)
-    step : ndarray, shape (q,)
-    starts : ndarray of int, shape (families,)
-        Where the directions of each family begin.
-    """
-
-    columns: Int
-    basis: Float
-    step: Float
-    starts: Int
+    columns: Int  # (n,)
+    basis: Float  # (n, q)
+    step: Float  # (q,)
+    starts: Int  # (families,) where the directions of each family begin
 
     @classmethod
     def of(cls, tried: Sequence[_Directions]) -> _Together:
