@@ -14,7 +14,7 @@ from bayesdist.infer.density.importance import (
     rejection,
     warmup_steps,
 )
-from bayesdist.infer.sampler import lookahead
+from bayesdist.infer.sampler import proposal_batch
 from bayesdist.infer.sampler.chains import Settings, run_chains
 from bayesdist.infer.sampler.checkpoints import Walkers
 from bayesdist.infer.sampler.ensembles import replay
@@ -78,7 +78,7 @@ def test_how_many_are_evaluated_at_a_time_does_not_matter(rows, monkeypatch):
     target, fit = target_of(model, matches, OutlierMixture())
     proposal = build_proposal(target, fit)
     expected = draw_batch(target, proposal, (1, 2), (5,), 60)
-    monkeypatch.setattr(lookahead, "ROWS", rows)
+    monkeypatch.setattr(proposal_batch, "ROWS", rows)
     batch = draw_batch(target, proposal, (1, 2), (5,), 60)
     for name in ("psi", "log_prob", "log_q"):
         np.testing.assert_allclose(
