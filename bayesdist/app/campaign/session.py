@@ -42,7 +42,7 @@ from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.overlap import overlap_test
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.infer import LinearFit, Matches
-from bayesdist.infer.catalogue.star_influence import StarErrors
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.nodes.alternation import with_columns
 from bayesdist.infer.series import Series

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.infer.catalogue.star_errors import star_covariance
-from bayesdist.infer.catalogue.star_influence import StarErrors, star_influence
+from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
+from bayesdist.infer.catalogue.star_influence import star_influence
 from bayesdist.infer.compare.frame_fields import frame_between, frame_fields, mean_squares, without
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target
@@ -282,16 +282,7 @@ def with_star_errors_of(
     change: `released` are then the release and its matches, with the same codes.
     """
     n = new.model.n_polynomial
-    motion_u, motion_v = (0.0, 0.0) if errors.motion is None else errors.motion.T
-    shared = star_covariance(
-        new.fit,
-        matches,
-        *errors.position.T,
-        motion_u=motion_u,
-        motion_v=motion_v,
-        epoch0=errors.epoch,
-        frames=False,
-    )
+    shared = star_covariance(new.fit, matches, errors, frames=False)
     out = replace(new, extra=shared.extra[:n, :n])
     if released is None or released[1].star is None or matches.star is None:
         return out
