@@ -33,11 +33,20 @@ Int = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class StarErrors:
-    """Errors of a catalogue by code of the star."""
+    """Errors of a catalogue by code of the star.
 
-    position: Float  # standard errors (S, 2), in the unit of u, v
-    motion: Float | None = None  # errors (S, 2) of proper motions, in that unit per year
-    # dates (S,) at which errors of positions and motions are uncorrelated
+    Parameters
+    ----------
+    position : ndarray, shape (S, 2)
+        Standard errors of the positions along u and v, in the unit of u, v.
+    motion : ndarray, shape (S, 2), optional
+        Standard errors of the proper motions, in that unit per year.
+    epoch : ndarray, shape (S,), optional
+        Dates at which errors of positions and motions are uncorrelated; needed with motions.
+    """
+
+    position: Float
+    motion: Float | None = None
     epoch: Float | None = None
 
     def levers(self, star: Int, epoch: Float | None) -> Float:
