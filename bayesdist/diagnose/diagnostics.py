@@ -41,8 +41,7 @@ from bayesdist.diagnose.selfcal.leverage import taken_by_stars
 from bayesdist.diagnose.selfcal.misfit import dithered_misfit
 from bayesdist.diagnose.selfcal.score import selfcal_score_tests
 from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, Shards
-from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance
-from bayesdist.infer.catalogue.star_influence import StarErrors
+from bayesdist.infer.catalogue.star_errors import StarCovariance, StarErrors, star_covariance
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.streams import restarted
@@ -381,16 +380,7 @@ def catalogue_covariance(
     if errors is None or stars is None or stars.star is None:
         return None
     log.info("assess: errors of the catalogue, one for each star in all of its exposures")
-    motion = None if errors.motion is None else errors.motion.T
-    return star_covariance(
-        fit,
-        stars,
-        *errors.position.T,
-        motion_u=0.0 if motion is None else motion[0],
-        motion_v=0.0 if motion is None else motion[1],
-        epoch0=errors.epoch,
-        frames=False,
-    )
+    return star_covariance(fit, stars, errors, frames=False)
 
 
 def hold_out(

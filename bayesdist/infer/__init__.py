@@ -8,7 +8,7 @@ from bayesdist.lazy import lazy_name
 
 _HOMES = {
     "bayesdist.infer.catalogue.by_magnitude": ("fit_by_magnitude",),
-    "bayesdist.infer.catalogue.star_errors": ("StarCovariance", "star_covariance"),
+    "bayesdist.infer.catalogue.star_errors": ("StarCovariance", "StarErrors", "star_covariance"),
     "bayesdist.infer.posterior.memberships": ("Memberships", "memberships"),
     "bayesdist.infer.equations.priors": ("GaussianPriors",),
     "bayesdist.infer.exposures.alone": ("ExposureSolutions", "fit_exposures"),

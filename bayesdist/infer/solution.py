@@ -117,11 +117,30 @@ class Solution(ABC):
 
     def mapped(self, matrix: Float) -> Solution:
         """Solution whose deviations from the mean are mapped by a matrix (D, D)."""
-        mean = np.asarray(self.mean)
-        cov = matrix @ np.asarray(self.cov) @ matrix.T
-        return TransformedSolution(
-            self.model, mean, cov, self, lambda theta: mean + (theta - mean) @ matrix.T
-        )
+        mean = np.asarray(self.mean, float)
+        return self.transformed(self.model, lambda theta: mean + (theta - mean) @ matrix.T, matrix)
+
+    def transformed(
+        self, model: DistortionModel, transform: Callable[[Float], Float], jacobian: Float
+    ) -> TransformedSolution:
+        """Solution of another model, by a transformation of the parameters.
+
+        Parameters
+        ----------
+        model : DistortionModel
+        transform : callable
+            From parameters (..., D) of this solution to (..., D') of the other.
+        jacobian : ndarray, shape (D', n)
+            Its derivatives at the mean by the first n parameters; the others have no effect.
+
+        Returns
+        -------
+        TransformedSolution
+        """
+        n = jacobian.shape[1]
+        cov = jacobian @ np.asarray(self.cov, float)[:n, :n] @ jacobian.T
+        mean = transform(np.asarray(self.mean, float))
+        return TransformedSolution(model, mean, (cov + cov.T) / 2, self, transform)
 
 
 def likelihood_of(solution: Solution) -> Likelihood:

@@ -6,7 +6,6 @@ covariance is the source's through the exact Jacobian of that transformation at 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -88,16 +87,6 @@ def bare_model(model: DistortionModel) -> DistortionModel:
     )
 
 
-def _viewed(
-    source: Solution, model: DistortionModel, transform: Callable[[Float], Float], jacobian: Float
-) -> TransformedSolution:
-    """Solution by a transformation, with its Jacobian (D, n) by the source's first parameters."""
-    n = jacobian.shape[1]
-    cov = jacobian @ np.asarray(source.cov, float)[:n, :n] @ jacobian.T
-    mean = transform(np.asarray(source.mean, float))
-    return TransformedSolution(model, mean, (cov + cov.T) / 2, source, transform)
-
-
 def without_frames(solution: Solution) -> TransformedSolution:
     """The polynomials and their drift alone.
 
@@ -112,7 +101,7 @@ def without_frames(solution: Solution) -> TransformedSolution:
         'first', those from which all exposures deviate in gauge 'held'.
     """
     n = solution.model.n_distortion
-    return _viewed(solution, bare_model(solution.model), lambda theta: theta[..., :n], np.eye(n))
+    return solution.transformed(bare_model(solution.model), lambda theta: theta[..., :n], np.eye(n))
 
 
 def segment(solution: Solution, s: int) -> TransformedSolution:
@@ -156,7 +145,7 @@ def segment(solution: Solution, s: int) -> TransformedSolution:
                 rows = model.coefficient_slice(chip.number, "uv".index(axis))
                 jacobian[rows, first + 2 * s - 1] = model.drift_terms(chip.number)[t]
     n = model.n_distortion
-    return _viewed(solution, new, lambda theta: theta[..., :n] @ jacobian.T, jacobian)
+    return solution.transformed(new, lambda theta: theta[..., :n] @ jacobian.T, jacobian)
 
 
 def reference_gauge(
@@ -220,7 +209,7 @@ def reference_gauge(
     jacobian += np.outer(turned(model, mean, 1j * turn, -1j * turn * shift), by_pose[0])
     for axis, unit in enumerate((1.0, 1j)):
         jacobian += np.outer(turned(model, none, turn, -turn * unit), by_pose[1 + axis])
-    view = _viewed(solution, turned_model(model), transform, jacobian)
+    view = solution.transformed(turned_model(model), transform, jacobian)
     sigma = root_of_diagonal(by_pose @ np.asarray(solution.cov, float)[:n, :n] @ by_pose.T)
     gauge = ReferenceGauge(
         chip=chip,

@@ -21,7 +21,7 @@ from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.stages.fit import run_fit
 from bayesdist.app.stages.match import run_match
 from bayesdist.data import MatchTable
-from bayesdist.infer.catalogue.star_errors import star_covariance
+from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit
 from bayesdist.infer.nodes import Matern, NodeGrid, TableFit
 from bayesdist.infer.series import Series
@@ -219,13 +219,10 @@ def _with_catalogue(bare: HierarchicalFit, data: FitData) -> TransformedSolution
         out[catalog.star] = values
         return out
 
-    stars = star_covariance(
-        bare,
-        matches,
-        by_code(catalog.sigma_u),
-        by_code(catalog.sigma_v),
-        motion_u=by_code(catalog.sigma_pm_u),
-        motion_v=by_code(catalog.sigma_pm_v),
-        epoch0=by_code(catalog.epoch),
+    position, motion = (
+        np.stack([by_code(getattr(catalog, f"{name}_{axis}")) for axis in "uv"], axis=1)
+        for name in ("sigma", "sigma_pm")
     )
+    errors = StarErrors(position, motion, by_code(catalog.epoch))
+    stars = star_covariance(bare, matches, errors)
     return with_star_errors(bare, stars)

@@ -15,8 +15,8 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive
 from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_validation
 from bayesdist.infer import OutlierMixture, Rejection, load
-from bayesdist.infer.catalogue.star_errors import star_covariance
-from bayesdist.infer.catalogue.star_influence import StarErrors, star_influence
+from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
+from bayesdist.infer.catalogue.star_influence import star_influence
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical
@@ -150,14 +150,7 @@ def solved(
         }
         shards.close()
     errors = one.errors
-    shared = star_covariance(
-        joint.fit,
-        kept,
-        *errors.position.T,
-        motion_u=errors.motion[:, 0],
-        motion_v=errors.motion[:, 1],
-        epoch0=errors.epoch,
-    )
+    shared = star_covariance(joint.fit, kept, errors)
     codes = np.unique(held.star[np.isin(np.array(held.exposure_names)[held.exposure], whole)])
     return joint, Predictive(
         model,

@@ -194,11 +194,7 @@ def test_influence_of_stars_is_what_the_fit_does_with_their_errors() -> None:
     n = joint.model.n_distortion
     variance = one.errors.variances[:, codes]
     total = np.einsum("lasd,lsa,lase->de", found.by, variance, found.by)
-    e = one.errors
-    expected = star_covariance(
-        joint.fit, kept, *e.position.T, motion_u=e.motion[:, 0], motion_v=e.motion[:, 1],
-        epoch0=e.epoch,
-    ).total[:n, :n]  # fmt: skip
+    expected = star_covariance(joint.fit, kept, one.errors).total[:n, :n]
     np.testing.assert_allclose(total, expected, rtol=1e-8, atol=1e-12 * np.abs(expected).max())
     assert not found.with_solution(np.array([10**6]), np.array([2004.0])).any()
 

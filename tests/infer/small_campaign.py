@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer import LinearFit
-from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance
+from bayesdist.infer.catalogue.star_errors import StarCovariance, StarErrors, star_covariance
 from bayesdist.infer.posterior.covariance import with_covariance
 from bayesdist.infer.solution import Solution, TransformedSolution
 from bayesdist.infer.transforms import lines, without_frames
@@ -180,10 +180,9 @@ class SharedStars:
 
     def covariance(self, fit: LinearFit) -> StarCovariance:
         """What the catalogue's errors make of a fit to the matches."""
-        position, motion = self.position, self.motion
-        return star_covariance(
-            fit, self.matches, position, position, motion_u=motion, motion_v=motion, epoch0=2004.0
-        )
+        n = int(self.matches.star.max()) + 1
+        position, motion = np.full((n, 2), self.position), np.full((n, 2), self.motion)
+        return star_covariance(fit, self.matches, StarErrors(position, motion, np.full(n, 2004.0)))
 
 
 def shared_stars(

@@ -25,7 +25,7 @@ from bayesdist.data import (
 from bayesdist.data.sky.tangent import mean_direction, tangent_plane
 from bayesdist.data.tables.files import read_table
 from bayesdist.errors import ConfigError, InputError
-from bayesdist.infer.catalogue.star_influence import StarErrors
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.products import IdcTab, read_idctab
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
 from bayesdist.products.formats.idctab.hst import parity_of

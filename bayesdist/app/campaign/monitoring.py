@@ -18,7 +18,7 @@ from bayesdist.app.star_files import PAIRS, part_files
 from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
-from bayesdist.infer.catalogue.star_influence import StarErrors
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.compare.monitoring import NewFit, fit_new, with_star_errors_of
 from bayesdist.infer.linear import Rejection
 from bayesdist.infer.nodes.corrected import on_the_chips, with_columns

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.infer.catalogue.star_errors import star_covariance
-from bayesdist.infer.catalogue.star_influence import StarErrors, star_influence
+from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
+from bayesdist.infer.catalogue.star_influence import star_influence
 from bayesdist.infer.compare.frame_fields import frame_between, frame_fields, mean_squares, without
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target
@@ -43,21 +43,43 @@ HELD = 1e-4  # sigma of a fixed rate, in units of its released sigma
 
 @dataclass(frozen=True, eq=False)
 class NewFit:
-    """Independent fit of the new matches."""
+    """Independent fit of the new matches.
 
-    released: TransformedSolution  # the released polynomials and their drift, without frames
-    fit: LinearFit  # least squares of the new matches, which starts the mixture
-    theta: Float  # mode (D,) of the mixture, in the model of `fit`
-    cov: Float  # (D, D)
-    hyper: dict[str, float]  # 'j', 'f', 's_out' at the mode, as far as the mixture has them
-    target: Target  # density of the new matches
-    psi: Float  # the mode in sampled coordinates
-    epoch: float | None  # mean date of the matches, where the model depends on time
-    # inverse variances (q,) of the parameters of an exposure; zero for those that are free
+    Parameters
+    ----------
+    released : TransformedSolution
+        The released polynomials and their drift, without frames.
+    fit : LinearFit
+        Least squares of the new matches, which starts the mixture.
+    theta : ndarray, shape (D,)
+        Mode of the mixture, in the model of `fit`.
+    cov : ndarray, shape (D, D)
+    hyper : dict of str to float
+        'j', 'f', 's_out' at the mode, as far as the mixture has them.
+    target : Target
+        Density of the new matches.
+    psi : ndarray
+        The mode in sampled coordinates.
+    epoch : float or None
+        Mean date of the matches, where the model depends on time.
+    scatter : ndarray, shape (q,)
+        Inverse variances of the parameters of an exposure; zero for those that are free.
+    extra : ndarray, shape (n, n) or None
+        Added to the covariance of the polynomials for errors that all matches of a star share.
+    common : ndarray, shape (n_distortion, n) or None
+        Covariance of the release with these polynomials, by stars in both.
+    """
+
+    released: TransformedSolution
+    fit: LinearFit
+    theta: Float
+    cov: Float
+    hyper: dict[str, float]
+    target: Target
+    psi: Float
+    epoch: float | None
     scatter: Float = field(default_factory=lambda: np.zeros(0))
-    # added to the covariance (n, n) of the polynomials for errors common to all matches of a star
     extra: Float | None = None
-    # covariance (n_distortion, n) of the release with these polynomials, by stars in both
     common: Float | None = None
 
     @property
@@ -81,19 +103,39 @@ class NewFit:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """Difference of the new matches' polynomials from the released ones."""
+    """Difference of the new matches' polynomials from the released ones.
 
-    model: DistortionModel  # released structure without frames
-    epoch: float | None  # date at which the solutions are compared
-    released: Float  # released polynomials (chips, 2, K) at that date
-    # new minus released (chips, 2, K), in the release's frame, without what frames could absorb
+    Parameters
+    ----------
+    model : DistortionModel
+        Released structure without frames.
+    epoch : float or None
+        Date at which the solutions are compared.
+    released : ndarray, shape (chips, 2, K)
+        Released polynomials at that date.
+    difference : ndarray, shape (chips, 2, K)
+        New minus released, in the frame of the release, without what frames could absorb.
+    cov : ndarray, shape (n, n)
+        Of the difference, n = 2 K chips.
+    released_cov : ndarray, shape (n, n)
+        Of the released polynomials at that date, and of all other errors common to the new matches.
+    absorbed : ndarray, shape (n, q)
+        Fields that frames absorb.
+    test : FieldTest
+        Of the whole difference.
+    frame : tuple of ndarray
+        Matrix (2, 2) and shift (2,) from the release to the first new exposure.
+    """
+
+    model: DistortionModel
+    epoch: float | None
+    released: Float
     difference: Float
-    cov: Float  # of the difference (n, n), n = 2 K chips
-    # of the released polynomials (n, n), and of all other errors common to the new matches
+    cov: Float
     released_cov: Float
-    absorbed: Float  # fields (n, q) that frames absorb
-    test: FieldTest  # of the whole difference
-    frame: tuple[Float, Float]  # matrix (2, 2), shift (2,) from the release to the first exposure
+    absorbed: Float
+    test: FieldTest
+    frame: tuple[Float, Float]
 
 
 def fit_new(
@@ -105,15 +147,33 @@ def fit_new(
     compute: Compute | None = None,
     scatter: Mapping[str, float] | None = None,
 ) -> NewFit:
-    """Fit of new matches, independent of the release.
+    """Fit new matches independently of the release.
 
-    Only the kind of the release's frames matters, not the frames of its exposures.  The mixture is
-    that of a released posterior by default, else Gaussian outliers.  `scatter` gives the standard
-    deviations of a campaign's exposures by the name of the parameter ('scale', ...), and is
-    required for such a release.
+    Parameters
+    ----------
+    released : Solution
+        A fit or a posterior; only the kind of its frames matters, not the frames of its exposures.
+    matches : MatchTable or PartitionedMatches
+        With errors.
+    mixture : OutlierMixture, optional
+        That of a released posterior by default, else Gaussian outliers.
+    rejection : Rejection
+        As of `fit_linear`.
+    compute : Compute, optional
+    scatter : mapping of str to float, optional
+        Standard deviations of a campaign's exposures, by the name of the parameter: 'scale', ...
+        Required for such a release.
 
-    InputError for matches in another unit, or without the epochs that the release needs;
-    DegenerateError when the matches do not determine polynomials of the released order.
+    Returns
+    -------
+    NewFit
+
+    Raises
+    ------
+    InputError
+        For matches in another unit, or without the epochs that the release needs.
+    DegenerateError
+        When the matches do not determine polynomials of the released order.
     """
     bare = without_frames(released)
     model = new_model(released.model, matches)
@@ -148,7 +208,10 @@ def fit_new(
 def new_model(released: DistortionModel, matches: Matches) -> DistortionModel:
     """Released structure with the exposures of new matches.
 
-    InputError for matches in another unit, of an unknown chip, or without epochs that are needed.
+    Raises
+    ------
+    InputError
+        For matches in another unit, of an unknown chip, or without epochs that are needed.
     """
     where = ", ".join(matches.sources)
     if matches.unit != released.unit:
@@ -177,8 +240,16 @@ def new_model(released: DistortionModel, matches: Matches) -> DistortionModel:
 def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
     """Difference of the new matches' polynomials from the release.
 
-    `draws` are the effective draws from which the released covariance was estimated; they are worth
-    the more, the smaller its fraction of the whole is (Welch and Satterthwaite).
+    Parameters
+    ----------
+    new : NewFit
+    draws : float
+        Effective draws from which the released covariance was estimated; they are worth the more,
+        the smaller its fraction of the whole is (Welch and Satterthwaite).
+
+    Returns
+    -------
+    Change
     """
     released, model = new.released, new.released.model
     n, K, C = model.n_polynomial, model.n_terms, len(model.chips)
@@ -211,7 +282,7 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
     variance = np.einsum("ij,jk,ik->i", projector, cov, projector)
     of_release = np.einsum("ij,jk,ik->i", projector, released_cov, projector)
     known = variance > 1e-16 * np.diag(cov)
-    fraction = float(np.mean(of_release[known] / variance[known]))
+    fraction = max(float(np.mean(of_release[known] / variance[known])), 1e-3)
     return Change(
         model=model,
         epoch=new.epoch,
@@ -220,9 +291,7 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
         cov=projector @ cov @ projector.T,
         released_cov=released_cov,
         absorbed=absorbed,
-        test=chi_square(
-            rest, cov, without=absorbed, norm=norm, draws=draws / max(fraction, 1e-3) ** 2
-        ),
+        test=chi_square(rest, cov, without=absorbed, norm=norm, draws=draws / fraction**2),
         frame=(M, d),
     )
 
@@ -276,22 +345,25 @@ def with_star_errors_of(
 ) -> NewFit:
     """New fit whose covariance includes the catalogue errors that all matches of a star have.
 
-    `errors` are those of the catalogue by code of the star, which the quoted errors contain, and
-    `matches` those of `new`.  A star has one error in all of its new exposures.  Where the release
-    was made with the same catalogue, that error has moved both sides, and what it moved alike is no
-    change: `released` are then the release and its matches, with the same codes.
+    A star has one error in all of its new exposures.  Where the release was made with the same
+    catalogue, that error has moved both sides, and what it moved alike is no change.
+
+    Parameters
+    ----------
+    errors : StarErrors
+        Of the catalogue, by code of the star; the quoted errors contain them.
+    new : NewFit
+    matches : MatchTable
+        Those of `new`, with codes of the stars.
+    released : tuple of LinearFit and MatchTable, optional
+        The release and its matches, where they have the same catalogue and codes.
+
+    Returns
+    -------
+    NewFit
     """
     n = new.model.n_polynomial
-    motion_u, motion_v = (0.0, 0.0) if errors.motion is None else errors.motion.T
-    shared = star_covariance(
-        new.fit,
-        matches,
-        *errors.position.T,
-        motion_u=motion_u,
-        motion_v=motion_v,
-        epoch0=errors.epoch,
-        frames=False,
-    )
+    shared = star_covariance(new.fit, matches, errors, frames=False)
     out = replace(new, extra=shared.extra[:n, :n])
     if released is None or released[1].star is None or matches.star is None:
         return out

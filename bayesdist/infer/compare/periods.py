@@ -49,19 +49,37 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class PeriodSums(Sums):
-    """Sums over the matches of one period."""
+    """Sums over the matches of one period.
 
-    equations: NormalEquations  # about the mean of the fit of all data, with the matches it uses
-    # with squared weights, where extra weights make the sandwich necessary
+    Parameters
+    ----------
+    equations : NormalEquations
+        About the mean of the fit of all data, with the matches that it uses.
+    squares : NormalEquations or None
+        With squared weights, where extra weights make the sandwich necessary.
+    n : int
+        Number of matches used.
+    """
+
+    equations: NormalEquations
     squares: NormalEquations | None
-    n: int  # matches used
+    n: int
 
 
 def sums_of_stars(stars: Stars, fit: LinearFit, radial_weight: float = 1.0) -> PeriodSums:
     """Sums over some matches of one period.
 
-    The fit is that of all data, whose rule for leaving matches out is then one for all, with
-    `radial_weight` in its corners.
+    Parameters
+    ----------
+    stars : Stars
+    fit : LinearFit
+        Of all data: its model, and its rule for leaving matches out, which is then one for all.
+    radial_weight : float
+        As the fit's.
+
+    Returns
+    -------
+    PeriodSums
     """
     equations = least_squares(stars, fit.mean, fit.clip, radial_weight)
     squares = None
@@ -84,17 +102,32 @@ def _check_model(model: DistortionModel) -> None:
 def compare_periods(
     fit: LinearFit, sums: Mapping[str, PeriodSums], *, rescale: bool = True
 ) -> PeriodComparison:
-    """Model of each of two or more periods, and the differences from the combined one.
+    """Model of each period, and the differences from the combined one.
 
-    The periods' `sums_of_stars` of `fit` together are the combined data set, of which `fit` need
-    not be the fit: where matches lie outside all periods it is not.  With `rescale` all errors are
-    multiplied by one factor, the root of chi-square per degree of freedom about the models of the
-    periods; otherwise quoted errors that are too small make a change of noise.  Residual structure
-    that is the same in all periods cancels in the differences as far as the periods cover the array
-    alike.
+    Parameters
+    ----------
+    fit : LinearFit
+        Of all data, as given to `sums_of_stars`.
+    sums : mapping of str to PeriodSums
+        Two or more periods.  Together they are the combined data set, of which `fit` need not be
+        the fit: where matches lie outside all periods it is not.
+    rescale : bool
+        True to multiply all errors by one factor, the root of chi-square per degree of freedom
+        about the models of the periods.  Otherwise quoted errors that are too small make a change
+        of noise.
 
-    InputError for fewer than two periods, and for a model with frames or time dependence;
-    DegenerateError when a period does not determine the model, naming the parameters.
+    Returns
+    -------
+    PeriodComparison
+        Residual structure that is the same in all periods cancels in the differences as far as
+        the periods cover the array alike.
+
+    Raises
+    ------
+    InputError
+        For fewer than two periods, and for a model with frames or time dependence.
+    DegenerateError
+        When a period does not determine the model, naming the parameters.
     """
     if len(sums) < 2:
         raise InputError(f"{len(sums)} periods are given", do="give two or more")
@@ -155,11 +188,18 @@ def _error_scale(
 
 @dataclass(frozen=True, eq=False)
 class CoefficientChange:
-    """Differences of all coefficients between two models."""
+    """Differences of all coefficients between two models.
 
-    names: tuple[str, ...]  # of D coefficients
-    difference: Float  # (D,)
-    sigma: Float  # standard errors (D,)
+    Parameters
+    ----------
+    names : tuple of str, length D
+    difference, sigma : ndarray, shape (D,)
+        Difference and its standard error.
+    """
+
+    names: tuple[str, ...]
+    difference: Float
+    sigma: Float
 
     @property
     def z(self) -> Float:
@@ -174,15 +214,31 @@ class CoefficientChange:
 
 @dataclass(frozen=True, eq=False)
 class PeriodComparison:
-    """Models of several periods and the combined one."""
+    """Models of several periods and the combined one.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    names : tuple of str, length P
+        Periods.
+    means : ndarray, shape (P, D)
+    covs : ndarray, shape (P, D, D)
+        Covariance of each, independent of the others.
+    fractions : ndarray, shape (P, D, D)
+        A_p = N^-1 N_p; their sum is the identity.
+    counts : tuple of int
+        Number of matches in each.
+    error_scale : float
+        Factor on the quoted errors.
+    """
 
     model: DistortionModel
-    names: tuple[str, ...]  # of P periods
-    means: Float  # (P, D)
-    covs: Float  # covariance (P, D, D) of each, independent of the others
-    fractions: Float  # A_p = N^-1 N_p (P, D, D); their sum is the identity
-    counts: tuple[int, ...]  # matches in each
-    error_scale: float  # factor on the quoted errors
+    names: tuple[str, ...]
+    means: Float
+    covs: Float
+    fractions: Float
+    counts: tuple[int, ...]
+    error_scale: float
 
     @cached_property
     def combined(self) -> Float:
@@ -213,9 +269,23 @@ class PeriodComparison:
         return out
 
     def difference(self, period: str, against: str | None = None) -> tuple[Float, Float]:
-        """Parameters (D,) of a period minus those of another, or of the combined model; covariance.
+        """Parameters of a period minus those of the combined model, or of another period.
 
-        InputError for an unknown period, or one against itself.
+        Parameters
+        ----------
+        period : str
+        against : str, optional
+            Another period; the combined model by default.
+
+        Returns
+        -------
+        difference : ndarray, shape (D,)
+        cov : ndarray, shape (D, D)
+
+        Raises
+        ------
+        InputError
+            For an unknown period, or one against itself.
         """
         contrast = self._contrast(period, against)
         # differences of the means: large constants cancel before they meet rounding errors
@@ -227,8 +297,16 @@ class PeriodComparison:
     ) -> CoefficientChange:
         """Difference of each coefficient with its error.
 
-        With `monomial` coefficients are those of pixel offsets, as in SIP, in place of Legendre
-        ones; `against` is as of `difference`.
+        Parameters
+        ----------
+        period, against
+            As `difference`.
+        monomial : bool
+            True for coefficients of pixel offsets, as in SIP, in place of Legendre ones.
+
+        Returns
+        -------
+        CoefficientChange
         """
         difference, cov = self.difference(period, against)
         if monomial:
@@ -249,9 +327,20 @@ class PeriodComparison:
     ) -> PositionChange:
         """Largest difference over the array with its significance.
 
-        It is searched on `grid` points along each axis, from edge to edge of the detector, and
-        compared with that of `n_draws` fields of noise: its probability is at least 1 / (n_draws +
-        1).
+        Parameters
+        ----------
+        period, against
+            As `difference`.
+        rng : numpy.random.Generator
+        grid : int
+            Points along each axis, from edge to edge of the detector.
+        n_draws : int
+            Fields of noise that the largest difference is compared with; its probability is at
+            least 1 / (n_draws + 1).
+
+        Returns
+        -------
+        PositionChange
         """
         difference, cov = self.difference(period, against)
         return largest_difference(self.model, difference, cov, rng=rng, grid=grid, n_draws=n_draws)
@@ -264,7 +353,21 @@ class PeriodComparison:
         chip: Chip | None = None,
         grid: tuple[int, int] = (17, 17),
     ) -> DifferenceField:
-        """Difference of the positions over a chip, the first by default, at `grid` points x, y."""
+        """Difference of the positions over a chip.
+
+        Parameters
+        ----------
+        period, against
+            As `difference`.
+        chip : Chip, optional
+            The first chip by default.
+        grid : tuple of int
+            Points on x and on y.
+
+        Returns
+        -------
+        DifferenceField
+        """
         chip = chip or self.model.chips[0]
         return difference_field(self.model, *self.difference(period, against), chip, grid)
 

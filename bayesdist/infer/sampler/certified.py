@@ -129,12 +129,12 @@ def _approximate(
         draws, share = proposal.accepted(n, rng)
         psi.append(draws[:, None])
         shares.append(share)
-    kept = np.array(psi)
+    all_psi = np.array(psi)
     log_prob = np.array([proposal.log_density(p[:, 0])[:, None] for p in psi])
     flat = batch.psi.reshape(-1, batch.psi.shape[-1])
     inside = np.isfinite(batch.log_prob.ravel())
     weights = batch.log_prob.ravel()[inside] - proposal.log_density(flat[inside])
-    verdict = diagnose(kept, target.names, weights, s.limits, coupled=False)
+    verdict = diagnose(all_psi, target.names, weights, s.limits, coupled=False)
     verdict = replace(
         verdict,
         pareto_k=certificate.pareto_k,
@@ -144,7 +144,7 @@ def _approximate(
         reasons = (*verdict.reasons, certificate.statement)
         verdict = replace(verdict, converged=False, reasons=reasons)
     return Chains(
-        psi=kept,
+        psi=all_psi,
         log_prob=log_prob,
         verdict=verdict,
         plan=Plan("certified surrogate (approximate)", (1.0, 0.0, 0.0), 1, 0.0),

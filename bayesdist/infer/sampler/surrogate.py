@@ -163,7 +163,7 @@ def draw_surrogate(
     `whiten` maps draws to the coordinates of the pilots.  NotConvergedError when next to no
     proposal is accepted.
     """
-    kept: list[Float] = []
+    accepted: list[Float] = []
     n_kept = tried = 0
     while n_kept < n:
         psi = propose(BATCH, rng)
@@ -171,7 +171,7 @@ def draw_surrogate(
         inside = np.isfinite(psi).all(axis=1)
         psi, chance = psi[inside], chance[inside]
         take = psi[chance < surrogate.log_weight(whiten(psi)) - surrogate.upper]
-        kept.append(take)
+        accepted.append(take)
         n_kept, tried = n_kept + len(take), tried + BATCH
         if tried >= 10 / LEAST_ACCEPTED and n_kept < LEAST_ACCEPTED * tried:
             raise NotConvergedError(
@@ -179,7 +179,7 @@ def draw_surrogate(
                 where="certificate",
                 do="sample the exact posterior",
             )
-    draws = np.concatenate(kept)[:n] if kept else propose(0, rng)
+    draws = np.concatenate(accepted)[:n] if accepted else propose(0, rng)
     return draws, n_kept / tried if tried else 1.0
 
 

@@ -10,8 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.linear import LinearFit
-from bayesdist.infer.posterior import Posterior
+from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["gauge_free", "gauge_free_matrix"]
@@ -41,18 +40,9 @@ def gauge_free_matrix(model: DistortionModel, theta: Float, null: Float) -> Floa
     return np.asarray(np.eye(D) - null @ np.linalg.pinv(J @ null) @ J)
 
 
-def gauge_free(solution: LinearFit | Posterior, null: Float) -> LinearFit | Posterior:
-    """Solution whose errors are those of relative positions on the detector.
+def gauge_free(solution: Solution, null: Float) -> Solution:
+    """Solution whose errors are those of relative positions on the detector; its mean stays.
 
-    Parameters
-    ----------
-    solution : LinearFit or Posterior
-    null : ndarray, shape (D, d)
-        Free directions at it.
-
-    Returns
-    -------
-    LinearFit or Posterior
-        With the same mean.
+    `null` (D, d) are the free directions at it.
     """
     return solution.mapped(gauge_free_matrix(solution.model, solution.mean, null))

@@ -32,7 +32,7 @@ class Sums:
         """Sum over the stars of both; ValueError for sums that refer to different things."""
         out: dict[str, Any] = {}
         rows: Rows = ()
-        if groups := getattr(self, "groups", None):
+        if (groups := getattr(self, "groups", None)) is not None:
             out["groups"], rows = _merged(groups, other.groups)  # type: ignore[attr-defined]
         for name in (one.name for one in fields(self) if one.name not in out):  # type: ignore[arg-type]
             a, b = getattr(self, name), getattr(other, name)

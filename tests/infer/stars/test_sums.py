@@ -31,7 +31,7 @@ class Moments(Sums):
 
 def moments(chips, exposures, *, about=None, side=8):
     """Sums of groups that are told apart by their totals."""
-    chips, exposures = np.array(chips), np.array(exposures)
+    chips, exposures = np.array(chips, np.int64), np.array(exposures, np.int64)
     groups = Groups(NOBODY, chips, exposures, np.zeros(len(chips)))
     total = np.stack([10.0 * chips, 1.0 + exposures], axis=1)
     at = 0.5 * chips if about is None else np.array(about)
@@ -47,6 +47,14 @@ def test_groups_of_both_are_in_the_sum():
         np.testing.assert_array_equal(found.about, [0, 0, 0, 0.5])
         assert (found.n, found.parts, found.by_name) == (5, (3, 5), {"all": 5})
         assert found.side == 8 and found.squares is None
+
+
+def test_chunks_without_stars_add_nothing():
+    none, some = moments([], []), moments([0, 1], [1, 2])
+    for found in (none + some, some + none):
+        np.testing.assert_array_equal(found.total, some.total)
+        np.testing.assert_array_equal(found.about, some.about)
+    assert len((none + none).groups) == 0
 
 
 def test_sums_of_other_things_do_not_add():
