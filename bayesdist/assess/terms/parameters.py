@@ -152,8 +152,7 @@ class ExposureVariation:
     # with frames in gauge 'held', in which exposures deviate from the polynomials
     model: DistortionModel
     mean: Float  # (D,), of its parameters
-    # length k, deviations that scatter, as an exposure's parameters are named: 'scale',
-    # 'shear_plus',
+    # (k,), deviations that scatter, named as an exposure's parameters: 'scale', 'shear_plus', ...
     kinds: tuple[str, ...]
     tau: Float  # (m, k), draws of the scatter of each kind
     # what of it is known to be velocity aberration: shown beside, as this scatter holds it

@@ -26,7 +26,7 @@ from bayesdist.missions.wise.assess.published import (
     noise_of_bins,
     printed_rows,
 )
-from bayesdist.missions.wise.simulate import SAMPLE_SIZES
+from bayesdist.missions.wise.published import SAMPLE_SIZES
 
 __all__ = [
     "LONGEST_DIFFERENCES",

@@ -18,7 +18,7 @@ from bayesdist.missions.wise.bands.measure import measure_bands
 from bayesdist.missions.wise.bands.optical import optical_models
 from bayesdist.missions.wise.bands.page import draw_bands, write_bands
 from bayesdist.missions.wise.bands.record import record_of, write_tables
-from bayesdist.missions.wise.simulate import WISE_BANDS
+from bayesdist.missions.wise.published import WISE_BANDS
 from bayesdist.products import sip_from_solution, write_wise_meta
 from bayesdist.report.drawing import save_drawings
 

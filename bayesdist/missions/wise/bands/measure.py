@@ -24,7 +24,12 @@ from bayesdist.missions.wise.assess.residual_structure import residual_partition
 from bayesdist.missions.wise.bands.context import BandResult, BandsInput, Printed
 from bayesdist.missions.wise.bands.inputs import BandRun
 from bayesdist.missions.wise.bands.optical import OpticalModel
-from bayesdist.missions.wise.simulate import FORMAL_RADII, LONGEST_VECTORS, SAMPLE_SIZES, WISE_BANDS
+from bayesdist.missions.wise.published import (
+    FORMAL_RADII,
+    LONGEST_VECTORS,
+    SAMPLE_SIZES,
+    WISE_BANDS,
+)
 from bayesdist.model.basis import polynomial_terms
 
 __all__ = ["measure_bands"]

@@ -17,11 +17,12 @@ from bayesdist.data import MatchTable, open_matches, write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
 from bayesdist.infer import Matches
-from bayesdist.missions.wise.pairs.files import ARRAY_SIZE, band_name
+from bayesdist.missions.wise.pairs.files import band_name
 from bayesdist.missions.wise.pairs.read import stream_rvb
 from bayesdist.missions.wise.pairs.section import RvbData
 from bayesdist.missions.wise.pairs.selection import SelectedPairs
 from bayesdist.missions.wise.pairs.stored import open_rvb
+from bayesdist.missions.wise.published import WISE_ARRAYS
 
 __all__ = ["RvbInput", "load_rvb"]
 
@@ -168,8 +169,8 @@ def _options(data: RvbData, size: tuple[float, float]) -> dict[str, Any]:
 def _require_array(label: str | None, size: tuple[float, float]) -> None:
     """Refuse a detector that has not the size of the band's array."""
     band = band_name(label)
-    if tuple(size) != ARRAY_SIZE[band]:
-        columns, rows = ARRAY_SIZE[band]
+    if tuple(size) != WISE_ARRAYS[band].size:
+        columns, rows = WISE_ARRAYS[band].size
         raise InputError(
             f"the array of {band} has {columns:g} x {rows:g} pixels, but the detector "
             f"{size[0]:g} x {size[1]:g}",
