@@ -20,7 +20,13 @@ from bayesdist.errors import InputError
 from bayesdist.infer.transforms import Solution, View, without_frames
 from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence, corrected
 
-__all__ = ["Calibration", "calibration_of", "calibration_of_maps", "gaussian_solution"]
+__all__ = [
+    "Calibration",
+    "as_calibration",
+    "calibration_of",
+    "calibration_of_maps",
+    "gaussian_solution",
+]
 
 Float = NDArray[np.float64]
 
@@ -275,6 +281,11 @@ def calibration_of(
         scale=size,
         scale_from=source,
     )
+
+
+def as_calibration(one: Solution | Calibration) -> Calibration:
+    """Calibration of a solution; a calibration as it is."""
+    return one if isinstance(one, Calibration) else calibration_of(one)
 
 
 def calibration_of_maps(

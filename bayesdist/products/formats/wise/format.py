@@ -81,7 +81,8 @@ def _calibration(named: tuple[str, Bands], name: str, choice: Choice) -> Calibra
 
 def _build(calibration: Calibration, _: Settings, options: BuildOptions) -> tuple[Built, ...]:
     """WISE's form: all linear terms in A and B, and an inverse of equal order."""
-    from bayesdist.products.formats.sip.build import build_sip  # no file that is read needs it
+    # no file that is read needs it
+    from bayesdist.products.formats.sip.build import sip_from_solution
 
     band = _band(calibration.detector)
     if band is None:
@@ -90,7 +91,7 @@ def _build(calibration: Calibration, _: Settings, options: BuildOptions) -> tupl
             where="products.wise_meta",
             do="name the band as detector.name, or leave wise_meta out",
         )
-    sip = build_sip(
+    sip = sip_from_solution(
         replace(calibration, plane=Plane("free")),  # the entries cannot state a sky position
         epoch=options.epoch,
         inverse_order=max(calibration.model.order, SIP_ORDERS[0]),
