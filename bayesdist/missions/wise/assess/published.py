@@ -12,6 +12,7 @@ from bayesdist.diagnose.statistics.rows import STATISTICS
 from bayesdist.errors import InputError
 
 __all__ = [
+    "HEADS",
     "TABLE_5_1",
     "TABLE_5_2",
     "TABLE_5_3",
@@ -21,7 +22,11 @@ __all__ = [
     "printed_rows",
 ]
 
-# columns: mean, sigma, min, max, median, 1 %, 99 %
+HEADS = dict(
+    zip(STATISTICS, ("Mean", "Sigma", "Min", "Max", "Median", "1%-tile", "99%-tile"), strict=True)
+)
+
+# columns as in HEADS
 TABLE_5_1 = """
 W1/X 0.002070 0.01949 -0.08298 0.06435 0.002512 -0.04942 0.04579
 W1/Y -0.009074 0.01159 -0.04935 0.04348 -0.00373 -0.03837 0.0251
