@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from bayesdist.assess.adjusted import with_diagnosed_errors
 from bayesdist.assess.budget.budget import ErrorBudget, budget_of
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.drawn import DrawnErrors
+from bayesdist.assess.drawn import DrawnErrors, generators
 from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms.correlated import Deviations, StructureErrors
 from bayesdist.assess.terms.forms import ErrorTerm, Image
 from bayesdist.assess.terms.given import Centroids, UserTerm
 from bayesdist.assess.terms.local import LocalErrors, table_of
 from bayesdist.assess.terms.parameters import catalogue_terms
-from bayesdist.assess.terms.seeds import generators
 from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.assess.units import pixel_scale_of
 from bayesdist.diagnose.diagnostics import Diagnostics
