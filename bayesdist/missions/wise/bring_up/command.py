@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from bayesdist.app.folder import atomic_directory
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import write_table
-from bayesdist.data.frame_stars import FrameStars
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bands.optical import optical_models
 from bayesdist.missions.wise.bring_up.iterate import BringUp, bring_up
+from bayesdist.missions.wise.frame_stars import FrameStars
 from bayesdist.missions.wise.pairs.files import RVB_ALIASES, band_name
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
