@@ -25,7 +25,7 @@ STATISTICS = (*_BASE, *(f"u_{s}" for s in _BASE), *(f"v_{s}" for s in _BASE))
 
 
 # the errors (rows, N, 2) of some draws, from standard normal ones of that shape for what is
-# independent from place to place
+# independent from position to position
 ErrorsOf = Callable[[slice, Float], Float]
 
 ROWS = 16  # draws whose noise comes from one generator: so that blocks do not change it
@@ -93,9 +93,9 @@ def drawn_statistics(
 ) -> tuple[dict[str, Float], ...]:
     """Statistics of each draw's errors, of several errors with the same noise.
 
-    `names`: of `STATISTICS`. `block`: places times draws that a thread holds at once. `seed`: of
-    the noise. `pairs`: (2, P), pairs of places whose differences are judged; places themselves by
-    default. `over_all`: True if largest differences are those of all places, not of `pairs`.
+    `names`: of `STATISTICS`. `block`: positions times draws that a thread holds at once. `seed`: of
+    the noise. `pairs`: (2, P), pairs of positions whose differences are judged; positions themselves by
+    default. `over_all`: True if largest differences are those of all positions, not of `pairs`.
     Returns (n_draws,), one for each of the errors.
     """
     width = max(n_places, 0 if pairs is None else pairs.shape[1])
