@@ -142,7 +142,7 @@ class DrawnErrors:
             [self.errors(domain.positions.at(epoch), scale) for epoch in epochs],
             names,
             n_draws=n_draws or self.n_draws,
-            n_places=domain.size,
+            n_positions=domain.size,
             block=BLOCK,
             seed=self.seed,
             pairs=pairs,

@@ -85,7 +85,7 @@ def drawn_statistics(
     names: Sequence[str],
     *,
     n_draws: int,
-    n_places: int,
+    n_positions: int,
     block: int,
     seed: int,
     pairs: Int | None = None,
@@ -94,11 +94,11 @@ def drawn_statistics(
     """Statistics of each draw's errors, of several errors with the same noise.
 
     `names`: of `STATISTICS`. `block`: positions times draws that a thread holds at once. `seed`: of
-    the noise. `pairs`: (2, P), pairs of positions whose differences are judged; positions themselves by
+    the noise. `pairs`: (2, P), pairs of positions whose differences are judged; the positions by
     default. `over_all`: True if largest differences are those of all positions, not of `pairs`.
     Returns (n_draws,), one for each of the errors.
     """
-    width = max(n_places, 0 if pairs is None else pairs.shape[1])
+    width = max(n_positions, 0 if pairs is None else pairs.shape[1])
     step = ROWS * max(1, block // (ROWS * width))
 
     def one(name: str, error: Float, seen: Float) -> Float:
@@ -108,7 +108,7 @@ def drawn_statistics(
 
     def found(start: int) -> list[list[Float]]:
         rows = slice(start, min(start + step, n_draws))
-        noise, out = _noise(seed, rows, n_places), []
+        noise, out = _noise(seed, rows, n_positions), []
         for error_of in errors:
             error = error_of(rows, noise)
             seen = error if pairs is None else error[:, pairs[0]] - error[:, pairs[1]]
@@ -123,9 +123,9 @@ def drawn_statistics(
     )
 
 
-def _noise(seed: int, rows: slice, n_places: int) -> Float:
+def _noise(seed: int, rows: slice, n_positions: int) -> Float:
     """Standard normal numbers (rows, N, 2), those of a draw the same in any block."""
-    shape = ROWS, n_places, 2
+    shape = ROWS, n_positions, 2
     starts = range(rows.start, rows.stop, ROWS)
     out = [np.random.default_rng((seed, k)).standard_normal(shape) for k in starts]
     return np.concatenate(out)[: rows.stop - rows.start]

@@ -126,7 +126,7 @@ class PlannedPattern:
     maps: dict[str, tuple[UncertaintyMap, ...] | None]
 
     def radii(self, kind: str) -> Float:
-        """Radial errors (1 sigma) at all positions of the grid, pixels; infinite where unbounded."""
+        """Radial errors (1 sigma) at all points of the grid, pixels; infinite where unbounded."""
         maps = self.maps[kind]
         return (
             np.array([np.inf]) if maps is None else np.concatenate([m.radius.ravel() for m in maps])

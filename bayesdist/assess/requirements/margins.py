@@ -121,9 +121,9 @@ def check_requirements(
     The field is that of all chips: the same grid on each of them, so that each has the same weight.
     A draw of the solution and an offset are common to all chips.
 
-    Of a relative error the statistic is that of the differences between two positions, over all pairs
-    of points.  Over a range of epochs the draws of everything are the same throughout, and that of
-    the statistic is the largest over nine epochs and the breaks between them.
+    Of a relative error the statistic is that of the differences between two positions, over all
+    pairs of points.  Over a range of epochs the draws of everything are the same throughout, and
+    that of the statistic is the largest over nine epochs and the breaks between them.
 
     Parameters
     ----------
