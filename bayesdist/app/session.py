@@ -134,7 +134,7 @@ class Session:
 
     def begun(self) -> None:
         """Move into the run's folder what was prepared beside it: the run has begun."""
-        if self._input is not None and self._input.settle():
+        if self._input is not None and self._input.move_into_run():
             fitted = self.fitted
             self.renew("matched", self._load_matched())
             self.renew("fitted", fitted)

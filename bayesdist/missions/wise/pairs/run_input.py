@@ -97,7 +97,7 @@ class RvbInput:
         write_partitioned(tables(), folder)
         self._counts = {"n_rows": selected.n_rows, "rejected": selected.rejected}
         if not self.run.is_planned:
-            self.settle()
+            self.move_into_run()
             return self._opened(self.run / PAIRS, self.run.record["pairs"])
         return self._opened(folder, self._counts)
 
@@ -108,7 +108,7 @@ class RvbInput:
         opened = open_matches(folder, unit=options["unit"], sigma=sigma)
         return replace(opened, dropped=counts["rejected"])
 
-    def settle(self) -> bool:
+    def move_into_run(self) -> bool:
         """Move what was written into the folder of the run, which has begun.
 
         Returns True for pairs that were moved, and have to be opened anew. InputError when the
