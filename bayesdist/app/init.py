@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from bayesdist.app.config import parse_config
+from bayesdist.app.config.data import data_sections
 from bayesdist.app.init_columns import column_lines, quoted
 from bayesdist.app.init_sigma import guessed_sigma
 from bayesdist.app.match_sources import mission_template
@@ -90,8 +91,8 @@ sip = {{}}                        # inverse_order, linear = "cd" | "sip", crval
 # idctab = {{instrument = "ACS", detector = "WFC"}}
 """
 
-_AUTO = f"""\
-# format = "auto"               # {" | ".join(FORMATS)}
+_AUTO = """\
+# format = "auto"               # {formats}
 """
 
 _CENTRE = """\
@@ -172,7 +173,7 @@ def _of_matches(
     names = dict(zip(table.chip_numbers, _chip_names(table), strict=True))
     blocks = [_CHIP.format(number=n, name=quoted(names[n]), **one) for n, one in chips.items()]
     return len(table), {
-        "format": _AUTO,
+        "format": _AUTO.format(formats=" | ".join((*FORMATS, *data_sections()))),
         "columns": column_lines(layout, columns),
         "unit_line": unit_line,
         "sigma": sigma,

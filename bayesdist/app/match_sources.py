@@ -31,7 +31,7 @@ class RunInput(Protocol):
     def load(self) -> Matches:
         """All matches that the configuration selects."""
 
-    def settle(self) -> bool:
+    def move_into_run(self) -> bool:
         """Truth of matches that were moved into the folder of the run, which has begun."""
 
     def close(self) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.diagnose.correlated import Discrepancy
+from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.catalogue.star_errors import StarCovariance
 from bayesdist.infer.equations.scaled import scaled_cholesky
 from bayesdist.infer.posterior.covariance import recolouring
 
-__all__ = ["covariance_of", "with_correlated_errors", "with_noise", "with_shared_stars"]
+__all__ = ["with_diagnosed_errors", "with_shared_stars"]
 
 Float = NDArray[np.float64]
 
@@ -27,55 +27,46 @@ def with_shared_stars(posterior: Posterior, fit: LinearFit, stars: StarCovarianc
     `fit`: that `stars` was computed for. The result comes with other draws of theta and the same
     mean; all else is as it was.
     """
-    before = covariance_of(posterior, fit)
+    before = _covariance(posterior, fit)
     return posterior.mapped(recolouring(before, before + stars.extra))
 
 
-def covariance_of(
-    posterior: Posterior, fit: LinearFit, stars: StarCovariance | None = None
-) -> Float:
-    """Covariance of a posterior without the noise of its draws, and with a catalogue's errors.
+def with_diagnosed_errors(
+    posterior: Posterior,
+    diagnostics: Diagnostics,
+    hierarchy: LinearFit | None = None,
+    *,
+    noise_alone: bool = False,
+) -> Posterior:
+    """Posterior whose draws are spread by all that diagnostics know of errors of its parameters.
 
-    Returns (D, D).
+    `posterior` is as it was sampled.  `noise_alone` counts, of the correlated errors, those of the
+    stars as they scatter: what else there is stands in terms of its own.
     """
+    solution, stars, found = posterior, diagnostics.catalogue, diagnostics.correlated
+    if stars is not None:
+        assert hierarchy is not None
+        solution = with_shared_stars(posterior, hierarchy, stars)
+    if found is None:
+        return solution
+    cov = found.noise if noise_alone else found.covariance
+    if hierarchy is None:
+        return solution.mapped(recolouring(found.formal, cov))
+    before = _covariance(posterior, hierarchy)
+    if stars is not None:
+        before = before + stars.extra
+    # frames follow as they are correlated with polynomials and drift
+    D = found.model.n_distortion
+    follow = np.linalg.solve(before[:D, :D], before[:D]).T
+    more = follow @ (cov - found.formal)[:D, :D] @ follow.T
+    return solution.mapped(recolouring(before, before + _least(before, (more + more.T) / 2)))
+
+
+def _covariance(posterior: Posterior, fit: LinearFit) -> Float:
+    """Covariance (D, D) of a posterior without the noise of its draws."""
     formal = np.asarray(fit.cov, float)
     wider = float(np.trace(np.linalg.solve(formal, posterior.cov))) / len(formal)
-    return wider * formal if stars is None else wider * formal + stars.extra
-
-
-def with_noise(
-    posterior: Posterior, correlated: Discrepancy, before: Float | None = None
-) -> Posterior:
-    """A posterior whose draws are spread by the errors of the stars as they scatter.
-
-    `before`: (D, D), its covariance where that is not the formal one, as in a hierarchy of
-    exposures.
-    """
-    return _widened(posterior, correlated, correlated.noise, before)
-
-
-def with_correlated_errors(
-    posterior: Posterior, correlated: Discrepancy, before: Float | None = None
-) -> Posterior:
-    """A posterior whose draws are spread by all that is known of errors of its parameters.
-
-    `posterior`, `correlated`, `before`: as `with_noise`.
-    """
-    return _widened(posterior, correlated, correlated.covariance, before)
-
-
-def _widened(
-    posterior: Posterior, correlated: Discrepancy, cov: Float, before: Float | None
-) -> Posterior:
-    formal = correlated.formal
-    if before is None:
-        return posterior.mapped(recolouring(formal, cov))
-    # frames follow as they are correlated with polynomials and drift
-    D = correlated.model.n_distortion
-    follow = np.linalg.solve(before[:D, :D], before[:D]).T
-    more = follow @ (cov - formal)[:D, :D] @ follow.T
-    after = before + _least(before, (more + more.T) / 2)
-    return posterior.mapped(recolouring(before, after))
+    return wider * formal
 
 
 def _least(before: Float, more: Float) -> Float:

@@ -7,6 +7,8 @@ draws.
 
 from __future__ import annotations
 
+import zlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -14,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.domain import EvaluationDomain, WorstPosition
-from bayesdist.assess.judged_statistics import ErrorsOf, drawn_statistics
 from bayesdist.assess.solution import Solution
+from bayesdist.assess.statistics import ErrorsOf, drawn_statistics
 from bayesdist.assess.terms.forms import (
     PRODUCT,
     ErrorDraws,
@@ -26,14 +28,27 @@ from bayesdist.assess.terms.forms import (
     NoiseField,
     Row,
 )
-from bayesdist.assess.terms.seeds import generators
 
-__all__ = ["DrawnErrors"]
+__all__ = ["DrawnErrors", "generators"]
 
 Float = NDArray[np.float64]
 
 BLOCK = 200_000  # positions times draws whose errors a thread holds at once
 MOST_PAIRS = 5000  # pairs of positions that stand for all: percentiles over them to about 1 %
+
+
+def generators(terms: Sequence[ErrorTerm], seed: int) -> list[np.random.Generator]:
+    """A generator for each term, by the name of its first row and how often that came before.
+
+    The draws of a term do not depend on what other terms there are.
+    """
+    seen: Counter[str] = Counter()
+    out = []
+    for term in terms:
+        name = term.rows[0].name
+        out.append(np.random.default_rng([seed, zlib.crc32(name.encode()), seen[name]]))
+        seen[name] += 1
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +142,7 @@ class DrawnErrors:
             [self.errors(domain.positions.at(epoch), scale) for epoch in epochs],
             names,
             n_draws=n_draws or self.n_draws,
-            n_places=domain.size,
+            n_positions=domain.size,
             block=BLOCK,
             seed=self.seed,
             pairs=pairs,

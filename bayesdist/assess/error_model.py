@@ -8,22 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.adjusted import (
-    covariance_of,
-    with_correlated_errors,
-    with_noise,
-    with_shared_stars,
-)
+from bayesdist.assess.adjusted import with_diagnosed_errors
 from bayesdist.assess.budget.budget import ErrorBudget, budget_of
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.drawn import DrawnErrors
+from bayesdist.assess.drawn import DrawnErrors, generators
 from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms.correlated import Deviations, StructureErrors
 from bayesdist.assess.terms.forms import ErrorTerm, Image
 from bayesdist.assess.terms.given import Centroids, UserTerm
 from bayesdist.assess.terms.local import LocalErrors, table_of
-from bayesdist.assess.terms.parameters import CatalogueErrors, catalogue_terms
-from bayesdist.assess.terms.seeds import generators
+from bayesdist.assess.terms.parameters import catalogue_terms
 from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.assess.units import pixel_scale_of
 from bayesdist.diagnose.diagnostics import Diagnostics
@@ -214,32 +208,20 @@ def _with_diagnosed(
     posterior: Posterior, diagnostics: Diagnostics, hierarchy: LinearFit | None, catalogue: str
 ) -> SolutionErrors:
     """Errors of the parameters with those of the catalogue, and of the stars as they scatter."""
-    solution, stars = posterior, diagnostics.catalogue
-    terms: tuple[CatalogueErrors, ...] = ()
-    if stars is not None:
-        assert hierarchy is not None
-        solution = with_shared_stars(posterior, hierarchy, stars)
-        terms = catalogue_terms(posterior, stars, catalogue)
-    if diagnostics.correlated is not None:
-        before = None if hierarchy is None else covariance_of(posterior, hierarchy, stars)
-        solution = with_noise(solution, diagnostics.correlated, before)
-    return SolutionErrors(solution, posterior if terms else None, terms)
+    solution = with_diagnosed_errors(posterior, diagnostics, hierarchy, noise_alone=True)
+    if diagnostics.catalogue is None:
+        return SolutionErrors(solution)
+    terms = catalogue_terms(posterior, diagnostics.catalogue, catalogue)
+    return SolutionErrors(solution, posterior, terms)
 
 
 def solution_with_errors(
     posterior: Posterior, diagnostics: Diagnostics | None, hierarchy: LinearFit | None = None
 ) -> Posterior:
-    """The solution that is exported and shown: all errors of the parameters are in its draws.
+    """Solution that is exported and shown: all errors of the parameters are in its draws.
 
     `posterior`: as it was sampled. `hierarchy`: as of `error_model`.
     """
     if diagnostics is None:
         return posterior
-    solution, stars = posterior, diagnostics.catalogue
-    if stars is not None:
-        assert hierarchy is not None
-        solution = with_shared_stars(posterior, hierarchy, stars)
-    if diagnostics.correlated is None:
-        return solution
-    before = None if hierarchy is None else covariance_of(posterior, hierarchy, stars)
-    return with_correlated_errors(solution, diagnostics.correlated, before)
+    return with_diagnosed_errors(posterior, diagnostics, hierarchy)

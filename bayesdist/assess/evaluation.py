@@ -347,7 +347,7 @@ def _own_checks(
 
 
 def _contradiction(diagnostics: Diagnostics, settings: EvaluationSettings) -> InputError | None:
-    """Check of an error that is larger than the residuals said to hold it; None where none is."""
+    """Error of a term that is larger than the residuals said to hold it; None where none is."""
     try:
         centroids_of(diagnostics, settings.contained)
     except InputError as error:

@@ -21,7 +21,13 @@ from bayesdist.infer.solution import Solution
 from bayesdist.infer.transforms import without_frames
 from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence, corrected
 
-__all__ = ["Calibration", "GaussianSolution", "calibration_of", "calibration_of_maps"]
+__all__ = [
+    "Calibration",
+    "GaussianSolution",
+    "as_calibration",
+    "calibration_of",
+    "calibration_of_maps",
+]
 
 Float = NDArray[np.float64]
 
@@ -268,6 +274,11 @@ def calibration_of(
         scale=size,
         scale_from=source,
     )
+
+
+def as_calibration(one: Solution | Calibration) -> Calibration:
+    """Calibration of a solution; a calibration as it is."""
+    return one if isinstance(one, Calibration) else calibration_of(one)
 
 
 def calibration_of_maps(

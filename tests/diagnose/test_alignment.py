@@ -39,7 +39,8 @@ from bayesdist.missions.wise.assess.published import (
     noise_of_bins,
     printed_rows,
 )
-from bayesdist.missions.wise.simulate import SAMPLE_SIZES, simulate_wise
+from bayesdist.missions.wise.published import SAMPLE_SIZES
+from bayesdist.missions.wise.simulate import simulate_wise
 
 SIZE = (60.0, 60.0)
 

@@ -22,7 +22,8 @@ from bayesdist.diagnose.residuals import (
 )
 from bayesdist.infer import Rejection, fit_linear, load
 from bayesdist.missions.wise.assess.histograms import band_sums
-from bayesdist.missions.wise.simulate import RESIDUAL_SIGMAS, WISE_BANDS, wise_set
+from bayesdist.missions.wise.published import RESIDUAL_SIGMAS, WISE_BANDS
+from bayesdist.missions.wise.simulate import wise_set
 
 from .support import matches_of, pairs_of
 

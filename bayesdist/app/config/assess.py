@@ -13,7 +13,7 @@ from bayesdist.app.config.section import Section
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.assess.terms.forms import GIVEN
 from bayesdist.assess.terms.given import TERM_KINDS
-from bayesdist.assess.terms.kinds import one_size_kinds
+from bayesdist.assess.terms.parameters import one_size_kinds
 from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
 
 __all__ = [

@@ -31,7 +31,7 @@ from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.terms.given import said_by_user
-from bayesdist.assess.terms.kinds import one_size_term
+from bayesdist.assess.terms.parameters import one_size_term
 from bayesdist.infer import OutlierMixture
 from bayesdist.model import Chip, TimeDependence
 

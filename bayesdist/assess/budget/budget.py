@@ -29,7 +29,7 @@ class BudgetTerm:
 
     name: str
     # 'random', 'systematic' (as the parts of the model, which all stars share), 'local' (shared by
-    # the stars at one place), or 'product' (of a file, known, and in no total)
+    # the stars at one position), or 'product' (of a file, known, and in no total)
     kind: str
     # (P,), standard deviations, in the unit of the budget; of products the displacements' sizes
     u: Float

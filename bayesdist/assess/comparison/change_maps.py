@@ -92,16 +92,18 @@ class Monitored:
             f"{m.rms:.3g} pix rms where errors alone make {m.noise_rms:.2g}, at most "
             f"{m.largest:.3g} +- {m.sigma_of_largest:.2g} pix{mas} at ({x:.0f}, {y:.0f}){chip}"
         )
-        told = (
+        stated = (
             f"chi-square {test.chi2:.4g} for {test.dof} degrees of freedom, "
             f"{probability(self.p_either)}"
         )
         if self.date is not None and len(self.date.gain) > 1:
-            told += " with the search over dates"
+            stated += " with the search over dates"
         if not self.changed:
-            return f"The released solution still describes the new matches: change {size} ({told})."
+            return (
+                f"The released solution still describes the new matches: change {size} ({stated})."
+            )
         return (
-            f"The released solution no longer describes the new matches: change {size} ({told})"
+            f"The released solution no longer describes the new matches: change {size} ({stated})"
             f"{self._since}."
         )
 

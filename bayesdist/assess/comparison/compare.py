@@ -149,7 +149,7 @@ def compare(
     keep : bool
         Leave shift, rotation and scale in.
     n_draws : int
-        Noise fields.  No share of them is told below 1 / (n_draws + 1).
+        Noise fields.  No fraction of them is stated below 1 / (n_draws + 1).
 
     Returns
     -------
@@ -235,7 +235,7 @@ def _root(cov: Float) -> Float:
 
 
 def _largest(difference: Float, noise: Float, sigma: Float) -> tuple[float, float]:
-    """Largest |z|, and the share of noise that has one as large."""
+    """Largest |z|, and the fraction of noise that has one as large."""
     known = sigma > 0
     z = [np.abs(d[:, known] / sigma[known]).max(axis=1, initial=0.0) for d in (difference, noise)]
     return float(z[0][0]), _share(z[1], float(z[0][0]))

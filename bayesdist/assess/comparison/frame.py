@@ -1,4 +1,4 @@
-"""Two calibrations laid on each other: the similarity between them, told apart from the rest.
+"""Two calibrations laid on each other: the similarity between them, separated from the rest.
 
 With w = u + i v, mean over the area of the detector,
 
@@ -70,9 +70,9 @@ class CommonFrame:
     # (2 K, q), fields that were taken out: of the shift, the scale and the rotation; none where
     # they are kept
     taken: Float
-    shares: tuple[float, float]  # share of A and of B in the variances
+    shares: tuple[float, float]  # fractions of A and of B in the variances
     similarity: Similarity
-    pixel_mas: float | None  # size of a pixel of A, where one side tells it
+    pixel_mas: float | None  # size of a pixel of A, where one side states it
 
     @property
     def norm(self) -> Float:

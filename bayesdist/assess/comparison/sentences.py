@@ -23,7 +23,7 @@ def probability(p: float) -> str:
 def verdict(found: Comparison, pixel_mas: float | None = None) -> str:
     """One sentence: whether the calibrations differ, by how much, and how sure that is.
 
-    `pixel_mas`: size of a pixel, where neither side tells it.
+    `pixel_mas`: size of a pixel, where neither side states it.
     """
     size = (
         f"{_length(found.rms, found, pixel_mas)} rms, at most "

@@ -78,7 +78,7 @@ class PlannedStars:
 
     per_detector: float  # detections of one exposure, on average
     sigma: float  # error of a detection on one axis, pixels
-    false: float = 0.0  # share of the detections that are false: they say nothing
+    false: float = 0.0  # fraction of the detections that are false: they say nothing
     least: int = 2  # fewest detections of a star that is used
     seed: int = 1
 
@@ -124,7 +124,7 @@ class PlannedPattern:
     maps: dict[str, tuple[UncertaintyMap, ...] | None]
 
     def radii(self, kind: str) -> Float:
-        """Radial errors (1 sigma) at all places of the grid, pixels; infinite where unbounded."""
+        """Radial errors (1 sigma) at all points of the grid, pixels; infinite where unbounded."""
         maps = self.maps[kind]
         return (
             np.array([np.inf]) if maps is None else np.concatenate([m.radius.ravel() for m in maps])
@@ -166,10 +166,10 @@ class PlannedPattern:
         degree = terms.sum(axis=1)
         of_term = np.zeros(len(terms))
         for chip in model.chips:
-            share = np.prod(chip.size) / self.camera.pixels
+            fraction = np.prod(chip.size) / self.camera.pixels
             for axis in (0, 1):
                 of_term += (
-                    share * variance[model.coefficient_slice(chip.number, axis)] * mean_square
+                    fraction * variance[model.coefficient_slice(chip.number, axis)] * mean_square
                 )
         return {
             int(k): float(np.sqrt(of_term[degree == k].sum())) for k in range(1, model.order + 1)

@@ -117,9 +117,9 @@ def check_requirements(
     The field is that of all chips: the same grid on each of them, so that each has the same weight.
     A draw of the solution and an offset are common to all chips.
 
-    Of a relative error the statistic is that of the differences between two places, over all pairs
-    of points.  Over a range of epochs the draws of everything are the same throughout, and that of
-    the statistic is the largest over nine epochs and the breaks between them.
+    Of a relative error the statistic is that of the differences between two positions, over all
+    pairs of points.  Over a range of epochs the draws of everything are the same throughout, and
+    that of the statistic is the largest over nine epochs and the breaks between them.
 
     Parameters
     ----------
@@ -344,7 +344,7 @@ def _margin(
     reached = np.quantile(draws, asked, method="inverted_cdf")
     verdict, reason = verdict_of(met, n_effective, asked, doubts)
     axis = requirement.statistic[0] if requirement.statistic[:2] in ("u_", "v_") else ""
-    place = errors.worst(worst_epoch, axis)
+    position = errors.worst(worst_epoch, axis)
     remedy = None
     if verdict == "missed" and not doubts:
         remedy = find_remedy(errors, requirement, worst_epoch, factor)
@@ -361,6 +361,6 @@ def _margin(
         epoch=worst_epoch.epoch,
         n_effective=n_effective,
         draws=draws,
-        worst=replace(place, rms=factor * place.rms),
+        worst=replace(position, rms=factor * position.rms),
         remedy=remedy,
     )

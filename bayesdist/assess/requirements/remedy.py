@@ -23,7 +23,7 @@ class Remedy:
     # where one term can do it alone, that which has to shrink least; else the largest one
     term: str
     factor: float  # by which its error must be multiplied; 0 where it cannot do it alone
-    now: float  # its radial rms over the places that are domain, in the requirement's unit
+    now: float  # its radial rms over the positions judged, in the requirement's unit
     needed: float
     enough: bool  # True if the requirement is met then, the other terms being as they are
     unit: str

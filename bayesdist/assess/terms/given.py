@@ -51,7 +51,7 @@ def said_by_user(source: str) -> str:
 
 @dataclass(frozen=True)
 class UserTerm:
-    """A Gaussian error given by the user, the same at every place of the detector.
+    """A Gaussian error given by the user, the same at every position of the detector.
 
     Parameters
     ----------
@@ -65,9 +65,9 @@ class UserTerm:
     source : str
         Where the number comes from: 'given by the user', or a publication.
     varies : bool
-        Of a systematic term: whether it may differ from place to place in a way that is not known,
-        as the errors of a catalogue do.  Requirements are then judged for one offset of the whole
-        field, for a smooth field, and for independent errors at every position.
+        Of a systematic term: true if it may differ from position to position in a way that is not
+        known, as the errors of a catalogue do.  Requirements are then judged for one offset of the
+        whole field, for a smooth field, and for independent errors at every position.
 
     Raises
     ------

@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.solution import Solution, place_of
-from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorDraws, Polynomials, Row, Together
+from bayesdist.assess.terms.forms import (
+    GIVEN,
+    MEASURED,
+    ErrorDraws,
+    ErrorTerm,
+    Polynomials,
+    Row,
+    Together,
+)
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_errors import StarCovariance
+from bayesdist.mission import load_object, missions
 from bayesdist.model import DistortionModel
 from bayesdist.names import require_known
 
@@ -24,6 +34,8 @@ __all__ = [
     "ExposureVariation",
     "ScaleError",
     "catalogue_terms",
+    "one_size_kinds",
+    "one_size_term",
 ]
 
 Float = NDArray[np.float64]
@@ -142,6 +154,20 @@ class ScaleError:
         return Polynomials(self.rows[0], model, mean, mean + sizes * moved)
 
 
+def one_size_kinds() -> tuple[str, ...]:
+    """Kinds of error terms that have one size, those that missions add among them."""
+    return (*LINEAR_KINDS, *(kind for one in missions().values() for kind in one.error_terms))
+
+
+def one_size_term(name: str, kind: str, sigma: float, solution: Solution, source: str) -> ErrorTerm:
+    """Error term of a kind; parameters as of `ScaleError`."""
+    make: Callable[..., ErrorTerm] = ScaleError
+    for mission in missions().values():
+        if kind in mission.error_terms:
+            make = load_object(mission.error_terms[kind])
+    return make(name, kind, sigma, solution, source)
+
+
 @dataclass(frozen=True, eq=False)
 class ExposureVariation:
     """Deviation of a new exposure from the polynomials that all exposures have in common.
@@ -152,8 +178,7 @@ class ExposureVariation:
     # with frames in gauge 'held', in which exposures deviate from the polynomials
     model: DistortionModel
     mean: Float  # (D,), of its parameters
-    # length k, deviations that scatter, as an exposure's parameters are named: 'scale',
-    # 'shear_plus',
+    # (k,), deviations that scatter, named as an exposure's parameters: 'scale', 'shear_plus', ...
     kinds: tuple[str, ...]
     tau: Float  # (m, k), draws of the scatter of each kind
     # what of it is known to be velocity aberration: shown beside, as this scatter holds it

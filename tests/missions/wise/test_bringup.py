@@ -7,10 +7,10 @@ import pytest
 from astropy.table import Table
 from scipy import stats
 
-from bayesdist.data.frame_stars import FrameStars
 from bayesdist.data.matching.pairs import mutual_pairs
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bring_up.iterate import bring_up
+from bayesdist.missions.wise.frame_stars import FrameStars
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.missions.wise.pairs.read import read_rvb
 from bayesdist.missions.wise.simulate import wise_solution

@@ -9,8 +9,8 @@ from bayesdist.assess import uncertainty_map
 from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer import Rejection, fit_linear
-from bayesdist.missions.wise.assess.formal_radii import implied_sigma
-from bayesdist.missions.wise.simulate import FORMAL_RADII, RADIAL_RESIDUALS, SAMPLE_SIZES
+from bayesdist.missions.wise.assess.published import implied_sigma
+from bayesdist.missions.wise.published import FORMAL_RADII, RADIAL_RESIDUALS, SAMPLE_SIZES
 from bayesdist.model import Chip, DistortionModel
 
 SIZE = (1016.0, 1016.0)

@@ -12,16 +12,13 @@ from bayesdist.app.check import check
 from bayesdist.data import read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Rejection, fit_linear
-from bayesdist.missions.wise.simulate import (
+from bayesdist.missions.wise.published import (
     RADIAL_RESIDUALS,
     RESIDUAL_SIGMAS,
     SAMPLE_SIZES,
     WISE_BANDS,
-    files,
-    sets,
-    wise_set,
-    write_wise_set,
 )
+from bayesdist.missions.wise.simulate import files, sets, wise_set, write_wise_set
 from bayesdist.missions.wise.simulate.survey import match_radius
 from bayesdist.missions.wise.simulated_pairs import simulate_sets
 

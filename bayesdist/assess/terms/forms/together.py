@@ -21,7 +21,7 @@ class Together:
     """Rows of one term: the same draw number in each, so that they may be correlated.
 
     The joint error is the sum of the rows that are in the total.  Rows that are not are held by it:
-    where one of them shrinks, the joint error does so at each position as the row's share in its
+    where one of them shrinks, the joint error does so at each position as the row's fraction of its
     variance says.
 
     Parameters

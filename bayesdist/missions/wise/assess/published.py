@@ -1,4 +1,4 @@
-"""The residual tables printed in WSDC D-T033, and how much of them is noise."""
+"""The residual tables printed in WSDC D-T033, and the errors of pairs that its numbers imply."""
 
 from __future__ import annotations
 
@@ -10,18 +10,25 @@ import numpy as np
 
 from bayesdist.diagnose.residuals.rows import STATISTICS
 from bayesdist.errors import InputError
+from bayesdist.model.basis import polynomial_terms
 
 __all__ = [
+    "HEADS",
     "TABLE_5_1",
     "TABLE_5_2",
     "TABLE_5_3",
     "TABLE_C_1",
     "PrintedRow",
+    "implied_sigma",
     "noise_of_bins",
     "printed_rows",
 ]
 
-# columns: mean, sigma, min, max, median, 1 %, 99 %
+HEADS = dict(
+    zip(STATISTICS, ("Mean", "Sigma", "Min", "Max", "Median", "1%-tile", "99%-tile"), strict=True)
+)
+
+# columns as in HEADS
 TABLE_5_1 = """
 W1/X 0.002070 0.01949 -0.08298 0.06435 0.002512 -0.04942 0.04579
 W1/Y -0.009074 0.01159 -0.04935 0.04348 -0.00373 -0.03837 0.0251
@@ -119,3 +126,20 @@ def noise_of_bins(mean_length: float, n_pairs: float, n_bins: int = 31 * 31) -> 
     over the bins. The result is of each axis, in the unit of `mean_length`.
     """
     return float(mean_length / np.sqrt(np.pi / 2) / np.sqrt(n_pairs / n_bins))
+
+
+def implied_sigma(radius_max: float, n_pairs: int, *, order: int = 4) -> float:
+    """Error of a pair, equal on both axes, that a largest radius hypot(sigma_x, sigma_y) implies.
+
+    Pairs that lie evenly over the array determine products of Legendre polynomials independently of
+    each other: that of degrees i and j has the variance (2i + 1)(2j + 1) / N in a corner, where the
+    radius is largest.
+
+    `radius_max`: largest hypot(sigma_x, sigma_y) of a polynomial's position over the array.
+    `n_pairs`: pairs that determine the polynomial, evenly over the array. `order`: of the
+    polynomial. The result is in the unit of the radius. InputError for no pairs.
+    """
+    if n_pairs < 1:
+        raise InputError(f"{n_pairs} pairs are given", do="give one pair or more")
+    corner = sum((2 * i + 1) * (2 * j + 1) for i, j in polynomial_terms(order))
+    return float(radius_max / np.sqrt(2 * corner / n_pairs))

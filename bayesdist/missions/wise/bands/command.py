@@ -16,11 +16,10 @@ from bayesdist.missions.wise.bands.findings import overview_table
 from bayesdist.missions.wise.bands.inputs import BandRun, open_bands
 from bayesdist.missions.wise.bands.measure import measure_bands
 from bayesdist.missions.wise.bands.optical import optical_models
-from bayesdist.missions.wise.bands.page import draw_bands, write_bands
+from bayesdist.missions.wise.bands.page import write_bands
 from bayesdist.missions.wise.bands.record import record_of, write_tables
-from bayesdist.missions.wise.simulate import WISE_BANDS
+from bayesdist.missions.wise.published import WISE_BANDS
 from bayesdist.products import sip_from_solution, write_wise_meta
-from bayesdist.report.drawing import save_drawings
 
 __all__ = ["bands_of_runs"]
 
@@ -68,12 +67,7 @@ def bands_of_runs(
             published=published,
             provenance={"command": command, **versions()},
         )
-        files = [*write_tables(inputs, folder), *_meta(bands, folder)]
-        drawings = draw_bands(inputs)
-        save_drawings(drawings, folder / "figures")
-        write_bands(folder / "bands.html", inputs, drawings)
-        files += ["bands.html", *(f"figures/{name}.png" for name in drawings)]
-        files += [f"figures/{name}.pdf" for name in drawings]
+        files = [*write_tables(inputs, folder), *_meta(bands, folder), *write_bands(folder, inputs)]
         write_json(folder / "bands.json", record_of(inputs) | {"files": files})
     return _text(Path(output), inputs)
 

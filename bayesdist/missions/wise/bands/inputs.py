@@ -10,7 +10,7 @@ from bayesdist.app.results import Results, results_of
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.assess import pixel_scale_of
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.simulate import WISE_BANDS
+from bayesdist.missions.wise.published import WISE_BANDS
 from bayesdist.model import Chip
 
 __all__ = ["BandRun", "open_bands"]

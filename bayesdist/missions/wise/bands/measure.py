@@ -14,17 +14,21 @@ from bayesdist.diagnose.residuals import (
     fitting_table,
     multiframe_table,
 )
-from bayesdist.missions.wise.assess.account import PRINTED_BINS, accounts
+from bayesdist.missions.wise.assess.account import PRINTED_BINS, accounts, partition_parts
 from bayesdist.missions.wise.assess.distortion_field import DistortionField, field_of_solution
-from bayesdist.missions.wise.assess.formal_radii import implied_sigma
 from bayesdist.missions.wise.assess.histograms import band_sums
-from bayesdist.missions.wise.assess.partition_parts import partition_parts
+from bayesdist.missions.wise.assess.published import implied_sigma
 from bayesdist.missions.wise.assess.residual_correlation import residual_correlation
 from bayesdist.missions.wise.assess.residual_structure import residual_partition
 from bayesdist.missions.wise.bands.context import BandResult, BandsInput, Printed
 from bayesdist.missions.wise.bands.inputs import BandRun
 from bayesdist.missions.wise.bands.optical import OpticalModel
-from bayesdist.missions.wise.simulate import FORMAL_RADII, LONGEST_VECTORS, SAMPLE_SIZES, WISE_BANDS
+from bayesdist.missions.wise.published import (
+    FORMAL_RADII,
+    LONGEST_VECTORS,
+    SAMPLE_SIZES,
+    WISE_BANDS,
+)
 from bayesdist.model.basis import polynomial_terms
 
 __all__ = ["measure_bands"]

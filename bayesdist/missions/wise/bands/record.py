@@ -11,6 +11,7 @@ from astropy.table import Table
 from bayesdist.app.output import write_table
 from bayesdist.missions.wise.assess.account import RowAccount
 from bayesdist.missions.wise.assess.histograms import ResidualHistogram
+from bayesdist.missions.wise.assess.published import HEADS
 from bayesdist.missions.wise.bands.context import BandResult, BandsInput
 
 __all__ = ["SCHEMA", "record_of", "write_tables"]
@@ -162,7 +163,7 @@ def write_tables(inputs: BandsInput, folder: Path) -> tuple[str, ...]:
         _add(out, "Sigma partition", [one.partition for one in accounts], table.unit)
         _add(out, "Sigma rest", [one.rest for one in accounts], table.unit)
         if any(one.printed is not None for one in accounts):
-            for statistic, head in _HEADS.items():
+            for statistic, head in HEADS.items():
                 values = [one.printed and one.printed.value[statistic] for one in accounts]
                 _add(out, f"{head} printed", values, table.unit)
             for k, which in enumerate(("least", "most")):
@@ -176,17 +177,6 @@ def write_tables(inputs: BandsInput, folder: Path) -> tuple[str, ...]:
         write_table(out, folder / path)
         names.append(path)
     return tuple(names)
-
-
-_HEADS = {
-    "mean": "Mean",
-    "sigma": "Sigma",
-    "min": "Min",
-    "max": "Max",
-    "median": "Median",
-    "p01": "1%-tile",
-    "p99": "99%-tile",
-}
 
 
 def _add(table: Table, name: str, values: list[float | None], unit: str) -> None:

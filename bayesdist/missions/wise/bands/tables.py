@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesdist.diagnose.residuals import STATISTICS
 from bayesdist.missions.wise.assess.account import RowAccount
-from bayesdist.missions.wise.assess.published import PrintedRow
+from bayesdist.missions.wise.assess.published import HEADS, PrintedRow
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput
 from bayesdist.numbers import MISSING, number, rounded
 from bayesdist.report.texttable import TextTable
@@ -20,7 +20,6 @@ TITLES = {
     "5-2": "Alignment of two bands observed together",
     "5-3": "Alignment within a band in many frames, all pairs of bins",
 }
-_HEADS = ("Mean", "Sigma", "Min", "Max", "Median", "1%-tile", "99%-tile")
 
 
 @BANDS.table("tables")
@@ -52,7 +51,9 @@ def statistics_table(name: str, inputs: BandsInput) -> TextTable:
             " minus 2MASS: there means and medians have the other sign, and minima and 1 % stand"
             " for maxima and 99 %."
         )
-    return TextTable(title, (table.first, "", *_HEADS), tuple(rows), words=(0, 1), note=note)
+    return TextTable(
+        title, (table.first, "", *HEADS.values()), tuple(rows), words=(0, 1), note=note
+    )
 
 
 def as_printed(row: PrintedRow, statistic: str) -> str:

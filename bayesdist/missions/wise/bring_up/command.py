@@ -12,17 +12,18 @@ from numpy.typing import NDArray
 from bayesdist.app.folder import atomic_directory
 from bayesdist.app.output import write_table
 from bayesdist.app.screen import table_text
-from bayesdist.data.frame_stars import FrameStars
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bands.optical import optical_models
 from bayesdist.missions.wise.bring_up.iterate import BringUp, bring_up
-from bayesdist.missions.wise.pairs.files import ARRAY_SIZE, RVB_ALIASES, band_name
+from bayesdist.missions.wise.frame_stars import FrameStars
+from bayesdist.missions.wise.pairs.files import RVB_ALIASES, band_name
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
 from bayesdist.missions.wise.pairs.write import write_rvb
+from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["bring_up_files"]
@@ -61,9 +62,8 @@ def bring_up_files(
     print. InputError for what cannot be read or written, and as `bring_up`.
     """
     band = band_name(band)
-    size = ARRAY_SIZE[band]
-    centre = ((size[0] + 1) / 2, (size[1] + 1) / 2)
-    model = DistortionModel(order, (Chip(1, band, size, centre),))
+    array = WISE_ARRAYS[band]
+    model = DistortionModel(order, (Chip(1, band, array.size, array.centre),))
     start = None if optical is None else _start(model, band, optical, rotation)
     stars, others = _read_lists(Path(detections), Path(reference))
     up = bring_up(stars, others, model, start, acceptance=RadialLimit(radius, corner_radius))
@@ -78,8 +78,7 @@ def bring_up_files(
 def _start(model: DistortionModel, band: str, optical: str | Path, rotation: float) -> Float:
     """Parameters of an optical model, without terms beyond the order of the model."""
     chip = model.chips[0]
-    arcsec = 2.75 * ARRAY_SIZE["W1"][0] / chip.size[0]
-    found = optical_models([optical], rotation, [band])[band].field(chip, arcsec)
+    found = optical_models([optical], rotation, [band])[band].field(chip, WISE_ARRAYS[band].scale)
     basis = model.basis()
     coefficients = np.zeros((2, basis.n_terms))
     n = min(basis.n_terms, found.polynomial.shape[1])

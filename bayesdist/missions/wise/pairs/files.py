@@ -18,9 +18,9 @@ from bayesdist.data.tables.names import BASIC, find_columns
 from bayesdist.data.tables.parquet import ParquetPart, describe_part
 from bayesdist.data.tables.quantities import Columns
 from bayesdist.errors import InputError
+from bayesdist.missions.wise.published import WISE_BANDS
 
 __all__ = [
-    "ARRAY_SIZE",
     "IPAC",
     "MAGNITUDES",
     "RVB_ALIASES",
@@ -31,15 +31,7 @@ __all__ = [
 
 PathLike = str | os.PathLike[str]
 
-# columns and rows of the band frames; those of W4 are binned 2 x 2
-ARRAY_SIZE: dict[str, tuple[float, float]] = {
-    "W1": (1016.0, 1016.0),
-    "W2": (1016.0, 1016.0),
-    "W3": (1016.0, 1016.0),
-    "W4": (508.0, 508.0),
-}
-
-MAGNITUDES = tuple(f"mag_{band.lower()}" for band in ARRAY_SIZE)
+MAGNITUDES = tuple(f"mag_{band.lower()}" for band in WISE_BANDS)
 
 # lower case; the first that the file has is taken
 RVB_ALIASES: dict[str, tuple[str, ...]] = {
@@ -65,8 +57,8 @@ def band_name(label: object) -> str:
     """
     text = str(label).strip().upper()
     name = text if text.startswith("W") else f"W{text.removesuffix('.0')}"
-    if name not in ARRAY_SIZE:
-        raise InputError(f"{label!r} is no band", do=f"give one of {', '.join(ARRAY_SIZE)}")
+    if name not in WISE_BANDS:
+        raise InputError(f"{label!r} is no band", do=f"give one of {', '.join(WISE_BANDS)}")
     return name
 
 

@@ -24,7 +24,6 @@ from bayesdist.data.tables.quantities import Columns, Quantities
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs.array_check import ArrayCheck
 from bayesdist.missions.wise.pairs.files import (
-    ARRAY_SIZE,
     MAGNITUDES,
     RVB_ALIASES,
     RvbFile,
@@ -32,6 +31,7 @@ from bayesdist.missions.wise.pairs.files import (
     open_rvb_files,
 )
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs, colour_of
+from bayesdist.missions.wise.published import WISE_ARRAYS, WISE_BANDS
 
 __all__ = ["chosen_band", "read_rvb", "rvb_bands", "stream_rvb"]
 
@@ -51,7 +51,7 @@ def rvb_bands(
 
 
 def _bands_of(files: Sequence[RvbFile]) -> dict[str, int]:
-    counts = dict.fromkeys(ARRAY_SIZE, 0)
+    counts = dict.fromkeys(WISE_BANDS, 0)
     for file in files:
         if "band" not in file.found:
             raise InputError(
@@ -120,7 +120,7 @@ def stream_rvb(
     check_sigma(sigma)
     files = open_rvb_files(path, columns)
     band = chosen_band(files, band)
-    size = size or ARRAY_SIZE[band]
+    size = size or WISE_ARRAYS[band].size
     check = ArrayCheck(band, size)
     for file in files:
         for table, first, place in file.blocks(list(RVB_ALIASES)):

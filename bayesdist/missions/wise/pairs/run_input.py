@@ -17,11 +17,12 @@ from bayesdist.data import MatchTable, open_matches, write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
 from bayesdist.infer import Matches
-from bayesdist.missions.wise.pairs.files import ARRAY_SIZE, band_name
+from bayesdist.missions.wise.pairs.files import band_name
 from bayesdist.missions.wise.pairs.read import stream_rvb
 from bayesdist.missions.wise.pairs.section import RvbData
 from bayesdist.missions.wise.pairs.selection import SelectedPairs
 from bayesdist.missions.wise.pairs.stored import open_rvb
+from bayesdist.missions.wise.published import WISE_ARRAYS
 
 __all__ = ["RvbInput", "load_rvb"]
 
@@ -96,7 +97,7 @@ class RvbInput:
         write_partitioned(tables(), folder)
         self._counts = {"n_rows": selected.n_rows, "rejected": selected.rejected}
         if not self.run.is_planned:
-            self.settle()
+            self.move_into_run()
             return self._opened(self.run / PAIRS, self.run.record["pairs"])
         return self._opened(folder, self._counts)
 
@@ -107,7 +108,7 @@ class RvbInput:
         opened = open_matches(folder, unit=options["unit"], sigma=sigma)
         return replace(opened, dropped=counts["rejected"])
 
-    def settle(self) -> bool:
+    def move_into_run(self) -> bool:
         """Move what was written into the folder of the run, which has begun.
 
         Returns True for pairs that were moved, and have to be opened anew. InputError when the
@@ -168,8 +169,8 @@ def _options(data: RvbData, size: tuple[float, float]) -> dict[str, Any]:
 def _require_array(label: str | None, size: tuple[float, float]) -> None:
     """Refuse a detector that has not the size of the band's array."""
     band = band_name(label)
-    if tuple(size) != ARRAY_SIZE[band]:
-        columns, rows = ARRAY_SIZE[band]
+    if tuple(size) != WISE_ARRAYS[band].size:
+        columns, rows = WISE_ARRAYS[band].size
         raise InputError(
             f"the array of {band} has {columns:g} x {rows:g} pixels, but the detector "
             f"{size[0]:g} x {size[1]:g}",

@@ -10,18 +10,17 @@ from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs.files import (
-    ARRAY_SIZE,
     IPAC,
     MAGNITUDES,
     RvbFile,
     open_rvb_files,
 )
 from bayesdist.missions.wise.pairs.read import rvb_bands, stream_rvb
+from bayesdist.missions.wise.published import WISE_ARRAYS
 
 __all__ = ["rvb_template"]
 
 SIGMA = 0.1  # pixels, for pairs that say nothing about their errors
-MAS = 2750.0  # of a pixel of W1 to W3
 
 _FORMAT = """\
 format = "rvb"                  # pairs of WISE and 2MASS, u and v in pixels of the band frame
@@ -76,8 +75,8 @@ def rvb_template(matches: str | Path) -> tuple[int, dict[str, object]] | None:
         else f"{SIGMA}                     # GUESSED: the table carries no errors",
     }
     coloured = "colour" in found or len(found.intersection(MAGNITUDES)) > 1
-    nx, ny = ARRAY_SIZE[band]
-    scale = MAS * ARRAY_SIZE["W1"][0] / nx
+    array = WISE_ARRAYS[band]
+    (nx, ny), scale = array.size, 1000 * array.scale
     return n, {
         "format": _FORMAT.format(band=band, found=comment),
         "columns": column_lines(None, None),
@@ -85,7 +84,7 @@ def rvb_template(matches: str | Path) -> tuple[int, dict[str, object]] | None:
         "sigma": said[sigma],
         "detector": _SELECTION.format(colour=_COLOUR if coloured else "")
         + _DETECTOR.format(band=band, nx=nx, ny=ny, scale=scale),
-        "reference": f"# reference_pixel = [{(nx + 1) / 2}, {(ny + 1) / 2}]  # the centre\n",
+        "reference": f"# reference_pixel = [{array.centre[0]}, {array.centre[1]}]  # the centre\n",
         "frames": "none",
         "grid_y": 33,
         "unit": "pix",
@@ -115,4 +114,4 @@ def _guessed_band(files: list[RvbFile]) -> str:
         for table, _, place in file.blocks(["x", "y"]):
             for key in "xy":
                 reach = max(reach, float(file.column(table, key, place).numbers().max()))
-    return "W4" if reach <= ARRAY_SIZE["W4"][0] + 1 else "W1"
+    return "W4" if reach <= WISE_ARRAYS["W4"].size[0] + 1 else "W1"

@@ -11,10 +11,11 @@ from pathlib import Path
 
 from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.pairs.files import ARRAY_SIZE, open_rvb_files
+from bayesdist.missions.wise.pairs.files import open_rvb_files
 from bayesdist.missions.wise.pairs.read import chosen_band, stream_rvb
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
 from bayesdist.missions.wise.pairs.write import write_rvb
+from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.missions.wise.rvb.linear import fit_transform, linear_moments
 from bayesdist.missions.wise.rvb.solutions import read_solutions
 from bayesdist.missions.wise.rvb.transform import RvbTransform, rereference, transformed
@@ -58,11 +59,11 @@ def transform_files(
     if fit:
         pieces = stream_rvb(files, band=band, columns=columns)
         best = fit_transform(
-            reduce(add, (linear_moments(one.matches, _centre(band)) for one in pieces))
+            reduce(add, (linear_moments(one.matches, WISE_ARRAYS[band].centre) for one in pieces))
         )
         transform, found = best.transform, f"\n{best.sentence}"
     else:
-        transform = replace(transform, centre=_centre(band))
+        transform = replace(transform, centre=WISE_ARRAYS[band].centre)
     written = _written(
         files, output, band, columns, lambda matches: transformed(matches, transform)
     )
@@ -86,17 +87,12 @@ def rereference_files(
     """
     columns = columns or {}
     band = _band(files, band, columns)
-    old, new = (read_solutions(path, centre=_centre(band)) for path in (free, fixed))
+    old, new = (read_solutions(path, centre=WISE_ARRAYS[band].centre) for path in (free, fixed))
     return _written(files, output, band, columns, lambda matches: rereference(matches, old, new))
 
 
 def _band(files: Sequence[str | Path], band: str | None, columns: Mapping[str, str]) -> str:
     return chosen_band(open_rvb_files(files, columns), band)
-
-
-def _centre(band: str) -> tuple[float, float]:
-    nx, ny = ARRAY_SIZE[band]
-    return (nx + 1) / 2, (ny + 1) / 2
 
 
 def _written(

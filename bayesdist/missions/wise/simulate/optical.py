@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.simulate import WISE_ARRAYS, wise_solution
+from bayesdist.missions.wise.published import WISE_ARRAYS
+from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import DistortionModel
 from bayesdist.products import SipHeader, write_sip
 from bayesdist.products.formats.common.cards import text_card

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from bayesdist.data.pieces import even_edges
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.simulate.pattern import BLOCKS, PartitionPattern, partition_pattern
-from bayesdist.missions.wise.simulate.published import (
+from bayesdist.missions.wise.published import (
     RESIDUAL_SIGMAS,
     SAMPLE_SIZES,
     WISE_ARRAYS,
     WISE_BANDS,
     WiseArray,
 )
+from bayesdist.missions.wise.simulate.pattern import BLOCKS, PartitionPattern, partition_pattern
 from bayesdist.missions.wise.simulate.solution import wise_solution
 from bayesdist.missions.wise.simulate.stars import POPULATIONS
 from bayesdist.missions.wise.simulate.survey import FalseMatches, Survey, false_matches, survey

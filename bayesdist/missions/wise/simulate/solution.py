@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.simulate.published import SAMPLE_SIZES, WISE_ARRAYS, WISE_COEFFICIENTS
+from bayesdist.missions.wise.published import SAMPLE_SIZES, WISE_ARRAYS, WISE_COEFFICIENTS
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate.matches import Truth, simulate_matches
 from bayesdist.simulate.partitioned import simulate_partitioned
