@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.assessment import assessment_epoch, evaluation_settings
+from bayesdist.app.assessment import evaluation_settings
 from bayesdist.app.checks import run_checks
 from bayesdist.app.config import Config
 from bayesdist.app.diagnosing import diagnose_fit_of_run, diagnose_run
@@ -181,8 +181,10 @@ class Results:
 
     @property
     def epoch(self) -> float | None:
-        """Epoch of the assessment, decimal years."""
-        return assessment_epoch(self.data, self.config)
+        """Epoch of the assessment, decimal years; stars are read only where it is theirs."""
+        if self.config.assess.epoch is not None or self.fit.model.time is None:
+            return self.config.assess.epoch
+        return self.data.median_epoch
 
     @property
     def product(self) -> ProductInput:
