@@ -269,22 +269,22 @@ class RunStore:
     def _begin(self, record: Record, name: str, checkpoints: str, harmed: str) -> None:
         """Note that a stage begins, and remove what it wrote before: it must not see that."""
         patterns = self.stages[name].checkpoints
-        before = record.under_way or {"stage": name, "files": [], "digest": ""}
+        before = record.under_way or {"stage": name, "files": []}
         known = record.artefacts.pop(name, None)
         record.stages.pop(name, None)
         remove_leftovers(self.folder)
-        files, digest = (set(known.files), known.digest) if known else (set(), "")
+        files = set(known.files) if known else set()
         if before["stage"] == name:
-            files, digest = files | set(before["files"]), digest or before["digest"]
+            files |= set(before["files"])
         else:
             self._remove(before["files"], record)  # of another stage that did not end
+        record.under_way = {"stage": name, "files": sorted(files)}
         if patterns:
             if record.checkpoints.get(name) != checkpoints or _is_one_of(harmed, patterns):
                 if record.checkpoints.pop(name, None) is not None:
                     self._write(record)  # first: what is half removed never counts
                 self._remove(self._checkpoints(name), record)
             record.checkpoints[name] = checkpoints
-        record.under_way = {"stage": name, "files": sorted(files), "digest": digest}
         self._sections, self._written = {}, set()
         self._write(record)  # first: what is half removed never counts
         self._remove({one for one in files if not _is_one_of(one, patterns)}, record)
@@ -292,13 +292,11 @@ class RunStore:
     def _end(self, name: str, key: str, parts: Mapping[str, Any], seconds: float) -> Artefact:
         """Note that a stage has ended."""
         record = self.record
-        assert record.under_way is not None
         written = {one for one in self._written if self._is_there(one)}
         written |= set(self._checkpoints(name))
         marks = {one: FileMark.of(self.folder / one) for one in sorted(written)}
         artefact = Artefact(key, parts, marks, self._sections)
-        if artefact.digest != record.under_way["digest"]:
-            self._drop_sections(record, name)
+        self._drop_sections(record, name, artefact)
         record.artefacts[name], record.under_way, self._sections = artefact, None, {}
         ended = datetime.now(UTC).isoformat(timespec="seconds")
         record.stages[name] = {"wall_s": seconds, "ended": ended}
@@ -307,12 +305,17 @@ class RunStore:
         self._write(record)
         return artefact
 
-    def _drop_sections(self, record: Record, name: str) -> None:
-        """Drop sections that a stage wrote from later ones, which had added to its former ones."""
+    def _drop_sections(self, record: Record, name: str, artefact: Artefact) -> None:
+        """Drop sections of a stage from later ones that added to them, made from something else."""
+        stale: set[str] = set()
         for later in list(self.stages)[list(self.stages).index(name) + 1 :]:
             known = record.artefacts.get(later)
-            if known is not None:
-                kept = {k: v for k, v in known.sections.items() if k not in self._sections}
+            made_from = {} if known is None else known.parts.get("from", {})
+            if known is not None and (
+                made_from.get(name, artefact.digest) != artefact.digest or stale & made_from.keys()
+            ):
+                stale.add(later)
+                kept = {k: v for k, v in known.sections.items() if k not in artefact.sections}
                 record.artefacts[later] = replace(known, sections=kept)
 
     def _in_order(self, found: dict[str, Any]) -> dict[str, Any]:
