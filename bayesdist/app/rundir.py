@@ -248,11 +248,6 @@ class RunDirectory:
                 error.cause, where=error.where, do="start again with --force"
             ) from error
 
-    @property
-    def matches(self) -> Path | list[Path]:
-        """What the configuration names as matches: a file, a pattern, a folder, or a list."""
-        return named_files(self.config, Path(self.record["base"]))
-
     # -- stages -----------------------------------------------------------------------------------
 
     def make(self, stage: str, function: Callable[[], T], *, force: bool = False) -> Made[T]:
@@ -275,15 +270,9 @@ class RunDirectory:
             )
         return self.store.stage(stage, function, *made_from, force=force)
 
-    def made(self, stage: str) -> Made[object] | None:
-        """A stage that stands; None for one that was not run, or on something else."""
-        if self._planned is not None:
-            return None
-        return self._standing().get(stage)
-
     def done(self, stage: str) -> bool:
         """Boolean: a stage has ended, and what it was made from is as it was."""
-        return self.made(stage) is not None
+        return self._planned is None and stage in self._standing()
 
     def _standing(self, before: str = "") -> dict[str, Made[object]]:
         """Stages that stand, of all or of those before one, in order."""

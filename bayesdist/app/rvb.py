@@ -12,6 +12,7 @@ from typing import Any
 from bayesdist.app.config import Data
 from bayesdist.app.config.rvb import RvbBlock
 from bayesdist.app.matches import is_large
+from bayesdist.app.named_files import named_files
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.star_files import PAIRS, part_files
 from bayesdist.data import MatchTable, open_matches, write_partitioned
@@ -51,7 +52,8 @@ class RvbInput:
         InputError
             For all that is wrong with files and selection, and a detector that is not the band's.
         """
-        config, path = self.run.config, self.run.matches
+        config = self.run.config
+        path = named_files(config, Path(self.run.record["base"]))
         data, options = config.data, self._options
         assert data is not None and config.detector.size is not None
         if not is_large(path):
