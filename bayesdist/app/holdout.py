@@ -8,20 +8,23 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.campaign.holdout import predictive_of_campaign
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.assess.error_model import ErrorModel, solution_with_errors
 from bayesdist.assess.evaluation import EvaluationSettings
+from bayesdist.data import MatchTable
 from bayesdist.diagnose.diagnostics import Diagnostics
-from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
+from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
 from bayesdist.infer import Posterior
+from bayesdist.infer.catalogue.star_influence import StarInfluence, star_influence
 
 __all__ = [
     "holdout_summary",
     "holdout_table",
     "predictive_of_run",
 ]
+
+TOGETHER = 1.5  # steps between nodes over which tables err as one: what their covariance comes to
 
 
 def predictive_of_run(
@@ -34,7 +37,8 @@ def predictive_of_run(
     """The solution as it is assessed, as it predicts.
 
     Quoted errors and jitter hold what the model leaves out at a position, as each star errs by it;
-    neighbours err by it together.
+    neighbours err by it together.  Exposures that were fitted jointly scatter, and have errors of
+    the catalogue and of tables.
 
     Parameters
     ----------
@@ -45,16 +49,45 @@ def predictive_of_run(
     data : FitData
     settings : EvaluationSettings
     """
-    if data.fitted.scatter is not None:
-        return predictive_of_campaign(posterior, found, errors, data, settings)
+    scatter = data.fitted.scatter
+    if scatter is not None:
+        return replace(
+            predictive_of(solution_with_errors(posterior, found, data.fit)),
+            deviations=ExposureDeviations(scatter.kinds, scatter.tau),
+            stars=_known_stars(data),
+            local=errors.local_tables(settings.grid, settings.epoch),
+            cell=_table_cell(data),
+        )
     out = predictive_of(solution_with_errors(posterior, found))
-    correlated = found.correlated
-    rows = None if correlated is None else correlated.facts.get("structure")
+    rows = None if found.correlated is None else found.correlated.facts.get("structure")
     if not rows:
         return out
     side = max(row["length_pix"] for row in rows)
     local = errors.local_tables(settings.grid, settings.epoch)
     return replace(out, local=local, cell=(side, side), local_in_noise=True)
+
+
+def _known_stars(data: FitData) -> StarInfluence | None:
+    """What errors of the catalogue did in the fit, of stars of exposures that are held out whole.
+
+    These stars were in the fit, in other exposures: that is no part of their residuals.
+    """
+    errors, held = data.matched.star_errors, data.matched.held
+    if errors is None or not isinstance(held, MatchTable) or held.star is None:
+        return None
+    assert isinstance(data.stars, MatchTable)
+    whole = np.isin(held.exposure_names, data.matched.whole)
+    codes = np.unique(held.star[whole[held.exposure]])
+    return star_influence(data.fit, data.stars, errors, codes)
+
+
+def _table_cell(data: FitData) -> tuple[float, float] | None:
+    """Pixels over which stars share the errors of the tables; None without tables."""
+    tables = data.fitted.tables.tables
+    if not tables:
+        return None
+    across, up = tables[0].step
+    return TOGETHER * across, TOGETHER * up
 
 
 def holdout_table(found: HoldoutValidation) -> Table:

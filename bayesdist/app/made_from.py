@@ -8,14 +8,14 @@ from typing import Any
 
 from bayesdist.app.config import Config
 from bayesdist.app.named_files import files_of_products
-from bayesdist.app.store import Adjustable, Made, WrittenByStage, as_json, differences
+from bayesdist.app.store import Adjustable, Made, Stage, as_json, differences
 from bayesdist.version import __version__
 
 __all__ = [
-    "CODECS",
     "LATER",
     "LIMITS",
     "NEEDS",
+    "STAGES",
     "changes",
     "is_adjustable",
     "made_from_of",
@@ -24,13 +24,13 @@ __all__ = [
 ]
 
 # stages in order; `revision` is raised when the numbers of a stage change
-CODECS = {
-    "match": WrittenByStage(),
-    "fit": WrittenByStage(),
-    "sample": WrittenByStage(checkpoints=("chain-*.h5",)),
-    "assess": WrittenByStage(),
-    "export": WrittenByStage(),
-    "report": WrittenByStage(),
+STAGES = {
+    "match": Stage(),
+    "fit": Stage(),
+    "sample": Stage(checkpoints=("chain-*.h5",)),
+    "assess": Stage(),
+    "export": Stage(),
+    "report": Stage(),
 }
 
 # stages that a stage cannot do without
@@ -80,7 +80,7 @@ def settings_of(config: Config) -> tuple[dict[str, Any], dict[str, Any], dict[st
 
 
 def made_from_of(
-    stage: str, before: Mapping[str, Made[None]], config: Config, facts: Mapping[str, Any]
+    stage: str, before: Mapping[str, Made[object]], config: Config, facts: Mapping[str, Any]
 ) -> tuple[object, ...] | None:
     """What a stage is made from; None where a stage is missing that it needs.
 

@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.assessment import assessment_epoch, evaluation_settings
+from bayesdist.app.assessment import evaluation_settings
 from bayesdist.app.checks import run_checks
 from bayesdist.app.config import Config
 from bayesdist.app.diagnosing import diagnose_fit_of_run, diagnose_run
@@ -65,7 +65,7 @@ class Results:
 
     def adopting_inputs(self) -> Results:
         """Results whose inputs lie in the run's folder, where they were prepared beside it."""
-        if self.source is None or not self.source.settle():
+        if self.source is None or not self.source.move_into_run():
             return self
         moved = self.having(inputs=self.source.load())
         self.reader.moved(moved.matched.stars)
@@ -181,8 +181,10 @@ class Results:
 
     @property
     def epoch(self) -> float | None:
-        """Epoch of the assessment, decimal years."""
-        return assessment_epoch(self.data, self.config)
+        """Epoch of the assessment, decimal years; stars are read only where it is theirs."""
+        if self.config.assess.epoch is not None or self.fit.model.time is None:
+            return self.config.assess.epoch
+        return self.data.median_epoch
 
     @property
     def product(self) -> ProductInput:

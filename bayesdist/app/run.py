@@ -127,7 +127,7 @@ def run_stage(results: Results, stage: str, *, force: bool = True) -> Results:
         Make it also where it stands.
     """
     made = results.run.make(stage, lambda: STAGES[stage](results), force=force)
-    return made.value() if made.was_made else results
+    return made.value or results
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from bayesdist.app.config import (
     load_config,
 )
 from bayesdist.app.folder import versions
-from bayesdist.app.made_from import CODECS, changes, made_from_of, with_seed
+from bayesdist.app.made_from import STAGES, changes, made_from_of, with_seed
 from bayesdist.app.named_files import files_of_products, named_files
 from bayesdist.app.refusals import (
     refuse_another_solution,
@@ -46,7 +46,7 @@ class RunDirectory:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self.store = RunStore(self.path, CODECS, head_of)
+        self.store = RunStore(self.path, STAGES, head_of)
         self._planned: tuple[dict[str, Any], str] | None = None
         self._adopted: tuple[Config, str, dict[str, str]] | None = None
 
@@ -248,11 +248,6 @@ class RunDirectory:
                 error.cause, where=error.where, do="start again with --force"
             ) from error
 
-    @property
-    def matches(self) -> Path | list[Path]:
-        """What the configuration names as matches: a file, a pattern, a folder, or a list."""
-        return named_files(self.config, Path(self.record["base"]))
-
     # -- stages -----------------------------------------------------------------------------------
 
     def make(self, stage: str, function: Callable[[], T], *, force: bool = False) -> Made[T]:
@@ -273,23 +268,17 @@ class RunDirectory:
                 where=str(self.path),
                 do="run them first",
             )
-        return self.store.stage(stage, lambda *_: function(), *made_from, force=force)
-
-    def made(self, stage: str) -> Made[None] | None:
-        """A stage that stands; None for one that was not run, or on something else."""
-        if self._planned is not None:
-            return None
-        return self._standing().get(stage)
+        return self.store.stage(stage, function, *made_from, force=force)
 
     def done(self, stage: str) -> bool:
         """Boolean: a stage has ended, and what it was made from is as it was."""
-        return self.made(stage) is not None
+        return self._planned is None and stage in self._standing()
 
-    def _standing(self, before: str = "") -> dict[str, Made[None]]:
+    def _standing(self, before: str = "") -> dict[str, Made[object]]:
         """Stages that stand, of all or of those before one, in order."""
         config, facts = self.config, self.store.record.facts
-        found: dict[str, Made[None]] = {}
-        for name in CODECS:
+        found: dict[str, Made[object]] = {}
+        for name in STAGES:
             if name == before:
                 break
             made_from = made_from_of(name, found, config, facts)

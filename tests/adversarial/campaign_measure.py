@@ -60,7 +60,8 @@ def assessed(truth: CampaignTruth, folder: Path, seed: int) -> Results:
     results = after_stages(directory, *STAGES)
     # how the linear terms went with time takes longer than all the rest, and no error has it
     made = directory.make("assess", lambda: run_evaluate(run_diagnose(results)))
-    return made.value()
+    assert made.value is not None
+    return made.value
 
 
 def actual_error(results: Results, truth: CampaignTruth) -> np.ndarray:

@@ -13,7 +13,6 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Generic, TypeVar
 
-from bayesdist.app.store.codec import Codec
 from bayesdist.app.store.keys import Adjustable, canonical, difference, digest_of
 from bayesdist.app.store.record import (
     SCHEMA,
@@ -27,7 +26,7 @@ from bayesdist.app.store.record import (
 from bayesdist.errors import InputError
 from bayesdist.files import is_leftover, remove_leftovers, watched_writes
 
-__all__ = ["Made", "RunStore"]
+__all__ = ["Made", "RunStore", "Stage"]
 
 T = TypeVar("T")
 
@@ -42,6 +41,22 @@ log = logging.getLogger("bayesdist")
 
 
 @dataclass(frozen=True)
+class Stage:
+    """What a store has to know of a stage.
+
+    Parameters
+    ----------
+    revision : int
+        Raised when the numbers of the stage change.
+    checkpoints : tuple of str
+        Patterns of the files by which it goes on where it was interrupted.
+    """
+
+    revision: int = 1
+    checkpoints: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Made(Generic[T]):
     """An artefact that stands.
 
@@ -51,16 +66,13 @@ class Made(Generic[T]):
         Of its stage.
     digest : str
         Hash of what was written: what is made from the artefact has it in its key.
-    value : callable
-        The artefact itself, loaded when it is asked for.
-    was_made : bool
-        Made now, not before.
+    value : object
+        What the stage has given; None where it was not run now, as the artefact stood before.
     """
 
     name: str
     digest: str
-    value: Callable[[], T]
-    was_made: bool
+    value: T | None = None
 
 
 class RunStore:
@@ -74,8 +86,8 @@ class RunStore:
     ----------
     folder : Path
         With a run.json.
-    codecs : mapping of str to Codec
-        Of each stage, in order.
+    stages : mapping of str to Stage
+        By name, in order.
     head : callable, optional
         What summary.json says of the run as a whole, from the facts of run.json.
     """
@@ -83,10 +95,10 @@ class RunStore:
     def __init__(
         self,
         folder: Path,
-        codecs: Mapping[str, Codec],
+        stages: Mapping[str, Stage],
         head: Callable[[Mapping[str, Any]], Mapping[str, Any]] = lambda facts: {},
     ) -> None:
-        self.folder, self.codecs, self.head = folder, codecs, head
+        self.folder, self.stages, self.head = folder, stages, head
         # of the stage that is being made here
         self._making = ""
         self._sections: dict[str, Any] = {}
@@ -111,7 +123,7 @@ class RunStore:
     def _merged(self, record: Record, before: str = "") -> dict[str, Any]:
         """Sections of the artefacts, later stages in place of earlier ones."""
         out: dict[str, Any] = {}
-        for name in self.codecs:
+        for name in self.stages:
             if name == before:  # never, where that is empty
                 break
             if name in record.artefacts:
@@ -125,13 +137,12 @@ class RunStore:
             return None
         if self._harmed(artefact, thorough=False):
             return None
-        codec = self.codecs[name]
-        return Made(name, artefact.digest, lambda: codec.load(self.folder), False)
+        return Made(name, artefact.digest)
 
     def _parts(self, name: str, made_from: tuple[object, ...]) -> dict[str, Any]:
         """What an artefact is made from, as run.json has it."""
         made = {one.name: one.digest for one in made_from if isinstance(one, Made)}
-        parts: dict[str, Any] = {"revision": self.codecs[name].revision, "from": made}
+        parts: dict[str, Any] = {"revision": self.stages[name].revision, "from": made}
         for one in made_from:
             if not isinstance(one, Made):
                 parts |= canonical(one)
@@ -183,16 +194,15 @@ class RunStore:
     # -- making -----------------------------------------------------------------------------------
 
     def stage(
-        self, name: str, function: Callable[..., T], *made_from: object, force: bool = False
+        self, name: str, function: Callable[[], T], *made_from: object, force: bool = False
     ) -> Made[T]:
-        """The artefact of a stage: loaded where it stands, and else made.
+        """The artefact of a stage, which is made unless it stands.
 
         Parameters
         ----------
         name : str
-            Of a codec.
         function : callable
-            Gets what the artefact is made from: artefacts as their values.
+            Writes files into the folder, and sections by `summarise`.
         *made_from : object
             `Made`, and mappings whose values have a canonical form.
         force : bool
@@ -202,21 +212,20 @@ class RunStore:
         -------
         Made
         """
-        codec, parts, record = self.codecs[name], self._parts(name, made_from), self.record
+        parts, record = self._parts(name, made_from), self.record
         key, known = digest_of(parts), record.artefacts.get(name)
         harmed = "" if known is None else self._harmed(known, thorough=True)
         if known is not None and known.key == key and not harmed and not force:
             log.info("%s: done before", name)
-            return Made(name, known.digest, lambda: codec.load(self.folder), False)
+            return Made(name, known.digest)
         log.info("%s: begins%s", name, _reason(known, parts, harmed))
         fixed = tuple(one for one in made_from if not isinstance(one, Adjustable))
         self._begin(record, name, digest_of(self._parts(name, fixed)), harmed)
         started = monotonic()
         with self._noted(name):
-            value = function(*(_value_of(one) for one in made_from))
-            self._sections |= as_json(codec.save(value, self.folder))
+            value = function()
         artefact = self._end(name, key, parts, monotonic() - started)
-        return Made(name, artefact.digest, lambda: value, True)
+        return Made(name, artefact.digest, value)
 
     def summarise(self, **sections: Any) -> None:
         """Replace sections of summary.json, for the stage that is under way."""
@@ -259,37 +268,35 @@ class RunStore:
 
     def _begin(self, record: Record, name: str, checkpoints: str, harmed: str) -> None:
         """Note that a stage begins, and remove what it wrote before: it must not see that."""
-        codec = self.codecs[name]
-        before = record.under_way or {"stage": name, "files": [], "digest": ""}
+        patterns = self.stages[name].checkpoints
+        before = record.under_way or {"stage": name, "files": []}
         known = record.artefacts.pop(name, None)
         record.stages.pop(name, None)
         remove_leftovers(self.folder)
-        files, digest = (set(known.files), known.digest) if known else (set(), "")
+        files = set(known.files) if known else set()
         if before["stage"] == name:
-            files, digest = files | set(before["files"]), digest or before["digest"]
+            files |= set(before["files"])
         else:
             self._remove(before["files"], record)  # of another stage that did not end
-        if codec.checkpoints:
-            if record.checkpoints.get(name) != checkpoints or _is_one_of(harmed, codec.checkpoints):
+        record.under_way = {"stage": name, "files": sorted(files)}
+        if patterns:
+            if record.checkpoints.get(name) != checkpoints or _is_one_of(harmed, patterns):
                 if record.checkpoints.pop(name, None) is not None:
                     self._write(record)  # first: what is half removed never counts
                 self._remove(self._checkpoints(name), record)
             record.checkpoints[name] = checkpoints
-        record.under_way = {"stage": name, "files": sorted(files), "digest": digest}
         self._sections, self._written = {}, set()
         self._write(record)  # first: what is half removed never counts
-        self._remove({one for one in files if not _is_one_of(one, codec.checkpoints)}, record)
+        self._remove({one for one in files if not _is_one_of(one, patterns)}, record)
 
     def _end(self, name: str, key: str, parts: Mapping[str, Any], seconds: float) -> Artefact:
         """Note that a stage has ended."""
         record = self.record
-        assert record.under_way is not None
         written = {one for one in self._written if self._is_there(one)}
         written |= set(self._checkpoints(name))
         marks = {one: FileMark.of(self.folder / one) for one in sorted(written)}
         artefact = Artefact(key, parts, marks, self._sections)
-        if artefact.digest != record.under_way["digest"]:
-            self._drop_sections(record, name)
+        self._drop_sections(record, name, artefact)
         record.artefacts[name], record.under_way, self._sections = artefact, None, {}
         ended = datetime.now(UTC).isoformat(timespec="seconds")
         record.stages[name] = {"wall_s": seconds, "ended": ended}
@@ -298,17 +305,22 @@ class RunStore:
         self._write(record)
         return artefact
 
-    def _drop_sections(self, record: Record, name: str) -> None:
-        """Drop sections that a stage wrote from later ones, which had added to its former ones."""
-        for later in list(self.codecs)[list(self.codecs).index(name) + 1 :]:
+    def _drop_sections(self, record: Record, name: str, artefact: Artefact) -> None:
+        """Drop sections of a stage from later ones that added to them, made from something else."""
+        stale: set[str] = set()
+        for later in list(self.stages)[list(self.stages).index(name) + 1 :]:
             known = record.artefacts.get(later)
-            if known is not None:
-                kept = {k: v for k, v in known.sections.items() if k not in self._sections}
+            made_from = {} if known is None else known.parts.get("from", {})
+            if known is not None and (
+                made_from.get(name, artefact.digest) != artefact.digest or stale & made_from.keys()
+            ):
+                stale.add(later)
+                kept = {k: v for k, v in known.sections.items() if k not in artefact.sections}
                 record.artefacts[later] = replace(known, sections=kept)
 
     def _in_order(self, found: dict[str, Any]) -> dict[str, Any]:
         """What there is of stages, in the order of these."""
-        return {one: found[one] for one in self.codecs if one in found}
+        return {one: found[one] for one in self.stages if one in found}
 
     def _is_there(self, name: str) -> bool:
         """Boolean: a file of the folder exists."""
@@ -342,12 +354,12 @@ class RunStore:
         if not path.is_relative_to(folder):
             return None
         name = path.relative_to(folder).as_posix()
-        checkpoints = (one for codec in self.codecs.values() for one in codec.checkpoints)
+        checkpoints = (one for stage in self.stages.values() for one in stage.checkpoints)
         return None if name in (RECORD, SUMMARY) or _is_one_of(name, (*checkpoints,)) else name
 
     def _checkpoints(self, name: str) -> list[str]:
         """Files by which a stage goes on, as they are there."""
-        found = (path for one in self.codecs[name].checkpoints for path in self.folder.glob(one))
+        found = (path for one in self.stages[name].checkpoints for path in self.folder.glob(one))
         return sorted(path.name for path in found)
 
     def _write(self, record: Record) -> None:
@@ -374,7 +386,7 @@ class RunStore:
         record = self.record
         files = {one for artefact in record.artefacts.values() for one in artefact.files}
         files |= set((record.under_way or {}).get("files", ()))
-        files |= {one for name in self.codecs for one in self._checkpoints(name)}
+        files |= {one for name in self.stages for one in self._checkpoints(name)}
         record.artefacts = {}
         self._remove({*files, *others, SUMMARY}, record)
         self._remove({RECORD}, record)
@@ -392,13 +404,6 @@ class RunStore:
                 remove_leftovers(folder)
                 if not any(not is_leftover(one.name) for one in folder.iterdir()):
                     folder.rmdir()
-
-
-def _value_of(one: object) -> object:
-    """What a function is given of what an artefact is made from."""
-    if isinstance(one, Made):
-        return one.value()
-    return one.value if isinstance(one, Adjustable) else one
 
 
 def _reason(known: Artefact | None, parts: Mapping[str, Any], harmed: str) -> str:

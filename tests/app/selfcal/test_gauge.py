@@ -125,7 +125,7 @@ def test_relative_errors_are_the_same_in_every_gauge(free, offsets):
 
 def test_a_free_direction_is_no_relative_error(free):
     """Whatever is added along free directions, relative errors stay."""
-    fit, null = free.fit, free.gauge.null
+    fit, null = free.fit, free.fitted.solved.gauge.null
     rng = np.random.default_rng(2)
     move = null @ rng.standard_normal((null.shape[1], 2))
     wider = replace(fit, cov=fit.cov + move @ move.T)

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bayesdist import files
-from bayesdist.app.store import Adjustable, Record, RunStore
+from bayesdist.app.store import Adjustable, Record, RunStore, Stage
 from bayesdist.files import atomic_path
 
 STAGES = ("first", "second", "third")
@@ -21,25 +21,6 @@ STAGES = ("first", "second", "third")
 
 class Killed(BaseException):
     """What no code catches."""
-
-
-class Table:
-    """A codec of lists: one file for each entry of even index, and a section of the summary."""
-
-    revision = 1
-
-    def __init__(self, name: str, checkpoints: tuple[str, ...] = ()) -> None:
-        self.name, self.checkpoints = name, checkpoints
-
-    def save(self, value: list[int], folder: Path) -> Mapping[str, Any]:
-        (folder / "parts").mkdir(exist_ok=True)
-        for k in value[::2]:
-            _write(folder / "parts" / f"{self.name}-{k}.txt", str(k))
-        _write(folder / f"{self.name}.json", json.dumps(value))
-        return {self.name: {"sum": sum(value)}, "last": self.name}
-
-    def load(self, folder: Path) -> list[int]:
-        return json.loads((folder / f"{self.name}.json").read_text())
 
 
 def _write(path: Path, text: str) -> None:
@@ -55,31 +36,45 @@ class Job:
         self.store = RunStore(
             folder,
             {
-                "first": Table("first"),
-                "second": Table("second", ("chain-*.txt",)),
-                "third": Table("third"),
+                "first": Stage(),
+                "second": Stage(checkpoints=("chain-*.txt",)),
+                "third": Stage(),
             },
         )
         if not (folder / "run.json").exists():
             Record({}).write(folder / "run.json")
+
+    def save(self, name: str, value: list[int]) -> None:
+        """Write one file for each entry of even index, and a section of the summary."""
+        (self.folder / "parts").mkdir(exist_ok=True)
+        for k in value[::2]:
+            _write(self.folder / "parts" / f"{name}-{k}.txt", str(k))
+        _write(self.folder / f"{name}.json", json.dumps(value))
+        self.store.summarise(**{name: {"sum": sum(value)}, "last": name})
+
+    def load(self, name: str) -> list[int]:
+        return json.loads((self.folder / f"{name}.json").read_text())
 
     def run(self, wanted: Mapping[str, int], force: str = "") -> None:
         """All stages, as the settings have them now."""
         store = self.store
         store.restore_summary()
 
-        def chain(first: list[int], start: dict[str, int], limit: dict[str, int]) -> list[int]:
-            found = [start["start"] + sum(first)]
-            for k in range(limit["steps"]):
+        def chain() -> None:
+            found = [wanted["start"] + sum(self.load("first"))]
+            for k in range(wanted["steps"]):
                 path = self.folder / f"chain-{k}.txt"
                 if not path.exists():
                     _write(path, str(7 * found[-1] % 1013))
                 found.append(int(path.read_text()))
-            return found
+            self.save("second", found)
+
+        def joined() -> None:
+            self.save("third", [*self.load("first"), *self.load("second")[:: wanted["grid"]]])
 
         first = store.stage(
             "first",
-            lambda n: list(range(n["length"])),
+            lambda: self.save("first", list(range(wanted["length"]))),
             {"length": wanted["length"]},
             force=force == "first",
         )
@@ -93,7 +88,7 @@ class Job:
         )
         store.stage(
             "third",
-            lambda one, other, grid: [*one, *other[:: grid["grid"]]],
+            joined,
             first,
             second,
             {"grid": wanted["grid"]},

@@ -11,6 +11,7 @@ from typing import Any
 
 from bayesdist.app.config import Data
 from bayesdist.app.matches import is_large
+from bayesdist.app.named_files import named_files
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.star_files import PAIRS, part_files
 from bayesdist.data import MatchTable, open_matches, write_partitioned
@@ -46,7 +47,8 @@ class RvbInput:
         InputError for all that is wrong with files and selection, and a detector that is not the
         band's.
         """
-        data, size, path = *self._settings, self.run.matches
+        data, size = self._settings
+        path = named_files(self.run.config, Path(self.run.record["base"]))
         options = _options(data, size)
         if not is_large(path):
             return load_rvb(path, data, size)
