@@ -15,6 +15,7 @@ from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.stages.assess import run_diagnose, run_evaluate
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.evaluation import budget_over
+from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.infer.transforms import reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh
@@ -137,7 +138,7 @@ def table_errors(results: Results, truth: CampaignTruth) -> np.ndarray:
     is taken off the error, as polynomials follow the tables.
     """
     out = []
-    local = {term.name: term for term in results.errors.terms}
+    local = {one.name: one for one in results.errors.terms if isinstance(one, LocalErrors)}
     for table in results.fitted.tables.tables:
         chip = next(one for one in truth.chips if one.number == table.chip)
         fine = mesh(*(np.arange(1.0, n, 3.0) for n in (chip.columns, chip.rows)))

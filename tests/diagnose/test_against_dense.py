@@ -97,8 +97,8 @@ class Dense:
         trace = np.bincount(self.star, np.einsum("naa->n", G))
         norm = np.bincount(self.star, np.sqrt((G**2).sum((1, 2))))
         q = len(U)
-        # what the quoted errors say of the scatter of V, and what scores do: E|psi|^4 of normal ones
-        # is trace^2 + 2 norm^2, in directions of unit information
+        # what the quoted errors say of the scatter of V, and what scores do: E|psi|^4 of normal
+        # ones is trace^2 + 2 norm^2, in directions of unit information
         root = np.linalg.cholesky(inverse)
         fourth = ((psi @ root) ** 2).sum(axis=1) ** 2
         quoted, normal = trace**2 + norm**2, trace**2 + 2 * norm**2
