@@ -25,7 +25,6 @@ _HOMES = {
         "read_hst1pass",
         "read_matches",
         "read_matchup",
-        "read_rvb",
         "write_partitioned",
     ),
     "bayesdist.model": (
@@ -51,6 +50,7 @@ _HOMES = {
         "save_posterior",
     ),
     "bayesdist.simulate": ("simulate_matches", "simulate_partitioned"),
+    "bayesdist.missions.wise.pairs.read": ("read_rvb",),
     "bayesdist.missions.wise.simulate": (
         "simulate_wise",
         "simulate_wise_partitioned",

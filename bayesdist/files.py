@@ -5,15 +5,39 @@ from __future__ import annotations
 import hashlib
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from bayesdist.errors import InputError
 
-__all__ = ["atomic_path", "is_leftover", "made_folder", "remove_leftovers", "sha256_of"]
+__all__ = [
+    "atomic_path",
+    "is_leftover",
+    "made_folder",
+    "remove_leftovers",
+    "sha256_of",
+    "watched_writes",
+]
 
 _MARK = ".bayesdist-"
+_watchers: list[Callable[[Path], None]] = []
+
+
+@contextmanager
+def watched_writes(note: Callable[[Path], None]) -> Iterator[None]:
+    """Call a function with every path that `atomic_path` writes, before the file takes its name.
+
+    Parameters
+    ----------
+    note : callable
+        Where it raises, the file does not appear.
+    """
+    _watchers.append(note)
+    try:
+        yield
+    finally:
+        _watchers.remove(note)
 
 
 @contextmanager
@@ -45,6 +69,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield temporary
         with temporary.open("rb+") as written:
             os.fsync(written.fileno())  # a rename may reach the disk before the content does
+        for note in _watchers:
+            note(target)
         os.replace(temporary, target)
     except OSError as error:
         if not _concerns(error, temporary, target):

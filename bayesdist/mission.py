@@ -38,6 +38,12 @@ class Mission:
         Commands that stand beside those of the core.
     match_formats : mapping of str to str
         Formats of files of matches, by name: each a `bayesdist.data.MatchFormat`.
+    data_sections : mapping of str to str
+        Sections `[data]` of formats that have keys of their own, by the name of the format: each a
+        subclass of `bayesdist.app.config.Data`.
+    match_sources : mapping of str to str
+        How the matches of these formats are read: each a
+        `bayesdist.app.match_sources.MatchSource`.
     error_terms : mapping of str to str
         Kinds of `[[budget]]` rows with one sigma: each makes an error term of name, kind, sigma,
         solution and source, as `bayesdist.assess.terms.parameters.ScaleError`.
@@ -50,6 +56,8 @@ class Mission:
     simulate: Mapping[str, str] = field(default_factory=dict)
     beside_core: Mapping[str, str] = field(default_factory=dict)
     match_formats: Mapping[str, str] = field(default_factory=dict)
+    data_sections: Mapping[str, str] = field(default_factory=dict)
+    match_sources: Mapping[str, str] = field(default_factory=dict)
     error_terms: Mapping[str, str] = field(default_factory=dict)
     report: str = ""
 

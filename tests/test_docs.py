@@ -20,7 +20,8 @@ from pydantic import BaseModel
 
 import bayesdist as bd
 from bayesdist.app.cli import bayesdist as root
-from bayesdist.app.config import Config
+from bayesdist.app.config import KINDS
+from bayesdist.app.config.data import data_sections
 
 from .docs_blocks import DOCS, blocks, run_page
 
@@ -136,6 +137,11 @@ def _configured(kind: type[BaseModel], section: str = "") -> set[tuple[str, str]
     return found
 
 
+def _configured_of_any_kind() -> set[tuple[str, str]]:
+    own = {pair for section in data_sections().values() for pair in _configured(section, "data")}
+    return own | {pair for kind in KINDS.values() for pair in _configured(kind)}
+
+
 def _models(annotation: object) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
@@ -165,13 +171,20 @@ def _documented() -> tuple[set[tuple[str, str]], set[tuple[str, str]]]:
 
 def test_every_key_of_the_configuration_is_documented_and_no_other():
     keys, words = _documented()
-    configured = _configured(Config)
+    configured = _configured_of_any_kind()
     assert configured - keys - words == set()
     assert {(s, k) for s, k in keys if s} - configured == set()
 
 
 SECTIONS = "|".join(
-    sorted(k for k in Config.model_fields if _models(Config.model_fields[k].annotation))
+    sorted(
+        {
+            name
+            for kind in KINDS.values()
+            for name, field in kind.model_fields.items()
+            if _models(field.annotation)
+        }
+    )
 )
 KEY = re.compile(
     rf"(?<![\w./\]])({SECTIONS})\.([a-z_0-9]+(?:\.[a-z_0-9]+)*)(?: = '(\w+)')?(?![\w(])"
@@ -194,19 +207,27 @@ def _advice():
 
 def test_keys_that_errors_advise_exist():
     """And the values that they advise are among those that the key may have."""
-    configured = {f"{section}.{key}" for section, key in _configured(Config)}
+    configured = {f"{section}.{key}" for section, key in _configured_of_any_kind()}
     found = 0
     for name, text in _advice():
         for section, key, value in KEY.findall(text):
             assert f"{section}.{key}" in configured, f"{name}: {text}"
             found += 1
             if value:
-                kind = Config
-                for part in (section, *key.split(".")):
-                    annotation = kind.model_fields[part].annotation
-                    kind = next(iter(_models(annotation)), kind)
-                assert value in _values(annotation), f"{name}: {text}"
+                known = {v for one in KINDS.values() for v in _values_of(one, section, key)}
+                assert value in known, f"{name}: {text}"
     assert found > 20
+
+
+def _values_of(kind: type[BaseModel], section: str, key: str) -> set[object]:
+    """Words that a key of one kind of run may have; none where the kind does not have the key."""
+    annotation: object = kind
+    for part in (section, *key.split(".")):
+        fields = next((m.model_fields for m in _models(annotation)), {})
+        if part not in fields:
+            return set()
+        annotation = fields[part].annotation
+    return _values(annotation)
 
 
 def _values(annotation: object) -> set[object]:

@@ -1,40 +1,45 @@
-"""Errors that groups of stars have beyond the quoted ones: when they are compared, kept, told."""
+"""Errors that groups of stars have beyond the quoted ones: when and in which words."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from bayesdist.app.config import Config
+from bayesdist.data import MatchTable
 from bayesdist.errors import DegenerateError
+from bayesdist.infer import GaussianPriors, LinearFit
 from bayesdist.infer.catalogue.added_errors import ONE, GroupedErrors, grouped_errors
-
-if TYPE_CHECKING:
-    from bayesdist.app.session import Session
-    from bayesdist.infer import LinearFit
 
 __all__ = [
     "added_errors_rows",
     "compared_errors",
+    "grouped_errors_of",
     "grouping_sentence",
-    "kept_grouped_errors",
+    "knows_circle",
 ]
 
 log = logging.getLogger("bayesdist")
 
-MOST_TOLD = 4  # groups that are told one by one
+MOST_LISTED = 4  # groups that are listed one by one
 
 
-def compared_errors(session: Session, fit: LinearFit) -> GroupedErrors | None:
-    """Whether groups of stars need jitters of their own, from the residuals of a fit.
+def compared_errors(
+    config: Config, fit: LinearFit, sample: MatchTable, priors: GaussianPriors
+) -> GroupedErrors | None:
+    """Jitters of groups of stars, or the one that will do, from the residuals of a fit.
 
     Parameters
     ----------
-    session : Session
+    config : Config
     fit : LinearFit
         With the quoted errors.
+    sample : MatchTable
+        Some of its stars.
+    priors : GaussianPriors
 
     Returns
     -------
@@ -42,21 +47,25 @@ def compared_errors(session: Session, fit: LinearFit) -> GroupedErrors | None:
         None where that is not asked: where errors come from the residuals themselves, where the
         jitter is given or is to be one, and where the match circle has cut the residuals.
     """
-    config = session.config
-    if not config.compares_jitters or session.in_circle:
+    if not config.compares_jitters or (knows_circle(config) and sample.has_nominal):
         return None
     by = config.outliers.jitter_by
     try:
         return grouped_errors(
-            session.sampled_matches,
+            sample,
             fit,
             by="" if by == "auto" else by,
             outliers=config.outliers.model != "none",
-            priors=session.priors,
+            priors=priors,
         )
     except DegenerateError as error:
         log.info("fit: one jitter for all stars: groups are not compared, as %s", error.cause)
         return None
+
+
+def knows_circle(config: Config) -> bool:
+    """Truth of a radius in which stars with nominal positions are said to have been matched."""
+    return config.data is not None and config.outliers.match_radius is not None
 
 
 def added_errors_rows(found: GroupedErrors) -> dict[str, Any]:
@@ -85,24 +94,24 @@ def added_errors_rows(found: GroupedErrors) -> dict[str, Any]:
     }
 
 
-def kept_grouped_errors(kept: Mapping[str, Any] | None) -> GroupedErrors | None:
-    """The same from what an earlier stage wrote; None where it wrote nothing of it."""
-    if kept is None:
+def grouped_errors_of(part: Mapping[str, Any] | None) -> GroupedErrors | None:
+    """Grouped errors from what `added_errors_rows` made; None for None."""
+    if part is None:
         return None
-    groups = kept["groups"]
+    groups = part["groups"]
 
     def column(name: str) -> Any:
         return np.array([row[name] for row in groups], float).reshape(-1, 2)
 
     return GroupedErrors(
-        kept["grouping"],
-        kept["by"],
+        part["grouping"],
+        part["by"],
         tuple(row["label"] for row in groups[::2]),
         column("n"),
         column("variance"),
         column("variance_error"),
-        dict(kept["evidence"]),
-        kept["dispersion"],
+        dict(part["evidence"]),
+        part["dispersion"],
     )
 
 
@@ -120,7 +129,7 @@ def grouping_sentence(found: GroupedErrors, unit: str) -> str:
     if found.grouping == ONE:
         return f"one jitter for both axes ({head})"
     each, joint = list(_each(found)), ", "
-    if len(each) > MOST_TOLD:
+    if len(each) > MOST_LISTED:
         each, joint = [min(each), max(each)], " to "
     sizes = joint.join(f"{value:.3g} +- {error:.2g} {unit} {where}" for value, error, where in each)
     return (

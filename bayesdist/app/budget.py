@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from bayesdist.app.judging import errors_of
+from bayesdist.app.results import open_results
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number, table_text
-from bayesdist.app.session import Session
-from bayesdist.app.sessions import session_of
-from bayesdist.app.stages import require
 from bayesdist.assess.budget.budget import TOTAL, ErrorBudget, place_budget
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.errors import InputError
+from bayesdist.model import DistortionModel
 
 __all__ = ["budget_at"]
 
@@ -57,26 +55,26 @@ def budget_at(
         For a run that has not been sampled, a chip that is not named or not there, and what
         `place_budget` refuses.
     """
-    with closing(session_of(RunDirectory.open(run))) as session:
-        require(session, "budget", ("fit", "sample"))
-        number_of = _chip(session, chip, str(run))
-        errors = errors_of(session)
+    with open_results(RunDirectory.open(run)) as results:
+        results.run.require("budget", ("fit", "sample"))
+        number_of = _chip(results.posterior.model, chip, str(run))
+        errors = errors_of(results)
         x, y = zip(at, *to, strict=True)
         found = place_budget(
             errors,
             x,
             y,
             chip=number_of,
-            epoch=session.epoch if epoch is None else epoch,
+            epoch=results.epoch if epoch is None else epoch,
             magnitude=magnitude,
             relative=bool(to),
         )
-        mas = session.config.detector.scale_mas if found.unit == "pix" else None
+        mas = results.config.detector.scale_mas if found.unit == "pix" else None
         return _text(found, at, mas)
 
 
-def _chip(session: Session, chip: int | None, run: str) -> int:
-    chips = session.posterior.model.chips
+def _chip(model: DistortionModel, chip: int | None, run: str) -> int:
+    chips = model.chips
     if chip is None and len(chips) > 1:
         raise InputError(
             f"has {len(chips)} chips, and none is named",

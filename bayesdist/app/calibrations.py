@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from bayesdist.app.results import open_results
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.sessions import session_of
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.calibration.subarray import Subarray, subarray_at_corner, subarrays_of_image
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.solution import Solution
 from bayesdist.products.formats.common.content import read_hdus
 from bayesdist.products.registry import read_calibration
 
@@ -96,8 +95,8 @@ def _as_assessed(folder: Path) -> Solution:
     """The posterior of a folder, with the errors as assessed where it is that of a run."""
     if not (folder / "run.json").exists():
         return load_posterior(folder)
-    with closing(session_of(RunDirectory(folder))) as session:
-        return session.signed
+    with open_results(RunDirectory(folder)) as results:
+        return results.solution
 
 
 def _scale_of_run(path: Path, solution: Solution) -> tuple[float, str] | None:

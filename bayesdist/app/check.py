@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from bayesdist.app.added_errors import grouping_sentence
-from bayesdist.app.config import load_config
+from bayesdist.app.checks import in_circle
+from bayesdist.app.config import Config, load_config
 from bayesdist.app.dates import idle_dates
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.rehearsal import rehearse
+from bayesdist.app.results import Results, open_results
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number
-from bayesdist.app.session import Session
-from bayesdist.app.sessions import own_lines, session_of
-from bayesdist.app.stages import rehearse
-from bayesdist.app.trust import warnings_of
+from bayesdist.checks import warnings_of
 from bayesdist.infer import Limits
 from bayesdist.infer.sampler.certified import PILOTS, has_second_stage
 from bayesdist.infer.sampler.move_schedule import expected_passes
@@ -52,18 +52,17 @@ def check(path: str | Path) -> str:
     config, text = load_config(path)
     with TemporaryDirectory() as nowhere:
         run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
-    with closing(session_of(run)) as session:
-        return "\n".join(own_lines(session) or _lines(session))
+    with open_results(run) as results:
+        rehearsed = rehearse(results)
+        lines = results.kind.lines(rehearsed.inputs, config) or _lines(rehearsed)
+        return "\n".join(lines)
 
 
-def _lines(session: Session) -> Iterator[str]:
-    rehearse(session)
-    matches, model = session.raw_matches, session.model
-    fit, errors = session.linear
-    session.fit = fit  # what a run would read from its files
-    if errors is not None:
-        session.magnitude_errors = errors
-    sigma = session.shards.survey.reference_sigma
+def _lines(results: Results) -> Iterator[str]:
+    """What the fit of matched stars says."""
+    data, config = results.data, results.config
+    matches, model, fit, fitted = data.placed, data.model, data.fit, data.fitted
+    sigma = data.shards.survey.reference_sigma
     yield (
         f"matches      {len(matches)} of {matches.n_rows} rows, "
         f"{len(matches.exposure_names)} exposure(s), u and v in {matches.unit}"
@@ -74,13 +73,13 @@ def _lines(session: Session) -> Iterator[str]:
         yield f"left out     {count} rows: {reason}"
     yield (
         f"errors       median {number(sigma)} {matches.unit}"
-        + (" (by magnitude)" if errors is not None else "")
+        + (" (by magnitude)" if fitted.errors.by_magnitude is not None else "")
     )
-    if session.grouped_errors is not None:
-        yield f"jitter       {grouping_sentence(session.grouped_errors, fit.unit)}"
+    if fitted.grouped is not None:
+        yield f"jitter       {grouping_sentence(fitted.grouped, fit.unit)}"
     yield f"model        order {model.order}, frames '{model.frames}', {model.n_params} parameters"
     if len(model.chips) > 1:
-        found = zip(model.chips, session.shards.survey.chips, strict=True)
+        found = zip(model.chips, data.shards.survey.chips, strict=True)
         yield "chips        " + ", ".join(f"{c.name} {s.n} stars" for c, s in found)
     yield f"rank         {model.n_params} of {model.n_params}, nothing is degenerate"
     yield f"condition    {number(fit.condition)} (normal matrix, unit diagonal)"
@@ -88,24 +87,28 @@ def _lines(session: Session) -> Iterator[str]:
         f"linear fit   rms {number(fit.rms_u)}, {number(fit.rms_v)} {fit.unit}; "
         f"chi2/dof {number(fit.chi2 / max(fit.dof, 1))}; {fit.n_rejected} rows rejected"
     )
-    yield _cost(session)
-    idle = idle_dates(session.config, session.config.requirements())
-    scaled = session.error_scale_sentence
-    for text in (*warnings_of(session), *([idle] if idle else []), *([scaled] if scaled else [])):
+    yield _cost(data, config)
+    idle = idle_dates(config, config.requirements())
+    scaled = data.error_scale_sentence
+    for text in (
+        *warnings_of(results.checks),
+        *([idle] if idle else []),
+        *([scaled] if scaled else []),
+    ):
         yield f"WARNING      {text}"
 
 
-def _cost(session: Session) -> str:
+def _cost(data: FitData, config: Config) -> str:
     """Expected passes and seconds, from the numbers of stars and parameters."""
-    sampler, n = session.config.sampler, len(session.shards)
+    sampler, n = config.sampler, len(data.shards)
     limits = Limits(sampler.target_ess, sampler.target_rhat)
-    n_params = session.model.n_params + len(session.config.mixture().hyper)
+    n_params = data.model.n_params + len(config.mixture().hyper)
     passes, how = expected_passes(n_params, n, limits, sampler.ensembles), ""
     if sampler.method == "certified":
         exact = has_second_stage(sampler.second_stage, passes, n)
         passes = PILOTS + (passes if exact else 0)
         how = "certified, with an exact second stage; " if exact else "certified, approximate; "
-    dear = IN_CIRCLE if session.in_circle else 1.0
+    dear = IN_CIRCLE if in_circle(data, config) else 1.0
     per_pass = dear * STAR_S * n
     total = dear * EXPANSIONS * EXPANSION_S * n + passes * (per_pass + OVERHEAD_S) + FIXED_S
     return (

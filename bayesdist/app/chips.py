@@ -1,4 +1,4 @@
-"""Do the chips of the configuration and those of the data agree?"""
+"""Agreement of the chips of a configuration with those of its data."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def check_chips(chips: Sequence[Chip], numbers: Sequence[int]) -> None:
     Parameters
     ----------
     chips : sequence of Chip
-        Those of the ``[[chip]]`` blocks; nothing is checked where there is none.
+        Of the ``[[chip]]`` blocks; nothing is checked where there is none.
     numbers : sequence of int
         Chip numbers of the matches; (1,) also where they name no chip.
 

@@ -36,16 +36,16 @@ RENAMED = {
     **{name: f"stage {name}" for name in ("match", "fit", "sample", "assess", "export", "report")},
     "validate": "requirements",
     "order": "select-order",
-    "bands": "wise bands",
-    "rvb": "wise rvb",
-    "rotate": "wise rotate",
-    "handbook": "hst handbook",
-    "pam": "hst pam",
 }
 EPILOG = (
     "Exit codes: 0 good, 1 bad input, 2 usage, 3 not converged under --strict, "
     "4 requirement missed."
 )
+
+
+def _renamed(name: str, new: str) -> RenamedError:
+    """Error of a command that has another name now."""
+    return RenamedError(f"the command {name!r} is {new!r} now", do=f"say 'bayesdist {new}'")
 
 
 class _Root(LazyGroup):
@@ -60,19 +60,18 @@ class _Root(LazyGroup):
         if found is not None:
             return found
         if cmd_name in RENAMED:
-            new = RENAMED[cmd_name]
-            raise RenamedError(
-                f"the command {cmd_name!r} is {new!r} now", do=f"say 'bayesdist {new}'"
-            )
+            raise _renamed(cmd_name, RENAMED[cmd_name])
         if cmd_name in mission_names():
             mission = load_mission(cmd_name)
             return LazyGroup(cmd_name, help=mission.title, lazy=mission.commands)
         if cmd_name == "simulate":
             lazy = {k: v for mission in missions().values() for k, v in mission.simulate.items()}
             return LazyGroup("simulate", help="Data of known truth.", lazy=lazy)
-        for mission in missions().values():
+        for name, mission in missions().items():
             if cmd_name in mission.beside_core:
                 return self.load(mission.beside_core[cmd_name])
+            if cmd_name in mission.commands:
+                raise _renamed(cmd_name, f"{name} {cmd_name}")
         return None
 
     def invoke(self, ctx: click.Context) -> int:

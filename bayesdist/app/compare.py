@@ -24,7 +24,6 @@ from bayesdist.products.formats.sip.calibration import MissingSize
 
 __all__ = ["compare_files"]
 
-SCHEMA = 1
 SEED = 20150206  # of the noise fields: the same comparison gives the same numbers
 
 

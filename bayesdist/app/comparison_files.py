@@ -8,9 +8,8 @@ from typing import Any
 
 from astropy.table import Table, vstack
 
-from bayesdist.app.folder import whole_folder
-from bayesdist.app.rundir import versions, write_json
-from bayesdist.app.session import write_table
+from bayesdist.app.folder import record_folder
+from bayesdist.app.output import write_table
 from bayesdist.assess.comparison.compare import Comparison
 from bayesdist.assess.comparison.gap import GapDifference
 from bayesdist.assess.comparison.sentences import gap_verdict, verdict
@@ -19,8 +18,6 @@ from bayesdist.report.comparison import difference_vectors
 from bayesdist.report.drawing import save_figures
 
 __all__ = ["comparison_summary", "joined", "write_comparison"]
-
-SCHEMA = 1
 
 
 def write_comparison(
@@ -43,20 +40,14 @@ def write_comparison(
     InputError
         For a folder that holds something, or cannot be made.
     """
-    with whole_folder(output) as folder:
+    with record_folder(output, "comparison.json", command) as (folder, record):
         write_table(joined(found, comparison_table), folder / "comparison.ecsv")
         write_table(joined(found, difference_table), folder / "difference.ecsv")
         if gaps:
             write_table(gap_table(gaps), folder / "gap.ecsv")
         save_figures({"difference": difference_vectors(found)}, folder / "figures")
-        record = {
-            "schema": SCHEMA,
-            "command": command,
-            "versions": versions(),
-            "chips": [comparison_summary(one) for one in found],
-            "gaps": [_gap_summary(one) for one in gaps],
-        }
-        write_json(folder / "comparison.json", record)
+        record["chips"] = [comparison_summary(one) for one in found]
+        record["gaps"] = [_gap_summary(one) for one in gaps]
 
 
 def comparison_summary(found: Comparison) -> dict[str, Any]:

@@ -1,21 +1,70 @@
-"""A folder that appears with all its files, or not at all."""
+"""A folder that appears whole or not at all, with a record of what a command found."""
 
 from __future__ import annotations
 
 import os
+import platform
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import metadata
 from pathlib import Path
+from typing import Any
 
+from bayesdist.app.store import write_json
 from bayesdist.errors import InputError
+from bayesdist.version import __version__
 
-__all__ = ["whole_folder"]
+__all__ = ["atomic_directory", "record_folder", "versions"]
+
+SCHEMA = 1  # of records of commands
+
+PACKAGES = ("arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, the platform, and the packages that matter."""
+    out = {"python": sys.version.split()[0], "platform": platform.platform()}
+    out["bayesdist"] = __version__  # also where it runs from a source tree
+    out |= {name: metadata.version(name) for name in PACKAGES}
+    return out
 
 
 @contextmanager
-def whole_folder(path: Path) -> Iterator[Path]:
+def record_folder(path: Path, name: str, command: str) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """A folder of tables and figures with a record that scripts read.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        New, or empty.
+    name : str
+        File of the record.
+    command : str
+        By which the folder is made.
+
+    Yields
+    ------
+    folder : pathlib.Path
+        Where to write.
+    record : dict
+        To be filled: it is written when the block succeeds.
+
+    Raises
+    ------
+    InputError
+        As `atomic_directory`.
+    """
+    with atomic_directory(path) as folder:
+        record: dict[str, Any] = {"schema": SCHEMA, "command": command, "versions": versions()}
+        yield folder, record
+        write_json(folder / name, record)
+
+
+@contextmanager
+def atomic_directory(path: Path) -> Iterator[Path]:
     """A folder that takes its name when the block succeeds, and else is removed.
 
     Parameters

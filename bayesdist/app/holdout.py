@@ -1,144 +1,101 @@
-"""Stars set aside before the fit: which ones, what they say afterwards, what is written of it."""
+"""Stars set aside before the fit: what they say afterwards, and what is written of it."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.kept import kept
-from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.terms.local import table_of
-from bayesdist.data.holdout import SetAside, Split, exposures_drawn, split_matches
-from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
-from bayesdist.diagnose.holdout.validation import LEAST_HELD, HeldOutTruth, held_out_truth
-from bayesdist.errors import InputError
-from bayesdist.model import LookupTable
-
-if TYPE_CHECKING:
-    from bayesdist.app.session import Session
-    from bayesdist.infer import Matches
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.assess.error_model import ErrorModel, solution_with_errors
+from bayesdist.assess.evaluation import EvaluationSettings
+from bayesdist.data import MatchTable
+from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
+from bayesdist.diagnose.holdout.validation import HoldoutValidation
+from bayesdist.infer import Posterior
+from bayesdist.infer.catalogue.star_influence import StarInfluence, star_influence
 
 __all__ = [
-    "held_out_of",
     "holdout_summary",
     "holdout_table",
-    "local_errors",
     "predictive_of_run",
-    "split_of",
-    "whole_exposures",
 ]
 
-
-def whole_exposures(session: Session, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Exposures that are set aside whole: the named ones, or so many drawn by the seed."""
-    block, seed = session.config.holdout, session.config.sampler.seed
-    if block is None:
-        return ()
-    needed = names[: session.needed_exposures]
-    if isinstance(block.exposures, int):
-        return exposures_drawn(names[len(needed) :], block.exposures, seed)
-    for name in block.exposures:
-        if name in needed:
-            raise InputError(
-                f"exposure {name!r} is to be held out, and defines the gauge",
-                where="holdout.exposures",
-                do="name another one",
-            )
-    return tuple(dict.fromkeys(block.exposures))
+TOGETHER = 1.5  # steps between nodes over which tables err as one: what their covariance comes to
 
 
-def split_of(session: Session, matches: Matches) -> Split | None:
-    """Matches that are fitted, and those that are set aside; None where none are.
-
-    Raises
-    ------
-    InputError
-        For an unknown exposure, and when nothing would be left, or too little set aside.
-    """
-    block = session.config.holdout
-    if block is None:
-        return None
-    whole = whole_exposures(session, matches.exposure_names)
-    split = split_matches(matches, SetAside(block.fraction, whole, session.config.sampler.seed))
-    if len(split.held) < LEAST_HELD:
-        raise InputError(
-            f"{len(split.held)} of {len(matches)} stars are held out, which say too little",
-            where=", ".join(matches.sources),
-            do=f"hold out at least {LEAST_HELD}: raise holdout.fraction",
-        )
-    return split
-
-
-def held_out_of(session: Session, *, anew: bool = False) -> HeldOutTruth | None:
-    """What held-out stars say of the posterior, once in a session.
-
-    Parameters
-    ----------
-    session : Session
-    anew : bool
-        Also where it has been done: the posterior may be another one.
-
-    Returns
-    -------
-    HeldOutTruth or None
-        None where no stars were set aside.
-
-    Raises
-    ------
-    InputError
-        For too few stars.
-    """
-    held = session.held_matches
-    if held is None:
-        return None
-
-    def judged() -> HeldOutTruth:
-        whole = whole_exposures(session, held.exposure_names)
-        return held_out_truth(session.predictive, held, whole=whole)
-
-    return kept(session, "held_out_truth", judged, anew=anew)
-
-
-def predictive_of_run(session: Session) -> Predictive:
+def predictive_of_run(
+    posterior: Posterior,
+    found: Diagnostics,
+    errors: ErrorModel,
+    data: FitData,
+    settings: EvaluationSettings,
+) -> Predictive:
     """The solution as it is assessed, as it predicts.
 
     Quoted errors and jitter hold what the model leaves out at a position, as each star errs by it;
-    neighbours err by it together.
+    neighbours err by it together.  Exposures that were fitted jointly scatter, and have errors of
+    the catalogue and of tables.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    found : Diagnostics
+        Of it, without what is held out.
+    errors : ErrorModel
+    data : FitData
+    settings : EvaluationSettings
     """
-    found, discrepancy = predictive_of(session.solution), session.discrepancy
-    rows = None if discrepancy is None else discrepancy.found.facts.get("structure")
-    if not rows:
-        return found
-    side = max(row["length_pix"] for row in rows)
-    return replace(found, local=local_errors(session), cell=(side, side), local_in_noise=True)
-
-
-def local_errors(session: Session) -> tuple[LookupTable, ...]:
-    """Errors of positions that belong to places on the detector, as tables of their own."""
-    grid, out = session.config.assess.grid, []
-    for chip in session.posterior.model.chips:
-        where = {"grid": grid, "epoch": session.epoch, "chip": chip.number}
-        domain = EvaluationDomain.of_chips(
-            session.posterior.model, grid, chips=(chip.number,), epoch=session.epoch
+    scatter = data.fitted.scatter
+    if scatter is not None:
+        return replace(
+            predictive_of(solution_with_errors(posterior, found, data.fit)),
+            deviations=ExposureDeviations(scatter.kinds, scatter.tau),
+            stars=_known_stars(data),
+            local=errors.local_tables(settings.grid, settings.epoch),
+            cell=_table_cell(data),
         )
-        structure = session.structure_sigma(**where)
-        parts = [term.sigma(domain) for term in session.local_terms]
-        parts += [] if structure is None else [structure]
-        if parts:
-            sigma = np.sqrt(sum(part**2 for part in parts)).reshape(grid[1], grid[0], 2)
-            out.append(table_of(chip.number, chip.size, sigma))
-    return tuple(out)
+    out = predictive_of(solution_with_errors(posterior, found))
+    rows = None if found.correlated is None else found.correlated.facts.get("structure")
+    if not rows:
+        return out
+    side = max(row["length_pix"] for row in rows)
+    local = errors.local_tables(settings.grid, settings.epoch)
+    return replace(out, local=local, cell=(side, side), local_in_noise=True)
 
 
-def holdout_table(found: HeldOutTruth) -> Table:
+def _known_stars(data: FitData) -> StarInfluence | None:
+    """What errors of the catalogue did in the fit, of stars of exposures that are held out whole.
+
+    These stars were in the fit, in other exposures: that is no part of their residuals.
+    """
+    errors, held = data.matched.star_errors, data.matched.held
+    if errors is None or not isinstance(held, MatchTable) or held.star is None:
+        return None
+    assert isinstance(data.stars, MatchTable)
+    whole = np.isin(held.exposure_names, data.matched.whole)
+    codes = np.unique(held.star[whole[held.exposure]])
+    return star_influence(data.fit, data.stars, errors, codes)
+
+
+def _table_cell(data: FitData) -> tuple[float, float] | None:
+    """Pixels over which stars share the errors of the tables; None without tables."""
+    tables = data.fitted.tables.tables
+    if not tables:
+        return None
+    across, up = tables[0].step
+    return TOGETHER * across, TOGETHER * up
+
+
+def holdout_table(found: HoldoutValidation) -> Table:
     """All tests, the most telling first."""
     names = (
         "name",
         "part",
-        "together",
+        "is_omnibus",
         "where",
         "n",
         "value",
@@ -157,18 +114,18 @@ def holdout_table(found: HeldOutTruth) -> Table:
     table.meta = {
         "verdict": found.verdict,
         "n": found.n,
-        "n_left_out": found.n_left_out,
+        "n_excluded": found.n_left_out,
         "exposures": list(found.exposures),
         "p_corrected": "Holm 1979, over all tests of this table",
     }
     return table
 
 
-def holdout_summary(found: HeldOutTruth) -> dict[str, Any]:
+def holdout_summary(found: HoldoutValidation) -> dict[str, Any]:
     """Section 'holdout' of summary.json."""
     return {
         "n": found.n,
-        "n_left_out": found.n_left_out,
+        "n_excluded": found.n_left_out,
         "exposures": list(found.exposures),
         "p_value": found.p_value,
         "verdict": found.verdict,
@@ -188,7 +145,7 @@ def holdout_summary(found: HeldOutTruth) -> dict[str, Any]:
             {
                 "name": t.name,
                 "part": t.part,
-                "together": t.together,
+                "is_omnibus": t.is_omnibus,
                 "where": t.where,
                 "n": t.n,
                 "value": t.value,

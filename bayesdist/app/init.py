@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from bayesdist.app.config import parse_config
+from bayesdist.app.config.data import data_sections
 from bayesdist.app.init_columns import column_lines, quoted
 from bayesdist.app.init_sigma import guessed_sigma
+from bayesdist.app.match_sources import mission_template
 from bayesdist.app.matches import load_matches
 from bayesdist.app.output import refuse_existing
-from bayesdist.app.rvb_init import is_rvb, rvb_template
-from bayesdist.data import MatchTable
+from bayesdist.data import FORMATS, MatchTable
 from bayesdist.data.reading.layout import TableLayout, table_layout
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
@@ -91,7 +92,7 @@ sip = {{}}                        # inverse_order, linear = "cd" | "sip", crval
 """
 
 _AUTO = """\
-# format = "auto"               # auto | table | hst1pass | matchup | astrometry.net | rvb
+# format = "auto"               # {formats}
 """
 
 _CENTRE = """\
@@ -149,8 +150,8 @@ def init(
     path = Path(path)
     refuse_existing(path, force)
     relative = quoted(os.path.relpath(Path(matches), path.resolve().parent))
-    rvb = rvb_template(matches) if columns is None and is_rvb(matches) else None
-    n, values = _of_matches(matches, columns, size) if rvb is None else rvb
+    own = mission_template(matches) if columns is None else None
+    n, values = _of_matches(matches, columns, size) if own is None else own
     order = 4 if n >= 300 else 3 if n >= 100 else 2
     text = _TEMPLATE.format(matches=relative, order=order, **values)
     parse_config(text, str(path))
@@ -172,7 +173,7 @@ def _of_matches(
     names = dict(zip(table.chip_numbers, _chip_names(table), strict=True))
     blocks = [_CHIP.format(number=n, name=quoted(names[n]), **one) for n, one in chips.items()]
     return len(table), {
-        "format": _AUTO,
+        "format": _AUTO.format(formats=" | ".join((*FORMATS, *data_sections()))),
         "columns": column_lines(layout, columns),
         "unit_line": unit_line,
         "sigma": sigma,

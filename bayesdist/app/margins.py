@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.session import Session, write_table
-from bayesdist.app.trust import labelled, trust
 from bayesdist.assess import Margin, Requirement
 
-__all__ = ["judged_requirements", "margin_rows", "requirement_of", "write_margins"]
+__all__ = ["judged_requirements", "margin_rows", "margin_table", "requirement_of"]
 
 # of what a requirement is, beside chip and epoch
 SCOPE = ("region", "epochs", "relative", "separation", "magnitude")
 
 
-def margin_rows(margins: tuple[Margin, ...]) -> list[dict[str, Any]]:
+def margin_rows(margins: Sequence[Margin]) -> list[dict[str, Any]]:
     """Margins as plain rows, for files and for the screen."""
     return [
         {
@@ -47,12 +45,10 @@ def margin_rows(margins: tuple[Margin, ...]) -> list[dict[str, Any]]:
     ]
 
 
-def write_margins(session: Session, margins: tuple[Margin, ...]) -> None:
-    """Replace the margins of a run: margins.ecsv and summary.json."""
-    rows = margin_rows(margins)
-    several = len(session.posterior.model.chips) > 1
+def margin_table(margins: Sequence[Margin], *, several: bool) -> Table:
+    """Margins as margins.ecsv has them; with chips where there are several."""
     columns: dict[str, list[Any]] = {}
-    for m, row in zip(margins, rows, strict=True):
+    for m, row in zip(margins, margin_rows(margins), strict=True):
         flat = {k: v for k, v in row.items() if k not in ("interval", "worst", "rests_on", *SCOPE)}
         flat["epoch"] = np.nan if flat["epoch"] is None else flat["epoch"]
         flat["chip"] = "all" if flat["chip"] is None else str(flat["chip"])
@@ -64,10 +60,7 @@ def write_margins(session: Session, margins: tuple[Margin, ...]) -> None:
             del flat["chip"], flat["worst_chip"]
         for name, value in flat.items():
             columns.setdefault(name, []).append(value)
-    table = Table(columns)
-    table.meta = trust(session) | labelled(session)
-    write_table(table, session.run / "margins.ecsv")
-    session.run.summarise(margins=rows)
+    return Table(columns)
 
 
 def judged_requirements(run: RunDirectory) -> tuple[Requirement, ...]:

@@ -68,7 +68,7 @@ def reading_options(data: Data, chips: Sequence[ChipBlock]) -> dict[str, Any]:
 
 
 def is_large(path: PathLike | Sequence[PathLike]) -> bool:
-    """Whether the files are Parquet with more rows than are taken into memory."""
+    """Truth of files in Parquet with more rows than are taken into memory."""
     files = input_files(path)
     if any(file.suffix.lower() != ".parquet" for file in files):
         return False

@@ -10,20 +10,20 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.campaign.monitoring import fit_exposures_of, read_new_exposures
-from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.comparison_files import joined
 from bayesdist.app.config import Config, load_config
-from bayesdist.app.folder import whole_folder
-from bayesdist.app.matches import load_matches, reading_options
-from bayesdist.app.rundir import RunDirectory, versions, write_json
-from bayesdist.app.rvb import load_rvb
-from bayesdist.app.session import Session, write_table
-from bayesdist.assess import misfit_of, partitions_for, star_sums
+from bayesdist.app.folder import record_folder
+from bayesdist.app.kinds.errors import read_magnitude_errors
+from bayesdist.app.match_sources import read_configured
+from bayesdist.app.output import write_table
+from bayesdist.app.results import results_of
+from bayesdist.app.rundir import RunDirectory
 from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_late
 from bayesdist.assess.comparison.tables import comparison_table, difference_table
 from bayesdist.assess.units import convert, pixel_scale_of
 from bayesdist.data import input_files
-from bayesdist.diagnose.residuals.misfit import Misfit, worst_misfit
+from bayesdist.diagnose.diagnostics import misfits_of, residual_sums
+from bayesdist.diagnose.residuals.misfit import worst_misfit
 from bayesdist.errors import InputError
 from bayesdist.files import sha256_of
 from bayesdist.infer import Matches, Posterior
@@ -36,7 +36,7 @@ from bayesdist.report.drawing import save_figures
 
 __all__ = ["monitor"]
 
-SCHEMA = 1
+CHANGE_MAPS = 1  # of the random streams that follow from the one seed
 
 
 def monitor(
@@ -69,10 +69,11 @@ def monitor(
     """
     directory = RunDirectory(run)
     if not (directory / "run.json").exists():
-        raise directory.no_run()
+        raise directory.not_a_run_error()
     config = directory.config
     posterior, matches, fitted, left_out = _fitted(directory, config, Path(new))
     try:
+        shards = fitted.target.shards
         change = change_of(fitted, draws=posterior.convergence.ess_bulk_min)
         scores: tuple[PeriodScore, ...] = ()
         if matches.has_epoch:
@@ -84,12 +85,12 @@ def monitor(
             change=change,
             maps=change_maps(
                 date.change if late and date is not None else change,
-                rng=np.random.default_rng([config.sampler.seed, SCHEMA]),
+                rng=np.random.default_rng([config.sampler.seed, CHANGE_MAPS]),
                 names=(str(new), str(run)),
                 grid=(nx, ny),
             ),
             date=date,
-            misfit=_misfit(fitted),
+            misfit=worst_misfit(misfits_of(fitted.fit, *residual_sums(fitted.fit, shards))),
             pixel_mas=pixel_scale_of(posterior, scale_mas=config.detector.scale_mas),
         )
         facts = _facts(fitted, posterior) | {"left_out": list(left_out)}
@@ -105,9 +106,9 @@ def _fitted(
 ) -> tuple[Posterior, Matches, NewFit, tuple[str, ...]]:
     """Release, new matches and their fit, and the exposures that the release has seen."""
     if config.campaign is not None:
-        session = CampaignSession(run)
-        exposures = read_new_exposures(session, new)
-        found = fit_exposures_of(session, exposures)
+        release = results_of(run)
+        exposures = read_new_exposures(release, new)
+        found = fit_exposures_of(release, exposures)
         return exposures.released, exposures.matches, found, exposures.left_out
     if config.selfcal is not None:
         raise InputError(
@@ -115,7 +116,7 @@ def _fitted(
             where=str(run.path),
             do="calibrate the new exposures by themselves, and use 'bayesdist compare'",
         )
-    posterior = Session(run).signed
+    posterior = results_of(run).solution
     matches = _new_matches(run, config, new)
     found = fit_new(
         posterior,
@@ -153,13 +154,10 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
             )
     assert data is not None
     _refuse_the_same(run, path)
-    if data.format == "rvb" and size is not None:
-        matches: Matches = load_rvb(path, data, size)
-    else:
-        matches = load_matches(path, **reading_options(data, config.chip))
+    matches = read_configured(path, data, size=size, chips=config.chip)
     if data.sigma != "by_magnitude":
         return matches
-    errors = Session(run).kept_errors()
+    errors = read_magnitude_errors(run.path)
     if errors is None:
         raise InputError(
             "errors by magnitude are asked for, and the run has measured none",
@@ -179,21 +177,6 @@ def _refuse_the_same(run: RunDirectory, path: Any) -> None:
                 where=str(file),
                 do="give matches that were not in its fit",
             )
-
-
-def _misfit(new: NewFit) -> Misfit:
-    """Structure that the least-squares fit of the new matches leaves."""
-    shards, fit, out = new.target.shards, new.fit, []
-    partitions = {
-        chip.number: partitions_for(round(found.n * fit.n_used / fit.n_rows))
-        for chip, found in zip(fit.model.chips, shards.survey.chips, strict=True)
-    }
-    wanted = {number: tuple(bins.values()) for number, bins in partitions.items()}
-    sums = shards.sum(star_sums, fit.mean, fit.clip, wanted)
-    for number, bins in partitions.items():
-        binned = {name: sums.binned[number, size] for name, size in bins.items()}
-        out.append(misfit_of(binned, order=fit.model.order, unit=fit.unit))
-    return worst_misfit(out)
 
 
 def _facts(new: NewFit, posterior: Posterior) -> dict[str, Any]:
@@ -258,7 +241,7 @@ def _write(
     command: str,
 ) -> None:
     date, maps = found.date, found.maps
-    with whole_folder(output) as folder:
+    with record_folder(output, "monitor.json", command) as (folder, record):
         write_table(joined(maps, comparison_table), folder / "change.ecsv")
         write_table(joined(maps, difference_table), folder / "difference.ecsv")
         figures = {"change": difference_vectors(maps, names=("new", "release"))}
@@ -277,10 +260,10 @@ def _write(
                     table["first"], date.gain, date.dof, found.p_since
                 )
         save_figures(figures, folder / "figures")
-        write_json(folder / "monitor.json", _summary(found, facts, command))
+        record |= _summary(found, facts)
 
 
-def _summary(found: Monitored, facts: dict[str, Any], command: str) -> dict[str, Any]:
+def _summary(found: Monitored, facts: dict[str, Any]) -> dict[str, Any]:
     test, date, worst = found.change.test, found.date, found.worst
     since = None
     if date is not None:
@@ -295,9 +278,6 @@ def _summary(found: Monitored, facts: dict[str, Any], command: str) -> dict[str,
         }
     scale = found.pixel_mas
     return {
-        "schema": SCHEMA,
-        "command": command,
-        "versions": versions(),
         "verdict": found.verdict,
         "changed": found.changed,
         "p_value": found.p_either,

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -12,11 +10,13 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.config import load_config
-from bayesdist.app.output import refuse_existing
+from bayesdist.app.config import Config, load_config
+from bayesdist.app.kinds.errors import QUOTED
+from bayesdist.app.kinds.stars import fit_stars, model_of, shards_of
+from bayesdist.app.output import refuse_existing, write_table
+from bayesdist.app.results import Results, open_results
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import table_text
-from bayesdist.app.session import Session, write_table
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.files import atomic_path
 from bayesdist.infer.compare.order import select_order
@@ -81,8 +81,8 @@ def order(
         )
     with TemporaryDirectory() as nowhere:
         run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
-        with closing(Session(run)) as session:
-            found, failed = _selected(session, range(low, high + 1))
+        with open_results(run) as results:
+            found, failed = _selected(results, range(low, high + 1))
     if output is not None:
         write_table(_table(found, failed), Path(output))
     if figure is not None:
@@ -90,39 +90,38 @@ def order(
     return "\n\n".join([_text(found, failed), found.sentence])
 
 
-def _selected(session: Session, orders: Sequence[int]) -> tuple[OrderSelection, dict[int, str]]:
-    """The comparison, and why the orders above those compared cannot be fitted.
-
-    Errors by magnitude are those of the highest order: its residuals hold the least misfit.
-    """
-    config = session.config
+def _selected(results: Results, orders: Sequence[int]) -> tuple[OrderSelection, dict[int, str]]:
+    """The comparison, and why the orders above those compared cannot be fitted."""
+    config = results.config
     # names of priors may be those of other orders
-    free = config.model_copy(update={"prior": []})
-    session.config = free.model_copy(
-        update={"fit": config.fit.model_copy(update={"radial_weight": 1.0})}
+    free = config.model_copy(
+        update={"prior": [], "fit": config.fit.model_copy(update={"radial_weight": 1.0})}
     )
     failed: dict[int, str] = {}
     for top in sorted(orders, reverse=True):
+        highest = free.model.model_copy(update={"order": top})
+        wanted = free.model_copy(update={"model": highest})
         try:
-            return _compared(session, range(min(orders), top + 1)), failed
+            return _compared(results, wanted, range(min(orders), top + 1)), failed
         except DegenerateError as error:
             if top <= min(orders) + 1:
                 raise
             failed[top] = error.sentence
-            session.errors_changed()
-            session.__dict__.pop("linear", None)
     raise AssertionError("the lowest two orders are compared or refused")
 
 
-def _compared(session: Session, orders: Sequence[int]) -> OrderSelection:
-    config = session.config
-    session.model = replace(session.model, order=max(orders))
+def _compared(results: Results, config: Config, orders: Sequence[int]) -> OrderSelection:
+    """The comparison of orders, by a configuration of the highest.
+
+    Errors by magnitude are those of the highest order: its residuals hold the least misfit.
+    """
+    matched, reader, errors = results.matched, results.reader, QUOTED
     if config.data is not None and config.data.sigma == "by_magnitude":
-        _, errors = session.linear
-        session.magnitude_errors = errors
+        errors = fit_stars(matched, config, reader=reader).errors
+    model = model_of(matched.stars, config)
     return select_order(
-        session.shards,
-        session.model,
+        shards_of(matched.stars, model, config, errors, reader),
+        model,
         orders=orders,
         rejection=Rejection(config.fit.clip_chi2, config.fit.clip_abs),
     )

@@ -1,12 +1,15 @@
-"""A file that a command is to write."""
+"""Files that a command or a stage writes."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from bayesdist.errors import InputError
+from astropy.table import Table
 
-__all__ = ["refuse_existing"]
+from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
+
+__all__ = ["refuse_existing", "write_table"]
 
 
 def refuse_existing(path: Path, force: bool) -> None:
@@ -18,3 +21,9 @@ def refuse_existing(path: Path, force: bool) -> None:
     """
     if path.exists() and not force:
         raise InputError("this file exists", where=str(path), do="replace it by --force")
+
+
+def write_table(table: Table, path: Path) -> None:
+    """Write a table as ECSV, whole or not at all."""
+    with atomic_path(path) as temporary:
+        table.write(temporary, format="ascii.ecsv")

@@ -8,26 +8,28 @@ import numpy as np
 from astropy.table import Table, vstack
 from astropy.time import Time
 
-from bayesdist.app.kept import kept
+from bayesdist.app.config import Config
+from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.assess import SAMPLE, convert, pixel_scale_of
-from bayesdist.assess.periods import TimeVariation, bins_for, time_variation
 from bayesdist.data import MatchTable
+from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, bins_for
 from bayesdist.errors import InputError
+from bayesdist.infer.stars.shards import Matches
 
 if TYPE_CHECKING:
-    from bayesdist.app.session import Session
-    from bayesdist.assess.wise import PatternChange, StatisticsTable
+    from bayesdist.diagnose.residuals import PatternChange, StatisticsTable
     from bayesdist.infer.compare.positions import PositionChange
 
-__all__ = ["check_pairs", "periods_of", "periods_summary", "periods_table"]
+__all__ = ["check_pairs", "period_settings", "periods_summary", "periods_table"]
 
 
-def check_pairs(session: Session) -> dict[str, int]:
+def check_pairs(raw: Matches, config: Config) -> dict[str, int]:
     """About how many pairs each period has, from the epochs of some of the pairs.
 
     Parameters
     ----------
-    session : Session
+    raw : MatchTable or PartitionedMatches
+    config : Config
 
     Returns
     -------
@@ -39,10 +41,9 @@ def check_pairs(session: Session) -> dict[str, int]:
     InputError
         Without epochs, and for a period without pairs: before anything is sampled.
     """
-    spans = session.config.spans()
+    spans = config.spans()
     if not spans:
         return {}
-    raw = session.raw_matches
     where = ", ".join(raw.sources)
     if not raw.has_epoch:
         raise InputError(
@@ -68,44 +69,35 @@ def check_pairs(session: Session) -> dict[str, int]:
     return out
 
 
-def periods_of(session: Session, *, anew: bool = False) -> TimeVariation | None:
-    """The configured periods compared, once in a session.
+def period_settings(data: FitData, config: Config) -> PeriodSettings | None:
+    """Which periods are compared, and how; None where none are asked for.
 
     Parameters
     ----------
-    session : Session
-    anew : bool
-        Also where it has been done: the fit may be another one.
+    data : FitData
+    config : Config
 
     Returns
     -------
-    TimeVariation or None
-        None where no periods are asked for.
+    PeriodSettings or None
 
     Raises
     ------
     InputError
-        As `check_pairs` and `time_variation`.
+        As `check_pairs`.
     """
-    if session.config.periods is None:
+    if config.periods is None:
         return None
-    return kept(session, "time_variation", lambda: _compared(session), anew=anew)
-
-
-def _compared(session: Session) -> TimeVariation:
-    fit, config = session.fit, session.config
-    least = min(check_pairs(session).values())
+    fit = data.fit
+    least = min(check_pairs(data.placed, config).values())
     scale = pixel_scale_of(fit, scale_mas=config.detector.scale_mas)
     angle = fit.unit != "pix" or scale is not None
     limits = [
         convert(r.limit, r.unit, fit.unit, scale, where=f"requirement {r.name!r}")
         for r in config.requirements()
     ]
-    return time_variation(
-        fit,
-        session.matches,
+    return PeriodSettings(
         config.spans(),
-        rng=session.rng("assess"),
         bins=bins_for(least // len(fit.model.chips)),
         radial_weight=config.fit.radial_weight,
         tolerance=min(limits, default=None),
@@ -181,7 +173,7 @@ def periods_summary(found: TimeVariation) -> dict[str, Any]:
         "n_outside": found.n_outside,
         "n_repeated": found.n_repeated,
         "periods": rows,
-        "ends": {"period": found.last, "against": found.first, **_position(found.ends)},
+        "first_vs_last": {"period": found.last, "against": found.first, **_position(found.ends)},
         "residuals": [
             _statistics(table, chip.number)
             for table, chip in zip(found.residuals, comparison.model.chips, strict=True)

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 
-from bayesdist.app.horizon import last_epoch
 from bayesdist.app.judging import probability_met
 from bayesdist.app.margins import judged_requirements
+from bayesdist.app.results import Results, open_results
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.session import Session
-from bayesdist.app.sessions import session_of
-from bayesdist.app.stages import require
 from bayesdist.assess.planning.exposures import Schedule, exposures_needed
 from bayesdist.assess.requirements.requirement import Requirement
-from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.planning import ExposureContent, exposure_content, exposure_information
+from bayesdist.infer.solution import Solution
 
 __all__ = ["plan"]
 
@@ -49,15 +45,15 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
     InputError
         For a run without requirements or without that one.
     """
-    with closing(session_of(RunDirectory.open(run))) as session:
-        require(session, "plan", ("fit", "sample", "assess"))
-        if session.config.selfcal is not None:
+    with open_results(RunDirectory.open(run)) as results:
+        results.run.require("plan", ("fit", "sample", "assess"))
+        if results.config.selfcal is not None:
             raise InputError(
                 "is a run of a self-calibration, where an exposure is worth what it overlaps",
                 where=str(run),
                 do="plan with matched stars",
             )
-        requirements = judged_requirements(session.run)
+        requirements = judged_requirements(results.run)
         chosen = [r for r in requirements if name is None or r.name == name]
         if not chosen:
             known = ", ".join(repr(r.name) for r in requirements)
@@ -66,43 +62,43 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
                 where=str(run),
                 do=f"name one of {known}" if known else "judge some with 'bayesdist requirements'",
             )
-        content = _content(session)
+        content = _content(results)
         lines = [f"An exposure is taken to hold {content.n_stars:.0f} matched stars as these do."]
         for requirement in chosen:
-            lines += ["", *_lines(session, requirement, content, epochs)]
+            lines += ["", *_lines(results, requirement, content, epochs)]
         return "\n".join(lines)
 
 
-def _content(session: Session) -> ExposureContent:
+def _content(results: Results) -> ExposureContent:
     """The average exposure of the run."""
-    stars = session.stars
-    jitter = float(np.mean(session.posterior.hyper.get("j", [0.0])))
+    stars = results.diagnostics.sample
+    jitter = float(np.mean(results.posterior.hyper.get("j", [0.0])))
     sigma = np.stack([np.asarray(stars.table.sigma_u), np.asarray(stars.table.sigma_v)], axis=1)
     true = np.ones(len(stars))
     if stars.outlier_probability is not None:
         true = 1.0 - stars.outlier_probability
     return exposure_content(
-        session.posterior.model,
+        results.posterior.model,
         stars.table,
         true[:, None] / (sigma**2 + jitter**2),
         n_total=stars.n_total,
-        n_exposures=max(len(session.raw_matches.exposure_names), 1),
+        n_exposures=max(len(results.data.placed.exposure_names), 1),
     )
 
 
 def _lines(
-    session: Session,
+    results: Results,
     requirement: Requirement,
     content: ExposureContent,
     epochs: Sequence[float],
 ) -> list[str]:
-    solution, time = session.solution, session.posterior.model.time
+    solution, time = results.solution, results.posterior.model.time
     schedules = []
     if time is None:
         schedules.append(Schedule("at any date", exposure_information(solution, content, None)))
     else:
-        wanted = requirement.epoch or (requirement.epochs or [session.epoch])[-1]
-        last = last_epoch(session)
+        wanted = requirement.epoch or (requirement.epochs or [results.epoch])[-1]
+        last = float(np.max(results.diagnostics.sample.table.epoch))
         for date in dict.fromkeys([*epochs, wanted]):
             schedules.append(
                 Schedule(f"at {date:.2f}", exposure_information(solution, content, date))
@@ -115,7 +111,7 @@ def _lines(
             )
 
     def met(candidate: Solution) -> float:
-        return probability_met(session, requirement, candidate, DRAWS)
+        return probability_met(results, requirement, candidate, DRAWS)
 
     found = exposures_needed(solution, schedules, met, requirement.probability)
     return [f"{requirement.name} (probability {requirement.probability:g} asked for)"] + [

@@ -11,15 +11,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.release import write_files
-from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.config import Config
 from bayesdist.app.file_positions import sip_positions
-from bayesdist.app.made_files import made_files
+from bayesdist.app.made_files import ProductInput, made_files
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import MEASURED, PRODUCT, Known, Row
 from bayesdist.calibration.calibration import Calibration
@@ -33,9 +32,6 @@ from bayesdist.products.formats.sip.read import sip_of
 from bayesdist.products.formats.wise.meta import bands_of
 from bayesdist.products.registry import read_calibration, recognized
 
-if TYPE_CHECKING:
-    from bayesdist.app.session import Session
-
 __all__ = ["product_terms"]
 
 Float = NDArray[np.float64]
@@ -47,27 +43,35 @@ ROUNDING = 1e-9  # of a pixel
 SKY_ROUNDING = 2e-9  # arcsec: what double precision leaves of an RA of 360 degrees, and back
 
 
-def product_terms(session: Session) -> tuple[Known, ...]:
+def product_terms(product: ProductInput, config: Config, base: Path) -> tuple[Known, ...]:
     """Terms of the files that the configuration asks for.
 
     They are read back from their bytes, so that digits and orders are those of the files; nothing
     of the run is touched.
+
+    Parameters
+    ----------
+    product : ProductInput
+    config : Config
+    base : Path
+        Folder that its files are relative to.
     """
-    release, made = session.config.products.release, made_files(session, session.solution)
+    release, made = config.products.release, made_files(product, config)
     out: list[Known] = []
     if "sip" in made:
         headers = {one.chip: sip_of(_content(one)) for one in made["sip"] if one.chip is not None}
-        out += _sip_terms(session, ", ".join(one.file_name for one in made["sip"]), headers)
+        out += _sip_terms(product, ", ".join(one.file_name for one in made["sip"]), headers)
     for one in made.get("idctab", ()):
         of_file = recognized(_content(one)).calibration()
-        out += _idctab_terms(session, one.file_name, [of_file])
+        out += _idctab_terms(product, one.file_name, [of_file])
     for one in made.get("wise_meta", ()):
         [band] = bands_of(_content(one))
-        chip = session.solution.model.chips[0].number
-        out += _sip_terms(session, one.file_name, {chip: band.sip}, like=one.made)
-    if release is not None and isinstance(session, CampaignSession):
+        chip = product.solution.model.chips[0].number
+        out += _sip_terms(product, one.file_name, {chip: band.sip}, like=one.made)
+    if release is not None:
         with TemporaryDirectory() as folder:
-            out += _idctab_terms(session, release.name, _released(session, Path(folder)))
+            sets = _released(product, config, base, Path(folder))
+            out += _idctab_terms(product, release.name, sets)
     return tuple(out)
 
 
@@ -76,11 +80,14 @@ def _content(built: Built) -> Content:
 
 
 def _sip_terms(
-    session: Session, file: str, headers: Mapping[int, SipHeader], like: SipHeader | None = None
+    product: ProductInput,
+    file: str,
+    headers: Mapping[int, SipHeader],
+    like: SipHeader | None = None,
 ) -> list[Known]:
     """Forward and inverse of one header for each chip."""
-    unit, scale = session.solution.model.unit, session.scale_arcsec
-    point = session.tangent_point if like is None else None  # WISE's entries have no CRVAL
+    unit, scale = product.solution.model.unit, product.scale_arcsec
+    point = product.tangent_point if like is None else None  # WISE's entries have no CRVAL
 
     def place(x: Float, y: Float, chip: int, _: float | None) -> Float:
         return sip_positions(
@@ -92,18 +99,18 @@ def _sip_terms(
         back_x, back_y = sip.inverse(*sip.forward(x, y))
         return np.stack([back_x - x, back_y - y], axis=-1)
 
-    rotates = session.systematics.aligned
-    turned = _Laid(session, place, scaled=False) if rotates else None
-    forward = turned or (lambda x, y, c, t: place(x, y, c, t) - _solution(session, x, y, c, t))
+    rotates = product.aligned
+    turned = _Laid(product, place, scaled=False) if rotates else None
+    forward = turned or (lambda x, y, c, t: place(x, y, c, t) - _solution(product, x, y, c, t))
     return [
-        _term(session, file, FORWARD, forward),
-        _term(session, file, INVERSE, _in_unit(session, missed)),
+        _term(product, file, FORWARD, forward),
+        _term(product, file, INVERSE, _in_unit(product, missed)),
     ]
 
 
-def _idctab_terms(session: Session, file: str, sets: Sequence[Calibration]) -> list[Known]:
+def _idctab_terms(product: ProductInput, file: str, sets: Sequence[Calibration]) -> list[Known]:
     """Forward, and inverse where there are such rows; one set for each segment of the drift."""
-    time = session.solution.model.time
+    time = product.solution.model.time
 
     def of(epoch: float | None) -> Calibration:
         if time is None or epoch is None or len(sets) == 1:
@@ -120,17 +127,18 @@ def _idctab_terms(session: Session, file: str, sets: Sequence[Calibration]) -> l
         back = one.inverses[chip].pixels(*about_zero.at(x, y))
         return np.stack([back[0] - x, back[1] - y], axis=-1)
 
-    out = [_term(session, file, FORWARD, _Laid(session, place, scaled=True))]
+    out = [_term(product, file, FORWARD, _Laid(product, place, scaled=True))]
     if all(one.inverses for one in sets):
-        out.append(_term(session, file, INVERSE, _in_unit(session, missed)))
+        out.append(_term(product, file, INVERSE, _in_unit(product, missed)))
     return out
 
 
-def _released(session: CampaignSession, folder: Path) -> list[Calibration]:
+def _released(product: ProductInput, config: Config, base: Path, folder: Path) -> list[Calibration]:
     """The files of a release, one set for each segment: of several periods of one, the first."""
-    block, filter = session.config.products.release, session.inputs.filter
+    block, filter = config.products.release, product.filter
     assert block is not None
-    entries = write_files(session, folder, {filter: session.solution}, session.tables)
+    solutions = {filter: product.solution}
+    entries = write_files(config, base, folder, solutions, product.tables)
     paths = {e["kind"]: folder / e["path"] for e in entries}
     before = read_d2im(paths["D2IMFILE"]) if "D2IMFILE" in paths else ()
     npol = read_lookup_file(paths["NPOLFILE"]) if "NPOLFILE" in paths else None
@@ -147,16 +155,16 @@ def _released(session: CampaignSession, folder: Path) -> list[Calibration]:
     segments: dict[int, Calibration] = {}
     for period in block.period:
         segments.setdefault(period.segment, sets[period.name])
-    time = session.solution.model.time
+    time = product.solution.model.time
     n = 1 if time is None else time.n_segments
     last = segments[min(segments)]
     return [segments.get(k, last) for k in range(n)]
 
 
-def _term(session: Session, file: str, direction: str, shift: Positions) -> Known:
-    solution = session.solution
+def _term(product: ProductInput, file: str, direction: str, shift: Positions) -> Known:
+    solution = product.solution
     least = ROUNDING * solution.model.pixel_size(solution.mean)
-    if session.tangent_point is not None:
+    if product.tangent_point is not None:
         least = max(least, SKY_ROUNDING / ARCSEC[solution.model.unit])
     against = "the solution" if direction == FORWARD else "its forward terms"
     source = f"{MEASURED}: as written, against {against}"
@@ -169,18 +177,18 @@ def _term(session: Session, file: str, direction: str, shift: Positions) -> Know
     return Known(Row(f"{file}, {direction}", PRODUCT, source, in_total=False), rounded)
 
 
-def _solution(session: Session, x: Float, y: Float, chip: int, epoch: float | None) -> Float:
+def _solution(product: ProductInput, x: Float, y: Float, chip: int, epoch: float | None) -> Float:
     """Positions (N, 2) by the solution: tables where it has some, then the polynomials."""
-    solution = session.solution
-    if isinstance(session, CampaignSession) and session.tables:
-        x, y = corrected(session.tables, x, y, chip=chip, filter=session.inputs.filter)
+    solution = product.solution
+    if product.tables:
+        x, y = corrected(product.tables, x, y, chip=chip, filter=product.filter)
     place = place_of(solution.model, epoch=epoch, chip=chip)
     return np.asarray(place.basis.evaluate(x, y) @ place.polynomial(solution.mean).T)
 
 
-def _in_unit(session: Session, missed: Positions) -> Positions:
+def _in_unit(product: ProductInput, missed: Positions) -> Positions:
     """Displacements of pixels as those of positions."""
-    solution = session.solution
+    solution = product.solution
 
     def shift(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
         place = place_of(solution.model, epoch=epoch, chip=chip)
@@ -196,27 +204,27 @@ class _Laid:
 
     Parameters
     ----------
-    session : Session
+    product : ProductInput
     place : callable
         Positions by the file, in a unit of its own where `scaled`.
     scaled : bool
         Whether the file's scale is a convention of its own, found at the date of the assessment.
     """
 
-    def __init__(self, session: Session, place: Positions, *, scaled: bool) -> None:
-        self.session, self.place, self.scaled = session, place, scaled
+    def __init__(self, product: ProductInput, place: Positions, *, scaled: bool) -> None:
+        self.product, self.place, self.scaled = product, place, scaled
         self._kept: dict[float | None, tuple[complex, complex, bool]] = {}
 
     def __call__(self, x: Float, y: Float, chip: int, epoch: float | None) -> Float:
         zero, factor, mirrored = self._map(epoch)
         w = self.place(x, y, chip, epoch) @ [1, -1j if mirrored else 1j]
         at = zero + factor * w
-        return np.stack([at.real, at.imag], axis=-1) - _solution(self.session, x, y, chip, epoch)
+        return np.stack([at.real, at.imag], axis=-1) - _solution(self.product, x, y, chip, epoch)
 
     def _map(self, epoch: float | None) -> tuple[complex, complex, bool]:
         if epoch not in self._kept:
             size = 1.0
-            date = self.session.epoch
+            date = self.product.epoch
             if self.scaled:
                 size = abs(self._fitted(epoch)[1] if epoch == date else self._map(date)[1])
             self._kept[epoch] = self._fitted(epoch, size)
@@ -227,9 +235,9 @@ class _Laid:
     ) -> tuple[complex, complex, bool]:
         """Shift and factor, of a given size, by least squares; mirrored where that is nearer."""
         z, w = [], []
-        for chip in self.session.solution.model.chips:
+        for chip in self.product.solution.model.chips:
             x, y = mesh(*grid_pixels(chip.size, GRID))
-            z.append(_solution(self.session, x, y, chip.number, epoch) @ [1, 1j])
+            z.append(_solution(self.product, x, y, chip.number, epoch) @ [1, 1j])
             w.append(self.place(x, y, chip.number, epoch) @ [1, 1j])
         here, there = np.concatenate(z), np.concatenate(w)
         found = []

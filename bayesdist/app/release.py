@@ -12,21 +12,20 @@ import numpy as np
 from bayesdist.app.campaign.filter_figures import draw_filters
 from bayesdist.app.campaign.filters import FilterComparison, compare_filters, comparison_table
 from bayesdist.app.campaign.release import write_files
-from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.app.folder import whole_folder
-from bayesdist.app.rundir import RunDirectory, versions, write_json
+from bayesdist.app.error_terms import published_tables
+from bayesdist.app.folder import record_folder
+from bayesdist.app.kinds.fitted import Fitted, required
+from bayesdist.app.output import write_table
+from bayesdist.app.results import Results, results_of
+from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import table_text
-from bayesdist.app.session import write_table
-from bayesdist.app.sessions import session_of
-from bayesdist.app.stages import require
-from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError
 from bayesdist.infer.exposures.shared_drift import with_drift_of
+from bayesdist.infer.solution import Solution
 from bayesdist.model import LookupTable
 
 __all__ = ["release_runs"]
 
-SCHEMA = 1
 PRINTED = ("filter", "chip", "term", "at_edge", "sigma_at_edge")
 
 
@@ -64,68 +63,61 @@ def release_runs(
         allowed, and a folder that is in use.
     """
     with ExitStack() as stack:
-        sessions: dict[str, CampaignSession] = {}
+        by_filter: dict[str, Results] = {}
         for path in runs:
-            session = stack.enter_context(closing(_opened(path)))
-            filter = session.inputs.filter
-            if filter in sessions:
+            results = stack.enter_context(closing(_opened(path)))
+            filter = results.inputs.filter
+            if filter in by_filter:
                 raise InputError(
-                    f"is of filter {filter}, as {sessions[filter].run.path} is",
+                    f"is of filter {filter}, as {by_filter[filter].run.path} is",
                     where=str(path),
                     do="give one run for each filter",
                 )
-            sessions[filter] = session
-        _require_alike(sessions)
-        doubts = _doubts(sessions, allowed=allow_unconverged)
-        solutions = _solutions(sessions)
-        comparison, why_not = _compared(sessions)
-        notes = [*doubts, *_notes(sessions, comparison)]
-        table = comparison_table(
-            solutions,
-            comparison,
-            chip=next(iter(sessions.values())).reference_chip,
-        )
+            by_filter[filter] = results
+        _require_alike(by_filter)
+        doubts = _doubts(by_filter, allowed=allow_unconverged)
+        solutions = _solutions(by_filter)
+        comparison, why_not = _compared(by_filter)
+        notes = [*doubts, *_notes(by_filter, comparison)]
+        first = next(iter(by_filter.values()))
+        chip = first.config.chips()[0].number
+        table = comparison_table(solutions, comparison, chip=chip)
         if comparison is None:
             table.meta["drift"] = {"verdict": why_not}
-        with whole_folder(Path(output)) as folder:
-            files = write_files(
-                next(iter(sessions.values())), folder, solutions, _tables(sessions), notes
-            )
+        with record_folder(Path(output), "release.json", command) as (folder, record):
+            tables = _tables(by_filter)
+            files = write_files(first.config, first.base, folder, solutions, tables, notes)
             write_table(table, folder / "filters.ecsv")
-            figures = draw_filters(folder, sessions, solutions)
-            write_json(
-                folder / "release.json",
-                {
-                    "schema": SCHEMA,
-                    "command": command,
-                    "versions": versions(),
-                    "runs": {name: str(one.run.path) for name, one in sessions.items()},
-                    "converged": not doubts,
-                    "drift": table.meta["drift"],
-                    "products": files,
-                    "figures": list(figures),
-                },
+            figures = draw_filters(
+                folder, {k: one.fitted for k, one in by_filter.items()}, solutions
             )
+            record |= {
+                "runs": {name: str(one.run.path) for name, one in by_filter.items()},
+                "converged": not doubts,
+                "drift": table.meta["drift"],
+                "products": files,
+                "figures": list(figures),
+            }
     rows = [dict(zip(table.colnames, row, strict=True)) for row in table]
     return _text(Path(output), files, rows, str(table["at_edge"].unit), why_not or None, comparison)
 
 
-def _opened(path: str | Path) -> CampaignSession:
-    """The session of a finished run of a campaign."""
-    session = session_of(RunDirectory.open(path))
-    if not isinstance(session, CampaignSession):
+def _opened(path: str | Path) -> Results:
+    """The results of a finished run of a campaign."""
+    run = RunDirectory.open(path)
+    if run.config.campaign is None:
         raise InputError(
             "is no run of a campaign", where=str(path), do="give runs that began with star lists"
         )
-    require(session, "release", ("match", "fit", "sample"))
-    return session
+    run.require("release", ("match", "fit", "sample"))
+    return results_of(run)
 
 
 # -- whether the runs go together -----------------------------------------------------------------
 
 
-def _require_alike(sessions: Mapping[str, CampaignSession]) -> None:
-    first, *others = sessions.values()
+def _require_alike(by_filter: Mapping[str, Results]) -> None:
+    first, *others = by_filter.values()
     if first.config.products.release is None:
         raise InputError(
             "has no [products.release], and the first run says what is released",
@@ -133,41 +125,45 @@ def _require_alike(sessions: Mapping[str, CampaignSession]) -> None:
             do="put the run of the reference filter first",
         )
     mine = _structure(first)
-    for session in others:
-        for what, theirs in _structure(session).items():
+    for results in others:
+        for what, theirs in _structure(results).items():
             if theirs != mine[what]:
                 raise InputError(
                     f"the {what} are not those of {first.run.path}"
                     + (f": {theirs} and {mine[what]}" if what != "chips" else ""),
-                    where=str(session.run.path),
+                    where=str(results.run.path),
                     do="run both filters with one structure",
                 )
-        if not _same_detector(first, session):
+        if not _same_detector(first.fitted, results.fitted):
             raise InputError(
                 f"the detector's tables are not those of {first.run.path}",
-                where=str(session.run.path),
+                where=str(results.run.path),
                 do="name that run in tables.detector and run this filter again",
             )
 
 
-def _structure(session: CampaignSession) -> dict[str, Any]:
+def _structure(results: Results) -> dict[str, Any]:
     """What files of several filters must have in common, in words that take a plural."""
-    model, time = session.posterior.model, session.posterior.model.time
+    model, time = results.posterior.model, results.posterior.model.time
     return {
         "chips": model.chips,
         "orders": model.order,
         "units": model.unit,
-        "pixel scales": session.config.detector.scale_mas,
+        "pixel scales": results.config.detector.scale_mas,
         "drifting terms": None if time is None else time.terms,
         "reference dates (RDATE)": None if time is None else time.epoch0,
         "breaks": None if time is None else time.breaks,
     }
 
 
-def _same_detector(a: CampaignSession, b: CampaignSession) -> bool:
+def _same_detector(a: Fitted, b: Fitted) -> bool:
     """Whether two runs corrected the pixels alike, as far as a D2IMFILE holds it."""
     mine, theirs = (
-        {t.chip: (t.first, t.step, t.values.astype(np.float32)) for t in one.tables if not t.filter}
+        {
+            t.chip: (t.first, t.step, t.values.astype(np.float32))
+            for t in one.tables.tables
+            if not t.filter
+        }
         for one in (a, b)
     )
     return mine.keys() == theirs.keys() and all(
@@ -175,17 +171,17 @@ def _same_detector(a: CampaignSession, b: CampaignSession) -> bool:
     )
 
 
-def _doubts(sessions: Mapping[str, CampaignSession], *, allowed: bool) -> list[str]:
+def _doubts(by_filter: Mapping[str, Results], *, allowed: bool) -> list[str]:
     """What has not converged, as sentences."""
     out = []
-    for name, session in sessions.items():
-        convergence = session.posterior.convergence
+    for name, results in by_filter.items():
+        convergence = results.posterior.convergence
         if not convergence.converged:
             why = "; ".join(convergence.reasons)
             if not allowed:
                 raise InputError(
                     f"the run of {name} has not converged ({why})",
-                    where=str(session.run.path),
+                    where=str(results.run.path),
                     do="resume it with more steps, or release it with --allow-unconverged",
                 )
             out.append(f"NOT CONVERGED: the run of {name} ({why}).")
@@ -195,35 +191,44 @@ def _doubts(sessions: Mapping[str, CampaignSession], *, allowed: bool) -> list[s
 # -- what is released -----------------------------------------------------------------------------
 
 
-def _solutions(sessions: Mapping[str, CampaignSession]) -> dict[str, Solution]:
+def _solutions(by_filter: Mapping[str, Results]) -> dict[str, Solution]:
     """The reference filter's solution, and the others with its drift."""
-    (first, reference), *others = sessions.items()
+    (first, reference), *others = by_filter.items()
     out: dict[str, Solution] = {first: reference.solution}
-    for name, session in others:
-        solution: Solution = session.solution
+    for name, results in others:
+        solution: Solution = results.solution
         if solution.model.time is not None:
             solution = with_drift_of(
-                solution, reference.solution, chip=reference.reference_chip, formal=session.fit
+                solution,
+                reference.solution,
+                chip=reference.config.chips()[0].number,
+                formal=results.fit,
             )
         out[name] = solution
     return out
 
 
-def _tables(sessions: Mapping[str, CampaignSession]) -> list[LookupTable]:
+def _tables(by_filter: Mapping[str, Results]) -> list[LookupTable]:
     """The detector's tables, once, and those of the filters."""
-    first = next(iter(sessions.values()))
-    out = [table for table in first.published_tables if not table.filter]
-    return out + [t for one in sessions.values() for t in one.published_tables if t.filter]
+    published = [
+        published_tables(one.fitted.tables, held=one.config.tables.detector is not None)
+        for one in by_filter.values()
+    ]
+    out = [table for table in published[0] if not table.filter]
+    return out + [table for tables in published for table in tables if table.filter]
 
 
-def _compared(sessions: Mapping[str, CampaignSession]) -> tuple[FilterComparison | None, str]:
+def _compared(by_filter: Mapping[str, Results]) -> tuple[FilterComparison | None, str]:
     """The comparison of the filters, or why there is none."""
-    if len(sessions) < 2:
+    if len(by_filter) < 2:
         return None, "not compared: there is one filter"
-    first = next(iter(sessions.values()))
+    first = next(iter(by_filter.values()))
     try:
         found = compare_filters(
-            {name: one.terms for name, one in sessions.items()},
+            {
+                name: required(one.fitted.alone, "fits of single exposures")
+                for name, one in by_filter.items()
+            },
             first.posterior.model.time,
             seed=first.config.sampler.seed,
         )
@@ -232,14 +237,12 @@ def _compared(sessions: Mapping[str, CampaignSession]) -> tuple[FilterComparison
     return found, ""
 
 
-def _notes(
-    sessions: Mapping[str, CampaignSession], comparison: FilterComparison | None
-) -> list[str]:
+def _notes(by_filter: Mapping[str, Results], comparison: FilterComparison | None) -> list[str]:
     """Lines for HISTORY."""
-    if len(sessions) < 2:
+    if len(by_filter) < 2:
         return []
-    first = next(iter(sessions))
-    out = [f"Filters {', '.join(sessions)}; the drift is that of {first}."]
+    first = next(iter(by_filter))
+    out = [f"Filters {', '.join(by_filter)}; the drift is that of {first}."]
     if comparison is not None:
         said = comparison.sentence
         out.append(f"Tested on the exposures: {said}.")

@@ -3,20 +3,38 @@
 from __future__ import annotations
 
 import logging
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from bayesdist.app.config import load_config
+from bayesdist.app.kinds.kind import kind_of
+from bayesdist.app.made_from import NEEDS
+from bayesdist.app.rehearsal import rehearse
+from bayesdist.app.results import Results, open_results
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.screen import log_file, progress_bar
-from bayesdist.app.session import STAGES, Session
-from bayesdist.app.sessions import own_stages, rehearse_run, session_of
-from bayesdist.app.stages import NEEDS, require, run_stage
+from bayesdist.app.screen import log_file
+from bayesdist.app.stages.assess import run_assess
+from bayesdist.app.stages.export import run_export
+from bayesdist.app.stages.fit import run_fit
+from bayesdist.app.stages.match import run_match
+from bayesdist.app.stages.report import run_report
+from bayesdist.app.stages.sample import run_sample
 from bayesdist.errors import InputError, NotConvergedError
+from bayesdist.infer.checks import convergence_check
 
-__all__ = ["continue_stage", "run"]
+__all__ = ["continue_stage", "initialized", "run", "run_stage"]
 
 log = logging.getLogger("bayesdist")
+
+STAGES: dict[str, Callable[[Results], Results]] = {
+    "match": run_match,
+    "fit": run_fit,
+    "sample": run_sample,
+    "assess": run_assess,
+    "export": run_export,
+    "report": run_report,
+}
 
 
 def run(
@@ -38,7 +56,7 @@ def run(
     output : path
         Run directory.
     resume : bool
-        Go on with the run that is there: stages that are done are skipped, checkpoints are used.
+        Resume the run that is there: stages that stand are skipped, checkpoints are used.
     force : bool
         Replace the run that is there.
     strict : bool
@@ -68,19 +86,11 @@ def run(
         seed=seed,
         command=command,
     )
-    with closing(session_of(directory)) as session:
-        _begin(session)
-        with log_file(directory / "bayesdist.log"):
-            redo = False
-            for stage in STAGES:
-                if stage == "match" and stage not in own_stages(session):
-                    continue
-                if directory.done(stage) and not redo:
-                    log.info("%s: done before", stage)
-                    continue
-                redo = True  # what comes after a stage that is made anew is made anew
-                _run_stage(session, stage)
-        _judge(session, strict)
+    with initialized(directory) as results:
+        names = list(STAGES)
+        for stage in names[names.index(results.kind.begins_with) :]:
+            results = run_stage(results, stage, force=False)
+        _judge(results, strict)
     return directory.path
 
 
@@ -92,44 +102,66 @@ def continue_stage(path: str | Path, stage: str, *, strict: bool = False) -> Run
     BayesdistError
     """
     directory = RunDirectory.open(path)
-    with closing(session_of(directory)) as session:
-        listed = "match" in own_stages(session)
-        if stage == "match" and not listed:
-            raise InputError(
-                "has no star lists to match", where=str(path), do="begin with the stage 'fit'"
-            )
-        require(session, stage, ("match",) if listed and stage == "fit" else NEEDS[stage])
-        _begin(session)
-        with log_file(directory / "bayesdist.log"):
-            _run_stage(session, stage)
+    begins_with = kind_of(directory.config).begins_with
+    if stage == "match" != begins_with:
+        raise InputError(
+            "has no star lists to match", where=str(path), do="begin with the stage 'fit'"
+        )
+    needs = (begins_with,) if stage == "fit" != begins_with else NEEDS[stage]
+    directory.require(stage, needs, thorough=True)
+    with initialized(directory) as results:
+        results = run_stage(results, stage)
         if stage == "sample":
-            _judge(session, strict)
+            _judge(results, strict)
     return directory
 
 
-def _begin(session: Session) -> None:
-    """Begin a planned run once it is known that it can be carried out."""
-    if session.run.begun:
-        session.run.follow()
-        return
-    rehearse_run(session)
-    session.run.begin()
-    session.begun()
+def run_stage(results: Results, stage: str, *, force: bool = True) -> Results:
+    """Results with the artefact of a stage: loaded where it stands, and else made.
+
+    Parameters
+    ----------
+    results : Results
+    stage : str
+    force : bool
+        Make it also where it stands.
+    """
+    made = results.run.make(stage, lambda: STAGES[stage](results), force=force)
+    return made.value or results
 
 
-def _run_stage(session: Session, stage: str) -> None:
-    with progress_bar(stage) as progress:
-        session.progress = progress if stage == "sample" else None
-        run_stage(session, stage, own_stages(session).get(stage))
+@contextmanager
+def initialized(directory: RunDirectory) -> Iterator[Results]:
+    """Results of a run whose folder is there, once it is known that it can be carried out.
+
+    Parameters
+    ----------
+    directory : RunDirectory
+
+    Yields
+    ------
+    Results
+    """
+    with open_results(directory) as results:
+        begins = directory.is_planned
+        if begins:
+            results = rehearse(results)
+        with directory.locked():
+            directory.begin()
+            if begins:
+                results = results.adopting_inputs()
+            with log_file(directory / "bayesdist.log"):
+                yield results
 
 
-def _judge(session: Session, strict: bool) -> None:
-    convergence = session.posterior.convergence
-    if strict and not convergence.converged:
-        exact = session.posterior.sampler.exact
+def _judge(results: Results, strict: bool) -> None:
+    """Raise where a sampler has not converged, if that is asked for."""
+    posterior = results.posterior
+    if strict and convergence_check(posterior.convergence).level == "fail":
+        exact = posterior.sampler.exact
         raise NotConvergedError(
-            f"the sampler has not converged ({'; '.join(convergence.reasons)})",
-            where=str(session.run.path),
+            f"the sampler has not converged ({'; '.join(posterior.convergence.reasons)})",
+            where=str(results.run.path),
             do="raise sampler.max_steps and resume, or simplify the model"
             if exact
             else "set sampler.second_stage = 'always' and run with --force",

@@ -2,73 +2,38 @@
 
 from __future__ import annotations
 
-import json
-import math
-import platform
-import re
-import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
-from time import monotonic
-from typing import Any
+from typing import Any, TypeVar
 
-import numpy as np
-from pydantic import ValidationError
-
-from bayesdist.app.campaign.files import campaign_files
-from bayesdist.app.config import Config, load_config, load_text
-from bayesdist.app.config_errors import as_config_error
-from bayesdist.app.selfcal.files import selfcal_files
-from bayesdist.app.star_files import FOLDER, PAIRS, part_files
-from bayesdist.data import input_files
-from bayesdist.errors import InputError
-from bayesdist.files import atomic_path, is_leftover, made_folder, remove_leftovers, sha256_of
-from bayesdist.version import __version__
-
-__all__ = ["RunDirectory", "as_json", "write_json"]
-
-SCHEMA = 1
-PACKAGES = ("arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
-
-# what a run writes beside its products and figures, which it lists itself; --force removes these
-# and nothing else
-OWN_FILES = re.compile(
-    r"config\.toml|run\.json|bayesdist\.log|fit\.nc|magnitude_errors\.ecsv|chain-\d+-\w+\.h5|"
-    r"posterior\.nc|(coefficients|budget|margins|periods|holdout|matching|series|drift|gauge|stars)\.ecsv|maps\.fits|"
-    r"(tables|hierarchy|exposure_terms|catalogue_errors|detections|solution)\.h5|stars\.parquet|"
-    r"summary\.json|report\.(html|md)"
+from bayesdist.app.config import (
+    Config,
+    config_of_record,
+    load_config,
 )
+from bayesdist.app.folder import versions
+from bayesdist.app.made_from import STAGES, changes, made_from_of, with_seed
+from bayesdist.app.named_files import files_of_products, named_files
+from bayesdist.app.refusals import (
+    refuse_another_solution,
+    refuse_edited,
+    refuse_foreign_files,
+    refuse_inside_input,
+    refuse_other_inputs,
+)
+from bayesdist.app.star_files import PAIRS, part_files
+from bayesdist.app.store import SCHEMA, Made, Record, RunStore, as_json
+from bayesdist.app.summary import head_of
+from bayesdist.assess import Requirement
+from bayesdist.data import input_files
+from bayesdist.errors import ConfigError, InputError
+from bayesdist.files import atomic_path, made_folder, remove_leftovers, sha256_of
 
+__all__ = ["RunDirectory"]
 
-# when to stop: a resumed run may be given other limits
-LIMITS = ("max_steps", "target_ess", "target_rhat")
-
-
-def as_json(value: Any) -> Any:
-    """A value as plain JSON: arrays as lists, and null for what is not a finite number."""
-    if isinstance(value, Mapping):
-        return {str(k): as_json(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [as_json(v) for v in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Path):
-        return str(value)
-    return value
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file, replaced atomically."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(
-            json.dumps(as_json(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n",
-            encoding="utf-8",
-        )
+T = TypeVar("T")
 
 
 class RunDirectory:
@@ -81,8 +46,9 @@ class RunDirectory:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
+        self.store = RunStore(self.path, STAGES, head_of)
         self._planned: tuple[dict[str, Any], str] | None = None
-        self._follow: tuple[Config, str] | None = None
+        self._adopted: tuple[Config, str, dict[str, str]] | None = None
 
     def __truediv__(self, name: str) -> Path:
         return self.path / name
@@ -102,7 +68,7 @@ class RunDirectory:
         seed: int | None = None,
         command: str = "",
     ) -> RunDirectory:
-        """A run that may go on in a folder, or may begin there; nothing is written yet.
+        """A run that may be resumed in a folder, or may begin there; nothing is written yet.
 
         Parameters
         ----------
@@ -113,7 +79,7 @@ class RunDirectory:
         base : Path
             Folder that relative inputs are relative to.
         resume, force : bool
-            Go on with the run that is there, or replace it.
+            Resume the run that is there, or replace it.
         seed : int, optional
             In place of the configured one.
         command : str
@@ -122,91 +88,105 @@ class RunDirectory:
         Raises
         ------
         InputError
-            When the folder holds another run or foreign files, or the input of a resumed run
-            changed.
+            When the folder holds another run or foreign files, or a resumed run was made from other
+            inputs or settings.
         """
         run = cls(path)
         if run.path.exists() and not run.path.is_dir():
             raise InputError("is a file, not a folder", where=str(path), do="choose another folder")
-        run._refuse_inside_input(config, base)
-        inputs = run._hashes(config, base)
-        if (run / "run.json").exists() and not force:
+        refuse_inside_input(run.path, config, base)
+        inputs = _hashes(config, base)
+        if run.is_initialized and not force:
             if not resume:
                 raise InputError(
                     "the folder holds another run",
                     where=str(path),
                     do="go on with it by --resume, replace it by --force, or choose another folder",
                 )
-            run._check_unchanged(config, text, inputs, seed)
-            run._follow = config, text
+            refuse_another_solution(run.path, run.config, run.record, config, base, inputs, seed)
+            run._adopted = config, text, inputs
             return run
-        foreign = run._foreign(text)
-        if foreign:
-            raise InputError(
-                f"the folder holds other files ({foreign[0]})",
-                where=str(path),
-                do="choose an empty folder",
-            )
-        if seed is not None:
-            sampler = config.sampler.model_copy(update={"seed": seed})
-            config = config.model_copy(update={"sampler": sampler})
-        record = {
-            "schema": SCHEMA,
-            "config": config.model_dump(),
+        if run.is_initialized:
+            run.store.record  # noqa: B018 - refuse to replace what nobody can tell from other files
+        else:
+            refuse_foreign_files(run.path, text)
+        facts = {
+            "config": with_seed(config, seed).model_dump(),
             "base": str(base.resolve()),
             "inputs": inputs,
-            "seed": config.sampler.seed,
+            "seed": config.sampler.seed if seed is None else seed,
             "versions": versions(),
             "command": command,
-            "created": _now(),
-            "stages": {},
+            "created": datetime.now(UTC).isoformat(timespec="seconds"),
         }
-        run._planned = as_json(record), text
+        run._planned = as_json(facts), text
         return run
 
     @property
-    def begun(self) -> bool:
-        """Whether the folder holds this run already."""
-        return self._planned is None
+    def is_initialized(self) -> bool:
+        """Boolean: the folder holds a run."""
+        return (self / "run.json").exists()
 
-    def follow(self) -> None:
-        """Take over the limits of the sampler that a resumed run was given.
+    @property
+    def is_planned(self) -> bool:
+        """Boolean: nothing of this run has been written yet."""
+        return self._planned is not None
 
-        A posterior that had not converged is then sampled further.
+    def locked(self) -> AbstractContextManager[None]:
+        """Keep other processes from working on this run; its folder is made.
+
+        Raises
+        ------
+        InputError
+            When another process is at work on it, or the folder cannot be made.
         """
-        if self._follow is None:
-            return
-        (config, text), record = self._follow, self.record
-        known = self.config
-        limits = {key: getattr(config.sampler, key) for key in LIMITS}
-        if limits == {key: getattr(known.sampler, key) for key in LIMITS}:
-            return
-        now = known.model_copy(update={"sampler": known.sampler.model_copy(update=limits)})
-        record["config"] = as_json(now.model_dump())
-        for stage in ("sample", "assess", "export", "report"):
-            record["stages"].pop(stage, None)
-        with atomic_path(self / "config.toml") as temporary:
-            temporary.write_text(text, encoding="utf-8", newline="")
-        self.write_record(record)
+        made_folder(self.path)
+        return self.store.locked()
 
     def begin(self) -> None:
-        """Write down what is about to be done; another run that stands there is removed.
+        """Write down what is about to be done.
+
+        Another run that stands there is removed; a resumed one takes over the settings that may
+        change.
 
         Raises
         ------
         InputError
             When the folder cannot be made or written.
         """
-        assert self._planned is not None
-        record, text = self._planned
-        if (self / "run.json").exists():
+        if self._planned is None:
+            self._adopt()
+            return
+        facts, text = self._planned
+        made_folder(self.path)
+        if self.is_initialized:
             self.clear()
         remove_leftovers(self.path)
-        made_folder(self.path)
+        self._write_text(text)
+        Record(facts).write(self / "run.json")
+        self._planned = None
+
+    def _adopt(self) -> None:
+        """Take over what a resumed run was given in another way, and put summary.json right."""
+        remove_leftovers(self.path)
+        if self._adopted is not None:
+            config, text, inputs = self._adopted
+            record, known = self.store.record, self.config
+            changed = {key for key, *_ in changes(known, with_seed(config, known.sampler.seed))}
+            if changed or inputs != record.facts["inputs"]:
+                config = with_seed(config, known.sampler.seed)
+                record.facts |= {"config": as_json(config.model_dump()), "inputs": inputs}
+                if any(key.startswith("requirement") for key in changed):
+                    record.facts.pop("requirements", None)
+                self._write_text(text)
+                record.write(self / "run.json")
+            self._adopted = None
+        self.store.restore_summary()
+
+    def _write_text(self, text: str) -> None:
+        """Write config.toml as the user wrote it."""
         with atomic_path(self / "config.toml") as temporary:
             temporary.write_text(text, encoding="utf-8", newline="")
-        self.write_record(record)
-        self._planned = None
 
     @classmethod
     def open(cls, path: str | Path) -> RunDirectory:
@@ -217,17 +197,18 @@ class RunDirectory:
         InputError
         """
         run = cls(path)
-        if (run / "run.json").exists():
-            run._check_configuration()
-            run._check_inputs()
+        if run.is_initialized:
+            refuse_edited(run.path, run.config)
+            now = _hashes(run.config, Path(run.record["base"]))
+            refuse_other_inputs(run.record["inputs"], now)
             return run
         if (run / "config.toml").exists():
             config, text = load_config(run / "config.toml")
             return cls.plan(path, config, text, run.path)
-        raise run.no_run()
+        raise run.not_a_run_error()
 
-    def no_run(self) -> InputError:
-        """What to say of a place that holds no run; a demo has its run in a folder of its own."""
+    def not_a_run_error(self) -> InputError:
+        """The error for a place that holds no run; a demo has its run in a folder of its own."""
         within = self / "run"
         cause = "is no run: it has neither run.json nor config.toml"
         if not self.path.exists():
@@ -242,205 +223,154 @@ class RunDirectory:
             else "make one with 'bayesdist run CONFIG.toml -o RUN'",
         )
 
-    def _refuse_inside_input(self, config: Config, base: Path) -> None:
-        """Refuse a run whose own Parquet files would become part of its input."""
-        named = _named(config, base)
-        for path in named if isinstance(named, list) else [named]:
-            if path.is_dir() and self.path.resolve().is_relative_to(path.resolve()):
-                raise InputError(
-                    "the run would lie inside the folder of its input",
-                    where=str(self.path),
-                    do="choose a folder outside of it",
-                )
-
-    def _foreign(self, text: str) -> list[str]:
-        """What forbids a run to begin in a folder that holds none, sorted.
-
-        A config.toml that says the same is no obstacle: a stage may be run on it.
-        """
-        if (self / "run.json").exists() or not self.path.is_dir():
-            return []
-        names = {p.name for p in self.path.iterdir() if not is_leftover(p.name)}
-        if "config.toml" in names and load_text(self / "config.toml") == text:
-            names.remove("config.toml")
-        return sorted(names)
-
-    def _own(self) -> list[Path]:
-        """Files that the run in this folder wrote."""
-        own = [p for p in self.path.iterdir() if OWN_FILES.fullmatch(p.name) and not p.is_dir()]
-        try:
-            summary = self.summary
-        except InputError:  # what it listed stays; the rest can be cleared all the same
-            summary = {}
-        products = [self / Path(p["path"]).name for p in summary.get("products", [])]
-        figures = [self / "figures" / Path(name).name for name in summary.get("figures", [])]
-        return own + products + figures + part_files(self / FOLDER) + part_files(self / PAIRS)
-
-    def clear(self) -> None:
-        """Remove what a run wrote, and nothing else."""
-        for path in self._own():
-            path.unlink(missing_ok=True)
-        for folder in ("figures", FOLDER, PAIRS):
-            remove_leftovers(self / folder)
-            try:
-                (self / folder).rmdir()
-            except OSError:  # there is none, or it holds other files
-                pass
-
-    @staticmethod
-    def _hashes(config: Config, base: Path) -> dict[str, str]:
-        """SHA-256 of every file that the configuration names, by its absolute path."""
-        return {str(f): sha256_of(f) for f in input_files(_named(config, base.resolve()))}
-
-    def _check_unchanged(
-        self, config: Config, text: str, inputs: dict[str, str], seed: int | None
-    ) -> None:
-        record = self.record
-        changed = load_text(self / "config.toml") != text
-        if changed and _without_limits(config) != _without_limits(self.config):
-            raise InputError(
-                "the configuration is not the one this run began with",
-                where=str(self / "config.toml"),
-                do="resume with the old one, or start again with --force",
-            )
-        if seed is not None and seed != record["seed"]:
-            raise InputError(
-                f"the run began with seed {record['seed']}",
-                where=str(self.path),
-                do="leave --seed out, or start again with --force",
-            )
-        self._compare(record["inputs"], inputs)
-
-    def _check_configuration(self) -> None:
-        """Refuse a config.toml that was edited in place: the run goes by what it began with."""
-        path = self / "config.toml"
-        if not path.exists():
-            return
-        now, known = load_config(path)[0], self.config
-        if now.model_copy(update={"sampler": known.sampler}) != known or (
-            # the command line may have given another seed
-            now.sampler.model_copy(update={"seed": known.sampler.seed}) != known.sampler
-        ):
-            raise InputError(
-                "was edited since the run began, which goes by the old one",
-                where=str(path),
-                do="restore it, or start again with --force",
-            )
-
-    def _check_inputs(self) -> None:
-        record = self.record
-        self._compare(record["inputs"], self._hashes(self.config, Path(record["base"])))
-
-    def _compare(self, known: dict[str, str], now: dict[str, str]) -> None:
-        for name in sorted(known.keys() | now.keys()):
-            if known.get(name) != now.get(name):
-                raise InputError(
-                    "this input changed since the run began",
-                    where=name,
-                    do="restore it, or start again with --force",
-                )
-
     # -- record -----------------------------------------------------------------------------------
 
     @property
     def record(self) -> dict[str, Any]:
         """Content of run.json, or of what it will be."""
         if self._planned is not None:
-            return self._planned[0]
-        try:
-            return json.loads((self / "run.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise InputError(
-                "cannot be read", where=str(self / "run.json"), do="start again with --force"
-            ) from error
+            return {"schema": SCHEMA, **self._planned[0], "stages": {}}
+        return self.store.record.as_dict()
 
-    def write_record(self, record: Mapping[str, Any]) -> None:
-        """Replace run.json."""
-        write_json(self / "run.json", record)
+    def note(self, **facts: Any) -> None:
+        """Add facts to run.json."""
+        record = self.store.record
+        record.facts |= as_json(facts)
+        record.write(self / "run.json")
 
     @property
     def config(self) -> Config:
         """The resolved configuration."""
         try:
-            return Config.model_validate(self.record["config"])
-        except ValidationError as error:  # made by a version that allowed other settings
-            fault = as_config_error(Config, error, str(self / "run.json"))
+            return config_of_record(self.record["config"], str(self / "run.json"))
+        except ConfigError as error:  # made by a version that allowed other settings
             raise InputError(
-                fault.cause, where=fault.where, do="start again with --force"
+                error.cause, where=error.where, do="start again with --force"
             ) from error
 
-    @property
-    def matches(self) -> Path | list[Path]:
-        """What the configuration names as matches: a file, a pattern, a folder, or a list."""
-        return _named(self.config, Path(self.record["base"]))
+    # -- stages -----------------------------------------------------------------------------------
+
+    def make(self, stage: str, function: Callable[[], T], *, force: bool = False) -> Made[T]:
+        """The artefact of a stage: made where it or what it was made from is not as it was.
+
+        Parameters
+        ----------
+        stage : str
+        function : callable
+            Writes its files into the folder and its sections by `summarise`.
+        force : bool
+            Make it also where it stands.
+        """
+        made_from = self._made_from(stage)
+        if made_from is None:
+            raise InputError(
+                f"'{stage}' needs stages that have not been run",
+                where=str(self.path),
+                do="run them first",
+            )
+        return self.store.stage(stage, function, *made_from, force=force)
 
     def done(self, stage: str) -> bool:
-        """Whether a stage has ended well."""
-        return stage in self.record["stages"]
+        """Boolean: a stage has ended, and what it was made from is as it was."""
+        return self._planned is None and stage in self._standing()
 
-    def outdate(self, stage: str) -> None:
-        """Note that a stage has to be run again, as what it shows has changed."""
-        record = self.record
-        if record["stages"].pop(stage, None) is not None:
-            self.write_record(record)
+    def _standing(self, before: str = "") -> dict[str, Made[object]]:
+        """Stages that stand, of all or of those before one, in order."""
+        config, facts = self.config, self.store.record.facts
+        found: dict[str, Made[object]] = {}
+        for name in STAGES:
+            if name == before:
+                break
+            made_from = made_from_of(name, found, config, facts)
+            made = None if made_from is None else self.store.standing(name, *made_from)
+            if made is not None:
+                found[name] = made
+        return found
+
+    def _made_from(
+        self, stage: str, requirements: Sequence[Requirement] | None = None
+    ) -> tuple[object, ...] | None:
+        """What a stage is made from now; None where a stage is missing that it needs."""
+        facts = self.store.record.facts
+        if requirements is not None:
+            facts = facts | {"requirements": [as_json(vars(one)) for one in requirements]}
+        return made_from_of(stage, self._standing(stage), self.config, facts)
+
+    def require(self, stage: str, needs: Sequence[str], *, thorough: bool = False) -> None:
+        """Refuse a stage, or another command, whose predecessors do not stand.
+
+        Parameters
+        ----------
+        stage : str
+            In words.
+        needs : sequence of str
+        thorough : bool
+            Look at the content of their files, not just at their sizes.
+
+        Raises
+        ------
+        InputError
+        """
+        for earlier in needs:
+            do = f"run 'bayesdist stage {earlier} {self.path}'"
+            known = None if self._planned is not None else self.store.record.artefacts.get(earlier)
+            if known is None:
+                raise InputError(
+                    f"'{stage}' needs stage '{earlier}', which has not been run",
+                    where=str(self.path),
+                    do=f"{do} first",
+                )
+            harmed = self.store.harmed(earlier, thorough=thorough)
+            if harmed:
+                raise InputError(
+                    f"is not as stage '{earlier}' wrote it",
+                    where=str(self / harmed),
+                    do=f"{do} again",
+                )
+            if not self.done(earlier):
+                raise InputError(
+                    f"'{stage}' needs stage '{earlier}', which was made from something else",
+                    where=str(self.path),
+                    do=f"{do} again",
+                )
 
     @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Time a stage, and note it as done when the block ends well."""
-        remove_leftovers(self.path)
-        record = self.record
-        record["stages"].pop(name, None)
-        self.write_record(record)
-        started = monotonic()
-        yield
-        record = self.record
-        record["stages"][name] = {"wall_s": monotonic() - started, "ended": _now()}
-        self.write_record(record)
+    def judged_by(self, requirements: Sequence[Requirement]) -> Iterator[None]:
+        """Write margins by other requirements: the assessment is by these from now on.
+
+        Until other ones are given, or the configuration's own are changed.
+        """
+        made_from = self._made_from("assess", requirements) if self.done("assess") else None
+        blocks = [as_json(vars(one)) for one in requirements]
+        own = [as_json(vars(one)) for one in self.config.requirements()]
+        with self.store.amended("assess", *(made_from or ())) as facts:
+            yield
+            facts.pop("requirements", None)
+            if blocks != own:
+                facts["requirements"] = blocks
 
     # -- summary ----------------------------------------------------------------------------------
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Content of summary.json so far."""
-        path = self / "summary.json"
-        if not path.exists():
-            return {"schema": SCHEMA}
-        try:
-            return json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise InputError("cannot be read", where=str(path), do="run the stage again") from error
+        """Sections of summary.json so far."""
+        return {} if self._planned is not None else self.store.summary
 
     def summarise(self, **sections: Any) -> None:
-        """Replace sections of summary.json."""
-        write_json(self / "summary.json", {**self.summary, **sections})
+        """Replace sections of summary.json, for the stage that is being made."""
+        self.store.summarise(**sections)
+
+    # -- the end ----------------------------------------------------------------------------------
+
+    def clear(self) -> None:
+        """Remove what a run wrote, and nothing else."""
+        pairs = part_files(self / PAIRS)
+        others = [path.relative_to(self.path).as_posix() for path in pairs]
+        # the last one may be of a command that came before the assessment
+        self.store.clear("config.toml", "bayesdist.log", *others, "catalogue_errors.h5")
 
 
-def _named(config: Config, base: Path) -> Path | list[Path]:
-    if config.campaign is not None:
-        return campaign_files(config, base)
-    if config.selfcal is not None:
-        return selfcal_files(config, base)
-    assert config.data is not None
-    names = config.data.matches
-    return base / names if isinstance(names, str) else [base / name for name in names]
-
-
-def _without_limits(config: Config) -> dict[str, Any]:
-    """A configuration without what may change when a run is resumed: its limits, and its seed,
-    which the command line may have given."""
-    out = config.model_dump()
-    for key in (*LIMITS, "seed"):
-        out["sampler"].pop(key)
-    return out
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python, the platform, and the packages that matter."""
-    out = {"python": sys.version.split()[0], "platform": platform.platform()}
-    out["bayesdist"] = __version__  # also where it runs from a source tree
-    out |= {name: metadata.version(name) for name in PACKAGES}
-    return out
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
+def _hashes(config: Config, base: Path) -> dict[str, str]:
+    """SHA-256 of every file that the configuration names, by its absolute path."""
+    named, others = named_files(config, base.resolve()), files_of_products(config, base.resolve())
+    return {str(f): sha256_of(f) for f in [*input_files(named), *others]}

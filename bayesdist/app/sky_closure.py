@@ -14,15 +14,16 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from bayesdist.app.file_positions import sky_of_header
-from bayesdist.app.session import Session
+from bayesdist.app.made_files import ProductInput
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky.tangent import sky_of_plane
+from bayesdist.diagnose.residuals.sample import StarSample
+from bayesdist.limits import SKY_CLOSURE
 
 __all__ = ["SkyClosure", "sky_closure"]
 
 Float = NDArray[np.float64]
 
-FAITHFUL = 1e-3  # of a pixel: a header that misses its own solution by more is wrong
 FALSE = 0.5  # probability above which a match is taken for a false one
 
 
@@ -74,7 +75,7 @@ class SkyClosure:
     @property
     def faithful(self) -> bool:
         """Whether the header is where the solution is."""
-        return self.solution <= FAITHFUL * self.pixel
+        return SKY_CLOSURE.met_by(self.solution / self.pixel)
 
     @property
     def level(self) -> int:
@@ -92,21 +93,24 @@ class SkyClosure:
         ]
 
 
-def sky_closure(session: Session, path: Path, chip: int) -> SkyClosure | None:
+def sky_closure(
+    product: ProductInput, stars: StarSample, path: Path, chip: int
+) -> SkyClosure | None:
     """Closure of a header as written; None where the stars are not on the sky, or none is left.
 
     Parameters
     ----------
-    session : Session
+    product : ProductInput
+    stars : StarSample
+        Some of those that were fitted.
     path : pathlib.Path
         Of the header.
     chip : int
         Its chip.  Of several exposures with frames only the first one counts, whose it is.
     """
-    point = session.tangent_point
+    point, solution = product.tangent_point, product.solution
     if point is None:
         return None
-    stars, solution = session.stars, session.solution
     table, model = stars.table, solution.model
     mine = stars.used & (np.array(table.chip_numbers)[table.chip] == chip)
     if model.n_frame:
@@ -122,7 +126,7 @@ def sky_closure(session: Session, path: Path, chip: int) -> SkyClosure | None:
         *sky_of_plane(table.u[mine] * arcsec, table.v[mine] * arcsec, point), unit="deg"
     )
     uv = model.predict(
-        solution.mean, x, y, chip=chip, **({} if model.time is None else {"epoch": session.epoch})
+        solution.mean, x, y, chip=chip, **({} if model.time is None else {"epoch": product.epoch})
     )
     own = SkyCoord(*sky_of_plane(*(uv.T * arcsec), point), unit="deg")
     east, north = true.spherical_offsets_to(at)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from bayesdist.app.margins import requirement_of
+from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number, table_text
-from bayesdist.app.session import Session
 
 __all__ = ["margins_text", "results_text"]
 
 
-def results_text(session: Session) -> str:
+def results_text(run: RunDirectory) -> str:
     """Budget, margins, verdict of the sampler, and where the report is."""
-    summary = session.run.summary
+    summary = run.summary
     c = summary["sampler"]
     state = (
         "converged"
@@ -19,7 +19,7 @@ def results_text(session: Session) -> str:
         else f"NOT CONVERGED: everything here is provisional ({'; '.join(c['reasons'])})"
     )
     parts = [
-        f"Error budget (rms over the detector, {session.posterior.unit})",
+        f"Error budget (rms over the detector, {summary['fit']['unit']})",
         table_text([{k: v for k, v in r.items() if k != "source"} for r in summary["budget"]], 3),
         "",
         "Margins",
@@ -28,7 +28,7 @@ def results_text(session: Session) -> str:
         f"Sampler: {state}; R-hat {number(c['rhat_max'], 5)}, ESS bulk {number(c['ess_bulk_min'])} "
         f"and tail {number(c['ess_tail_min'])}, {c['passes']} passes, {number(c['wall_s'], 3)} s",
         *(f"WARNING: {text}" for text in summary.get("warnings", [])),
-        f"Report:  {session.run / 'report.html'}",
+        f"Report:  {run / 'report.html'}",
     ]
     return "\n".join(parts)
 

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from bayesdist.app.config import load_requirements
 from bayesdist.app.dates import idle_dates
-from bayesdist.app.horizon import write_horizons
-from bayesdist.app.judging import assessed_horizons, margins_of
-from bayesdist.app.margins import margin_rows, write_margins
+from bayesdist.app.evaluation_files import save_margins
+from bayesdist.app.judging import margins_of, validity_periods_of
+from bayesdist.app.margins import margin_rows
+from bayesdist.app.results import open_results
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.session import Session
-from bayesdist.app.sessions import session_of
-from bayesdist.app.stages import require
 from bayesdist.app.summary_text import margins_text
 from bayesdist.assess import Margin, Requirement
 from bayesdist.errors import InputError
@@ -47,20 +44,18 @@ def validate(run: str | Path, requirements: str | Path) -> tuple[str, bool]:
         run cannot be judged by; its name is in the message.
     """
     asked = load_requirements(requirements)
-    with closing(session_of(RunDirectory.open(run))) as session:
-        require(session, "requirements", ("fit", "sample"))
+    directory = RunDirectory.open(run)
+    with open_results(directory) as results:
+        directory.require("requirements", ("fit", "sample"))
         with _named_after(requirements, asked):
-            margins = margins_of(session, asked)
-            horizons = assessed_horizons(session, asked)
-        before = _judgement(session)
-        write_margins(session, margins)
-        write_horizons(session, horizons)
-        if _judgement(session) != before:
-            session.run.outdate("report")
-        report = session.run / "report.html"
-        outdated = report.exists() and not session.run.done("report")
-        label = session.posterior.approximation
-    warnings = label, idle_dates(session.config, asked, str(requirements))
+            margins = margins_of(results, asked)
+            horizons = validity_periods_of(results, asked)
+        fit, posterior, gauge = results.fit, results.posterior, results.gauge_words
+        with directory.locked(), directory.judged_by(asked):
+            save_margins(directory, fit, posterior, gauge, margins, horizons)
+        report = directory / "report.html"
+        outdated = report.exists() and not directory.done("report")
+    warnings = posterior.approximation, idle_dates(results.config, asked, str(requirements))
     lines = [*_lines(margins), *(one.sentence for one in horizons)]
     lines += [f"WARNING: {text}" for text in warnings if text]
     if outdated:
@@ -79,13 +74,8 @@ def _named_after(path: str | Path, asked: Sequence[Requirement]) -> Iterator[Non
         raise type(error)(error.cause, where=f"{path}: {error.where}", do=error.do) from error
 
 
-def _judgement(session: Session) -> list[Any]:
-    """What the run says of its requirements."""
-    return [session.run.summary.get(key) for key in ("margins", "horizons")]
-
-
 def _lines(margins: Sequence[Margin]) -> Iterator[str]:
-    yield margins_text(margin_rows(tuple(margins)))
+    yield margins_text(margin_rows(margins))
     for m in margins:
         if m.verdict != "met":
             yield f"{m.requirement.name}: {m.verdict}: {m.reason}"

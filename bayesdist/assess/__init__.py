@@ -1,4 +1,4 @@
-"""What a solution is worth: uncertainty maps, error budget, margins against requirements."""
+"""Assessment of a solution: uncertainty maps, error budget, margins against requirements."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ _HOMES = {
     "bayesdist.assess.budget.detector": ("detector_budget", "error_budget"),
     "bayesdist.assess.domain": ("EvaluationDomain",),
     "bayesdist.assess.error_model": ("ErrorModel", "error_model"),
+    "bayesdist.assess.evaluation": ("Evaluation", "EvaluationSettings", "evaluate"),
     "bayesdist.assess.maps": ("UncertaintyMap", "uncertainty_map"),
     "bayesdist.assess.mosaic": ("chip_places",),
     "bayesdist.assess.requirements.margins": ("Margin", "Requirement", "check_requirements"),
-    "bayesdist.assess.solution": ("Solution",),
     "bayesdist.assess.statistics": ("STATISTICS", "field_statistic"),
     "bayesdist.assess.terms.given": ("TERM_KINDS", "UserTerm"),
     "bayesdist.assess.terms.local": ("LocalErrors",),

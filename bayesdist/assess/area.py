@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bayesdist.calibration.area import determinant
 from bayesdist.calibration.chip_map import chip_map
 from bayesdist.errors import InputError
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.solution import Solution
 from bayesdist.model.basis import point_blocks
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 

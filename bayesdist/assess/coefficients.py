@@ -21,19 +21,11 @@ Float = NDArray[np.float64]
 def coefficient_table(fit: LinearFit, posterior: Posterior | None = None) -> Table:
     """Every parameter of the model, with its uncertainties.
 
-    Parameters
-    ----------
-    fit : LinearFit
-    posterior : Posterior, optional
-
-    Returns
-    -------
-    astropy.table.Table
-        One row for each parameter and, behind them, one for each polynomial coefficient in
-        monomial form: coefficient of (x - xref)^i (y - yref)^j.  Columns: name, chip, axis, i, j,
-        form ('legendre', 'monomial', 'tdd' or 'frame'), value and sigma of least squares; with a
-        posterior also mean, sd, lo68, hi68, lo95, hi95, rhat, ess_bulk (of the sampled, that is
-        the Legendre form); unit.
+    Returns one row for each parameter and, behind them, one for each polynomial coefficient in
+    monomial form: coefficient of (x - xref)^i (y - yref)^j.  Columns: name, chip, axis, i, j, form
+    ('legendre', 'monomial', 'tdd' or 'frame'), value and sigma of least squares; with a posterior
+    also mean, sd, lo68, hi68, lo95, hi95, rhat, ess_bulk (of the sampled, that is the Legendre
+    form); unit.
     """
     model = fit.model
     blocks = [_Block.of(fit.mean, np.sqrt(np.diag(fit.cov)), posterior and posterior.flat)]

@@ -26,22 +26,12 @@ MIN_POSITIONS = 4  # of a region
 
 @dataclass(frozen=True)
 class WorstPosition:
-    """Where an error is largest.
+    """Position at which an error is largest."""
 
-    Parameters
-    ----------
-    chip : int
-        Number.
-    x, y : float
-        FITS 1-based pixels.
-    rms : float
-        Root mean square of the error there over the draws.
-    """
-
-    chip: int
-    x: float
+    chip: int  # number
+    x: float  # FITS 1-based pixels
     y: float
-    rms: float
+    rms: float  # root mean square of the error there over the draws
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,11 +183,11 @@ class EvaluationDomain:
         )
 
     def at(self, epoch: float | None) -> EvaluationDomain:
-        """The same positions at another epoch."""
+        """Domain of these positions at another epoch."""
         return replace(self, epoch=None if epoch is None else float(epoch))
 
     def on(self, chip: int) -> EvaluationDomain:
-        """Those of the positions that are on one chip."""
+        """Domain of the positions that are on one chip."""
         rows = self.chip == chip
         return replace(self, chip=self.chip[rows], x=self.x[rows], y=self.y[rows])
 

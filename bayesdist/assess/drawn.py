@@ -7,6 +7,8 @@ draws.
 
 from __future__ import annotations
 
+import zlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -14,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.domain import EvaluationDomain, WorstPosition
-from bayesdist.assess.judged_statistics import ErrorsOf, drawn_statistics
-from bayesdist.assess.solution import Solution
+from bayesdist.assess.statistics import ErrorsOf, drawn_statistics
 from bayesdist.assess.terms.forms import (
     PRODUCT,
     ErrorDraws,
@@ -26,9 +27,9 @@ from bayesdist.assess.terms.forms import (
     NoiseField,
     Row,
 )
-from bayesdist.assess.terms.seeds import generators
+from bayesdist.infer.solution import Solution
 
-__all__ = ["DrawnErrors"]
+__all__ = ["DrawnErrors", "generators"]
 
 Float = NDArray[np.float64]
 
@@ -36,28 +37,30 @@ BLOCK = 200_000  # positions times draws whose errors a thread holds at once
 MOST_PAIRS = 5000  # pairs of positions that stand for all: percentiles over them to about 1 %
 
 
+def generators(terms: Sequence[ErrorTerm], seed: int) -> list[np.random.Generator]:
+    """A generator for each term, by the name of its first row and how often that came before.
+
+    The draws of a term do not depend on what other terms there are.
+    """
+    seen: Counter[str] = Counter()
+    out = []
+    for term in terms:
+        name = term.rows[0].name
+        out.append(np.random.default_rng([seed, zlib.crc32(name.encode()), seen[name]]))
+        seen[name] += 1
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class DrawnErrors:
-    """Draws of everything that moves a position.
-
-    Parameters
-    ----------
-    solution : Solution
-    terms : tuple of ErrorTerm
-    draws : tuple of ErrorDraws
-        One for each term.
-    image : Image
-    n_draws : int
-    seed : int
-        Of the errors that are independent from position to position, and of the terms.
-    """
+    """Draws of everything that moves a position."""
 
     solution: Solution
     terms: tuple[ErrorTerm, ...]
-    draws: tuple[ErrorDraws, ...]
+    draws: tuple[ErrorDraws, ...]  # one for each term
     image: Image
     n_draws: int
-    seed: int
+    seed: int  # of the errors that are independent from position to position, and of the terms
     _kept: dict[EvaluationDomain, tuple[ErrorField, ...]] = field(default_factory=dict, repr=False)
 
     @property
@@ -76,14 +79,11 @@ class DrawnErrors:
         return tuple(row for one in self.at(domain) for row in one.rows)
 
     def treatments(self, grid: tuple[int, int] | None = None) -> tuple[DrawnErrors, ...]:
-        """The same draws with what may vary over the field varying: smoothly, and everywhere.
+        """Draws with what may vary over the field varying: smoothly, and everywhere.
 
         Nothing where no term may vary.
 
-        Parameters
-        ----------
-        grid : tuple of int, optional
-            Points of each chip over which a smooth field has its size.
+        `grid`: points of each chip over which a smooth field has its size.
         """
         model = self.solution.model
         others = [
@@ -112,25 +112,10 @@ class DrawnErrors:
     ) -> dict[str, Float]:
         """Statistics of each draw's error over the positions, or over pairs of them.
 
-        Parameters
-        ----------
-        domain : EvaluationDomain
-        names : sequence of str
-            Of `STATISTICS`.
-        scale : mapping of str to float, optional
-            Factors by which rows are multiplied.
-        n_draws : int, optional
-            The first so many of the draws; all by default.
-
-        Returns
-        -------
-        dict of str to ndarray, shape (n_draws,)
-
-        Raises
-        ------
-        InputError
-            For no pair of positions that near, a magnitude where no errors by magnitude are known,
-            and a missing epoch.
+        `names`: of `STATISTICS`. `scale`: factors by which rows are multiplied. `n_draws`: the
+        first so many of the draws; all by default. Returns (n_draws,). InputError for no pair of
+        positions that near, a magnitude where no errors by magnitude are known, and a missing
+        epoch.
         """
         (found,) = self.over_epochs(domain, (domain.epoch,), names, scale=scale, n_draws=n_draws)
         return found
@@ -144,20 +129,10 @@ class DrawnErrors:
         scale: Mapping[str, float] | None = None,
         n_draws: int | None = None,
     ) -> tuple[dict[str, Float], ...]:
-        """The same at several epochs, sooner than one by one.
+        """Statistics at several epochs, sooner than one by one.
 
-        Parameters
-        ----------
-        domain : EvaluationDomain
-        epochs : sequence of float or None
-            Decimal years.
-        names, scale, n_draws
-            As `statistics`.
-
-        Returns
-        -------
-        tuple of dict of str to ndarray, shape (n_draws,)
-            One for each epoch.
+        `epochs`: decimal years. `names`, `scale`, `n_draws`: as `statistics`. Returns (n_draws,),
+        one for each epoch.
         """
         pairs = domain.pairs()
         if pairs is not None and pairs.shape[1] > MOST_PAIRS:
@@ -167,7 +142,7 @@ class DrawnErrors:
             [self.errors(domain.positions.at(epoch), scale) for epoch in epochs],
             names,
             n_draws=n_draws or self.n_draws,
-            n_places=domain.size,
+            n_positions=domain.size,
             block=BLOCK,
             seed=self.seed,
             pairs=pairs,
@@ -177,11 +152,7 @@ class DrawnErrors:
     def worst(self, domain: EvaluationDomain, axis: str = "") -> WorstPosition:
         """The position at which the error is largest; of two, the one farther off.
 
-        Parameters
-        ----------
-        domain : EvaluationDomain
-        axis : {'', 'u', 'v'}
-            Of which axis; of both by default.
+        `axis`: one of '', 'u', 'v', of which axis; of both by default.
         """
         variance = sum(
             one.total()
@@ -207,12 +178,7 @@ class DrawnErrors:
     ) -> ErrorsOf:
         """Errors (d, N, 2) of some draws, given normal numbers for what is independent.
 
-        Parameters
-        ----------
-        domain : EvaluationDomain
-            Of positions, not of differences.
-        scale : mapping of str to float, optional
-            Factors by which rows are multiplied.
+        `domain`: of positions, not of differences. `scale`: factors by which rows are multiplied.
         """
         scale = scale or {}
         fields = self.at(domain)

@@ -6,24 +6,33 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from bayesdist.assess.adjusted import with_diagnosed_errors
 from bayesdist.assess.budget.budget import ErrorBudget, budget_of
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.drawn import DrawnErrors
-from bayesdist.assess.solution import Solution
+from bayesdist.assess.drawn import DrawnErrors, generators
+from bayesdist.assess.terms.correlated import Deviations, StructureErrors
 from bayesdist.assess.terms.forms import ErrorTerm, Image
 from bayesdist.assess.terms.given import Centroids, UserTerm
-from bayesdist.assess.terms.seeds import generators
+from bayesdist.assess.terms.local import LocalErrors, table_of
+from bayesdist.assess.terms.parameters import catalogue_terms
 from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.assess.units import pixel_scale_of
+from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError
+from bayesdist.infer import LinearFit, Posterior
+from bayesdist.infer.solution import Solution
+from bayesdist.model import LookupTable
 
-__all__ = ["ErrorModel", "error_model"]
+__all__ = ["ErrorModel", "error_model", "solution_with_errors"]
+
+Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorModel:
-    """What the error of a position is made of.
+    """All errors of a position: those of the solution, and independent terms.
 
     Parameters
     ----------
@@ -73,6 +82,41 @@ class ErrorModel:
         ]
         return DrawnErrors(solution, (self.solution, *self.terms), (one, *draws), image, n, seed)
 
+    def with_terms(self, *terms: ErrorTerm) -> ErrorModel:
+        """Error model with more terms; errors of centroids replace those that were there."""
+        known = self.terms
+        if any(isinstance(term, Centroids) for term in terms):
+            known = tuple(term for term in known if not isinstance(term, Centroids))
+        return replace(self, terms=(*known, *terms))
+
+    def structure_sigma(self, domain: EvaluationDomain) -> Float | None:
+        """Standard deviations (N, 2) of what the model leaves out; None where nothing is left."""
+        for term in self.terms:
+            if isinstance(term, StructureErrors) and term.left:
+                return term.sigma(domain)
+        return None
+
+    def local_tables(self, grid: tuple[int, int], epoch: float | None) -> tuple[LookupTable, ...]:
+        """Errors that belong to positions on the detector, as a table of each chip.
+
+        Parameters
+        ----------
+        grid : tuple of int
+            Points on x and y of each chip.
+        epoch : float or None
+            Decimal years.
+        """
+        model, out = self.solution.solution.model, []
+        for chip in model.chips:
+            domain = EvaluationDomain.of_chips(model, grid, chips=(chip.number,), epoch=epoch)
+            structure = self.structure_sigma(domain)
+            parts = [term.sigma(domain) for term in self.terms if isinstance(term, LocalErrors)]
+            parts += [] if structure is None else [structure]
+            if parts:
+                sigma = np.sqrt(sum(part**2 for part in parts)).reshape(grid[1], grid[0], 2)
+                out.append(table_of(chip.number, chip.size, sigma))
+        return tuple(out)
+
     def at(
         self, domain: EvaluationDomain, *, n: int = 4000, rng: np.random.Generator
     ) -> ErrorBudget:
@@ -90,20 +134,41 @@ class ErrorModel:
 
 def error_model(
     solution: Solution,
+    diagnostics: Diagnostics | None = None,
     terms: Sequence[ErrorTerm] = (),
     *,
+    hierarchy: LinearFit | None = None,
+    catalogue: str = "catalogue",
     aligned: bool = False,
+    single: bool = False,
+    frames: bool = False,
+    structure_left: bool = True,
     pixel_scale: float | None = None,
 ) -> ErrorModel:
-    """The error model of a solution.
+    """The error model of a solution, with what residuals say of it.
 
     Parameters
     ----------
     solution : LinearFit or Posterior
+    diagnostics : Diagnostics, optional
+        Its correlated errors, and what errors of the catalogue do, count in; the solution is then a
+        posterior as it was sampled.
     terms : sequence of ErrorTerm
-        A `SolutionErrors` among them says what of the solution's errors is shown by itself.
+        Other errors.  A `SolutionErrors` among them says what of the solution's errors is shown by
+        itself.
+    hierarchy : LinearFit, optional
+        Of a hierarchy of exposures: its covariance has no noise of draws.
+    catalogue : str
+        Name of the file that states the catalogue's errors.
     aligned : bool
         As of `ErrorModel`.
+    single : bool
+        Whether the star lies in a single exposure, whose deviation counts; else in the mean.
+    frames : bool
+        Whether errors of the exposures' frames follow the correlated errors.
+    structure_left : bool
+        Whether what the model leaves out at a position counts; not where errors of look-up tables
+        stand for it.
     pixel_scale : float, optional
         Size of one pixel in mas; `pixel_scale_of` the solution by default.
 
@@ -119,6 +184,14 @@ def error_model(
     if pixel_scale is None:
         pixel_scale = pixel_scale_of(solution)
     of_solution, others = SolutionErrors(solution), list[ErrorTerm]()
+    if diagnostics is not None:
+        assert isinstance(solution, Posterior)
+        of_solution = _with_diagnosed(solution, diagnostics, hierarchy, catalogue)
+        correlated = diagnostics.correlated
+        if correlated is not None and correlated.structure:
+            others.append(StructureErrors(correlated, frames, structure_left))
+        if correlated is not None and correlated.linear is not None:
+            others.append(Deviations(correlated, single, frames))
     for term in terms:
         if isinstance(term, SolutionErrors):
             of_solution = replace(term, solution=solution)
@@ -129,3 +202,26 @@ def error_model(
     if not any(isinstance(term, Centroids) for term in others):
         others.append(Centroids(None))  # a domain that names a magnitude asks for it
     return ErrorModel(of_solution, tuple(others), aligned)
+
+
+def _with_diagnosed(
+    posterior: Posterior, diagnostics: Diagnostics, hierarchy: LinearFit | None, catalogue: str
+) -> SolutionErrors:
+    """Errors of the parameters with those of the catalogue, and of the stars as they scatter."""
+    solution = with_diagnosed_errors(posterior, diagnostics, hierarchy, noise_alone=True)
+    if diagnostics.catalogue is None:
+        return SolutionErrors(solution)
+    terms = catalogue_terms(posterior, diagnostics.catalogue, catalogue)
+    return SolutionErrors(solution, posterior, terms)
+
+
+def solution_with_errors(
+    posterior: Posterior, diagnostics: Diagnostics | None, hierarchy: LinearFit | None = None
+) -> Posterior:
+    """Solution that is exported and shown: all errors of the parameters are in its draws.
+
+    `posterior`: as it was sampled. `hierarchy`: as of `error_model`.
+    """
+    if diagnostics is None:
+        return posterior
+    return with_diagnosed_errors(posterior, diagnostics, hierarchy)

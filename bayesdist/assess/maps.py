@@ -1,4 +1,4 @@
-"""How well a solution knows the position at every place of the detector."""
+"""Maps of the uncertainty of a solution's positions over the detector."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.solution import Solution, kind_of, place_of
+from bayesdist.assess.solution import place_of
 from bayesdist.calibration.chip_map import position_moments
+from bayesdist.infer.solution import Solution
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
 
-__all__ = ["RELATIVE", "SigmaMap", "UncertaintyMap", "uncertainty_map", "with_local"]
+__all__ = ["RELATIVE", "UncertaintyMap", "uncertainty_map", "with_local"]
 
 Float = NDArray[np.float64]
 
@@ -19,8 +20,8 @@ RELATIVE = "relative positions"
 
 
 @dataclass(frozen=True, eq=False)
-class SigmaMap:
-    """Standard deviations of a position over the detector.
+class UncertaintyMap:
+    """Standard deviation of the model's position over the detector.
 
     Parameters
     ----------
@@ -28,12 +29,26 @@ class SigmaMap:
     y : ndarray, shape (ny,)
         FITS 1-based pixels.
     sigma_u, sigma_v : ndarray, shape (ny, nx)
+        In `unit`.
+    correlation : ndarray, shape (ny, nx)
+        Between u and v; 0 where one of them is known exactly.
+    unit : str
+    chip : int
+    epoch : float or None
+        Decimal years.
+    kind : str
+        'least squares', 'posterior', or `RELATIVE`: the posterior without what the gauge decides.
     """
 
     x: Float
     y: Float
     sigma_u: Float
     sigma_v: Float
+    correlation: Float
+    unit: str
+    chip: int
+    epoch: float | None
+    kind: str
 
     @property
     def radius(self) -> Float:
@@ -50,31 +65,6 @@ class SigmaMap:
         """Pixel (x, y) of the largest radius."""
         return position_of_largest(self.radius, self.x, self.y)
 
-
-@dataclass(frozen=True, eq=False)
-class UncertaintyMap(SigmaMap):
-    """Standard deviation of the model's position over the detector.
-
-    Parameters
-    ----------
-    x, y, sigma_u, sigma_v
-        As `SigmaMap`; sigmas in `unit`.
-    correlation : ndarray, shape (ny, nx)
-        Between u and v; 0 where one of them is known exactly.
-    unit : str
-    chip : int
-    epoch : float or None
-        Decimal years.
-    kind : str
-        'least squares', 'posterior', or `RELATIVE`: the posterior without what the gauge decides.
-    """
-
-    correlation: Float
-    unit: str
-    chip: int
-    epoch: float | None
-    kind: str
-
     @property
     def sigma_u_max(self) -> float:
         """Largest sigma_u."""
@@ -89,15 +79,7 @@ class UncertaintyMap(SigmaMap):
 def with_local(found: UncertaintyMap, sigma: Float | None) -> UncertaintyMap:
     """A map with what the model leaves out at each position; itself where that is not known.
 
-    Parameters
-    ----------
-    found : UncertaintyMap
-    sigma : ndarray, shape (ny nx, 2), or None
-        Of u and v at the points of the map.
-
-    Returns
-    -------
-    UncertaintyMap
+    `sigma`: (ny nx, 2), of u and v at the points of the map.
     """
     if sigma is None:
         return found
@@ -158,5 +140,5 @@ def uncertainty_map(
         unit=solution.model.unit,
         chip=place.chip.number,
         epoch=place.epoch,
-        kind=kind_of(solution),
+        kind=solution.kind,
     )

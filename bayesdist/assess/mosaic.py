@@ -1,11 +1,12 @@
-"""How the chips of a detector lie beside each other."""
+"""Arrangement of the chips of a detector."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.solution import place_of
+from bayesdist.infer.solution import Solution
 
 __all__ = ["chip_places"]
 
@@ -15,17 +16,9 @@ Float = NDArray[np.float64]
 def chip_places(solution: Solution, *, epoch: float | None = None) -> tuple[tuple[int, int], ...]:
     """Row and column of each chip in a drawing of the detector, along the axes of the first chip.
 
-    Parameters
-    ----------
-    solution : LinearFit or Posterior
-    epoch : float, optional
-        Decimal years; needed by a model with time dependence.
-
-    Returns
-    -------
-    tuple of (int, int)
-        In the order of the model's chips; row 0 is the one on top (largest y), column 0 the one at
-        the left.  No two chips have the same place: where they overlap, all stand in one column.
+    `epoch`: decimal years; needed by a model with time dependence. The result is in the order of
+    the model's chips; row 0 is the one on top (largest y), column 0 the one at the left.  No two
+    chips have the same place: where they overlap, all stand in one column.
     """
     chips = solution.model.chips
     centres, gradient = [], None
@@ -48,7 +41,7 @@ def chip_places(solution: Solution, *, epoch: float | None = None) -> tuple[tupl
 
 
 def _ranks(values: Float, least: float) -> list[int]:
-    """Which of the groups, from the lowest, each value is in; groups lie `least` apart."""
+    """Group of each value, counted from the lowest; groups lie `least` apart."""
     order = np.argsort(values, kind="stable")
     new = np.diff(values[order]) > least
     ranks = np.empty(len(values), np.int64)

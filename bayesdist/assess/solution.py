@@ -1,4 +1,4 @@
-"""What a solution is to this package, and what it says at one place.
+"""A solution at one place, where it is one polynomial.
 
 At one chip, epoch and exposure the whole model is a single polynomial of the pixel position, so
 maps, budgets and margins carry 2 K coefficients and their covariance instead of one Jacobian row
@@ -13,35 +13,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, DistortionModel, Groups, PolynomialBasis
 
-__all__ = ["Place", "Solution", "kind_of", "place_of"]
+__all__ = ["Place", "place_of"]
 
 Float = NDArray[np.float64]
 
 
-def kind_of(solution: Solution) -> str:
-    """'posterior' for a solution whose convergence was judged, else 'least squares'."""
-    return "posterior" if hasattr(solution, "convergence") else "least squares"
-
-
 @dataclass(frozen=True, eq=False)
 class Place:
-    """One chip at one epoch in one exposure, where the model is one polynomial.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    group : Groups
-        The single group of this place.
-    epoch : float or None
-        Decimal years, as asked for.
-    """
+    """One chip at one epoch in one exposure, where the model is one polynomial."""
 
     model: DistortionModel
-    group: Groups
-    epoch: float | None
+    group: Groups  # the single group of this place
+    epoch: float | None  # decimal years, as asked for
 
     @property
     def chip(self) -> Chip:
@@ -79,24 +65,9 @@ def place_of(
 ) -> Place:
     """The place of a chip, an epoch and an exposure.
 
-    Parameters
-    ----------
-    model : DistortionModel
-    epoch : float, optional
-        Decimal years; needed by a model with time dependence.
-    exposure : int or str, optional
-        Code or name; the gauge exposure by default.
-    chip : int, optional
-        Chip number; the first chip by default.
-
-    Returns
-    -------
-    Place
-
-    Raises
-    ------
-    InputError
-        For an unknown chip or exposure, or a missing or infinite epoch.
+    `epoch`: decimal years; needed by a model with time dependence. `exposure`: code or name; the
+    gauge exposure by default. `chip`: chip number; the first chip by default. InputError for an
+    unknown chip or exposure, or a missing or infinite epoch.
     """
     if epoch is not None and not np.isfinite(epoch):
         raise InputError(f"the epoch is {epoch}", do="give it in decimal years")

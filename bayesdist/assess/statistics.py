@@ -1,23 +1,34 @@
-"""Statistics that turn an error field into one number."""
+"""Statistics that turn an error field into one number, for all draws in blocks."""
 
 from __future__ import annotations
 
 import functools
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.names import require_known
+from bayesdist.names import require_known
 
-__all__ = ["STATISTICS", "extent", "field_statistic"]
+__all__ = ["STATISTICS", "ErrorsOf", "drawn_statistics", "extent", "field_statistic"]
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
 _PERCENTILES = {"p50": 50.0, "p68": 68.0, "p90": 90.0, "p95": 95.0, "p99": 99.0}
 _DIRECTIONS = 64  # over half a turn
 _BASE = ("max", "rms", "mean", *_PERCENTILES)
 
 STATISTICS = (*_BASE, *(f"u_{s}" for s in _BASE), *(f"v_{s}" for s in _BASE))
+
+
+# the errors (rows, N, 2) of some draws, from standard normal ones of that shape for what is
+# independent from position to position
+ErrorsOf = Callable[[slice, Float], Float]
+
+ROWS = 16  # draws whose noise comes from one generator: so that blocks do not change it
 
 
 def field_statistic(name: str, error: Float) -> Float:
@@ -57,16 +68,9 @@ def field_statistic(name: str, error: Float) -> Float:
 def extent(name: str, error: Float) -> Float:
     """Largest difference between the errors at any two points.
 
-    Parameters
-    ----------
-    name : {'max', 'u_max', 'v_max'}
-    error : ndarray, shape (..., N, 2)
-
-    Returns
-    -------
-    ndarray, shape (...)
-        Of both axes the largest extent along any of 64 directions, which falls short of the largest
-        distance by 0.03 % at most.
+    `name`: one of 'max', 'u_max', 'v_max'. `error`: (..., N, 2). Returns (...), of both axes the
+    largest extent along any of 64 directions, which falls short of the largest distance by 0.03 %
+    at most.
     """
     axis = name.removesuffix("max").rstrip("_")
     if axis:
@@ -74,3 +78,54 @@ def extent(name: str, error: Float) -> Float:
     angles = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     along = (np.ptp(error @ [np.cos(a), np.sin(a)], axis=-1) for a in angles)
     return functools.reduce(np.maximum, along)
+
+
+def drawn_statistics(
+    errors: Sequence[ErrorsOf],
+    names: Sequence[str],
+    *,
+    n_draws: int,
+    n_positions: int,
+    block: int,
+    seed: int,
+    pairs: Int | None = None,
+    over_all: bool = False,
+) -> tuple[dict[str, Float], ...]:
+    """Statistics of each draw's errors, of several errors with the same noise.
+
+    `names`: of `STATISTICS`. `block`: positions times draws that a thread holds at once. `seed`: of
+    the noise. `pairs`: (2, P), pairs of positions whose differences are judged; the positions by
+    default. `over_all`: True if largest differences are those of all positions, not of `pairs`.
+    Returns (n_draws,), one for each of the errors.
+    """
+    width = max(n_positions, 0 if pairs is None else pairs.shape[1])
+    step = ROWS * max(1, block // (ROWS * width))
+
+    def one(name: str, error: Float, seen: Float) -> Float:
+        if over_all and name.endswith("max"):
+            return extent(name, error)
+        return field_statistic(name, seen)
+
+    def found(start: int) -> list[list[Float]]:
+        rows = slice(start, min(start + step, n_draws))
+        noise, out = _noise(seed, rows, n_positions), []
+        for error_of in errors:
+            error = error_of(rows, noise)
+            seen = error if pairs is None else error[:, pairs[0]] - error[:, pairs[1]]
+            out.append([one(name, error, seen) for name in names])
+        return out
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        blocks = list(pool.map(found, range(0, n_draws, step)))
+    return tuple(
+        {name: np.concatenate([b[e][k] for b in blocks]) for k, name in enumerate(names)}
+        for e in range(len(errors))
+    )
+
+
+def _noise(seed: int, rows: slice, n_positions: int) -> Float:
+    """Standard normal numbers (rows, N, 2), those of a draw the same in any block."""
+    shape = ROWS, n_positions, 2
+    starts = range(rows.start, rows.stop, ROWS)
+    out = [np.random.default_rng((seed, k)).standard_normal(shape) for k in starts]
+    return np.concatenate(out)[: rows.stop - rows.start]

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 
-from bayesdist.assess.names import require_known
-from bayesdist.assess.solution import Solution
 from bayesdist.data.tables.units import UNITS
 from bayesdist.errors import InputError
+from bayesdist.infer.solution import Solution
+from bayesdist.limits import PIXEL_SIZE
+from bayesdist.names import require_known
 
 __all__ = ["UNITS", "convert", "pixel_doubt", "pixel_scale_of", "require_scale"]
-
-PIXELS_OF_ONE_KIND = 3.0  # factor by which two kinds of pixels differ at most
 
 _MAS = {"mas": 1.0, "arcsec": 1e3, "deg": 3.6e6}
 
@@ -58,12 +57,7 @@ def convert(
 
 
 def require_scale(scale_mas: float) -> None:
-    """Pass a pixel scale that is positive and finite.
-
-    Raises
-    ------
-    InputError
-    """
+    """Pass a pixel scale that is positive and finite."""
     if not (math.isfinite(scale_mas) and scale_mas > 0):
         raise InputError(
             f"the pixel scale is {scale_mas} mas",
@@ -77,24 +71,10 @@ def pixel_scale_of(
 ) -> float | None:
     """Size of one pixel, in mas.
 
-    Parameters
-    ----------
-    solution : LinearFit or Posterior
-    chip : int, optional
-        Chip number; the first chip by default.
-    scale_mas : float, optional
-        The scale where the user gives it; it is returned as it is.
-
-    Returns
-    -------
-    float or None
-        In mas per pixel.  Without `scale_mas`: where u and v are angles, the square root of the
-        pixel area at the reference pixel, without drift and frames; where they are pixels, None.
-
-    Raises
-    ------
-    InputError
-        For an unknown chip or a scale that is not positive.
+    `chip`: chip number; the first chip by default. `scale_mas`: the scale where the user gives it;
+    it is returned as it is. The result is in mas per pixel.  Without `scale_mas`: where u and v are
+    angles, the square root of the pixel area at the reference pixel, without drift and frames;
+    where they are pixels, None. InputError for an unknown chip or a scale that is not positive.
     """
     if scale_mas is not None:
         require_scale(scale_mas)
@@ -106,21 +86,12 @@ def pixel_scale_of(
 
 
 def pixel_doubt(solution: Solution) -> str:
-    """Doubt about u and v that are called pixels and are not, as a clause; empty without one.
-
-    Parameters
-    ----------
-    solution : LinearFit or Posterior
-
-    Returns
-    -------
-    str
-    """
+    """Doubt about u and v that are called pixels and are not, as a clause; empty without one."""
     model = solution.model
     if model.unit != "pix":
         return ""
     size = model.linear_scale(solution.mean)
-    if 1 / PIXELS_OF_ONE_KIND <= size <= PIXELS_OF_ONE_KIND:
+    if 1 / PIXEL_SIZE.value <= size <= PIXEL_SIZE.value:
         return ""
     return (
         f"u and v are called pixels, and one pixel of x, y is {size:.4g} of theirs: if they are "

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from bayesdist.assess.names import require_known
 from bayesdist.assess.solution import Place, Solution, place_of
 from bayesdist.errors import InputError
 from bayesdist.model.basis import point_blocks
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
+from bayesdist.names import require_known
 
 __all__ = ["PARTS", "VectorMap", "distortion_vectors"]
 
@@ -154,7 +154,7 @@ def _linear_part(place: Place, polynomial: Float) -> Float:
 
 
 def _reference(place: Place, polynomial: Float) -> tuple[Float, str]:
-    """What the array position is compared with: the identity or the best similarity, and a note."""
+    """Positions that distortion is shown against, by identity or best similarity, and a note."""
     scale, angle, parity = _best_similarity(place, polynomial)
     turn = scale * np.exp(1j * angle)
     if place.model.unit == "pix" and parity > 0 and abs(turn - 1.0) < NEAR_IDENTITY:

@@ -17,10 +17,17 @@ from bayesdist.calibration.chip_map import ChipMap, sampling_of
 from bayesdist.calibration.inverse import ExplicitInverse
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
-from bayesdist.infer.transforms import Solution, View, without_frames
+from bayesdist.infer.solution import Solution
+from bayesdist.infer.transforms import without_frames
 from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence, corrected
 
-__all__ = ["Calibration", "calibration_of", "calibration_of_maps", "gaussian_solution"]
+__all__ = [
+    "Calibration",
+    "GaussianSolution",
+    "as_calibration",
+    "calibration_of",
+    "calibration_of_maps",
+]
 
 Float = NDArray[np.float64]
 
@@ -224,24 +231,16 @@ class Calibration:
 
 
 @dataclass(frozen=True, eq=False)
-class Gaussian:
-    """Normal distribution of parameters that are known by their mean and covariance alone."""
+class GaussianSolution(Solution):
+    """Solution with a normal distribution of its parameters, of which nothing else is known."""
 
+    model: DistortionModel
     mean: Float
     cov: Float
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
         """Parameter vectors, shape (n, D)."""
         return rng.multivariate_normal(self.mean, self.cov, size=n, method="eigh")
-
-
-def gaussian_solution(model: DistortionModel, mean: Float, cov: Float) -> View:
-    """Solution from its mean and covariance."""
-    return View(model, mean, cov, Gaussian(mean, cov), _same)  # type: ignore[arg-type]
-
-
-def _same(theta: Float) -> Float:
-    return theta
 
 
 def calibration_of(
@@ -275,6 +274,11 @@ def calibration_of(
         scale=size,
         scale_from=source,
     )
+
+
+def as_calibration(one: Solution | Calibration) -> Calibration:
+    """Calibration of a solution; a calibration as it is."""
+    return one if isinstance(one, Calibration) else calibration_of(one)
 
 
 def calibration_of_maps(
@@ -316,7 +320,7 @@ def calibration_of_maps(
         cov, errors = np.zeros((model.n_params, model.n_params)), "none"
     return Calibration(
         name,
-        gaussian_solution(model, mean, cov),
+        GaussianSolution(model, mean, cov),
         errors=errors,
         reference_date=reference_date if time is not None else None,
         **what,  # type: ignore[arg-type]

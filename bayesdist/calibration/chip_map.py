@@ -14,7 +14,7 @@ from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.solution import Solution
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.basis import point_blocks
 
@@ -202,7 +202,7 @@ class ChipMap:
 
 def sampling_of(solution: Solution) -> tuple[float, tuple[str, ...]]:
     """Effective number of draws behind a solution's covariance, and notes on these."""
-    convergence = getattr(solution, "convergence", None)
+    convergence = solution.convergence
     if convergence is None:
         return np.inf, ()
     notes = () if convergence.converged else ("has not converged",)

@@ -1,4 +1,4 @@
-"""A calibration oriented by another one, or by an aperture, with the error of that."""
+"""A calibration oriented by another one, with the error of that."""
 
 from __future__ import annotations
 
@@ -12,29 +12,16 @@ from bayesdist.calibration.plane import ARCSEC, Agreement, Orientation, Plane
 from bayesdist.calibration.similarity import correlations
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.compare.frame_fields import term_squares
-from bayesdist.infer.transforms import Derived, Solution
+from bayesdist.infer.solution import DerivedSolution, Solution
 from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.similarity import turned, turned_model
 
-__all__ = ["Aperture", "lay_on", "lay_on_aperture", "oriented"]
+__all__ = ["lay_on", "oriented"]
 
 Float = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 GRID = (33, 17)  # points on which the largest distance is sought
-
-
-@dataclass(frozen=True)
-class Aperture:
-    """Position of an aperture, in the terms of the Science Instrument Aperture File."""
-
-    name: str  # as "JWFC2FIX"
-    v2_ref: float  # V2Ref, arcsec
-    v3_ref: float  # V3Ref, arcsec
-    v3_idl_y_angle: float  # of the ideal Y axis from V3 towards V2, degrees
-    v_idl_parity: int  # 1 or -1
-    reference_pixel: tuple[float, float]  # of the chip, at (V2Ref, V3Ref), FITS 1-based
-    source: str = "given as numbers"  # of the numbers
 
 
 def lay_on(
@@ -68,8 +55,13 @@ def lay_on(
     reference that cannot be evaluated, a scale that is not positive, or u, v mirrored against x, y;
     DegenerateError when the calibration maps the chip to one point.
     """
-    _check_epoch(calibration, epoch)
     model = calibration.model
+    if model.time is not None and epoch is None:
+        raise InputError(
+            "the solution depends on time and no epoch is given",
+            where="epoch",
+            do="give the decimal year at which it is laid on the reference",
+        )
     size = model.chips[model.chip_code(chip)].size
     other = reference.model.chips[reference.model.chip_code(chip)].size
     if tuple(size) != tuple(other):
@@ -95,7 +87,11 @@ def lay_on(
             do="check its linear terms",
         )
     if abs(flipped) > abs(S):
-        raise _mirrored(reference.name)
+        raise InputError(
+            "u, v are mirrored against the detector's x, y",
+            where=reference.name,
+            do="let u run with x and v with y, or change the sign of one of them",
+        )
     dS = (weight * w) @ slopes.conj()
     held = _held_scale(model.unit, scale_arcsec)
     if held is None:
@@ -125,76 +121,6 @@ def lay_on(
         source=f"chip {chip} laid on {reference.name.rpartition('/')[2]}"
         + ("" if epoch is None else f" at {epoch:g}"),
         agreement=agreement,
-    )
-
-
-def lay_on_aperture(
-    calibration: Calibration,
-    aperture: Aperture,
-    *,
-    parity: tuple[int, int],
-    chip: int = 2,
-    epoch: float | None = None,
-    scale_arcsec: float | None = None,
-    scale_sigma: float = 0.0,
-    sigma_position: float,
-    sigma_angle_deg: float,
-) -> Orientation:
-    """Similarity from a calibration to an aperture, with its error.
-
-    The aperture's reference point goes to (V2Ref, V3Ref), and the detector's y axis there lies
-    along the ideal Y axis, which is at V3IdlYAngle from V3 towards V2.  `parity` is the sense of V2
-    and V3 against the axes of the aperture, `chip` that of its reference pixel; scale as for
-    `lay_on`, needed for u, v in pixels.  The errors of V2Ref and V3Ref [arcsec] and of V3IdlYAngle
-    [deg] are not stated by the aperture file.
-
-    InputError for a missing epoch or scale, a parity other than the aperture's, or u, v mirrored
-    against x, y.
-    """
-    _check_epoch(calibration, epoch)
-    where = f"aperture {aperture.name}"
-    if aperture.v_idl_parity != parity[0] * parity[1]:
-        raise InputError(
-            f"VIdlParity is {aperture.v_idl_parity}, and that of the detector is "
-            f"{parity[0] * parity[1]}",
-            where=where,
-            do="give an aperture of that detector",
-        )
-    held = _held_scale(calibration.unit, scale_arcsec)
-    if held is None:
-        raise InputError(
-            "an aperture gives no scale for u and v in pixels",
-            where="scale_arcsec",
-            do="give the arcseconds of one pixel of u, v",
-        )
-    basis = calibration.model.basis(chip)
-    z, slopes = _complex(*calibration.coefficients(chip, epoch), basis.n_terms)
-    x, y = ([v] for v in aperture.reference_pixel)
-    phi, (by_x, by_y) = basis.evaluate(x, y)[0], (g[0] for g in basis.gradient(x, y))
-    point, along_x, along_y = z @ phi, z @ by_x, z @ by_y
-    if (np.conj(along_x) * along_y).imag <= 0:
-        raise _mirrored(where)
-    a = np.deg2rad(aperture.v3_idl_y_angle)
-    wanted = complex(parity[0] * np.sin(a), parity[1] * np.cos(a))
-    angle = float(np.angle(wanted / along_y))
-    b = held * np.exp(1j * angle)
-    d_log = -1j * np.imag(by_y @ slopes / along_y)
-    shift = -b * point
-    d_shift = -b * d_log * point - b * (phi @ slopes)
-    return Orientation(
-        angle=angle,
-        scale=held,
-        shift=np.array([shift.real, shift.imag]),
-        v2v3=(aperture.v2_ref, aperture.v3_ref),
-        reference_cov=_cov_about(
-            b * point,
-            sigma_position**2,
-            (scale_sigma / held) ** 2,
-            np.deg2rad(sigma_angle_deg) ** 2,
-        ),
-        derivative=np.stack([d_shift.real, d_shift.imag, d_log.real, d_log.imag]),
-        base=calibration.solution,
-        source=f"chip {chip} laid on aperture {aperture.name} ({aperture.source})",
     )
 
 
@@ -245,7 +171,7 @@ def oriented(calibration: Calibration, orientation: Orientation) -> Calibration:
 
 
 @dataclass(frozen=True, eq=False)
-class _Oriented(Derived):
+class _Oriented(DerivedSolution):
     """Solution in the plane of an aperture: each draw turned by a draw of the orientation."""
 
     model: DistortionModel
@@ -267,9 +193,6 @@ class _Oriented(Derived):
         turn = o.scale * np.exp(moved[:, 2] + 1j * (o.angle + moved[:, 3]))
         shift = complex(*o.shift) + moved[:, 0] + 1j * moved[:, 1]
         return turned(self.source.model, theta, turn, shift)
-
-
-# -- parts of both ways ---------------------------------------------------------------------------
 
 
 def _complex(coefficients: Float, jacobian: Float, n_terms: int) -> tuple[Complex, Complex]:
@@ -297,15 +220,6 @@ def _agreement(left: Complex, basis: PolynomialBasis) -> Agreement:
     )
 
 
-def _check_epoch(calibration: Calibration, epoch: float | None) -> None:
-    if calibration.model.time is not None and epoch is None:
-        raise InputError(
-            "the solution depends on time and no epoch is given",
-            where="epoch",
-            do="give the decimal year at which it is laid on the reference",
-        )
-
-
 def _held_scale(unit: str, scale_arcsec: float | None) -> float | None:
     """Arcseconds in one unit of u, v, or None where it is to be fitted."""
     if scale_arcsec is None:
@@ -315,15 +229,6 @@ def _held_scale(unit: str, scale_arcsec: float | None) -> float | None:
             f"the scale is {scale_arcsec}", where="scale_arcsec", do="give a positive number"
         )
     return float(scale_arcsec)
-
-
-def _mirrored(where: str) -> InputError:
-    """Error of (u, v) that no rotation brings onto the axes of the aperture."""
-    return InputError(
-        "u, v are mirrored against the detector's x, y",
-        where=where,
-        do="let u run with x and v with y, or change the sign of one of them",
-    )
 
 
 def _cov_about(arm: complex, variance: float, log_scale: float, angular: float) -> Float:

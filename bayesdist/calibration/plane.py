@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.solution import Solution
 
 __all__ = ["ARCSEC", "Agreement", "Orientation", "Plane"]
 
@@ -46,7 +46,7 @@ class Orientation:
     derivative: Float  # (4, D), of these four by the parameters of `base`
     base: Solution  # solution without frames that was laid on the reference
     source: str  # the reference, as a clause for the file's HISTORY
-    agreement: Agreement | None = None  # None where the reference is a point and a direction
+    agreement: Agreement
 
     @property
     def cov(self) -> Float:

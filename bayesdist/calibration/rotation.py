@@ -22,7 +22,6 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
-from bayesdist.infer.transforms import View
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["coefficient_map", "is_exact", "pixel_matrix", "rotated"]
@@ -124,9 +123,7 @@ def rotated(
     def transform(theta: Float) -> Float:
         return np.asarray(theta, float) @ linear.T + shift
 
-    cov = linear @ np.asarray(solution.cov, float) @ linear.T
-    mean = transform(np.asarray(solution.mean, float))
-    turned = View(new, mean, (cov + cov.T) / 2, solution, transform)
+    turned = solution.transformed(new, transform, linear)
     return replace(calibration, solution=turned, plane=Plane(), with_plane=None, inverses={})
 
 

@@ -3,8 +3,8 @@
     image = LTM chip + LTV
 
 in FITS 1-based pixels, which is how stwcs, too, brings an image to its chip.  CENTERA and SIZAXIS
-serve for raw images only: they count overscan, and calibration changes SIZAXIS but not CENTERA, so
-that in calibrated images their corner is no longer that of the image.
+are not read: they count overscan, and calibration changes SIZAXIS but not CENTERA, so that in
+calibrated images their corner is no longer that of the image.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ __all__ = [
     "FULL",
     "Subarray",
     "subarray_at_corner",
-    "subarray_of_centre",
     "subarray_of_header",
     "subarrays_of_image",
 ]
@@ -68,20 +67,6 @@ FULL = Subarray()
 def subarray_at_corner(x: float, y: float) -> Subarray:
     """Subarray whose first pixel is pixel (x, y) of the chip, FITS 1-based."""
     return Subarray((1.0 - x, 1.0 - y))
-
-
-def subarray_of_centre(
-    centre: tuple[float, float],
-    size: tuple[int, int],
-    overscan: tuple[int, int] = (0, 0),
-) -> Subarray:
-    """Subarray of a raw image from its CENTERA and SIZAXIS.
-
-    CENTERA1, CENTERA2 are the pixel size // 2 + 1 of the image, counted on the raw chip; `overscan`
-    is the columns and rows in front of the chip's first pixel.
-    """
-    corner = [c - n // 2 - o for c, n, o in zip(centre, size, overscan, strict=True)]
-    return Subarray((1.0 - corner[0], 1.0 - corner[1]), size=size)
 
 
 def subarray_of_header(

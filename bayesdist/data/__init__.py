@@ -1,10 +1,9 @@
 """Input: matched positions, reference catalogues, and the matching of star lists with catalogues.
 
-`read_matches` reads any known kind of file, `read_rvb` WISE's pairs.  Each kind of file has a
-module of its own, and all of them end in a `MatchTable`, where units, errors and row numbers have
-been checked.  Tables that are larger than the memory are Parquet: `open_matches` leaves them on
-disk and gives `PartitionedMatches`, whose pieces are MatchTables; `write_partitioned` makes such
-files.
+`read_matches` reads any known kind of file.  Each kind has a module of its own, and all of them end
+in a `MatchTable`, where units, errors and row numbers have been checked.  Tables that are larger
+than the memory are Parquet: `open_matches` leaves them on disk and gives `PartitionedMatches`,
+whose pieces are MatchTables; `write_partitioned` makes such files.
 """
 
 from __future__ import annotations
@@ -44,10 +43,6 @@ _HOMES = {
     "bayesdist.data.reading.options": ("ReadOptions",),
     "bayesdist.data.reading.read": ("read_matches",),
     "bayesdist.data.reading.table": ("matches_from_table",),
-    "bayesdist.data.rvb": ("read_rvb", "rvb_bands", "stream_rvb"),
-    "bayesdist.data.rvb_accept": ("RadialLimit",),
-    "bayesdist.data.rvb_pairs": ("RvbPairs",),
-    "bayesdist.data.rvb_select": ("RvbSelection", "SelectedPairs"),
     "bayesdist.data.sky.earth": ("velocity_aberration",),
     "bayesdist.data.sky.tangent": ("mean_direction", "tangent_plane"),
     "bayesdist.data.starlists": (

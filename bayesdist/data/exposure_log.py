@@ -194,7 +194,8 @@ class ExposureLog:
                     do = "add it to the log"
                     if key == "vafactor":
                         do += (
-                            ", or compute it from epoch, ra and dec (campaign.aberration = 'earth')"
+                            ", or compute it from epoch, ra and dec "
+                            "(campaign.vafactor_source = 'earth')"
                         )
                     raise InputError(f"exposure {one.name} has no {key}", where=self.source, do=do)
 

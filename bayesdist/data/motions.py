@@ -173,7 +173,7 @@ def motion_error_line(catalog: ReferenceCatalog) -> MotionErrorLine:
             "has no magnitudes to tell badly measured motions by",
             where=catalog.source,
             do="give them, or one largest error for all, or keep all stars "
-            "(campaign.motions = 'all')",
+            "(campaign.pm_selection = 'all')",
         )
     count = int(np.clip(len(catalog) // _STARS_IN_BIN, 1, _MAX_BINS))
     parts = np.array_split(np.argsort(catalog.mag, kind="stable"), count)

@@ -21,7 +21,7 @@ Float = NDArray[np.float64]
 
 
 class PixelToSky(Protocol):
-    """What is asked of a WCS: astropy.wcs.WCS and stwcs' HSTWCS have it."""
+    """Method of a WCS that is needed: astropy.wcs.WCS and stwcs' HSTWCS have it."""
 
     def all_pix2world(self, pixels: Any, origin: int, /) -> Any:
         """Right ascension and declination (N, 2), degrees, of pixels (N, 2)."""

@@ -21,17 +21,7 @@ Int = NDArray[np.int64]
 def sums_over(cluster: Int, values: Float, n: int = 0) -> Float:
     """Sums of values over clusters.
 
-    Parameters
-    ----------
-    cluster : ndarray of int, shape (N,)
-        Numbered from 0.
-    values : ndarray, shape (N, ...)
-    n : int, optional
-        Clusters that there are at least.
-
-    Returns
-    -------
-    ndarray, shape (c, ...)
+    `cluster` (N,) counts from 0, `values` are (N, ...); there are at least `n` clusters.
     """
     columns = values.reshape(len(values), math.prod(values.shape[1:])).T
     sums = [np.bincount(cluster, column, n) for column in columns]
@@ -41,12 +31,7 @@ def sums_over(cluster: Int, values: Float, n: int = 0) -> Float:
 def add_over(total: Float, cluster: Int, values: Float) -> None:
     """Add values (N, ...) to the totals (c, ...) of their clusters, which may be few of many.
 
-    Parameters
-    ----------
-    total : ndarray, shape (c, ...)
-        Changed in place.
-    cluster : ndarray of int, shape (N,)
-    values : ndarray, shape (N, ...)
+    `total` is changed in place.
     """
     present, of = np.unique(cluster, return_inverse=True)
     total[present] += sums_over(of, values)
@@ -55,15 +40,7 @@ def add_over(total: Float, cluster: Int, values: Float) -> None:
 def joint_clusters(group: Int, cluster: Int) -> tuple[Int, Int]:
     """Group (c,) of each part of a cluster that lies in one group, and part (N,) of each value.
 
-    Parameters
-    ----------
-    group, cluster : ndarray of int, shape (N,)
-        Not negative.
-
-    Returns
-    -------
-    owner : ndarray of int, shape (c,)
-    of : ndarray of int, shape (N,)
+    `group` and `cluster` (N,) are not negative.
     """
     n = int(cluster.max(initial=0)) + 1
     keys, of = np.unique(group * n + cluster, return_inverse=True)
@@ -73,19 +50,7 @@ def joint_clusters(group: Int, cluster: Int) -> tuple[Int, Int]:
 def squares_over(cluster: Int, values: Float, group: Int | None = None, n: int = 1) -> Float:
     """Squares (n, ...) of the sums over clusters, added up in each group.
 
-    Parameters
-    ----------
-    cluster : ndarray of int, shape (N,)
-        Not negative.
-    values : ndarray, shape (N, ...)
-    group : ndarray of int, shape (N,), optional
-        One group by default.
-    n : int
-        Number of groups.
-
-    Returns
-    -------
-    ndarray, shape (n, ...)
+    `cluster` (N,) is not negative, `values` are (N, ...); one of `n` groups by default.
     """
     owner, of = joint_clusters(np.zeros_like(cluster) if group is None else group, cluster)
     return sums_over(owner, sums_over(of, values) ** 2, n)
@@ -94,16 +59,7 @@ def squares_over(cluster: Int, values: Float, group: Int | None = None, n: int =
 def products_over(group: Int, cluster: Int, values: Float, n: int) -> Float:
     """Products of sums of k values over groups and clusters, added up over the clusters.
 
-    Parameters
-    ----------
-    group, cluster : ndarray of int, shape (N,)
-    values : ndarray, shape (N, k)
-    n : int
-        Number of groups.
-
-    Returns
-    -------
-    ndarray, shape (k n, k n)
+    Matrix (k n, k n) for values (N, k) of n groups.
     """
     k = values.shape[1]
     rows = (group[:, None] * k + np.arange(k)).ravel()

@@ -8,7 +8,7 @@ from bayesdist.lazy import lazy_name
 
 _HOMES = {
     "bayesdist.infer.catalogue.by_magnitude": ("fit_by_magnitude",),
-    "bayesdist.infer.catalogue.star_errors": ("StarCovariance", "star_covariance"),
+    "bayesdist.infer.catalogue.star_errors": ("StarCovariance", "StarErrors", "star_covariance"),
     "bayesdist.infer.posterior.memberships": ("Memberships", "memberships"),
     "bayesdist.infer.equations.priors": ("GaussianPriors",),
     "bayesdist.infer.exposures.alone": ("ExposureSolutions", "fit_exposures"),
@@ -29,12 +29,11 @@ _HOMES = {
     "bayesdist.infer.posterior": ("Posterior", "SamplerInfo"),
     "bayesdist.infer.convergence": ("Convergence", "Limits"),
     "bayesdist.infer.sampler.sample": ("sample",),
+    "bayesdist.infer.solution": ("ReferenceGauge", "Solution", "TransformedSolution"),
     "bayesdist.infer.stars.mixture": ("OutlierMixture",),
     "bayesdist.infer.stars.shards": ("Compute", "Matches", "Shards", "load"),
     "bayesdist.infer.transforms": (
         "LinearTerms",
-        "ReferenceGauge",
-        "View",
         "linear_terms",
         "lines",
         "reference_gauge",

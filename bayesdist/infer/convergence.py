@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.limits import DRAWS_PER_WALKER
+
 __all__ = [
     "Convergence",
     "Limits",
@@ -24,8 +26,6 @@ __all__ = [
 ]
 
 Float = NDArray[np.float64]
-
-LEAST_PER_WALKER = 5.0  # effective draws that each walker must have made
 
 _COLUMNS = ("rhat", "ess_bulk", "ess_tail", "mcse_mean", "mcse_sd")
 
@@ -168,11 +168,11 @@ def diagnose(
     # every walker counts at least as one draw, even if it never moved: many walkers must not
     # compensate for walkers that do not mix
     each_walker = float(np.minimum(bulk, tail).min()) / (E * W)
-    if each_walker < LEAST_PER_WALKER:
+    if not DRAWS_PER_WALKER.met_by(each_walker):
         k = int(np.argmin(np.minimum(bulk, tail)))
         reasons.append(
             f"a walker has made {each_walker:.2g} effective draws of {names[k]} and must have made "
-            f"at least {LEAST_PER_WALKER:g}"
+            f"at least {DRAWS_PER_WALKER.value:g}"
         )
     return Convergence(
         names=names,

@@ -22,10 +22,10 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.errors import FormatError
 from bayesdist.files import atomic_path
 from bayesdist.infer.convergence import Convergence, Limits
-from bayesdist.infer.linear import Clip, LinearFit
-from bayesdist.infer.posterior import Posterior, SamplerInfo
-from bayesdist.infer.posterior.certificate import Certificate
+from bayesdist.infer.linear import LinearFit
+from bayesdist.infer.posterior import Certificate, Posterior, SamplerInfo
 from bayesdist.infer.posterior.memberships import memberships, star_log_likelihood
+from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.model import DistortionModel
 

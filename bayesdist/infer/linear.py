@@ -7,7 +7,7 @@ the corners.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -24,12 +24,13 @@ from bayesdist.infer.equations.normal import least_squares
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.rank import check_coverage, require_full_rank
 from bayesdist.infer.equations.scaled import scaled_cholesky
+from bayesdist.infer.solution import Solution
+from bayesdist.infer.stars.likelihood import Clip, ClippedGaussian
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
-from bayesdist.infer.transforms import Solution
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
-__all__ = ["Clip", "LinearFit", "Rejection", "build_model", "fit_linear", "residuals"]
+__all__ = ["LinearFit", "Rejection", "build_model", "fit_linear", "residuals"]
 
 Float = NDArray[np.float64]
 
@@ -62,28 +63,7 @@ NO_REJECTION = Rejection(np.inf, None)
 
 
 @dataclass(frozen=True, eq=False)
-class Clip:
-    """Limits on the residuals of the first pass, beyond which stars are left out of the second."""
-
-    theta: Float  # of the first pass
-    chi2_limit: float
-    abs_limit: float  # in the unit of u, v
-
-    def keeps(self, model: DistortionModel, matches: MatchTable) -> NDArray[np.bool_]:
-        """Boolean mask (N,) of a table's stars within both limits."""
-        stars, order = prepare(model, matches)
-        return in_table_order(self.keeps_of(stars), order).astype(bool)
-
-    def keeps_of(self, stars: Stars) -> NDArray[np.bool_]:
-        """Boolean mask (N,) of prepared stars within both limits, in their own order."""
-        residual = stars.residuals(self.theta)
-        chi2 = residual[:, 0] ** 2 / stars.var_u + residual[:, 1] ** 2 / stars.var_v
-        r2 = (residual**2).sum(axis=1)
-        return np.asarray((chi2 <= self.chi2_limit) & (r2 <= self.abs_limit**2))
-
-
-@dataclass(frozen=True, eq=False)
-class LinearFit:
+class LinearFit(Solution):
     """A weighted least-squares solution with its formal covariance.
 
     Parameters
@@ -132,14 +112,9 @@ class LinearFit:
         )
 
     @property
-    def unit(self) -> str:
-        """Unit of u and v."""
-        return self.model.unit
-
-    @property
-    def sigma(self) -> Float:
-        """Formal sigma of each parameter."""
-        return np.sqrt(np.diag(self.cov))
+    def likelihood(self) -> ClippedGaussian:
+        """Normal errors of the stars in the second pass, at the mean."""
+        return ClippedGaussian(np.asarray(self.mean), self.clip)
 
     @property
     def n_rejected(self) -> int:
@@ -167,6 +142,10 @@ class LinearFit:
         ndarray, shape (n, D)
         """
         return self.mean + rng.standard_normal((n, len(self.mean))) @ self._root.T
+
+    def mapped(self, matrix: Float) -> LinearFit:
+        """Fit whose deviations from the mean are mapped by a matrix (D, D)."""
+        return replace(self, cov=matrix @ self.cov @ matrix.T)
 
 
 def build_model(
@@ -280,7 +259,7 @@ def _fitted(
 ) -> LinearFit:
     radial_weight = rejection.radial_weight
     check_coverage(model, shards.survey, priors.n_informative)
-    first = shards.sum(least_squares, None, None, np.inf, np.inf, radial_weight)
+    first = shards.sum(least_squares, None, None, radial_weight)
     theta = starting_point(first, model, priors)
     refuse_absorbed_drift(first, theta, model, priors)
     theta = gauss_newton(first, theta, model, priors)
@@ -294,8 +273,7 @@ def _fitted(
         if rejection.clip_abs is None
         else rejection.clip_abs * model.pixel_size(theta),
     )
-    rule = (clip.theta, clip.chi2_limit, clip.abs_limit, radial_weight)
-    second = shards.sum(least_squares, clip.theta, *rule)
+    second = shards.sum(least_squares, clip.theta, clip, radial_weight)
     n_used, n_far = int(second.scalars[0]), int(second.scalars[1])
     n_rejected = len(shards) - n_used
     if n_used * 2 + priors.n_informative < model.n_params or n_used < 0.05 * len(shards):
@@ -313,7 +291,7 @@ def _fitted(
     factor = matrix.factor()
     cov = factor.covariance()
     # at the solution: the statistics, and the squared weights that a sandwich needs
-    final = shards.sum(least_squares, theta, *rule, 2)
+    final = shards.sum(least_squares, theta, clip, radial_weight, 2)
     if radial_weight != 1.0:
         meat, _ = final.assemble(model, theta)
         cov = cov @ (meat + priors.matrix(model)).dense() @ cov

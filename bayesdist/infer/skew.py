@@ -17,8 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.linear import LinearFit
-from bayesdist.infer.posterior import Posterior
+from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["Skew", "skew_of"]
@@ -45,12 +44,12 @@ class Skew:
         return self.value / self.sigma if self.sigma > 0 else float("inf")
 
 
-def skew_of(solution: LinearFit | Posterior, *, chip: int | None = None) -> Skew:
+def skew_of(solution: Solution, *, chip: int | None = None) -> Skew:
     """Skew in a solution's linear terms, with its error.
 
     Parameters
     ----------
-    solution : LinearFit or Posterior
+    solution : Solution
         The error of a fit with extra weight in the corners is that of its sandwich covariance.
     chip : int, optional
         Chip number; the first chip by default.

@@ -1,29 +1,25 @@
 """Transformed solutions: in the reference gauge, in one segment, term by term.
 
-A view is a solution again: its draws are those of its source, transformed one by one, and its
+The result is a solution again: its draws are those of its source, transformed one by one, and its
 covariance is the source's through the exact Jacobian of that transformation at the mean.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
+from bayesdist.infer.solution import ReferenceGauge, Solution, TransformedSolution, root_of_diagonal
 from bayesdist.model import DistortionModel, TimeDependence
 from bayesdist.model.similarity import turned, turned_model
 
 __all__ = [
     "LINEAR_TERMS",
-    "Derived",
     "LinearTerms",
-    "ReferenceGauge",
-    "Solution",
-    "View",
+    "bare_model",
     "linear_terms",
     "lines",
     "reference_gauge",
@@ -35,109 +31,6 @@ Float = NDArray[np.float64]
 
 # constant, x and y of both axes as ACS ISR 2015-06 numbers them (Equations 1-2)
 LINEAR_TERMS = ("A_1", "A_2", "A_3", "B_1", "B_2", "B_3")
-
-
-class Solution(Protocol):
-    """A fit or a posterior: a model with values, their covariance, and draws of them."""
-
-    @property
-    def model(self) -> DistortionModel: ...
-
-    @property
-    def mean(self) -> Float: ...
-
-    @property
-    def cov(self) -> Float: ...
-
-    def draws(self, n: int, rng: np.random.Generator) -> Float: ...
-
-
-def _root_of_diagonal(cov: Float) -> Float:
-    """Standard deviations (D,), 0 where rounding leaves a fixed parameter's variance negative."""
-    return np.sqrt(np.maximum(np.diag(cov), 0.0))
-
-
-@dataclass(frozen=True)
-class ReferenceGauge:
-    """Rotation and shift that bring one chip to the reference gauge.
-
-        (u', v') = R(rotation) ((u, v) - shift)
-
-    Parameters
-    ----------
-    chip : int
-    epoch : float or None
-        Where the polynomials depend on time: the date at which the gauge holds.
-    rotation : float
-        Radians, from u towards v.
-    shift : tuple of float
-        In the unit of u, v.
-    sigma_rotation : float
-    sigma_shift : tuple of float
-        How well the data determine them.
-    """
-
-    chip: int
-    epoch: float | None
-    rotation: float
-    shift: tuple[float, float]
-    sigma_rotation: float
-    sigma_shift: tuple[float, float]
-
-
-class Derived:
-    """Base of solutions made from another one, whose sampler diagnostics they hand on."""
-
-    source: Solution
-
-    @property
-    def convergence(self) -> Any:
-        """Convergence of the source posterior; None for a fit."""
-        return self.source.convergence  # type: ignore[attr-defined]
-
-    @property
-    def approximation(self) -> str:
-        """Warning that the source posterior's draws are not exact; empty for a fit."""
-        return str(self.source.approximation)  # type: ignore[attr-defined]
-
-
-@dataclass(frozen=True, eq=False)
-class View(Derived):
-    """A solution transformed from another one.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    mean : ndarray, shape (D,)
-        The source's mean, transformed.
-    cov : ndarray, shape (D, D)
-    source : Solution
-    transform : callable
-        From parameters (..., D') of the source to (..., D).
-    gauge : ReferenceGauge, optional
-        Rotation and shift applied by `reference_gauge`.
-    """
-
-    model: DistortionModel
-    mean: Float
-    cov: Float
-    source: Solution
-    transform: Callable[[Float], Float]
-    gauge: ReferenceGauge | None = None
-
-    @property
-    def sigma(self) -> Float:
-        """Standard deviation of each parameter."""
-        return _root_of_diagonal(self.cov)
-
-    @property
-    def unit(self) -> str:
-        """Unit of u and v."""
-        return self.model.unit
-
-    def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Parameter vectors, shape (n, D): draws of the source, each transformed."""
-        return self.transform(np.asarray(self.source.draws(n, rng), float))
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +55,7 @@ class LinearTerms:
     @property
     def sigma(self) -> Float:
         """Standard deviation of each term."""
-        return _root_of_diagonal(self.cov)
+        return root_of_diagonal(self.cov)
 
     def select(self, *labels: str) -> LinearTerms:
         """Selected terms, in the order of the labels given.
@@ -181,7 +74,7 @@ class LinearTerms:
         return LinearTerms(labels, self.values[index], self.cov[np.ix_(index, index)])
 
 
-def _bare(model: DistortionModel) -> DistortionModel:
+def bare_model(model: DistortionModel) -> DistortionModel:
     """Model of the polynomials alone, whose parameters are the first ones of the full model."""
     return replace(
         model,
@@ -194,17 +87,7 @@ def _bare(model: DistortionModel) -> DistortionModel:
     )
 
 
-def _viewed(
-    source: Solution, model: DistortionModel, transform: Callable[[Float], Float], jacobian: Float
-) -> View:
-    """View by a transformation, given its Jacobian (D, n) by the source's first n parameters."""
-    n = jacobian.shape[1]
-    cov = jacobian @ np.asarray(source.cov, float)[:n, :n] @ jacobian.T
-    mean = transform(np.asarray(source.mean, float))
-    return View(model, mean, (cov + cov.T) / 2, source, transform)
-
-
-def without_frames(solution: Solution) -> View:
+def without_frames(solution: Solution) -> TransformedSolution:
     """The polynomials and their drift alone.
 
     Parameters
@@ -213,15 +96,15 @@ def without_frames(solution: Solution) -> View:
 
     Returns
     -------
-    View
+    TransformedSolution
         Of the polynomials as they are before the frames: those of the first exposure in gauge
         'first', those from which all exposures deviate in gauge 'held'.
     """
     n = solution.model.n_distortion
-    return _viewed(solution, _bare(solution.model), lambda theta: theta[..., :n], np.eye(n))
+    return solution.transformed(bare_model(solution.model), lambda theta: theta[..., :n], np.eye(n))
 
 
-def segment(solution: Solution, s: int) -> View:
+def segment(solution: Solution, s: int) -> TransformedSolution:
     """One segment of the time dependence, as a model without breaks, as one IDCTAB holds it.
 
     Parameters
@@ -232,7 +115,7 @@ def segment(solution: Solution, s: int) -> View:
 
     Returns
     -------
-    View
+    TransformedSolution
         Without frames; its coefficients are those at the segment's reference date.
 
     Raises
@@ -250,7 +133,7 @@ def segment(solution: Solution, s: int) -> View:
             if time is None
             else f"choose one of 0 to {time.n_segments - 1}",
         )
-    new = replace(_bare(model), time=TimeDependence(time.terms, (time.epoch0[s],)))
+    new = replace(bare_model(model), time=TimeDependence(time.terms, (time.epoch0[s],)))
     jacobian = np.zeros((new.n_params, model.n_distortion))
     jacobian[: model.n_polynomial, : model.n_polynomial] = np.eye(model.n_polynomial)
     for chip in model.chips:
@@ -262,10 +145,12 @@ def segment(solution: Solution, s: int) -> View:
                 rows = model.coefficient_slice(chip.number, "uv".index(axis))
                 jacobian[rows, first + 2 * s - 1] = model.drift_terms(chip.number)[t]
     n = model.n_distortion
-    return _viewed(solution, new, lambda theta: theta[..., :n] @ jacobian.T, jacobian)
+    return solution.transformed(new, lambda theta: theta[..., :n] @ jacobian.T, jacobian)
 
 
-def reference_gauge(solution: Solution, chip: int = 2, *, epoch: float | None = None) -> View:
+def reference_gauge(
+    solution: Solution, chip: int = 2, *, epoch: float | None = None
+) -> TransformedSolution:
     """Rotate and shift (u, v) so that one chip has A_1 = B_1 = 0 and A_3 = 0.
 
     The gauge of ACS ISR 2015-06, section 4.2: at the chip's reference pixel there is neither an
@@ -283,7 +168,7 @@ def reference_gauge(solution: Solution, chip: int = 2, *, epoch: float | None = 
 
     Returns
     -------
-    View
+    TransformedSolution
         Without frames; `gauge` has the rotation and shift.  A rotation makes a term that drifted on
         one axis drift on both, so both are in the model of the view.
 
@@ -292,7 +177,7 @@ def reference_gauge(solution: Solution, chip: int = 2, *, epoch: float | None = 
     InputError
         For an unknown chip.
     """
-    model = _bare(solution.model)
+    model = bare_model(solution.model)
     time = model.time
     if time is not None and epoch is None:
         epoch = time.epoch0[0]
@@ -324,8 +209,8 @@ def reference_gauge(solution: Solution, chip: int = 2, *, epoch: float | None = 
     jacobian += np.outer(turned(model, mean, 1j * turn, -1j * turn * shift), by_pose[0])
     for axis, unit in enumerate((1.0, 1j)):
         jacobian += np.outer(turned(model, none, turn, -turn * unit), by_pose[1 + axis])
-    view = _viewed(solution, turned_model(model), transform, jacobian)
-    sigma = _root_of_diagonal(by_pose @ np.asarray(solution.cov, float)[:n, :n] @ by_pose.T)
+    view = solution.transformed(turned_model(model), transform, jacobian)
+    sigma = root_of_diagonal(by_pose @ np.asarray(solution.cov, float)[:n, :n] @ by_pose.T)
     gauge = ReferenceGauge(
         chip=chip,
         epoch=epoch,
@@ -406,7 +291,7 @@ def _linear_jacobian(
     model: DistortionModel, chip: int | None, epoch: float | None
 ) -> tuple[tuple[str, ...], Float]:
     """Labels (k,) and the matrix (k, n) that maps the parameters to the linear terms."""
-    bare = _bare(model)
+    bare = bare_model(model)
     labels: list[str] = []
     rows = []
     for one in bare.chips:

@@ -1,1 +1,1 @@
-"""What belongs to one mission: it uses the core from outside, as anybody's own instrument would."""
+"""Missions: each uses the core from outside, as anybody's own instrument would."""

@@ -278,6 +278,61 @@ class DistortionModel(ParameterLayout):
             out[np.ix_(rows, np.arange(2), columns)] = np.einsum("nk,akm->nam", phi, d)
         return out
 
+    def slopes(
+        self,
+        theta: ArrayLike,
+        x: ArrayLike,
+        y: ArrayLike,
+        *,
+        epoch: ArrayLike | None = None,
+        exposure: ArrayLike | None = None,
+        chip: ArrayLike | None = None,
+    ) -> Float:
+        """Derivatives of the positions by the pixel.
+
+        Parameters
+        ----------
+        theta : array_like, shape (n_params,)
+        x, y, epoch, exposure, chip
+            As in `predict`.
+
+        Returns
+        -------
+        ndarray, shape (N, 2, 2)
+            [[du/dx, du/dy], [dv/dx, dv/dy]], in the unit of u, v per pixel.
+        """
+        px, py = np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(y))
+        groups = self.groups(px.size, epoch=epoch, exposure=exposure, chip=chip)
+        return self.linearised(theta, groups, px, py)[1]
+
+    def linearised(
+        self, theta: ArrayLike, groups: Groups, x: Float, y: Float
+    ) -> tuple[Float, Float]:
+        """Positions of pixels, and their derivatives by the pixel.
+
+        Parameters
+        ----------
+        theta : array_like, shape (n_params,)
+        groups : Groups
+            Of the pixels.
+        x, y : ndarray, shape (N,)
+
+        Returns
+        -------
+        position : ndarray, shape (N, 2)
+        slope : ndarray, shape (N, 2, 2)
+            As of `slopes`.
+        """
+        effective = self.effective(self._checked(theta), groups)
+        position, slope = np.empty((x.size, 2)), np.empty((x.size, 2, 2))
+        for g, rows in enumerate(groups.members()):
+            basis = self.bases[groups.chip[g]]
+            phi = basis.evaluate(x[rows], y[rows])
+            position[rows] = phi @ effective[g].T
+            for axis, D in enumerate(basis.derivatives):
+                slope[rows, :, axis] = phi @ (D @ effective[g].T)
+        return position, slope
+
     def pixel_size(self, theta: ArrayLike, chip: int | None = None) -> float:
         """Size of a pixel at a chip's reference pixel, in the unit of u, v.
 

@@ -26,6 +26,7 @@ __all__ = [
     "CHIP_DEVIATIONS",
     "DEVIATIONS",
     "FRAME_KINDS",
+    "LINEAR_MATRICES",
     "RIGID",
     "chip_matrix",
     "frame_matrix",
@@ -52,14 +53,13 @@ DEVIATIONS = ("scale", "shear_plus", "shear_cross")  # deviations of the detecto
 
 CHIP_DEVIATIONS = (*RIGID, *DEVIATIONS)  # of one chip against the reference chip
 
-# matrices that scale, shear_plus and shear_cross multiply
-_SHAPES = {
+# matrices that the linear parameters multiply near zero
+LINEAR_MATRICES = {
+    "rotation": np.array([[0.0, -1.0], [1.0, 0.0]]),
     "scale": np.array([[1.0, 0.0], [0.0, 1.0]]),
     "shear_plus": np.array([[1.0, 0.0], [0.0, -1.0]]),
     "shear_cross": np.array([[0.0, 1.0], [1.0, 0.0]]),
 }
-
-_QUARTER = np.array([[0.0, -1.0], [1.0, 0.0]])
 
 
 def frame_names(kind: str) -> tuple[str, ...]:
@@ -79,9 +79,9 @@ def _parts(kind: str, p: Float) -> tuple[Float, Float]:
     """Rotation (..., 2, 2), and the symmetric factor after it (..., 2, 2)."""
     names = frame_names(kind)
     behind = np.broadcast_to(np.eye(2), (*p.shape[:-1], 2, 2)).copy()
-    for name, shape in _SHAPES.items():
+    for name in DEVIATIONS:
         if name in names:
-            behind += p[..., names.index(name), None, None] * shape
+            behind += p[..., names.index(name), None, None] * LINEAR_MATRICES[name]
     angle = p[..., names.index("rotation")] if "rotation" in names else np.zeros(p.shape[:-1])
     return _rotation(angle), behind
 
@@ -103,7 +103,10 @@ def frame_tangent(kind: str, p: ArrayLike) -> Float:
         return np.zeros((0, 2, 2))
     p = np.asarray(p, float)
     turn, behind = _parts(kind, p)
-    return np.stack([turn @ (_QUARTER @ behind if n == "rotation" else _SHAPES[n]) for n in names])
+    quarter = LINEAR_MATRICES["rotation"]
+    return np.stack(
+        [turn @ (quarter @ behind if n == "rotation" else LINEAR_MATRICES[n]) for n in names]
+    )
 
 
 def rigid_part(kind: str, p: ArrayLike) -> tuple[Float, Float]:
@@ -113,7 +116,7 @@ def rigid_part(kind: str, p: ArrayLike) -> tuple[Float, Float]:
     turn, _ = _parts(kind, p)
     tangent = np.zeros((*p.shape[:-1], len(names), 2, 2))
     if "rotation" in names:
-        tangent[..., names.index("rotation"), :, :] = turn @ _QUARTER
+        tangent[..., names.index("rotation"), :, :] = turn @ LINEAR_MATRICES["rotation"]
     return turn, tangent
 
 
@@ -125,7 +128,7 @@ def chip_matrix(p: ArrayLike) -> tuple[Float, Float]:
     p = np.asarray(p, float)
     L = np.zeros((*p.shape[:-1], 2, 2))
     for name, value in zip(CHIP_DEVIATIONS[2:], np.moveaxis(p, -1, 0)[2:], strict=True):
-        L += value[..., None, None] * (_QUARTER if name == "rotation" else _SHAPES[name])
+        L += value[..., None, None] * LINEAR_MATRICES[name]
     return L, p[..., :2].copy()
 
 

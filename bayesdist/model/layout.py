@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
@@ -41,6 +42,26 @@ class Chip:
     name: str
     size: tuple[float, float]
     reference_pixel: tuple[float, float]
+
+    def quadrature(self, nodes: int) -> tuple[Float, Float, Float]:
+        """Gauss-Legendre quadrature over the area of the chip.
+
+        Parameters
+        ----------
+        nodes : int
+            On each axis: exact for polynomials of degree 2 nodes - 1 in x and in y.
+
+        Returns
+        -------
+        x, y : ndarray, shape (nodes^2,)
+            FITS 1-based pixels.
+        weight : ndarray, shape (nodes^2,)
+            Square pixels; they add up to the area.
+        """
+        at, weight = leggauss(nodes)
+        nx, ny = self.size
+        x, y = np.meshgrid((nx + 1 + nx * at) / 2, (ny + 1 + ny * at) / 2)
+        return x.ravel(), y.ravel(), nx * ny / 4 * np.outer(weight, weight).ravel()
 
 
 @dataclass(frozen=True)

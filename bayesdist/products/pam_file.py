@@ -30,20 +30,9 @@ def write_pam(
 ) -> None:
     """Write pixel area maps of an image, whole or not at all.
 
-    Parameters
-    ----------
-    path : path-like
-    maps : sequence of PixelAreaMap
-        One for each chip, in the order of the exposure's extensions.
-    instrument, detector : str
-        INSTRUME and DETECTOR; left out where empty.
-    source : str
-        The calibration, for the header.
-
-    Raises
-    ------
-    InputError
-        Without maps, or when the file cannot be written.
+    `maps`: one for each chip, in the order of the exposure's extensions. `instrument`, `detector`:
+    INSTRUME and DETECTOR; left out where empty. `source`: the calibration, for the header.
+    InputError without maps, or when the file cannot be written.
     """
     if not maps:
         raise InputError("there is no map to write", where=str(path), do="give one for each chip")

@@ -54,20 +54,8 @@ def all_formats() -> tuple[Format, ...]:
 def open_document(path: str | os.PathLike[str]) -> Document:
     """Document of a file, whose format is recognized by its content.
 
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    Document
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read or is of no format.
-    FormatError
-        When it is of a format and broken.
+    InputError when the file cannot be read or is of no format. FormatError when it is of a format
+    and broken.
     """
     return recognized(read_content(path))
 
@@ -97,21 +85,8 @@ def read_calibration(
 ) -> Calibration:
     """Calibration of a file of any format.
 
-    Parameters
-    ----------
-    path : path-like
-    filter, size
-        As in `Choice`.
-
-    Returns
-    -------
-    Calibration
-
-    Raises
-    ------
-    InputError
-        For a file that holds none, a filter or band that it does not have or that has to be named,
-        or a SIP header without a size.
+    `filter`, `size`: as in `Choice`. InputError for a file that holds none, a filter or band that
+    it does not have or that has to be named, or a SIP header without a size.
     """
     return open_document(path).calibration(Choice(filter, size))
 

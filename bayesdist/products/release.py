@@ -18,7 +18,7 @@ from bayesdist.calibration.plane import Orientation
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
 from bayesdist.model.lookup import LookupTable
-from bayesdist.products.formats.idctab.build import build_idctab
+from bayesdist.products.formats.idctab.build import idctab_from_solution
 from bayesdist.products.formats.idctab.drift import Loss, storable
 from bayesdist.products.formats.idctab.hst import combination_of
 from bayesdist.products.formats.idctab.table import IdcTab, write_idctab
@@ -135,7 +135,7 @@ def write_release(
     ------
     InputError
         For no filter or period, periods of one name, a table or stand-in of a filter that has no
-        solution, whatever `oriented`, `storable` and `build_idctab` refuse, or a file that
+        solution, whatever `oriented`, `storable` and `idctab_from_solution` refuse, or a file that
         cannot be written.  No file is written unless all IDCTABs could be made.
     DegenerateError
         When the linear part of a chip is singular.
@@ -164,7 +164,7 @@ def write_release(
         ]
         for stand_in, other in stand_ins.items():
             rows[stand_in] = rows[other]
-        made[period.name] = build_idctab(
+        made[period.name] = idctab_from_solution(
             rows,
             instrument=instrument,
             detector=detector,

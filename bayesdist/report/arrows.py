@@ -12,7 +12,7 @@ from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
-from bayesdist.report.numbers import size_of
+from bayesdist.numbers import size_of
 from bayesdist.report.panels import Panels
 from bayesdist.report.style import CYCLE, INK, PALE, PALETTE, figure_style, nice_below
 

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from bayesdist.assess import BinnedResiduals, Misfit
+    from bayesdist.assess import BinnedResiduals
     from bayesdist.data import MagnitudeErrors
-    from bayesdist.diagnose.alignment import Alignment
-    from bayesdist.model import Chip, LookupTable
+    from bayesdist.diagnose.overlap import OverlapTest
+from bayesdist.model import Chip, LookupTable
 
 __all__ = [
     "CampaignResults",
@@ -24,7 +24,6 @@ __all__ = [
     "Detections",
     "Footprints",
     "LinearSeries",
-    "OverlapTest",
 ]
 
 Float = NDArray[np.float64]
@@ -115,27 +114,6 @@ class LinearSeries:
 
 
 @dataclass(frozen=True, eq=False)
-class OverlapTest:
-    """Two exposures of the run aligned with each other, through the old files and the new ones."""
-
-    names: tuple[str, str]
-    epochs: tuple[float, float]
-    pa_v3: tuple[float, float]  # NaN where it is not known
-    old: Alignment  # of the same stars, by the initial distortion
-    new: Alignment  # by the solution
-    binned_old: BinnedResiduals  # over the common area; axes (xi, eta), pixels
-    binned_new: BinnedResiduals
-    corner: tuple[float, float]  # (xi, eta) of the area's corner, where cells begin, pixels
-    pixel_mas: float
-    with_motions: bool  # True where proper motions between the epochs were removed
-
-    @property
-    def n_stars(self) -> int:
-        """Stars that both exposures have."""
-        return len(self.new.residual)
-
-
-@dataclass(frozen=True, eq=False)
 class CampaignResults:
     """Results that a campaign adds to a run."""
 
@@ -153,8 +131,6 @@ class CampaignResults:
     tables: tuple[LookupTable, ...] = field(default=())
     series: LinearSeries | None = None
     overlap: OverlapTest | None = None
-    doubts: tuple[str, ...] = ()
-    misfits: tuple[Misfit, ...] = ()  # structure in each chip's residuals after the joint fit
     held: tuple[str, ...] = ()  # parameters constrained by their prior alone
 
     def section(self, name: str) -> Mapping[str, Any]:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2 as chi_square
 from scipy.stats import norm
 
+from bayesdist.numbers import size_of
 from bayesdist.report.arrows import Arrows, vector_map
 from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.numbers import size_of
 from bayesdist.report.panels import ChipPanels
 from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure, nice_below
 

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.checks import Check, warnings_of
+from bayesdist.numbers import MISSING, count, with_mas
 from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.numbers import MISSING, count, with_mas
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -26,30 +27,19 @@ if TYPE_CHECKING:
     )
     from bayesdist.assess.budget.budget import ErrorBudget
     from bayesdist.assess.budget.surface import BudgetSurface
-    from bayesdist.assess.periods import TimeVariation
     from bayesdist.assess.requirements.validity import Horizon
     from bayesdist.data import MagnitudeErrors
     from bayesdist.diagnose import ScoreTest
-    from bayesdist.diagnose.holdout.validation import HeldOutTruth
-    from bayesdist.diagnose.residuals.misfit import Misfit
+    from bayesdist.diagnose.holdout.validation import HoldoutValidation
+    from bayesdist.diagnose.periods import TimeVariation
     from bayesdist.infer import LinearFit, Posterior
     from bayesdist.infer.catalogue.added_errors import GroupedErrors
     from bayesdist.model import Chip
     from bayesdist.report.campaign import CampaignResults
 
-__all__ = ["Check", "ChipResults", "Product", "ReportInput", "SelfcalResults", "campaign_of"]
+__all__ = ["ChipResults", "Product", "ReportInput", "SelfcalResults", "campaign_of"]
 
 Float = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Check:
-    """One criterion: the value found, and its limit."""
-
-    name: str  # with the unit
-    value: float | str
-    limit: str = ""  # in words; empty where there is none
-    level: str = "note"  # 'pass', 'warn', 'fail', or 'note' without a limit
 
 
 @dataclass(frozen=True)
@@ -157,8 +147,7 @@ class ReportInput:
     margins: tuple[Margin, ...] = ()
     horizons: tuple[Horizon, ...] = ()  # validity periods; empty where nothing depends on time
     products: tuple[Product, ...] = ()
-    warnings: tuple[str, ...] = ()  # sentences on top
-    misfits: tuple[Misfit, ...] = ()  # structure in each chip's residuals; not a campaign's
+    checks: tuple[Check, ...] = ()  # criteria and remarks but those of requirements and products
     score_tests: tuple[ScoreTest, ...] = ()  # of the residuals
     magnitude_errors: MagnitudeErrors | None = None  # where the stars had no errors
     added_errors: GroupedErrors | None = None  # beyond the quoted ones, by groups
@@ -166,13 +155,18 @@ class ReportInput:
     provenance: Mapping[str, Any] = field(default_factory=dict)  # nested
     campaign: CampaignResults | None = None  # of a run on star lists
     periods: TimeVariation | None = None  # models of several periods compared
-    held_out: HeldOutTruth | None = None  # stars set aside before the fit
+    held_out: HoldoutValidation | None = None  # stars set aside before the fit
     selfcal: SelfcalResults | None = None  # of a run without a catalogue
 
     @property
     def unit(self) -> str:
         """Unit of u and v."""
         return self.fit.model.unit
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences that belong on top."""
+        return warnings_of(self.checks)
 
     @property
     def words(self) -> Words:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from bayesdist.report.numbers import display_scale
+from bayesdist.numbers import display_scale
 from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure
 
 __all__ = [

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from bayesdist.report.numbers import display_scale
+from bayesdist.numbers import display_scale
 from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure
 
 if TYPE_CHECKING:

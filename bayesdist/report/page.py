@@ -11,8 +11,8 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
+from bayesdist.numbers import MISSING
 from bayesdist.report.drawing import DPI, Drawing
-from bayesdist.report.numbers import MISSING
 from bayesdist.report.registry import Registry
 from bayesdist.report.texttable import Level, TextTable
 

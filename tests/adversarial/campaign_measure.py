@@ -7,24 +7,24 @@ from typing import Any
 
 import numpy as np
 
+from bayesdist.app.assessment import assessment_rng
 from bayesdist.app.campaign.interpolation import INTERPOLATION as BETWEEN
-from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.config import load_config
-from bayesdist.app.judging import budget_of
+from bayesdist.app.results import Results
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.session import Session
-from bayesdist.app.sessions import own_stages, rehearse_run, session_of
-from bayesdist.app.stages import run_stage
-from bayesdist.app.stages.assess import run_assess
+from bayesdist.app.stages.assess import run_diagnose, run_evaluate
+from bayesdist.assess import LocalErrors
 from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.evaluation import budget_over
 from bayesdist.infer.transforms import reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh
+from tests.app.support import after_stages
 
 from .campaign_truth import ARCSEC, BRIGHT, EPOCH0, FAINT, NEW, TERMS, CampaignTruth
 from .written import toml_text
 
-STAGES = ("match", "fit", "sample", "assess")
+STAGES = ("match", "fit", "sample")
 GRID, DRAWS = (17, 17), 2000
 
 
@@ -42,7 +42,7 @@ def configuration(truth: CampaignTruth, seed: int) -> dict[str, Any]:
         for k, chip in enumerate(truth.chips)
     ]
     return {
-        "campaign": files | {"start": "start_idc.fits", "mag": [BRIGHT, FAINT]},
+        "campaign": files | {"initial_distortion": "start_idc.fits", "mag": [BRIGHT, FAINT]},
         "tables": {"method": "none"},
         "detector": {"scale_mas": 1000 * ARCSEC},
         "chip": chips,
@@ -52,34 +52,30 @@ def configuration(truth: CampaignTruth, seed: int) -> dict[str, Any]:
     } | truth.config
 
 
-def assessed(truth: CampaignTruth, folder: Path, seed: int) -> Session:
-    """A session of a run of this campaign, its assessment made."""
+def assessed(truth: CampaignTruth, folder: Path, seed: int) -> Results:
+    """Results of a run of this campaign, its assessment made."""
     truth.write(folder)
     (folder / "config.toml").write_text(toml_text(configuration(truth, seed)))
     settings, text = load_config(folder / "config.toml")
     directory = RunDirectory.plan(folder / "run", settings, text, folder)
-    session = session_of(directory)
-    rehearse_run(session)
-    directory.begin()
-    session.begun()
-    own = own_stages(session)
-    for stage in STAGES:
-        # how the linear terms went with time takes longer than all the rest, and no error has it
-        run_stage(session, stage, run_assess if stage == "assess" else own.get(stage))
-    return session
+    results = after_stages(directory, *STAGES)
+    # how the linear terms went with time takes longer than all the rest, and no error has it
+    made = directory.make("assess", lambda: run_evaluate(run_diagnose(results)))
+    assert made.value is not None
+    return made.value
 
 
-def actual_error(session: Session, truth: CampaignTruth) -> np.ndarray:
+def actual_error(results: Results, truth: CampaignTruth) -> np.ndarray:
     """Predicted less true positions (NEW, chips * ny * nx, 2) in exposures that are yet to come.
 
     Whoever uses the calibration there fits shift and rotation, with stars all over the chips.
     """
-    solution, epoch = session.solution, session.epoch
+    solution, epoch = results.solution, results.epoch
     assert epoch is not None
     mean = np.asarray(solution.mean)
     predicted, mosaic = [], []
     for chip in solution.model.chips:
-        x, y = mesh(*grid_pixels(chip.size, session.config.assess.grid))
+        x, y = mesh(*grid_pixels(chip.size, results.config.assess.grid))
         predicted.append(
             solution.model.predict(mean, x, y, chip=chip.number, epoch=np.full(x.size, epoch))
         )
@@ -98,13 +94,13 @@ def _aligned(predicted: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 
 def coefficient_errors(
-    session: Session, truth: CampaignTruth
+    results: Results, truth: CampaignTruth
 ) -> tuple[list[str], np.ndarray, np.ndarray]:
     """Names, errors (n,) and covariance (n, n) of the coefficients, in the gauge of the first chip.
 
     True are those of the least-squares polynomials through the true map and through its drift.
     """
-    bare = without_frames(session.solution)
+    bare = without_frames(results.solution)
     first = truth.chips[0].number
     view = reference_gauge(bare, first)
     true = view.transform(_true_coefficients(bare.model, truth))
@@ -135,19 +131,19 @@ def _true_coefficients(model: DistortionModel, truth: CampaignTruth) -> np.ndarr
     return theta
 
 
-def table_errors(session: CampaignSession, truth: CampaignTruth) -> np.ndarray:
+def table_errors(results: Results, truth: CampaignTruth) -> np.ndarray:
     """Of the look-up tables over the grid of the assessment (chips, N, 3, 2).
 
     Error, and its sigmas by the nodes alone and with what lies between them.  The best polynomial
     is taken off the error, as polynomials follow the tables.
     """
     out = []
-    local = {term.name: term for term in session.local_terms}
-    for table in session.tables:
+    local = {term.name: term for term in results.errors.terms if isinstance(term, LocalErrors)}
+    for table in results.fitted.tables.tables:
         chip = next(one for one in truth.chips if one.number == table.chip)
         fine = mesh(*(np.arange(1.0, n, 3.0) for n in (chip.columns, chip.rows)))
-        grid = mesh(*grid_pixels((chip.columns, chip.rows), session.config.assess.grid))
-        basis = session.solution.model.basis(chip.number)
+        grid = mesh(*grid_pixels((chip.columns, chip.rows), results.config.assess.grid))
+        basis = results.solution.model.basis(chip.number)
 
         def left(x: np.ndarray, y: np.ndarray, table=table, chip=chip) -> np.ndarray:
             return table.evaluate(x, y) - truth.beside(*chip.mosaic(x, y))
@@ -155,17 +151,17 @@ def table_errors(session: CampaignSession, truth: CampaignTruth) -> np.ndarray:
         follows = np.linalg.lstsq(basis.evaluate(*fine), left(*fine))[0]
         error = left(*grid) - basis.evaluate(*grid) @ follows
         domain = EvaluationDomain.of_chips(
-            session.posterior.model,
-            session.config.assess.grid,
+            results.posterior.model,
+            results.config.assess.grid,
             chips=(chip.number,),
-            epoch=session.epoch,
+            epoch=results.epoch,
         )
         nodes, between = (local[name].sigma(domain) for name in ("look-up tables", BETWEEN))
         out.append(np.stack([error, nodes, np.hypot(nodes, between)], axis=1))
     return np.array(out)
 
 
-def stated_sigma(session: Session) -> np.ndarray:
+def stated_sigma(results: Results) -> np.ndarray:
     """Standard deviations (N, 2) of all terms of the budget together, over the same grid."""
-    total = budget_of(session).total
+    total = budget_over(results.errors, results.settings, assessment_rng(results.config)).total
     return np.column_stack([total.u, total.v])

@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.assessment import assessment_rng
 from bayesdist.app.config import load_config
-from bayesdist.app.judging import budget_of, margins_of
+from bayesdist.app.judging import margins_of
+from bayesdist.app.results import Results
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.selfcal.session import SelfcalSession
-from bayesdist.app.session import Session
-from bayesdist.app.sessions import own_stages, rehearse_run, session_of
-from bayesdist.app.stages import run_stage
 from bayesdist.assess import Margin, Requirement
+from bayesdist.assess.evaluation import budget_over
 from bayesdist.assess.requirements.verdict import clopper_pearson
 from bayesdist.assess.statistics import field_statistic
 from bayesdist.model.grid import grid_pixels, mesh
+from tests.app.support import after_stages
 
 from . import campaign_measure
 from .campaign_truth import CampaignTruth
@@ -59,8 +59,8 @@ def configuration(truth: Truth, seed: int) -> dict[str, Any]:
     return config
 
 
-def assessed(truth: Truth, folder: Path, seed: int) -> Session:
-    """A session of a run of these stars, its assessment made."""
+def assessed(truth: Truth, folder: Path, seed: int) -> Results:
+    """Results of a run of these stars, its assessment made."""
     if truth.self_calibrated:
         lists_of(truth).write(folder / "stars.ecsv")
     else:
@@ -71,29 +71,22 @@ def assessed(truth: Truth, folder: Path, seed: int) -> Session:
     (folder / "config.toml").write_text(toml_text(configuration(truth, seed)))
     settings, text = load_config(folder / "config.toml")
     directory = RunDirectory.plan(folder / "run", settings, text, folder)
-    session = session_of(directory)
-    rehearse_run(session)
-    directory.begin()
-    session.begun()
-    own = own_stages(session)
-    for stage in ("match", *STAGES) if truth.self_calibrated else STAGES:
-        run_stage(session, stage, own.get(stage))
-    return session
+    return after_stages(directory, *(("match", *STAGES) if truth.self_calibrated else STAGES))
 
 
-def actual_error(session: Session, truth: Truth, rng: np.random.Generator) -> np.ndarray:
+def actual_error(results: Results, truth: Truth, rng: np.random.Generator) -> np.ndarray:
     """Predicted less true positions (ny * nx, 2) over the grid of the assessment.
 
     Of a model with frames a position is one in an exposure chosen at random among those whose
     frames were fitted, along the axes of the polynomials, as the budget has it.  It is compared
     with the map that all exposures have in common, seen as that exposure points.
     """
-    if isinstance(session, SelfcalSession):
-        return selfcal_error(session, truth, rng)
-    solution = session.solution
+    if results.fitted.solved is not None:
+        return selfcal_error(results, truth, rng)
+    solution = results.solution
     model, mean = solution.model, np.asarray(solution.mean)
-    x, y = mesh(*grid_pixels(model.chips[0].size, session.config.assess.grid))
-    epoch = session.epoch
+    x, y = mesh(*grid_pixels(model.chips[0].size, results.config.assess.grid))
+    epoch = results.epoch
     when: dict[str, Any] = {"epoch": None if epoch is None else np.full(x.size, epoch)}
     true = truth.true_map(x, y, epoch)
     if model.frames == "none":
@@ -103,31 +96,31 @@ def actual_error(session: Session, truth: Truth, rng: np.random.Generator) -> np
     return truth.frames[model.exposures[code]].undone(np.asarray(seen)) - true
 
 
-def stated_sigma(session: Session) -> np.ndarray:
+def stated_sigma(results: Results) -> np.ndarray:
     """Standard deviations (ny * nx, 2) of all terms of the budget together, over the same grid."""
-    total = budget_of(session).total
+    total = budget_over(results.errors, results.settings, assessment_rng(results.config)).total
     return np.column_stack([total.u, total.v])
 
 
-def carried(truth: Truth | CampaignTruth, folder: Path, seed: int) -> Session:
-    """A session of a run of whatever kind, its assessment made."""
+def carried(truth: Truth | CampaignTruth, folder: Path, seed: int) -> Results:
+    """Results of a run of whatever kind, its assessment made."""
     if isinstance(truth, CampaignTruth):
         return campaign_measure.assessed(truth, folder, seed)
     return assessed(truth, folder, seed)
 
 
 def compared(
-    session: Session, truth: Truth | CampaignTruth, rng: np.random.Generator
+    results: Results, truth: Truth | CampaignTruth, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Actual errors (m, N, 2) and stated ones (N, 2) over the grid, and how many stars there are.
 
     In m exposures, or once.
     """
     if isinstance(truth, CampaignTruth):
-        error = campaign_measure.actual_error(session, truth)
-        return error, campaign_measure.stated_sigma(session), len(session.matches)
-    error = actual_error(session, truth, rng)[None]
-    return error, stated_sigma(session), truth.stars["x"].size
+        error = campaign_measure.actual_error(results, truth)
+        return error, campaign_measure.stated_sigma(results), len(results.data.stars)
+    error = actual_error(results, truth, rng)[None]
+    return error, stated_sigma(results), truth.stars["x"].size
 
 
 def attainable(margin: Margin, factor: float) -> float:
@@ -144,7 +137,7 @@ def attainable(margin: Margin, factor: float) -> float:
     return float(np.mean(at_or_under >= enough[0])) if enough.size else 0.0
 
 
-def judged(session: Session, error: np.ndarray) -> list[dict[str, Any]]:
+def judged(results: Results, error: np.ndarray) -> list[dict[str, Any]]:
     """Verdicts on requirements whose limits are a little under and over the actual error's."""
     requirements = tuple(
         Requirement(name, statistic, factor * float(field_statistic(statistic, error)))
@@ -160,7 +153,7 @@ def judged(session: Session, error: np.ndarray) -> list[dict[str, Any]]:
             "verdict": m.verdict,
             "reason": m.reason,
         }
-        for m, (_, _, factor) in zip(margins_of(session, requirements), ASKED, strict=True)
+        for m, (_, _, factor) in zip(margins_of(results, requirements), ASKED, strict=True)
     ]
 
 
@@ -179,12 +172,12 @@ def measured(name: str, seed: int, n: int | None = None) -> dict[str, Any]:
     one = KINDS[name]
     truth = one.truth(seed, n)
     began = time.perf_counter()
-    with TemporaryDirectory() as folder, closing(carried(truth, Path(folder), seed)) as session:
+    with TemporaryDirectory() as folder, closing(carried(truth, Path(folder), seed)) as results:
         rng = np.random.default_rng([7, seed])
-        error, stated, n_stars = compared(session, truth, rng)
-        margins = [margin for one in error[:JUDGED] for margin in judged(session, one)]
-        warnings = list(session.run.summary["warnings"])
-        converged = bool(session.posterior.convergence.converged)
+        error, stated, n_stars = compared(results, truth, rng)
+        margins = [margin for one in error[:JUDGED] for margin in judged(results, one)]
+        warnings = list(results.run.summary["warnings"])
+        converged = bool(results.posterior.convergence.converged)
     pull = np.abs(error) / stated
     return {
         "kind": name,

@@ -8,7 +8,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.polynomial import legendre
 
-from bayesdist.app.selfcal.session import SelfcalSession
+from bayesdist.app.results import Results
 from bayesdist.model.grid import grid_pixels, mesh
 
 from .fields import MIDDLE, SIDE
@@ -23,12 +23,12 @@ def lists_of(truth: Truth) -> Table:
     return Table({name: truth.stars[name] for name in COLUMNS})
 
 
-def aligned(session: SelfcalSession, truth: Truth) -> np.ndarray:
+def aligned(results: Results, truth: Truth) -> np.ndarray:
     """Shift, rotation and scale (4,) of the true sky by which held parameters have no errors.
 
     As z -> (p + i q) z + (r + i s), of the positions z = u + i v.
     """
-    solution, gauge = session.solution, session.gauge
+    solution, gauge = results.solution, results.fitted.solved.gauge
     model, mean = solution.model, np.asarray(solution.mean)
     assert gauge.open.shape[1] == 4, "the exposures leave more free than a similarity"
     nodes, weights = legendre.leggauss(NODES)
@@ -53,18 +53,18 @@ def moved(uv: np.ndarray, by: np.ndarray) -> np.ndarray:
     return np.stack([p * u - q * v + r, q * u + p * v + s], axis=1)
 
 
-def selfcal_error(session: SelfcalSession, truth: Truth, rng: np.random.Generator) -> np.ndarray:
+def selfcal_error(results: Results, truth: Truth, rng: np.random.Generator) -> np.ndarray:
     """Predicted less true positions (ny * nx, 2) over the grid, in the gauge of the run.
 
     In an exposure chosen at random among those whose frames were fitted, along the axes of the
     polynomials.
     """
-    solution = session.solution
+    solution = results.solution
     model, mean = solution.model, np.asarray(solution.mean)
-    x, y = mesh(*grid_pixels(model.chips[0].size, session.config.assess.grid))
+    x, y = mesh(*grid_pixels(model.chips[0].size, results.config.assess.grid))
     code = int(rng.integers(1, len(model.exposures)))
     at: dict[str, Any] = {"exposure": np.full(x.size, code)}
     frame = truth.frames[model.exposures[code]]
-    true = moved(frame.seen(truth.true_map(x, y, None)), aligned(session, truth))
+    true = moved(frame.seen(truth.true_map(x, y, None)), aligned(results, truth))
     error = np.asarray(model.predict(mean, x, y, **at)) - true
     return np.linalg.solve(model.frame(mean, code)[0], error.T).T

@@ -27,13 +27,13 @@ CHANCE = 1e-3
 def outcome(kind: str, seed: int, n: int | None = None) -> dict[str, Any]:
     """Errors of coefficients and tables, and score tests, of one campaign."""
     truth = KINDS[kind].truth(seed, n)
-    with TemporaryDirectory() as folder, closing(assessed(truth, Path(folder), seed)) as session:
-        _, error, cov = coefficient_errors(session, truth)
+    with TemporaryDirectory() as folder, closing(assessed(truth, Path(folder), seed)) as results:
+        _, error, cov = coefficient_errors(results, truth)
         return {
             "chi2": float(error @ np.linalg.solve(cov, error)),
             "pull": error / np.sqrt(np.diag(cov)),
-            "tables": table_errors(session, truth) if session.tables else None,
-            "tests": {one.name: one for one in session.score_tests},
+            "tables": table_errors(results, truth) if results.fitted.tables.tables else None,
+            "tests": {one.name: one for one in results.diagnostics.score_tests},
         }
 
 

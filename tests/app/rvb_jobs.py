@@ -10,12 +10,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from astropy.table import Table
 
-from bayesdist.data.rvb_files import ARRAY_SIZE
+from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.missions.wise.simulate import wise_solution
 from tests.app.support import write_config
 
 SIGMA = 0.1
-DETECTORS = {band: {"name": band, "size": ARRAY_SIZE[band]} for band in ARRAY_SIZE}
+DETECTORS = {band: {"name": band, "size": array.size} for band, array in WISE_ARRAYS.items()}
 
 
 def rvb_pairs(
@@ -34,7 +34,7 @@ def rvb_pairs(
     """
     rng = np.random.default_rng(seed)
     model, theta = wise_solution(band)
-    size = np.array(ARRAY_SIZE[band])
+    size = np.array(WISE_ARRAYS[band].size)
     x, y = (s / 2 + 0.5 + half * s / 2 * rng.uniform(-1, 1, n) for s in size)
     offset = rng.normal(0, 1.5, (n, 2))
     if circle is not None:

@@ -18,6 +18,10 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.cli import main
+from bayesdist.app.rehearsal import rehearse
+from bayesdist.app.results import Results, results_of
+from bayesdist.app.run import run_stage
+from bayesdist.app.rundir import RunDirectory
 from bayesdist.data import MatchTable
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import Truth, simulate_matches
@@ -213,3 +217,15 @@ def begin_stagewise(folder: Path, config: Path, *stages: str) -> Path:
 
 def summary_of(run: Path) -> dict[str, Any]:
     return json.loads((run / "summary.json").read_text(encoding="utf-8"))
+
+
+def after_stages(directory: RunDirectory, *stages: str, rehearsed: bool = True) -> Results:
+    """Results of stages of a run that begins here; whoever has them closes them."""
+    results = results_of(directory)
+    if rehearsed:
+        results = rehearse(results)
+    directory.begin()
+    results = results.adopting_inputs()
+    for stage in stages:
+        results = run_stage(results, stage)
+    return results

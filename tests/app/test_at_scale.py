@@ -8,9 +8,10 @@ import pytest
 
 from bayesdist.app import matches as app_matches
 from bayesdist.app.config import load_config
+from bayesdist.app.kinds.stars import fit_stars
 from bayesdist.app.matches import load_matches
+from bayesdist.app.results import open_results
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.session import Session
 from bayesdist.data import MatchTable, PartitionedMatches, read_matches, write_partitioned
 from bayesdist.data.partitioned import PartPiece
 from bayesdist.infer import load_fit, load_posterior
@@ -111,7 +112,7 @@ def test_no_stage_takes_all_rows_into_memory(job, tmp_path, on_disk, monkeypatch
     monkeypatch.setattr(
         MatchTable, "_complete", lambda self: (sizes.append(np.size(self.x)), complete(self))[1]
     )
-    for name in ("session", "stages.report"):
+    for name in ("kinds.fit_data", "kinds.reader", "kinds.stars", "stages.report"):
         monkeypatch.setattr(f"bayesdist.app.{name}.SAMPLE", 900, raising=False)
     monkeypatch.setattr("bayesdist.infer.linear.MEDIAN_STARS", 900)
     good("init", tmp_path / "c.toml", "--matches", job.parent / "stars")
@@ -141,10 +142,9 @@ def test_sums_over_pieces_are_those_of_the_whole(job, tmp_path, on_disk, monkeyp
     for limit in (1000, 10 * N):
         monkeypatch.setattr(app_matches, "IN_MEMORY", limit)
         run = RunDirectory.plan(tmp_path / "none", config, text, job.parent)
-        session = Session(run)
-        session.fit = session.linear[0]
-        sums.append(session.sums)
-        session.close()
+        with open_results(run) as results:
+            fitted = fit_stars(results.matched, results.config)
+            sums.append(results.having(fitted=fitted).diagnostics.sums)
     one, other = sums
     np.testing.assert_array_equal(one.exposures.n_used, other.exposures.n_used)
     for name in ("uu", "vv"):

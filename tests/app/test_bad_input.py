@@ -373,7 +373,7 @@ def test_a_stage_of_what_is_no_run(tmp_path, stage):
 
 
 def test_damaged_files_of_a_run(begun, tmp_path):
-    (begun / "run.json").write_text('{"schema": 1, "config"')
+    (begun / "run.json").write_text('{"schema": 2, "config"')
     refused(tmp_path, "stage", "sample", begun, words=["run.json"])
     refused(tmp_path, "run", begun / "config.toml", "-o", begun, "--resume", words=["run.json"])
 

@@ -39,7 +39,7 @@ name = "catalogue"
 kind = "random"
 sigma_u = 0.004
 sigma_v = 0.004
-in_residuals = true
+included_in_scatter = true
 source = "a paper"
 [[budget]]
 name = "proper motions"
@@ -190,7 +190,12 @@ def too_large(run, folder):
 
 def test_errors_larger_than_the_residuals_are_refused_before_anything_is_sampled(run, tmp_path):
     config = too_large(run, tmp_path / "job")
-    words = ["budget term 'catalogue'", "errors of 0.04", "that scatter by 0.0", "in_residuals"]
+    words = [
+        "budget term 'catalogue'",
+        "errors of 0.04",
+        "that scatter by 0.0",
+        "included_in_scatter",
+    ]
     refused(tmp_path, "run", config, "-o", tmp_path / "run", words=words)
     refused(tmp_path, "check", config, words=words)
 
@@ -199,7 +204,7 @@ def test_errors_larger_than_the_residuals_are_told_by_assess(run, tmp_path, monk
     """As where the posterior takes more stars for false matches than the linear fit rejects."""
     folder = too_large(run, tmp_path / "run").parent
     with monkeypatch.context() as patch:
-        patch.setattr("bayesdist.app.stages._check_residuals", lambda *_: None)
+        patch.setattr("bayesdist.app.rehearsal._check_residuals", lambda *_: None)
         good("stage", "fit", folder, "-q")
     for stage in ("sample", "assess"):
         good("stage", stage, folder, "-q")

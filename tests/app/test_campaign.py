@@ -7,12 +7,11 @@ import pytest
 from astropy.table import Table
 
 from bayesdist.app.campaign import series
-from bayesdist.app.campaign.table_file import read_tables
+from bayesdist.app.kinds.table_file import read_tables
 from bayesdist.data import read_exposures, read_matches
 from bayesdist.data.tables.files import read_table
 from bayesdist.infer import load_posterior
 from bayesdist.infer.nodes import NodeGrid
-from bayesdist.infer.nodes.sums import interpolation
 from bayesdist.infer.transforms import reference_gauge, segment, without_frames
 from bayesdist.missions.acs.simulate import read_acs
 from bayesdist.model import corrected
@@ -192,7 +191,7 @@ def test_what_lies_between_nodes_is_what_the_truth_has_there(run, folder):
         x, y = (a.ravel() for a in np.meshgrid(*(np.arange(4.5, n, 16.0) for n in chip.size)))
         px, py = corrected(truth.tables, x, y, chip=chip.number, filter="F606W")
         shift = np.column_stack([px - x, py - y])
-        W = grid.without_polynomials(interpolation(grid, x, y).toarray().T).T
+        W = grid.without_polynomials(grid.interpolation(x, y).toarray().T).T
         A = np.hstack([W, grid.basis.evaluate(x, y)])
         left = shift - A @ np.linalg.lstsq(A, shift, rcond=1e-10)[0]
         true = (left**2).mean(axis=0)

@@ -10,10 +10,10 @@ from astropy.io import fits
 from astropy.table import Table, vstack
 from astropy.time import Time
 
-from bayesdist.app import stages
-from bayesdist.app.campaign.soundness import frames_not_set, shear_doubts
+from bayesdist.app.campaign.soundness import frames_not_set, shear_warnings
+from bayesdist.app.results import results_of
+from bayesdist.app.run import STAGES
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.sessions import session_of
 from bayesdist.data import MatchTable
 from bayesdist.data.tables.files import read_table
 from bayesdist.errors import DegenerateError
@@ -48,8 +48,11 @@ def campaign(folder, tmp_path) -> Campaign:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda t: t.remove_column("vafactor"), ["f606w-001", "vafactor", "campaign.aberration"]),
-        (masked("vafactor", 3), ["f606w-003", "vafactor", "campaign.aberration"]),
+        (
+            lambda t: t.remove_column("vafactor"),
+            ["f606w-001", "vafactor", "campaign.vafactor_source"],
+        ),
+        (masked("vafactor", 3), ["f606w-003", "vafactor", "campaign.vafactor_source"]),
         (setting("vafactor", 3, 0.0), ["row 3", "f606w-003", "VAFACTOR is 0.0"]),
         (setting("vafactor", 3, 2.0), ["row 3", "f606w-003", "VAFACTOR is 2.0"]),
         (lambda t: t.remove_column("epoch"), ["'epoch'", "rename"]),
@@ -65,7 +68,7 @@ def test_a_log_that_lacks_something(campaign, change, words):
 
 def test_aberration_of_the_earth_needs_no_factor_but_a_target(campaign):
     campaign.log(lambda t: t.remove_column("vafactor"))
-    campaign.replaced("q_max = 0.1", 'q_max = 0.1\naberration = "earth"')
+    campaign.replaced("q_max = 0.1", 'q_max = 0.1\nvafactor_source = "earth"')
     assert "of the Earth alone" in campaign.check()
     assert any("VAFACTOR was computed" in text for text in campaign.matched()["warnings"])
     shutil.rmtree(campaign.path.parent / "run")
@@ -136,8 +139,8 @@ def test_an_exposure_with_one_chip_serves_for_that_one(campaign, folder, name, m
     assert np.isfinite(fit.mean).all() and np.isfinite(fit.cov).all()
     assert 0.8 < fit.chi2 / fit.dof < 1.3
     assert name in summary_of(run)["exposures_skipped"]  # of those that are fitted alone
-    doubts = session_of(RunDirectory.open(run)).doubts
-    assert any(f"chip {missing}" in text and name in text for text in doubts)
+    warnings = results_of(RunDirectory.open(run)).matched.warnings
+    assert any(f"chip {missing}" in text and name in text for text in warnings)
 
 
 @pytest.mark.parametrize(("kept", "name"), [(2, "WFC1"), (1, "WFC2")])
@@ -223,7 +226,7 @@ def test_one_roll_angle_is_said_to_be_degenerate(campaign, rolls):
 
 @pytest.mark.parametrize("rolls", [[20.0, 110.0], [20.0, 40.0], [20.0, np.nan, 60.0], [np.nan]])
 def test_several_roll_angles_are_not(rolls):
-    assert shear_doubts(np.array(rolls), "PA_V3") == []
+    assert shear_warnings(np.array(rolls), "PA_V3") == []
 
 
 def test_one_roll_angle_shows_in_the_matches_whatever_the_log_says(campaign):
@@ -376,7 +379,7 @@ def test_one_exposure_in_two_lists(campaign):
     [
         (["sigma_u", "sigma_v"], ["no errors of the positions", "sigma_u"]),
         (["epoch"], ["proper motions but no epoch"]),
-        (["mag"], ["no magnitudes", "campaign.motions = 'all'"]),
+        (["mag"], ["no magnitudes", "campaign.pm_selection = 'all'"]),
     ],
     ids=["errors", "epoch", "magnitudes"],
 )
@@ -562,7 +565,7 @@ def test_resuming_after_a_list_was_removed(campaign):
 
 @pytest.mark.slow
 def test_a_damaged_campaign_is_calibrated_and_says_so(campaign, monkeypatch):
-    monkeypatch.setitem(stages._FUNCTIONS, "report", lambda session: None)
+    monkeypatch.setitem(STAGES, "report", lambda results: results)
     campaign.lists(scattered, ONE).lists(lambda t: t[t["chip"] == 1], "f606w-006")
     # a few steps: what is said does not rest on the draws
     campaign.replaced("target_ess = 100", "max_steps = 20")

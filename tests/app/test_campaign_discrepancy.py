@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.app.session import Session
+from bayesdist.app.results import Results
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
-from bayesdist.infer.discrepancy.cells import cell_sums
-from bayesdist.infer.discrepancy.information import Information
-from bayesdist.infer.posterior.likelihood import scores_of
+from bayesdist.diagnose.correlated.cells import cell_sums
+from bayesdist.diagnose.correlated.information import Information
+from bayesdist.infer.solution import likelihood_of
 from tests.adversarial import KINDS
 from tests.adversarial.campaign_measure import actual_error, assessed, stated_sigma
 from tests.adversarial.campaign_truth import CampaignTruth
@@ -29,13 +29,13 @@ SIZE = 0.01  # px: of the pattern, either way along x
 @dataclass(frozen=True)
 class Run:
     truth: CampaignTruth
-    session: Session
+    results: Results
 
 
 def run_of(kind: str, folder: Path) -> Iterator[Run]:
     truth = KINDS[kind].truth(1)
-    with closing(assessed(truth, folder, 1)) as session:
-        yield Run(truth, session)
+    with closing(assessed(truth, folder, 1)) as results:
+        yield Run(truth, results)
 
 
 @pytest.fixture(scope="module")
@@ -50,11 +50,11 @@ def plain(tmp_path_factory):
 
 
 def rows(run: Run) -> dict[str, dict]:
-    return {row["name"]: row for row in summary_of(run.session.run.path)["budget"]}
+    return {row["name"]: row for row in summary_of(run.results.run.path)["budget"]}
 
 
 def test_a_pattern_is_measured_and_in_the_budget(patterned):
-    found = summary_of(patterned.session.run.path)["discrepancy"]["structure"]
+    found = summary_of(patterned.results.run.path)["discrepancy"]["structure"]
     by_axis = {row["axis"]: row["rms"] for row in found}
     # the polynomials lie along the pixels but for a small rotation
     assert by_axis["u"] == pytest.approx(SIZE, rel=0.4)
@@ -66,8 +66,8 @@ def test_a_pattern_is_measured_and_in_the_budget(patterned):
 
 def test_errors_with_a_pattern_cover(patterned):
     error, stated = (
-        actual_error(patterned.session, patterned.truth),
-        stated_sigma(patterned.session),
+        actual_error(patterned.results, patterned.truth),
+        stated_sigma(patterned.results),
     )
     pull = np.abs(error) / stated
     assert 0.55 < np.mean(pull < 1.0) < 0.9
@@ -75,11 +75,11 @@ def test_errors_with_a_pattern_cover(patterned):
 
 
 def test_draws_are_spread_by_what_the_pattern_does_to_the_fit(patterned):
-    session = patterned.session
-    posterior, n = session.posterior, session.posterior.model.n_distortion
-    more = np.sqrt(np.diag(session.solution.cov)[:n] / np.diag(posterior.cov)[:n])
+    results = patterned.results
+    posterior, n = results.posterior, results.posterior.model.n_distortion
+    more = np.sqrt(np.diag(results.solution.cov)[:n] / np.diag(posterior.cov)[:n])
     assert np.median(more) > 1.02 and more.min() > 0.9
-    table = Table.read(session.run / "coefficients.ecsv")
+    table = Table.read(results.run / "coefficients.ecsv")
     assert np.isfinite(table["sd"]).all()
 
 
@@ -93,14 +93,17 @@ def test_where_nothing_is_left_out_errors_are_hardly_wider(plain):
 
 def test_at_the_mode_the_priors_pull_as_hard_as_the_stars(plain):
     """Or the structure would be that of deviations which their priors have shrunk."""
-    session = plain.session
-    scores = scores_of(session.posterior)
-    sums = session.shards.sum(cell_sums, scores, 32)
-    information = Information(session.model, scores.theta, sums, session.priors)
+    results = plain.results
+    likelihood = likelihood_of(results.posterior)
+    sums = results.data.shards.sum(cell_sums, likelihood, 32)
+    information = Information(results.fit.model, likelihood.theta, sums, results.fitted.priors)
     of_stars = Information(
-        session.model, scores.theta, sums, type(session.priors).none(session.model)
+        results.fit.model,
+        likelihood.theta,
+        sums,
+        type(results.fitted.priors).none(results.fit.model),
     )
-    D = session.model.n_distortion
+    D = results.fit.model.n_distortion
 
     def distance(score: np.ndarray) -> float:
         """In standard deviations of the posterior, over the deviations of all exposures."""

@@ -10,11 +10,17 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.campaign.fit import fit_campaign
+from bayesdist.app.campaign.inputs import read_campaign
+from bayesdist.app.campaign.matching import match_lists
+from bayesdist.app.config import load_config
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.results import open_results, results_of
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.stages.assess import _assess_holdout
+from bayesdist.app.stages.assess import run_diagnose
 from bayesdist.data import read_matches
 from bayesdist.data.tables.files import read_table
+from bayesdist.infer import load_fit
 from tests.app.support import cli, good, one_sentence, refused, summary_of
 
 N, LATER = 14, 3  # exposures, and how many of them the release does not see
@@ -69,9 +75,9 @@ def run(folder):
     run = begin(folder, folder.parent / "release", parts(folder)[0], holdout=HOLDOUT)
     for stage in ("match", "fit", "sample"):
         good("stage", stage, run, "-q")
-    session = CampaignSession(RunDirectory.open(run))
-    _assess_holdout(session)
-    session.close()
+    directory = RunDirectory.open(run)
+    with open_results(directory) as results:
+        directory.make("assess", lambda: run_diagnose(results))
     return run
 
 
@@ -88,16 +94,36 @@ def test_what_is_held_out_is_no_part_of_the_fit(run) -> None:
     found, data = summary["holdout"], summary["data"]
     assert len(found["exposures"]) == 2 and data["n_exposures"] == N - LATER - 2
     pairs = read_matches(run / "pairs", unit="pix")
-    assert data["rejected"]["held out"] == found["n"] + found["n_left_out"]
+    assert data["rejected"]["held out"] == found["n"] + found["n_excluded"]
     assert summary["matching"]["n_pairs"] == len(pairs)
-    session = CampaignSession(RunDirectory.open(run))
-    kept, held = session.pairs, session.held_pairs
+    matched = results_of(RunDirectory.open(run)).matched
+    kept, held = matched.stars, matched.held
     assert len(kept) + len(held) == len(pairs)
     assert not set(kept.exposure_names) & set(found["exposures"])
     # a star goes or stays with all of its detections
     whole = np.isin(np.array(held.exposure_names)[held.exposure], found["exposures"])
     assert not set(kept.star) & set(held.star[~whole])
     assert len(set(held.star[~whole])) == pytest.approx(0.2 * len(set(pairs.star)), rel=0.25)
+
+
+def test_functions_find_what_the_run_has_found(run) -> None:
+    """Lists are matched and fitted without a run's folder, and are prepared as those of the run."""
+    config, _ = load_config(run / "config.toml")
+    matched = match_lists(read_campaign(config, run), config, run)
+    fitted = fit_campaign(matched, config, run)
+    known = load_fit(run / "fit.nc")
+    np.testing.assert_array_equal(fitted.linear.mean, known.mean)
+    np.testing.assert_array_equal(fitted.linear.cov, known.cov)
+    results, prepared = results_of(RunDirectory.open(run)), FitData(matched, fitted)
+    for name in ("x", "u", "sigma_u", "star", "exposure"):
+        for made, read in (
+            (prepared.stars, results.data.stars),
+            (prepared.held, results.data.held),
+        ):
+            np.testing.assert_array_equal(getattr(made, name), getattr(read, name))
+    assert matched.whole == results.matched.whole and len(matched.whole) == 2
+    np.testing.assert_array_equal(fitted.alone.values, results.fitted.alone.values)
+    np.testing.assert_array_equal(fitted.scatter.tau, results.fitted.scatter.tau)
 
 
 def test_what_is_held_out_agrees_with_the_prediction(run) -> None:
@@ -126,9 +152,9 @@ def test_an_exposure_that_went_wrong_is_named(run, folder, tmp_path) -> None:
     for one in run.iterdir():
         if one.is_file():
             shutil.copy(one, tmp_path / "other" / one.name)
-    session = CampaignSession(RunDirectory.open(tmp_path / "other"))
-    _assess_holdout(session)
-    found = summary_of(tmp_path / "other")["holdout"]
+    results = results_of(RunDirectory.open(tmp_path / "other"))
+    run_diagnose(results)
+    found = results.run.summary["holdout"]
     assert found["level"] == "fail" and f"exposure {name}, held out whole" in found["verdict"]
 
 

@@ -165,7 +165,7 @@ def write(folder: Path, sense: int, *, seed=1, change=None, **campaign) -> Path:
     return write_config(
         folder / "config.toml",
         data=None,
-        campaign=files | {"start": "start_idc.fits"} | campaign,
+        campaign=files | {"initial_distortion": "start_idc.fits"} | campaign,
         tables={"method": "none"},
         detector={"scale_mas": 1000 * PIXEL},
         chip=[

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.app.caveats import visits_of
 from bayesdist.app.config import parse_config
+from bayesdist.assess.checks import visits_of
 
 from .support import config_text
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
-from bayesdist.app.config import load_config, load_requirements, parse_config
+from bayesdist.app.config import KINDS, load_config, load_requirements, parse_config
+from bayesdist.app.config.errors import INSTEAD, RENAMED
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import Compute
 from tests.app.support import config_text, write_config
@@ -335,3 +338,64 @@ def test_a_missing_file_and_a_folder(tmp_path):
     for path in (tmp_path / "none.toml", tmp_path):
         with pytest.raises(InputError, match="cannot be read"):
             load_config(path)
+
+
+# -- three kinds ----------------------------------------------------------------------------------
+
+BEGINS = {
+    "data": {"matches": "stars.ecsv"},
+    "campaign": {"lists": "l", "catalog": "c", "exposures": "e", "initial_distortion": "i"},
+    "selfcal": {"lists": "l"},
+}
+
+
+def of_kind(kind: str, **sections) -> str:
+    """A configuration of a kind, with other sections or with changed ones."""
+    own = {"data": None, kind: BEGINS[kind] | sections.pop(kind, {})}
+    if kind == "campaign":
+        own |= {"detector": None, "model": {"order": 2}, "chip": [CHIP]}
+    return config_text(**(own | sections))
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_a_kind_is_known_by_its_section(kind):
+    config = parsed(of_kind(kind))
+    assert type(config) is KINDS[kind]
+    others = KINDS.keys() - {kind}
+    assert all(getattr(config, other) is None for other in others)
+    assert config.fit.clip_chi2 == 25.0 and config.mixture() and config.resources() == Compute()
+    for other in others:
+        assert "give one" in str(refusal(of_kind(kind, **{other: BEGINS[other]})))
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_sections_of_another_kind_are_refused_with_its_name(kind):
+    own = KINDS[kind].model_fields
+    others = {name: k for k in KINDS for name in KINDS[k].model_fields if name not in own}
+    assert len(others) > 3
+    for name in others.keys() - KINDS.keys():
+        error = refusal(of_kind(kind, **{name: {"any": 1}}))
+        assert error.cause.startswith(f"unknown key '{name}': it is of [")
+        assert error.cause.endswith(f"and this is a [{kind}]")
+        assert error.where == f"c.toml: {name}" and error.do.startswith(("leave it out", "set"))
+
+
+@pytest.mark.parametrize(("kind", "path"), sorted(INSTEAD))
+def test_what_to_set_in_place_of_a_key_of_another_kind(kind, path):
+    section, _, key = path.partition(".")
+    content = {key: {}} if key else {"any": 1}
+    if section == "model":
+        content |= {"order": 2}
+    error = refusal(of_kind(kind, **{section: content}))
+    assert error.do == INSTEAD[kind, path]
+
+
+@pytest.mark.parametrize("path", sorted(RENAMED))
+def test_an_old_key_names_the_new_one(path):
+    section, _, key = path.partition(".")
+    kind = section if section in KINDS else "campaign"
+    block = BEGINS.get(section, {}) | {key: 1}
+    error = refusal(of_kind(kind, **{section: [block] if section == "budget" else block}))
+    assert f"it is called '{RENAMED[path]}' now" in error.cause
+    assert error.where.endswith(key)
+    assert f'"{RENAMED[path]}"' in json.dumps(KINDS[kind].model_json_schema())

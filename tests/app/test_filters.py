@@ -11,13 +11,15 @@ import pytest
 from astropy.table import Table
 
 import bayesdist.app.release
-import bayesdist.app.session
+import bayesdist.app.results
 import bayesdist.products.release
 from bayesdist.app.campaign.filters import compare_filters
 from bayesdist.app.campaign.reference import held_tables
+from bayesdist.app.kinds.table_file import StoredLookupTables, read_tables, write_tables
 from bayesdist.app.release import _require_alike
+from bayesdist.app.results import results_of
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.sessions import session_of
+from bayesdist.assess import LocalErrors
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.data import read_exposures
 from bayesdist.errors import InputError
@@ -87,8 +89,8 @@ def runs(folder):
 
 
 @pytest.fixture(scope="module")
-def sessions(runs):
-    return {name: session_of(RunDirectory.open(run)) for name, run in runs.items()}
+def by_filter(runs):
+    return {name: results_of(RunDirectory.open(run)) for name, run in runs.items()}
 
 
 @pytest.fixture(scope="module")
@@ -101,30 +103,34 @@ def release(runs, folder):
 # -- what one run takes from the other ------------------------------------------------------------
 
 
-def test_the_detectors_tables_are_held_and_the_filters_are_fitted(sessions):
-    reference, other = (sessions[name] for name in FILTERS)
-    assert [(t.chip, t.filter) for t in reference.tables] == [(1, ""), (2, "")]
-    assert [(t.chip, t.filter) for t in other.tables] == [
+def local_errors(results):
+    return [term for term in results.errors.terms if isinstance(term, LocalErrors)]
+
+
+def test_the_detectors_tables_are_held_and_the_filters_are_fitted(by_filter):
+    reference, other = (by_filter[name] for name in FILTERS)
+    assert [(t.chip, t.filter) for t in reference.fitted.tables.tables] == [(1, ""), (2, "")]
+    assert [(t.chip, t.filter) for t in other.fitted.tables.tables] == [
         *((1, ""), (2, "")),
         *((1, "F814W"), (2, "F814W")),
     ]
-    for a, b in zip(reference.tables, other.tables, strict=False):
+    for a, b in zip(reference.fitted.tables.tables, other.fitted.tables.tables, strict=False):
         np.testing.assert_array_equal(a.values, b.values)
     # pixels are those that both tables have corrected
-    raw, x = other.pairs, other.raw_matches.x
+    raw, x = other.matched.stars, other.data.placed.x
     numbers = raw.chip_number
-    both, _ = corrected(other.tables, raw.x, raw.y, chip=numbers, filter="F814W")
+    both, _ = corrected(other.fitted.tables.tables, raw.x, raw.y, chip=numbers, filter="F814W")
     assert len(x) == len(both) and np.array_equal(x, both)
 
 
-def test_the_error_of_the_held_tables_stays_in_the_budget(sessions):
-    other = sessions["F814W"]
-    [term] = [one for one in other.local_terms if one.name == "look-up tables"]
-    for chip in other.plain_model.chips:
+def test_the_error_of_the_held_tables_stays_in_the_budget(by_filter):
+    other = by_filter["F814W"]
+    [term] = [one for one in local_errors(other) if one.name == "look-up tables"]
+    for chip in other.fit.model.chips:
         x, y = np.meshgrid(
             *(np.linspace(1, n, m) for n, m in zip(chip.size, (33, 17), strict=True))
         )
-        held = held_sigma(other.tables, x.ravel(), y.ravel(), chip=chip.number)
+        held = held_sigma(other.fitted.tables.tables, x.ravel(), y.ravel(), chip=chip.number)
         domain = EvaluationDomain.of_chips(
             other.posterior.model, (33, 17), chips=(chip.number,), epoch=other.epoch
         )
@@ -133,23 +139,23 @@ def test_the_error_of_the_held_tables_stays_in_the_budget(sessions):
         assert (sigma > 0.9 * held).all() and (held > 0).all()
 
 
-def test_a_d2imfile_serves_as_well(sessions, release, runs):
-    block = sessions["F814W"].config.tables
-    chips = sessions["F814W"].config.chips()
+def test_a_d2imfile_serves_as_well(by_filter, release, runs):
+    block = by_filter["F814W"].config.tables
+    chips = by_filter["F814W"].config.chips()
     of_run = held_tables(block, chips, runs["F814W"])
     file = block.model_copy(update={"detector": str(release.path / "acs_wfc_d2i.fits")})
     for a, b in zip(of_run, held_tables(file, chips, runs["F814W"]), strict=True):
         np.testing.assert_array_equal(a.values.astype(np.float32), b.values.astype(np.float32))
 
 
-def test_drift_of_few_exposures_is_that_of_the_reference(sessions):
+def test_drift_of_few_exposures_is_that_of_the_reference(by_filter):
     """Eight exposures know the drift as well as 22 do, and it is the true one."""
     model, theta = acs_solution("F814W")
     true = [lines(Truth(model, theta), s) for s in (0, 1)]
     pulls = []
     for s in (0, 1):
-        found = lines(reference_gauge(sessions["F814W"].posterior, 2), s)
-        first = lines(reference_gauge(sessions["F606W"].posterior, 2), s)
+        found = lines(reference_gauge(by_filter["F814W"].posterior, 2), s)
+        first = lines(reference_gauge(by_filter["F606W"].posterior, 2), s)
         for chip in ("WFC1", "WFC2"):
             for term in ("A_2", "B_2", "B_3"):
                 label = f"{chip}.{term}.beta"
@@ -220,10 +226,10 @@ def test_offsets_between_filters_are_the_true_ones(release):
 
 
 @pytest.fixture(scope="module")
-def plane(sessions, folder):
+def plane(by_filter, folder):
     """Both solutions as they are released, turned into the plane of the IDCTAB."""
-    first, other = (sessions[name].solution for name in FILTERS)
-    formal = sessions["F814W"].fit
+    first, other = (by_filter[name].solution for name in FILTERS)
+    formal = by_filter["F814W"].fit
     released = {"F606W": first, "F814W": with_drift_of(other, first, formal=formal)}
     views = {name: reference_gauge(without_frames(one), 2) for name, one in released.items()}
     orientation = laid_on(
@@ -240,7 +246,7 @@ def plane(sessions, folder):
 @pytest.mark.parametrize("filter", FILTERS)
 @pytest.mark.parametrize(("period", "date"), [("pre", "2005-03-01"), ("post", "2013-01-01")])
 def test_stwcs_sees_our_model_and_the_true_sky(
-    filter, period, date, release, sessions, folder, plane, tmp_path
+    filter, period, date, release, by_filter, folder, plane, tmp_path
 ):
     """All files together: 0.1 mas from the model, and as far from the truth as is stated."""
     pytest.importorskip("stwcs")
@@ -261,10 +267,10 @@ def test_stwcs_sees_our_model_and_the_true_sky(
     [true_centre] = truth.model.predict(truth.theta[filter], 2048.0, 1024.0, **middle)
     rng = np.random.default_rng(1)
     x, y = rng.uniform(1, 4096, 600), rng.uniform(1, 2048, 600)
-    [term] = [one for one in sessions[filter].local_terms if one.name == "look-up tables"]
+    [term] = [one for one in local_errors(by_filter[filter]) if one.name == "look-up tables"]
     for chip in (1, 2):
         theirs = wcs[chip].all_pix2world(np.stack([x, y], axis=1), 1)
-        px, py = corrected(sessions[filter].tables, x, y, chip=chip, filter=filter)
+        px, py = corrected(by_filter[filter].fitted.tables.tables, x, y, chip=chip, filter=filter)
         ours = model.predict(turned.mean, px, py, epoch=epoch, chip=chip)
         assert separation_mas(to_sky(ours - centre, pointing, v2v3), theirs).max() < 0.1
 
@@ -364,11 +370,13 @@ def test_a_run_that_is_not_finished(runs, folder, tmp_path):
     refused(tmp_path, runs["F606W"], tmp_path / "half", words=["fit", "half"])
 
 
-def test_other_tables_of_the_detector(runs, folder, tmp_path):
+def test_other_tables_of_the_detector(runs, tmp_path, monkeypatch):
+    # as if the run had been made with them
+    monkeypatch.setattr(RunDirectory, "require", lambda run, what, needs: None)
     other = shutil.copytree(runs["F814W"], tmp_path / "other")
-    session = session_of(RunDirectory.open(other))
-    moved = [replace(t, values=t.values + 1e-4 * (not t.filter)) for t in session.tables]
-    session.keep_tables(tuple(moved))
+    stored = read_tables(other / "tables.h5", do="")
+    moved = [replace(t, values=t.values + 1e-4 * (not t.filter)) for t in stored.tables]
+    write_tables(other / "tables.h5", replace(stored, tables=tuple(moved)))
     refused(tmp_path, runs["F606W"], other, words=["detector's tables", str(runs["F606W"])])
 
 
@@ -378,7 +386,7 @@ def test_a_run_that_has_not_converged(runs, tmp_path, monkeypatch):
         poor = replace(posterior.convergence, converged=False, reasons=("R-hat 1.3",))
         return replace(posterior, convergence=poor)
 
-    monkeypatch.setattr(bayesdist.app.session, "load_posterior", doubtful)
+    monkeypatch.setattr(bayesdist.app.results, "load_posterior", doubtful)
     refused(tmp_path, runs["F606W"], words=["R-hat 1.3", "--allow-unconverged"])
     good("release", runs["F606W"], "-o", tmp_path / "out", "--allow-unconverged", "-q")
     for path in sorted((tmp_path / "out").glob("*.fits")):
@@ -425,7 +433,7 @@ def test_runs_of_another_structure(change, words):
             config=SimpleNamespace(
                 detector=SimpleNamespace(scale_mas=scale), products=SimpleNamespace(release=1)
             ),
-            tables=(),
+            fitted=SimpleNamespace(tables=StoredLookupTables()),
             run=SimpleNamespace(path=name),
         )
 

@@ -45,7 +45,7 @@ def run(tmp_path_factory):
 def test_held_out_stars_are_no_part_of_the_fit(run):
     summary = summary_of(run[1])
     data, found = summary["data"], summary["holdout"]
-    assert data["rejected"]["held out"] == found["n"] and found["n_left_out"] == 0
+    assert data["rejected"]["held out"] == found["n"] and found["n_excluded"] == 0
     assert data["n_used"] + sum(data["rejected"].values()) == data["n_rows"] == 1500
     stars = read_metadata(run[1] / "stars" / "part-00000.parquet")
     assert stars.num_rows == 1500 - found["n"]

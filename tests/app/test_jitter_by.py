@@ -202,11 +202,21 @@ def test_matches_in_circles_are_refused_and_not_compared(tmp_path):
 @pytest.mark.parametrize("kind", ["campaign", "selfcal"])
 def test_other_models_of_errors_have_no_jitters_of_groups(tmp_path, kind):
     block = {
-        "campaign": {"lists": "l", "catalog": "c.ecsv", "exposures": "e.ecsv", "start": "s.fits"},
+        "campaign": {
+            "lists": "l",
+            "catalog": "c.ecsv",
+            "exposures": "e.ecsv",
+            "initial_distortion": "s.fits",
+        },
         "selfcal": {"lists": "l", "match_radius": 1.0},
     }[kind]
     sections = {"data": None, kind: block, "outliers": {"jitter_by": "exposure"}}
     if kind == "campaign":
         sections |= {"chip": CHIPS, "detector": None, "model": {"order": 3}}
     path = write_config(tmp_path / "config.toml", **sections)
-    refused(tmp_path, "check", path, words=("outliers.jitter_by", f"a [{kind}] has a model"))
+    refused(
+        tmp_path,
+        "check",
+        path,
+        words=("outliers.jitter_by", f"it is of [data], and this is a [{kind}]"),
+    )

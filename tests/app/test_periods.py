@@ -13,8 +13,8 @@ from lxml import html as lxml_html
 
 from bayesdist.app import matches as app_matches
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.assess.periods import time_variation
 from bayesdist.data import MatchTable, write_partitioned
+from bayesdist.diagnose.periods import PeriodSettings, time_variation
 from bayesdist.infer import fit_linear
 from bayesdist.model import Chip, DistortionModel
 from tests.app.support import (
@@ -128,7 +128,8 @@ def test_no_change_is_said_where_there_is_none(quiet):
     rows = inside(matches, period)
     assert [row["n_pairs"] for row in found["periods"]] == [r.sum() for r in rows]
     assert sum(r.sum() for r in rows) == N - 40
-    assert found["ends"]["period"] == NAMES[2] and found["ends"]["against"] == NAMES[0]
+    ends = found["first_vs_last"]
+    assert ends["period"] == NAMES[2] and ends["against"] == NAMES[0]
     assert not any("distortion changes" in text for text in summary_of(run)["warnings"])
 
 
@@ -197,7 +198,7 @@ def test_a_change_is_found_measured_and_put_on_top(moved):
     # the tightest limit: 0.1 mas
     assert found["tolerance"] == pytest.approx(0.002)
     assert found["verdict"].endswith(f"beyond the tolerance of 0.002 pix: {', '.join(NAMES)}.")
-    ends = found["ends"]
+    ends = found["first_vs_last"]
     assert abs(ends["largest"] - CHANGE) < 4 * ends["sigma"] and ends["p_value"] < 1e-3
     # it grows towards the edges on the left and on the right
     assert ends["at"][0] in (1.0, SIZE[0])
@@ -285,7 +286,7 @@ def test_stars_of_several_periods_are_counted():
     edges = Time(np.array([[c - 2.5, c + 2.5] for c in CENTRES]), format="mjd").decimalyear
     spans = {"a": tuple(edges[0]), "c": tuple(edges[2])}
     rng = np.random.default_rng(1)
-    found = time_variation(fit, matches, spans, rng=rng, bins=4)
+    found = time_variation(fit, matches, PeriodSettings(spans, bins=4), rng=rng)
     assert found.n_repeated == 10 and found.n_outside == (period == 1).sum()
     assert (found.first, found.last) == ("a", "c")
     outside, repeated = found.cautions
@@ -309,7 +310,8 @@ def test_chips_are_compared_together():
     matches = MatchTable(x, y, *uv.T, sigma_u=sigma, sigma_v=sigma, epoch=2010.05 + late,
                          chip=chip, chip_numbers=(1, 2))  # fmt: skip
     spans = {"early": (2010.0, 2010.1), "late": (2011.0, 2011.1)}
-    found = time_variation(fit_linear(matches, model), matches, spans, rng=rng, bins=8)
+    fit = fit_linear(matches, model)
+    found = time_variation(fit, matches, PeriodSettings(spans, bins=8), rng=rng)
     assert found.significant and found.ends.chip == 2
     assert abs(found.ends.largest - 0.05) < 5 * found.ends.sigma
     quiet, loud = ([one.p_value for one in several] for several in found.patterns)

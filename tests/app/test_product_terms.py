@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import closing
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,11 +11,11 @@ from astropy.table import Table
 from astropy.wcs import WCS
 
 from bayesdist.app.file_positions import sip_positions
-from bayesdist.app.judging import products_of
-from bayesdist.app.product_terms import _Laid
+from bayesdist.app.made_files import ProductInput
+from bayesdist.app.product_terms import _Laid, product_terms
+from bayesdist.app.results import open_results
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.sessions import session_of
-from bayesdist.app.systematics import Systematics
+from bayesdist.calibration.calibration import GaussianSolution
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import read_wise_meta, sip_from_solution, write_wise_meta
 from tests.app.support import good, summary_of
@@ -85,8 +84,8 @@ def run(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def session(run):
-    with closing(session_of(RunDirectory.open(run))) as found:
+def results(run):
+    with open_results(RunDirectory.open(run)) as found:
         yield found
 
 
@@ -112,12 +111,13 @@ def test_the_inverse_row_is_what_astropy_leaves(run):
     assert sip["inverse_rms"] == row["radial"] <= sip["closure_pix"]
 
 
-def test_forward_it_is_exact_at_its_own_date_and_lacks_the_drift_at_others(run, session):
+def test_forward_it_is_exact_at_its_own_date_and_lacks_the_drift_at_others(run, results):
     row = rows_of(run)["sip.hdr, forward"]
     assert row["radial"] < 1e-10
-    [term] = [t for t in products_of(session) if t.row.name == "sip.hdr, forward"]
+    terms = product_terms(results.product, results.config, results.base)
+    [term] = [t for t in terms if t.row.name == "sip.hdr, forward"]
     x, y = np.array([1.0, 300.0, 512.0]), np.array([200.0, 7.0, 256.0])
-    solution = session.solution
+    solution = results.solution
     at = [solution.model.predict(solution.mean, x, y, epoch=t) for t in (2008.0, 2016.5)]
     np.testing.assert_allclose(term.shift(x, y, 1, 2016.5), at[0] - at[1], atol=1e-10)
     assert np.abs(at[0] - at[1]).max() > 0.02
@@ -162,7 +162,7 @@ def test_axes_and_size_of_a_file_are_its_own_and_a_wave_is_not():
             at = model.basis(chip.number).terms.index(k)
             mean[model.coefficient_slice(chip.number, axis)][at] = half
     solution = SimpleNamespace(model=model, mean=mean)
-    session = SimpleNamespace(solution=solution, epoch=None, systematics=Systematics(solution))
+    product = ProductInput(solution, "")
 
     def wave(x, y, chip, epoch):
         return 0.01 * np.sin(np.stack([x, y], axis=-1) * 2 * np.pi / 32 + chip)
@@ -172,7 +172,7 @@ def test_axes_and_size_of_a_file_are_its_own_and_a_wave_is_not():
         z = 0.05 * np.exp(0.3j) * (u @ [1, -1j]) + 7 - 3j  # -1j: mirrored
         return np.stack([z.real, z.imag], axis=-1)
 
-    found = _Laid(session, other, scaled=True)
+    found = _Laid(product, other, scaled=True)
     x, y = np.random.default_rng(1).uniform(1, 128, (2, 50))
     for chip in (1, 2):
         # shift, turn and scale take up what they can of a wave: next to nothing
@@ -191,7 +191,7 @@ def test_digits_of_wise_entries_are_what_is_left(tmp_path):
     monomial[:, 3:] = 1e-6 * rng.standard_normal((2, 3))
     monomial[:, 0] = 0.3, -0.2
     mean = basis.from_monomials(monomial).ravel()
-    solution = SimpleNamespace(model=model, mean=mean, cov=1e-12 * np.eye(len(mean)))
+    solution = GaussianSolution(model, mean, 1e-12 * np.eye(len(mean)))
     header = sip_from_solution(solution, linear="sip", inverse_order=2)
     write_wise_meta(tmp_path / "w1.meta", {1: header})
     [band] = read_wise_meta(tmp_path / "w1.meta")

@@ -12,8 +12,9 @@ import pytest
 from astropy.table import Table, vstack
 
 from bayesdist.app import matches
-from bayesdist.data import open_matches, read_rvb
+from bayesdist.data import open_matches
 from bayesdist.infer import load_fit
+from bayesdist.missions.wise.pairs.read import read_rvb
 from bayesdist.missions.wise.rvb.transform import RvbTransform
 from tests.app.rvb_jobs import DETECTORS, rvb_job, rvb_pairs, write_rvb_table
 from tests.app.support import cli, good, refused, snapshot, summary_of
@@ -76,7 +77,7 @@ def test_on_disk_the_pairs_are_selected_once(tmp_path, monkeypatch):
     assert len(kept) == 600 - sum(counted(table).values()) and kept.has_epoch
     # the input is not selected anew by later stages, and the fit is that of the pairs in memory
     with monkeypatch.context() as patch:
-        patch.setattr("bayesdist.app.rvb.stream_rvb", None)
+        patch.setattr("bayesdist.missions.wise.pairs.run_input.stream_rvb", None)
         for stage in STAGES:
             good("stage", stage, run)
     assert summary_of(run)["data"] == summary["data"]
@@ -96,7 +97,7 @@ def test_half_a_set_that_a_killed_run_left_is_not_trusted(tmp_path):
     whole = len(open_matches(run / "pairs"))
     record = json.loads((run / "run.json").read_text())
     assert record.pop("pairs")["n_rows"] == 600
-    record["stages"] = {}
+    record["artefacts"] = {}
     (run / "run.json").write_text(json.dumps(record))
     (run / "pairs" / "part-00000.parquet").write_bytes(b"half")
     good("run", config, "-o", run, "--resume")

@@ -12,8 +12,8 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
 
+from bayesdist.app.results import results_of
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.session import Session
 from bayesdist.assess import area_map, binned_residuals, misfit_of, uncertainty_map
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.infer import load_fit, load_posterior, residuals
@@ -274,15 +274,16 @@ def test_validate_keeps_the_chip_and_the_report_takes_it_up(run, tmp_path):
 
 def test_structure_is_looked_for_on_each_chip(run):
     """By arrays, chip by chip; the smaller probability counts twice."""
-    session = Session(RunDirectory.open(run))
-    fit, table = session.fit, session.matches
+    results = results_of(RunDirectory.open(run))
+    fit, table = results.fit, results.data.stars
     residual, used = residuals(fit, table), fit.uses(table)
+    found = results.diagnostics
     p = {}
     for chip in CHIPS:
         here = used & (table.chip_number == chip.number)
-        bins = session._partitions[chip.number]
+        bins = found.partitions[chip.number]
         arrays = (table.x[here], table.y[here], *residual[here].T)
-        sums = {n: session.sums.binned[chip.number, bins[n]] for n in bins if n != "shown"}
+        sums = {n: found.sums.binned[chip.number, bins[n]] for n in bins if n != "shown"}
         for name, one in sums.items():
             expected = binned_residuals(*arrays, bins=bins[name], size=chip.size)
             np.testing.assert_array_equal(one.residuals().count, expected.count)

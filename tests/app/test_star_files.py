@@ -103,7 +103,6 @@ def test_one_part_for_each_piece(finished, matches, part, tmp_path, monkeypatch)
 
 def test_force_removes_the_parts_and_nothing_else(finished, tmp_path, no_report):
     path = shutil.copytree(finished.path, tmp_path / "run")
-    (path / "stars" / "part-00001.parquet").write_text("of a run of more stars")
     (path / "stars" / ".bayesdist-0a1b2c3d-part-00002.parquet").write_text("of a killed run")
     (path / "stars" / "mine.parquet").write_text("precious")
     RunDirectory(shutil.copytree(path, tmp_path / "other")).clear()

@@ -8,16 +8,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.app.campaign import systematics
 from bayesdist.app.campaign.aberration import PERIOD, SWING, scale_error
-from bayesdist.app.campaign.systematics import (
-    catalogue_covariance,
-    catalogue_terms,
-    with_shared_stars,
-)
+from bayesdist.app.campaign.inputs import errors_by_star
+from bayesdist.assess.adjusted import with_shared_stars
 from bayesdist.assess.terms.parameters import CATALOGUE as POSITIONS
-from bayesdist.assess.terms.parameters import MOTIONS
+from bayesdist.assess.terms.parameters import MOTIONS, catalogue_terms
 from bayesdist.data import MatchTable, ReferenceCatalog
+from bayesdist.diagnose.diagnostics import catalogue_covariance
 from bayesdist.infer import Posterior, Rejection, fit_linear
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.model import Chip, DistortionModel
@@ -68,13 +65,13 @@ def posterior_of(fit, n=1000, wider=1.0, seed=1):
 
 
 @pytest.mark.parametrize("wider", [1.0, 1.8])
-def test_exposures_do_not_help_against_the_catalogue(wider, fit, matches, catalog, tmp_path):
+def test_exposures_do_not_help_against_the_catalogue(wider, fit, matches, catalog):
     """Closed form: centroids average over 9 exposures, the errors of the catalogue do not.
 
     Where the scatter is larger than quoted, it is by errors of the single measurements.
     """
     posterior = posterior_of(fit, wider=wider)
-    found = catalogue_covariance(tmp_path / "c.h5", fit, posterior, matches, catalog)
+    found = catalogue_covariance(fit, matches, errors_by_star(catalog))
     draws = with_shared_stars(posterior, fit, found).flat
     phi = MODEL.basis().evaluate(*stars())
     inverse = np.kron(np.eye(2), np.linalg.inv(phi.T @ phi))
@@ -85,10 +82,10 @@ def test_exposures_do_not_help_against_the_catalogue(wider, fit, matches, catalo
     np.testing.assert_allclose(draws.mean(axis=0), posterior.mean, atol=1e-9)
 
 
-def test_few_draws_keep_what_they_are(fit, matches, catalog, tmp_path):
+def test_few_draws_keep_what_they_are(fit, matches, catalog):
     """Each draw is moved by one linear map: twenty of twelve parameters are enough."""
     posterior = posterior_of(fit, n=5)
-    found = catalogue_covariance(tmp_path / "c.h5", fit, posterior, matches, catalog)
+    found = catalogue_covariance(fit, matches, errors_by_star(catalog))
     spread = with_shared_stars(posterior, fit, found)
     a, b = (p.flat - posterior.mean for p in (posterior, spread))
     recolour, *_ = np.linalg.lstsq(a, b)
@@ -96,44 +93,20 @@ def test_few_draws_keep_what_they_are(fit, matches, catalog, tmp_path):
     assert spread.hyper is posterior.hyper and spread.theta.shape == posterior.theta.shape
 
 
-def test_it_is_computed_once_for_a_posterior(fit, matches, catalog, tmp_path, monkeypatch):
-    path = tmp_path / "c.h5"
-    posterior, other = (posterior_of(fit, n=50, seed=s) for s in (1, 2))
-    first = catalogue_covariance(path, fit, posterior, matches, catalog)
-    calls = []
-    true = systematics.star_covariance
-    monkeypatch.setattr(
-        systematics, "star_covariance", lambda *a, **k: calls.append(1) or true(*a, **k)
-    )
-    again = catalogue_covariance(path, fit, posterior, matches, catalog)
-    np.testing.assert_array_equal(first.total, again.total)
-    np.testing.assert_array_equal(first.counted, again.counted)
-    assert not calls
-    catalogue_covariance(path, fit, other, matches, catalog)  # sampled again: never a stale one
-    assert len(calls) == 1
-    path.write_bytes(b"broken")
-    catalogue_covariance(path, fit, other, matches, catalog)
-    assert len(calls) == 2
-
-
-def test_without_codes_or_errors_there_is_none(fit, matches, catalog, tmp_path):
-    posterior, zero = posterior_of(fit, n=5), np.zeros(STARS)
+def test_without_codes_or_errors_there_is_none(fit, matches, catalog):
+    zero = np.zeros(STARS)
     exact = replace(catalog, sigma_u=zero, sigma_v=zero)
     bare = replace(catalog, sigma_u=None, sigma_v=None)
-    for table, reference in (
-        (replace(matches, star=None), catalog),
-        (matches, exact),
-        (matches, bare),
-    ):
-        path = tmp_path / "c.h5"
-        assert catalogue_covariance(path, fit, posterior, table, reference) is None
-        assert not path.exists()
+    assert errors_by_star(exact) is None and errors_by_star(bare) is None
+    errors = errors_by_star(catalog)
+    assert catalogue_covariance(fit, replace(matches, star=None), errors) is None
+    assert catalogue_covariance(fit, matches, None) is None
 
 
 # -- rows of the budget ---------------------------------------------------------------------------
 
 
-def test_motions_have_a_row_of_their_own_and_count_once(fit, matches, catalog, tmp_path):
+def test_motions_have_a_row_of_their_own_and_count_once(fit, matches, catalog):
     """Positions and motions together are the whole, also when both come from the file."""
     moving = replace(
         catalog,
@@ -146,21 +119,17 @@ def test_motions_have_a_row_of_their_own_and_count_once(fit, matches, catalog, t
     # the matches' errors hold those of the catalogue: 0.01 over 2 years is less than the centroid's
     dated = replace(matches, epoch=np.repeat(np.linspace(2004.0, 2006.0, EXPOSURES), STARS))
     posterior = posterior_of(fit, n=50)
-    first, kept = (
-        catalogue_covariance(tmp_path / "m.h5", fit, posterior, dated, moving) for _ in range(2)
-    )
-    np.testing.assert_array_equal(first.motions, kept.motions)
-    terms = catalogue_terms(posterior, kept, "/somewhere/stars.ecsv")
+    found = catalogue_covariance(fit, dated, errors_by_star(moving))
+    terms = catalogue_terms(posterior, found, "stars.ecsv")
     assert [t.name for t in terms] == [POSITIONS, MOTIONS]
-    np.testing.assert_allclose(sum(t.covariance for t in terms), first.total, atol=1e-15)
+    np.testing.assert_allclose(sum(t.covariance for t in terms), found.total, atol=1e-15)
     assert np.trace(terms[1].covariance) > 0
     for term, what in zip(terms, ("positions", "proper motions"), strict=True):
         assert term.source.startswith("given by the user: ") and "stars.ecsv" in term.source
         assert f"errors of {what}" in term.source
-    still = catalogue_covariance(tmp_path / "s.h5", fit, posterior, matches, catalog)
-    again = catalogue_covariance(tmp_path / "s.h5", fit, posterior, matches, catalog)
-    assert still.motions is None and again.motions is None
-    assert [t.name for t in catalogue_terms(posterior, again, "stars.ecsv")] == [POSITIONS]
+    still = catalogue_covariance(fit, matches, errors_by_star(catalog))
+    assert still.motions is None
+    assert [t.name for t in catalogue_terms(posterior, still, "stars.ecsv")] == [POSITIONS]
 
 
 @pytest.mark.parametrize("exptime", [30.0, 375.0, 1200.0])

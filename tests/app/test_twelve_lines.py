@@ -44,7 +44,7 @@ def test_the_session_of_the_readme(tmp_path, monkeypatch):
 
 def test_the_sip_terms_are_those_that_were_published(tmp_path):
     """From simulated pairs back to Appendix B of the WISE report, within the errors stated."""
-    from bayesdist.missions.wise.simulate import WISE_COEFFICIENTS
+    from bayesdist.missions.wise.published import WISE_COEFFICIENTS
 
     matches, _ = bd.simulate_wise(3000, rng=np.random.default_rng(2))
     fit = bd.fit_linear(matches, bd.build_model(matches, order=4, size=(1016, 1016)))

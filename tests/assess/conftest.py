@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bayesdist.infer import Solution
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
 
 @dataclass(frozen=True, eq=False)
-class StandIn:
+class StandIn(Solution):
     """A Gaussian solution of given mean and covariance."""
 
     model: DistortionModel

@@ -56,5 +56,5 @@ def fields_at(drawn, x, y, *, chip=None, epoch=None) -> DrawnFields:
 def drawn_fields(
     solution, x, y, *, terms=(), aligned=False, epoch=None, chip=None, n_draws=1000, rng
 ) -> DrawnFields:
-    drawn = error_model(solution, terms, aligned=aligned, pixel_scale=1.0).drawn(n_draws, rng)
+    drawn = error_model(solution, terms=terms, aligned=aligned, pixel_scale=1.0).drawn(n_draws, rng)
     return fields_at(drawn, x, y, chip=chip, epoch=epoch)

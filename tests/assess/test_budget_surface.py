@@ -32,7 +32,8 @@ def drawn(solution_of, *, time=TIME, frames="none", exposures=("a",), aligned=Fa
     solution = solution_of(model, mean, root @ root.T)
     terms = (ScaleError("aberration", "scale", 1e-4, solution),) if time is TIME else ()
     what = {"grid": GRID, "n_draws": 300, "terms": terms, "aligned": aligned}
-    errors = error_model(solution, terms, aligned=aligned).drawn(300, np.random.default_rng(2))
+    model = error_model(solution, terms=terms, aligned=aligned)
+    errors = model.drawn(300, np.random.default_rng(2))
     return solution, errors, what
 
 

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
-from bayesdist.assess.terms.centroid import centroid_scatter
+from bayesdist.assess.terms.centroid import centroid_errors
 from bayesdist.data import MatchTable
+from bayesdist.diagnose.residuals.centroid import centroid_scatter
 from bayesdist.diagnose.residuals.sample import StarSample
 from bayesdist.errors import InputError
 
@@ -23,7 +24,7 @@ def sample(n=20_000, *, seed=1, catalogue=0.015, false=0.03, with_mag=True):
 
 
 def test_what_is_known_to_be_in_the_residuals_is_taken_off():
-    found = centroid_scatter(sample(), [("catalogue", 0.015, 0.015)])
+    found = centroid_errors(centroid_scatter(sample()), [("catalogue", 0.015, 0.015)])
     at = np.array([15.0, 17.0, 19.0])
     # 800 stars in a bin: scatter to 4 %, of which the catalogue is half at first
     for sigma in found.at(at):
@@ -38,4 +39,4 @@ def test_without_magnitudes_nothing_is_said():
 
 def test_errors_that_are_larger_than_the_residuals_cannot_be_in_them():
     with pytest.raises(InputError, match="said to be in residuals that scatter by"):
-        centroid_scatter(sample(), [("catalogue", 0.3, 0.3)])
+        centroid_errors(centroid_scatter(sample()), [("catalogue", 0.3, 0.3)])

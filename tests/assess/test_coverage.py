@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import Requirement, binned_sums, partitions_for
-from bayesdist.assess.coverage import BY_CHANCE, coverage_of
+from bayesdist.diagnose.residuals.coverage import coverage_of
 from bayesdist.infer.stars.survey import _hull
+from bayesdist.limits import UNCOVERED_BY_CHANCE
 from bayesdist.model import Chip
 
 SIZE = (1016.0, 508.0)
@@ -38,7 +39,7 @@ def test_even_stars_never_alarm(rng, n):
 @pytest.mark.parametrize("half", [0.6, 0.85])
 def test_a_gap_of_known_area_is_found(rng, n, half):
     one = covered(*even(rng, n, half))
-    assert abs(one.gap - (1 - half**2)) < BY_CHANCE * one.by_chance + 0.02
+    assert abs(one.gap - (1 - half**2)) < UNCOVERED_BY_CHANCE.value * one.by_chance + 0.02
     assert one.significant
     assert f"{100 * one.gap:.0f} % of the detector" in one.sentence
     assert "chip A" in covered(*even(rng, n, half), several=True).sentence
@@ -81,14 +82,14 @@ def test_a_requirement_within_the_stars_is_judged(rng):
     one = covered(*even(rng, 6000, 0.6))
 
     def misses(**options):
-        return one.misses(Requirement("r", "max", 1.0, **options), (33, 17))
+        return Requirement("r", "max", 1.0, **options).reaches_beyond(one, (33, 17))
 
     assert misses() and misses(chip=3) and misses(region="lower left")
     assert not misses(region="inner 50 %") and not misses(chip=1)
     corner = ((10.0, 10.0), (200.0, 10.0), (10.0, 150.0))
     assert misses(region=corner)
     whole = covered(*even(rng, 6000))
-    assert not whole.misses(Requirement("r", "max", 1.0), (33, 17))
+    assert not Requirement("r", "max", 1.0).reaches_beyond(whole, (33, 17))
 
 
 def test_stars_on_a_line_leave_the_detector_to_others():

@@ -28,9 +28,9 @@ from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.assess.terms.parameters import CatalogueErrors, ExposureVariation, ScaleError
 from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.data import MagnitudeErrors
+from bayesdist.diagnose.correlated import Discrepancy
+from bayesdist.diagnose.correlated.deviations import LinearDeviations
 from bayesdist.diagnose.tables.mean_square import MeanSquare
-from bayesdist.infer.discrepancy import Discrepancy
-from bayesdist.infer.discrepancy.linear import LinearDeviations
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
 from .conftest import StandIn
@@ -142,7 +142,7 @@ SOLUTIONS = {name for name in TERMS if name.startswith("solution")}
 
 def drawn(*terms, aligned=False, n=DRAWS, seed=1):
     [*own] = [t.solution for t in terms if isinstance(t, SolutionErrors)] or [CERTAIN]
-    model = error_model(own[0], terms, aligned=aligned, pixel_scale=50.0)
+    model = error_model(own[0], terms=terms, aligned=aligned, pixel_scale=50.0)
     return model.drawn(n, np.random.default_rng(seed))
 
 

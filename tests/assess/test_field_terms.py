@@ -45,7 +45,7 @@ def scatter_of(model, mean, **tau):
 
 
 def draw_errors(solution, n, rng, *, terms=(), aligned=False):
-    return error_model(solution, terms, aligned=aligned).drawn(n, rng)
+    return error_model(solution, terms=terms, aligned=aligned).drawn(n, rng)
 
 
 def holding(solution, without, *catalogue):

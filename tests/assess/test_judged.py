@@ -24,7 +24,7 @@ def errors(solution_of):
     rng = np.random.default_rng(3)
     root = 0.01 * rng.normal(size=(MODEL.n_params, MODEL.n_params))
     solution = solution_of(MODEL, cov=root @ root.T)
-    return error_model(solution, TERMS).drawn(150, np.random.default_rng(4))
+    return error_model(solution, terms=TERMS).drawn(150, np.random.default_rng(4))
 
 
 def cases(**more):
@@ -55,7 +55,7 @@ def test_noise_has_its_size_and_belongs_to_a_place(solution_of):
     still = solution_of(MODEL)
     noise = (UserTerm("noise", "random", 0.02, 0.02, "pix"),)
     n, places = 4000, 60
-    errors = error_model(still, noise).drawn(n, np.random.default_rng(5))
+    errors = error_model(still, terms=noise).drawn(n, np.random.default_rng(5))
     square = errors.statistics(cases()[0], ["rms"])["rms"] ** 2 / 0.02**2 * places
     dof = 2 * places
     assert np.mean(square) == pytest.approx(dof, abs=5 * np.sqrt(2 * dof / n))

@@ -23,7 +23,7 @@ def drawn(squares: dict[int, MeanSquare], sigma: float = 1.0):
     fit = fit_linear(matches, model, **UNCLIPPED)
     values = {1: np.full((*SHAPE, 2), sigma)}
     term = LocalErrors.on_grid("left out", values, model, squares=squares)
-    errors = error_model(fit, [term]).drawn(DRAWS, np.random.default_rng(1))
+    errors = error_model(fit, terms=[term]).drawn(DRAWS, np.random.default_rng(1))
     domain = EvaluationDomain.of_chips(model, SHAPE)
     return lambda names: errors.statistics(domain, names)
 

@@ -111,8 +111,8 @@ def test_false_detections_cost_what_is_expected(capsys):
         )  # fmt: skip
         solved = self_calibrate(
             simulated.model, simulated.unlabelled, simulated.theta, match_radius=1.0, jitter=0.0,
-            least=3,
-        ).solution  # fmt: skip
+            min_detections=3,
+        ).mode  # fmt: skip
         off = (aligned(solved.theta, simulated.theta, gauge) - simulated.theta)[free]
         chi2 += off @ np.linalg.solve(cov[np.ix_(free, free)], off)
     with capsys.disabled():

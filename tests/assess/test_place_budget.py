@@ -22,7 +22,8 @@ def errors_of(solution_of, *, sigma=(0.03, 0.02), terms=()):
     """Errors of the shift and the scale of u."""
     cov = np.zeros((6, 6))
     cov[0, 0], cov[1, 1] = np.square(sigma)
-    return error_model(solution_of(MODEL, cov=cov), terms).drawn(DRAWS, np.random.default_rng(1))
+    model = error_model(solution_of(MODEL, cov=cov), terms=terms)
+    return model.drawn(DRAWS, np.random.default_rng(1))
 
 
 def named(budget):

@@ -62,7 +62,7 @@ def test_who_uses_the_file_has_both(solution):
 
 def test_at_a_place_it_is_the_field_and_between_two_the_difference(solution):
     def errors(terms):
-        return error_model(solution, terms).drawn(100, np.random.default_rng(3))
+        return error_model(solution, terms=terms).drawn(100, np.random.default_rng(3))
 
     x, y = [11.0, 151.0], [20.0, 90.0]
     single = place_budget(errors((TERM,)), x, y, chip=2).every
@@ -78,7 +78,7 @@ def test_at_a_place_it_is_the_field_and_between_two_the_difference(solution):
 def test_the_page_carries_it(solution):
     from bayesdist.report.sections.explorer import _product
 
-    errors = error_model(solution, (TERM,)).drawn(100, np.random.default_rng(3))
+    errors = error_model(solution, terms=(TERM,)).drawn(100, np.random.default_rng(3))
     surface = budget_surface(errors, GRID)
     carried = json.loads(json.dumps(_product(*surface.products)))
     [span] = carried["spans"]

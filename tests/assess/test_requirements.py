@@ -6,8 +6,10 @@ import pytest
 from scipy import stats
 
 from bayesdist.assess import STATISTICS, Requirement, UserTerm, check_requirements, drawn
-from bayesdist.assess.requirements.verdict import Caveat, clopper_pearson, scatter_too_small
+from bayesdist.assess.requirements.verdict import clopper_pearson
+from bayesdist.checks import EITHER, LARGER, Check
 from bayesdist.errors import InputError
+from bayesdist.infer.checks import scatter_too_small
 from bayesdist.model import Chip, DistortionModel
 
 RADIAL = [s for s in STATISTICS if s[:2] not in ("u_", "v_")]
@@ -206,17 +208,17 @@ def test_a_posterior_that_is_not_converged_leaves_everything_undecided(shifting)
 
 def test_what_is_missed_is_missed_for_sure_where_errors_can_only_be_larger(shifting):
     reqs = [Requirement("easy", "rms", 5.0), Requirement("hard", "rms", 1e-6)]
-    for larger, verdicts in ((False, ["undecided"] * 2), (True, ["undecided", "missed"])):
-        caveats = [Caveat("structure is left", larger=larger)]
-        found = margins_of(shifting(), reqs, caveats=caveats)
+    for doubt, verdicts in ((EITHER, ["undecided"] * 2), (LARGER, ["undecided", "missed"])):
+        checks = [Check("Fit", sentence="structure is left", doubt=doubt)]
+        found = margins_of(shifting(), reqs, checks=checks)
         assert [m.verdict for m in found] == verdicts
         for m in found:
             if m.verdict == "undecided":
                 assert m.reason.startswith("structure is left; the stated errors alone would")
         assert all(m.remedy is None for m in found)
     # draws that are not to be trusted decide nothing, in either direction
-    caveats = [Caveat("structure is left")]
-    for m in margins_of(shifting(converged=False), reqs, caveats=caveats):
+    checks = [Check("Fit", sentence="structure is left", doubt=LARGER)]
+    for m in margins_of(shifting(converged=False), reqs, checks=checks):
         assert m.verdict == "undecided"
 
 
@@ -316,9 +318,9 @@ def test_a_catalogue_that_varies_is_judged_by_its_worst_form(exact):
     (moving,) = margins_of(exact, limit, terms=[catalogue("a", 0.01)])
     assert still[0].verdict == "met"
     assert moving.probability_met < still[0].probability_met and moving.verdict != "met"
-    doubt = Caveat("the residuals go with magnitude")
-    (doubted,) = margins_of(exact, limit, terms=[catalogue("a", 0.01)], caveats=[doubt])
-    assert doubt.text in doubted.reason and "varies over the field" in doubted.reason
+    doubt = Check("Fit", sentence="the residuals go with magnitude", doubt=LARGER)
+    (doubted,) = margins_of(exact, limit, terms=[catalogue("a", 0.01)], checks=[doubt])
+    assert doubt.sentence in doubted.reason and "varies over the field" in doubted.reason
 
 
 @pytest.mark.parametrize(("stars", "small"), [(1500, True), (20, False)])

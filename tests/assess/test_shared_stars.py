@@ -98,7 +98,7 @@ def test_positions_in_exposures_that_no_fit_has_seen(full):
         fit = fit_hierarchical(matches, model, n_tau=64)
         term = ExposureVariation(model, fit.mean, fit.scatter.kinds, fit.tau_draws)
         chip, x, y = evenly(150, rng)
-        drawn = error_model(fit, [term], aligned=True).drawn(1000, rng)
+        drawn = error_model(fit, terms=[term], aligned=True).drawn(1000, rng)
         fields = [fields_at(drawn, x[chip == c], y[chip == c], chip=c) for c in NUMBERS]
         sigma = np.concatenate([np.stack(f.sigma("model"), axis=1) for f in fields])
         alone = np.concatenate([np.stack(f.sigma("coefficients"), axis=1) for f in fields])

@@ -11,6 +11,7 @@ from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.budget.detector import detector_budget
 from bayesdist.assess.error_model import error_model
 from bayesdist.assess.requirements.validity import horizon_of
+from bayesdist.infer import Solution
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from tests.benchmarks.timing import median, say
 
@@ -35,7 +36,7 @@ QUICK = Sizes(grid=(9, 5), epochs=3, draws=50)
 
 
 @dataclass(frozen=True, eq=False)
-class _Gaussian:
+class _Gaussian(Solution):
     """A solution of independent coefficients."""
 
     model: DistortionModel
@@ -81,7 +82,8 @@ def run(sizes: Sizes) -> dict[str, Any]:
             detector_budget(solution, epoch=epoch, rng=np.random.default_rng(1), **what)
 
     def followed(statistic: str) -> None:
-        errors = error_model(solution, what["terms"]).drawn(sizes.draws, np.random.default_rng(1))
+        model = error_model(solution, terms=what["terms"])
+        errors = model.drawn(sizes.draws, np.random.default_rng(1))
         asked = Requirement("r", statistic, 0.1, "pix", probability=0.95)
         horizon_of(errors, asked, epochs, grid=sizes.grid)
 

@@ -62,11 +62,11 @@ def _calibrated(exposures: int, stars: int, order: int) -> dict[str, Any]:
     detections = field.unlabelled
     clock = [time.perf_counter()]
     found = self_calibrate(
-        field.model, detections, field.theta, match_radius=1.0, start_radius=2.0, least=3
+        field.model, detections, field.theta, match_radius=1.0, start_radius=2.0, min_detections=3
     )
     clock.append(time.perf_counter())
-    posterior = sample_selfcal(found.solution, seed=2)
-    catalogue = star_catalogue(found.solution)
+    posterior = sample_selfcal(found.mode, seed=2)
+    catalogue = star_catalogue(found.mode)
     clock.append(time.perf_counter())
     solve_s, sample_s = np.diff(clock)
     return {

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bayesdist.data.matching.linear_map import LinearMap, best_similarity, iterated_map
-from bayesdist.infer.selfcal import Solution, self_calibrate
+from bayesdist.infer.selfcal import SelfCalibrationMode, self_calibrate
 from bayesdist.infer.selfcal.problem import Problem, StarPriors
 from bayesdist.model import DistortionModel
 from tests.benchmarks.dithered import (
@@ -79,16 +79,16 @@ def own_solution(sky: DitheredSky, frames: str) -> dict[str, Any]:
         start_of(sky, model),
         match_radius=FIRST_MATCH,
         start_radius=REACH,
-        least=3,
-    ).solution
+        min_detections=3,
+    ).mode
     onto = _onto_references(first, sky.references, rigid=frames == RIGID)
 
     def known(problem: Problem, *_: object) -> StarPriors:
         return _priors(problem, first.theta, onto, sky.references)
 
     found = self_calibrate(
-        model, detections, first.theta, match_radius=MATCH, least=3, references=known
-    ).solution
+        model, detections, first.theta, match_radius=MATCH, min_detections=3, references=known
+    ).mode
     seconds, cpu = time.perf_counter() - clock, time.process_time() - cpu
     return {
         "places": onto(sky.places(model, found.theta)),
@@ -98,7 +98,7 @@ def own_solution(sky: DitheredSky, frames: str) -> dict[str, Any]:
     }
 
 
-def _onto_references(solution: Solution, references: Float, *, rigid: bool) -> LinearMap:
+def _onto_references(solution: SelfCalibrationMode, references: Float, *, rigid: bool) -> LinearMap:
     """From the sky of a solution onto the reference stars.
 
     Where exposures are rigid it is a similarity, under which they stay so.
@@ -129,7 +129,7 @@ def _priors(problem: Problem, theta: Float, onto: LinearMap, references: Float) 
     return replace(none, centre=centre, precision=precision)
 
 
-def _sigma(sky: DitheredSky, solution: Solution) -> Float:
+def _sigma(sky: DitheredSky, solution: SelfCalibrationMode) -> Float:
     """Errors (N, 2) of relative places of the grid that the solution claims."""
     model = solution.problem.model
     x, y = sky.grid

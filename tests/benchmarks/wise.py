@@ -9,7 +9,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from bayesdist.missions.wise.simulate import WISE_BANDS, wise_set, write_wise_set
+from bayesdist.missions.wise.published import WISE_BANDS
+from bayesdist.missions.wise.simulate import wise_set, write_wise_set
 from tests.benchmarks.timing import say
 
 __all__ = ["FULL", "QUICK", "Sizes", "run"]

@@ -12,9 +12,10 @@ from scipy.stats import chi2
 
 from bayesdist.data import MatchTable
 from bayesdist.infer import fit_by_magnitude
-from bayesdist.infer.nodes import TableFit, TablePosterior, fit_with_tables, pixel_jacobian
-from bayesdist.infer.series import Course, Series, fit_series
-from bayesdist.infer.transforms import Solution, View, lines, reference_gauge, without_frames
+from bayesdist.infer.nodes import TableFit, TablePosterior, fit_with_tables
+from bayesdist.infer.series import Series, TrendModel, fit_series
+from bayesdist.infer.solution import Solution, TransformedSolution
+from bayesdist.infer.transforms import lines, reference_gauge, without_frames
 from bayesdist.missions.acs.simulate.pointings import SPANS
 from bayesdist.missions.acs.simulate.stars import centroid_error
 from bayesdist.model import corrected
@@ -69,7 +70,7 @@ def line_errors(found: Calibrated, seed: int) -> Outcome:
     drift = found.bare.model.time
     assert drift is not None
     series = found.terms
-    course = Course("lines", drift.breaks, reference=drift.epoch0)
+    trend = TrendModel("lines", drift.breaks, reference=drift.epoch0)
     keep = [k for k, name in enumerate(series.coefficients) if name.split(".")[-1] in TERMS]
     some = Series(
         series.epoch,
@@ -77,7 +78,7 @@ def line_errors(found: Calibrated, seed: int) -> Outcome:
         series.cov[:, keep][:, :, keep],
         tuple(series.coefficients[k] for k in keep),
     )
-    posterior = fit_series(some, course, seed=seed, target_ess=100, target_rhat=1.05)
+    posterior = fit_series(some, trend, seed=seed, target_ess=100, target_rhat=1.05)
     names = {chip.number: chip.name for chip in found.bare.model.chips}
     draws = np.stack([posterior.alpha, posterior.beta], axis=-1)  # (n, S, k, 2)
     at = [[some.coefficients.index(f"{names[c]}.{term}") for c in CHIPS] for term in TERMS]
@@ -112,14 +113,14 @@ def node_errors(found: Calibrated, tables: TableFit, step: float) -> Outcome:
         "rms after": tables.progress[-1].rms,
         "rms noise": _noise(found),
     }
-    session = found.session
-    pairs = session.pairs
+    pairs = found.matched.stars
+    model = found.matched.affine_model(found.results.config)
     assert isinstance(pairs, MatchTable)
-    _, with_errors, _ = fit_by_magnitude(pairs, session.plain_model)
+    _, with_errors, _ = fit_by_magnitude(pairs, model)
     assert isinstance(with_errors, MatchTable)
-    binned = fit_with_tables(with_errors, session.plain_model, method="binned", step=(step, step))
+    binned = fit_with_tables(with_errors, model, method="binned", step=(step, step))
     others = {table.chip: table for table in binned.tables}
-    for posterior in tables.part().posteriors:
+    for posterior in tables.posteriors:
         table = posterior.table
         grid = grids(step)[table.chip]
         x, y = grid.positions
@@ -137,7 +138,7 @@ def node_errors(found: Calibrated, tables: TableFit, step: float) -> Outcome:
 
 def _noise(found: Calibrated) -> float:
     """Rms of the errors of centroids and catalogue, as they were drawn, of all pairs."""
-    pairs = found.session.pairs
+    pairs = found.matched.stars
     assert isinstance(pairs, MatchTable) and pairs.star is not None
     assert pairs.sigma_u is not None and pairs.sigma_v is not None
     single = centroid_error(found.campaign.truth.stars.mag[pairs.star])
@@ -153,7 +154,7 @@ def position_errors(found: Calibrated, tables: TableFit, rng: np.random.Generato
     Polynomial with its drift, errors of the catalogue, and tables.
     """
     view = reference_gauge(without_frames(found.joint), REFERENCE)
-    posteriors = {p.table.chip: p for p in tables.part().posteriors}
+    posteriors = {p.table.chip: p for p in tables.posteriors}
     truth = found.campaign.truth
     chip = rng.choice(CHIPS, POSITIONS)
     x, y = rng.uniform(0.5, 4096.5, POSITIONS), rng.uniform(0.5, 2048.5, POSITIONS)
@@ -180,7 +181,7 @@ def position_errors(found: Calibrated, tables: TableFit, rng: np.random.Generato
 
 
 def _position(
-    view: View,
+    view: TransformedSolution,
     found: Calibrated,
     posterior: TablePosterior,
     x: np.ndarray,
@@ -188,9 +189,9 @@ def _position(
     where: dict[str, Any],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions (N, 2) and their covariance (N, 2, 2)."""
-    px, py = corrected(found.session.tables, x, y, chip=where["chip"])
+    px, py = corrected(found.results.fitted.tables.tables, x, y, chip=where["chip"])
     D = view.model.jacobian(view.mean, px, py, **where)
-    J = pixel_jacobian(view.model, view.mean, px, py, **where)
+    J = view.model.slopes(view.mean, px, py, **where)
     table = posterior.position_sigma(x, y, refitted=True) ** 2
     cov = np.einsum("nap,pq,nbq->nab", D, view.cov, D, optimize=True)
     cov += np.einsum("nai,ni,nbi->nab", J, table, J)
@@ -244,7 +245,7 @@ def alignments(found: Calibrated) -> Outcome:
 
 def _calibrations(found: Calibrated) -> dict[str, Callable[..., np.ndarray]]:
     """Positions (N, 2) of x, y, chip and epoch by three calibrations."""
-    truth, tables = found.campaign.truth, found.session.tables
+    truth, tables = found.campaign.truth, found.results.fitted.tables.tables
     view = reference_gauge(without_frames(found.joint), REFERENCE)
 
     def new(x: np.ndarray, y: np.ndarray, chip: np.ndarray, epoch: float) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,16 +13,19 @@ from unittest import mock
 import numpy as np
 
 from bayesdist.app.campaign import fit as stage
-from bayesdist.app.campaign.matching import run_match
-from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.campaign.matched import CampaignMatched, campaign_matches
 from bayesdist.app.config import load_config
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.results import Results, open_results
 from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.stages.fit import run_fit
+from bayesdist.app.stages.match import run_match
 from bayesdist.data import MatchTable
-from bayesdist.infer.catalogue.star_errors import star_covariance
+from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit
 from bayesdist.infer.nodes import Matern, NodeGrid, TableFit
-from bayesdist.infer.posterior.recoloured import Recoloured
 from bayesdist.infer.series import Series
+from bayesdist.infer.solution import TransformedSolution
 from bayesdist.missions.acs.simulate import AcsCampaign, acs_model, read_acs
 from bayesdist.missions.acs.simulate.pointings import OWN
 from bayesdist.model import LookupTable
@@ -102,27 +105,32 @@ class Calibrated:
     ----------
     campaign : AcsCampaign
         What it was made from.
-    session : CampaignSession
+    results : Results
     tables : TableFit or None
-    bare, joint : HierarchicalFit and Recoloured
+    bare, joint : HierarchicalFit and TransformedSolution
         All exposures jointly; without and with the correlated errors of the catalogue.
     terms : Series
         Linear terms of every exposure alone.
     """
 
     campaign: AcsCampaign
-    session: CampaignSession
+    results: Results
     tables: TableFit | None
     bare: HierarchicalFit
-    joint: Recoloured
+    joint: TransformedSolution
     terms: Series
+
+    @property
+    def matched(self) -> CampaignMatched:
+        """Pairs as they were matched."""
+        return campaign_matches(self.results.matched)
 
 
 @contextmanager
 def calibrated(setting: Setting, seed: int) -> Iterator[Calibrated]:
     """Simulate a campaign and calibrate it.
 
-    Its files are gone afterwards, and with them what the session has not yet read.
+    Its files are gone afterwards, and with them what has not yet been read.
     """
     with tempfile.TemporaryDirectory() as folder:
         base = Path(folder) / "campaign"
@@ -131,18 +139,18 @@ def calibrated(setting: Setting, seed: int) -> Iterator[Calibrated]:
         settings, text = load_config(config)
         run = RunDirectory.plan(Path(folder) / "run", settings, text, base)
         run.begin()
-        with closing(CampaignSession(run)) as session:
-            run_match(session)
+        with open_results(run) as results:
+            results = run_match(results)
             with _results_of("fit_tables", "fit_hierarchical") as made:
-                stage.run_campaign_fit(session)
+                results = run_fit(results)
             bare = made["fit_hierarchical"]
             yield Calibrated(
                 campaign=read_acs(base),
-                session=session,
-                tables=made["fit_tables"],
+                results=results,
+                tables=made["fit_tables"].fit,
                 bare=bare,
-                joint=_with_catalogue(bare, session),
-                terms=session.terms,
+                joint=_with_catalogue(bare, results.data),
+                terms=results.fitted.alone,
             )
 
 
@@ -201,9 +209,9 @@ def _results_of(*names: str) -> Iterator[dict[str, Any]]:
         yield made
 
 
-def _with_catalogue(bare: HierarchicalFit, session: CampaignSession) -> Recoloured:
+def _with_catalogue(bare: HierarchicalFit, data: FitData) -> TransformedSolution:
     """The joint fit with the errors that a star of the catalogue has in all exposures."""
-    catalog, matches = session.inputs.catalog, session.matches
+    catalog, matches = campaign_matches(data.matched).inputs.catalog, data.stars
     assert isinstance(matches, MatchTable)
 
     def by_code(values: Any) -> np.ndarray:
@@ -211,13 +219,10 @@ def _with_catalogue(bare: HierarchicalFit, session: CampaignSession) -> Recolour
         out[catalog.star] = values
         return out
 
-    stars = star_covariance(
-        bare,
-        matches,
-        by_code(catalog.sigma_u),
-        by_code(catalog.sigma_v),
-        motion_u=by_code(catalog.sigma_pm_u),
-        motion_v=by_code(catalog.sigma_pm_v),
-        epoch0=by_code(catalog.epoch),
+    position, motion = (
+        np.stack([by_code(getattr(catalog, f"{name}_{axis}")) for axis in "uv"], axis=1)
+        for name in ("sigma", "sigma_pm")
     )
+    errors = StarErrors(position, motion, by_code(catalog.epoch))
+    stars = star_covariance(bare, matches, errors)
     return with_star_errors(bare, stars)

@@ -10,9 +10,9 @@ from astropy.table import Table
 from scipy.interpolate import RegularGridInterpolator
 
 from bayesdist.app.config import load_config
+from bayesdist.app.results import Results, results_of
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.session import Session
-from bayesdist.app.sessions import session_of
+from bayesdist.app.stages.assess import run_diagnose
 from bayesdist.app.stages.fit import run_fit
 from bayesdist.app.stages.sample import run_sample
 from bayesdist.model import Chip, DistortionModel, TimeDependence
@@ -168,7 +168,7 @@ def campaign(kind: Kind, seed: int) -> Campaign:
     return Campaign(model, theta, pattern, Table(columns), rng)
 
 
-def assessed(kind: Kind, seed: int, stars: Table, folder: Path) -> Session:
+def assessed(kind: Kind, seed: int, stars: Table, folder: Path) -> Results:
     """As `bayesdist run` has it when budget and margins are made."""
     stars.write(folder / "stars.parquet")
     text = CONFIG.format(
@@ -182,10 +182,6 @@ def assessed(kind: Kind, seed: int, stars: Table, folder: Path) -> Session:
     (folder / "config.toml").write_text(text)
     config, text = load_config(folder / "config.toml")
     directory = RunDirectory.plan(folder / "run", config, text, folder)
-    session = session_of(directory)
+    results = results_of(directory)
     directory.begin()
-    session.begun()
-    run_fit(session)
-    run_sample(session)
-    session.measure()
-    return session
+    return run_diagnose(run_sample(run_fit(results)))

@@ -33,9 +33,9 @@ def _judged(name: str, seed: int, limits: dict[str, float]) -> tuple[list[Margin
     )
     with TemporaryDirectory() as folder, one_thread():
         truth = campaign(kind, seed)
-        with closing(assessed(kind, seed, truth.stars, Path(folder))) as session:
-            margins = margins_of(session, requirements)
-            solution, grid = session.solution, session.config.assess.grid
+        with closing(assessed(kind, seed, truth.stars, Path(folder))) as results:
+            margins = margins_of(results, requirements)
+            solution, grid = results.solution, results.config.assess.grid
     model, rng = solution.model, truth.rng
     x, y = mesh(*grid_pixels(model.chips[0].size, grid))
     epoch = np.full(x.size, BEYOND) if kind.drift else None

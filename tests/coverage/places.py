@@ -20,7 +20,7 @@ from bayesdist.assess.terms.correlated import STRUCTURE_IN_FIT
 from bayesdist.assess.terms.forms import PolynomialField
 from bayesdist.assess.terms.given import CENTROID
 from bayesdist.assess.terms.solution import COEFFICIENTS, TIME_DEPENDENCE
-from bayesdist.infer.discrepancy import Discrepancy
+from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.model import DistortionModel
 
 from .campaigns import (
@@ -88,9 +88,9 @@ def covered(name: str, seed: int) -> dict[str, dict[str, np.ndarray]]:
     kind = KINDS[name]
     with TemporaryDirectory() as folder, one_thread():
         truth = campaign(kind, seed)
-        with closing(assessed(kind, seed, truth.stars, Path(folder))) as session:
-            solution, errors = session.solution, errors_of(session)
-            discrepancy = session.discrepancy.found
+        with closing(assessed(kind, seed, truth.stars, Path(folder))) as results:
+            solution, errors = results.solution, errors_of(results)
+            discrepancy = results.diagnostics.correlated
         rng = truth.rng
         x, y = rng.uniform(0.5, SIDE + 0.5, (2, PLACES))
         mag = np.repeat(rng.uniform(BRIGHT, FAINT, DATES), PLACES // DATES)

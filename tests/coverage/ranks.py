@@ -17,10 +17,10 @@ from bayesdist.app.judging import errors_of, margins_of
 from bayesdist.assess import Requirement
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.statistics import field_statistic
+from bayesdist.diagnose.correlated import DiscrepancyPriors
+from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.correlated.structure import LENGTHS, UNLIKE
 from bayesdist.infer import OutlierMixture
-from bayesdist.infer.discrepancy import DiscrepancyPriors
-from bayesdist.infer.discrepancy.functions import StructureFunctions
-from bayesdist.infer.discrepancy.structure import LENGTHS, UNLIKE
 from bayesdist.model.grid import grid_pixels, mesh
 from tests.adversarial import fields
 from tests.adversarial.measure import GRID, assessed
@@ -104,16 +104,16 @@ def ranks(seed: int) -> dict[str, float]:
     with (
         one_thread(),
         TemporaryDirectory() as folder,
-        closing(assessed(truth, Path(folder), seed)) as session,
+        closing(assessed(truth, Path(folder), seed)) as results,
     ):
-        model, mean = session.solution.model, np.asarray(session.solution.mean)
+        model, mean = results.solution.model, np.asarray(results.solution.mean)
         basis, points = model.basis(), fields.even_pixels(24)
         at = np.stack(points, axis=1) - fields.MIDDLE + polynomial(*points)
         true = np.linalg.lstsq(basis.evaluate(*points), at, rcond=None)[0].T.ravel()
-        errors, kept = errors_of(session), session.discrepancy.found
+        errors, kept = errors_of(results), results.diagnostics.correlated
         n, rng = errors.n_draws, np.random.default_rng([32, seed])
         with_structure = kept.structure_theta[np.arange(n) % kept.n_draws]
-        coefficients = session.systematics.solution.draws(n, rng) - mean + with_structure
+        coefficients = results.errors.solution.solution.draws(n, rng) - mean + with_structure
         found = {
             name: float(np.mean(draws < actual))
             for name, draws, actual in zip(model.names, coefficients.T, true - mean, strict=True)
@@ -126,7 +126,7 @@ def ranks(seed: int) -> dict[str, float]:
             for axis, name in enumerate("uv"):
                 found[f"{name} at {i}, {j}"] = float(np.mean(drawn[:, k, axis] < error[k, axis]))
         asked = tuple(Requirement(s, s, 1.0) for s in STATISTICS)
-        for margin in margins_of(session, asked):
+        for margin in margins_of(results, asked):
             name = margin.requirement.statistic
             found[name] = float(np.mean(margin.draws < field_statistic(name, error)))
     return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.infer.discrepancy import DiscrepancyPriors
+from bayesdist.diagnose.correlated import DiscrepancyPriors
 
 from .ranks import half_cauchy, structure
 from .runs import all_ranks

@@ -127,7 +127,7 @@ class Dated:
         projection = projection_of(
             functions_for(scored_sample(matches, fit)), fit.mean, GaussianPriors.none(model)
         )
-        found = gap_test(projection), motion_test(projection)
+        found = gap_test(projection), motion_test(projection.scored)
         return {one.name: one for one in found if one is not None}
 
     def tests(self, seed: int) -> dict[str, ScoreTest]:

@@ -13,10 +13,10 @@ import numpy as np
 from bayesdist.data.holdout import SetAside, Split, split_matches
 from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive
-from bayesdist.diagnose.holdout.validation import HeldOutTruth, held_out_truth
+from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_validation
 from bayesdist.infer import OutlierMixture, Rejection, load
-from bayesdist.infer.catalogue.star_errors import star_covariance
-from bayesdist.infer.catalogue.star_influence import StarErrors, star_influence
+from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
+from bayesdist.infer.catalogue.star_influence import star_influence
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical
@@ -150,14 +150,7 @@ def solved(
         }
         shards.close()
     errors = one.errors
-    shared = star_covariance(
-        joint.fit,
-        kept,
-        *errors.position.T,
-        motion_u=errors.motion[:, 0],
-        motion_v=errors.motion[:, 1],
-        epoch0=errors.epoch,
-    )
+    shared = star_covariance(joint.fit, kept, errors)
     codes = np.unique(held.star[np.isin(np.array(held.exposure_names)[held.exposure], whole)])
     return joint, Predictive(
         model,
@@ -169,8 +162,8 @@ def solved(
     )
 
 
-def judged(one: Field, aside: SetAside, *, mixture: bool = False) -> HeldOutTruth:
+def judged(one: Field, aside: SetAside, *, mixture: bool = False) -> HoldoutValidation:
     """Hold out, solve, predict, judge."""
     split = split_matches(one.matches, aside)
     _, predictive = solved(one, split, aside.exposures, mixture=mixture)
-    return held_out_truth(predictive, split.held, whole=aside.exposures)
+    return holdout_validation(predictive, split.held, whole=aside.exposures)

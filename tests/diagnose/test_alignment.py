@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2, kstest
 
 from bayesdist.assess import residual_statistics
-from bayesdist.assess.wise import (
+from bayesdist.diagnose.residuals import (
     STATISTICS,
     BinValues,
     band_bins,
@@ -24,7 +24,7 @@ from bayesdist.assess.wise import (
 )
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import build_model, fit_linear, residuals
-from bayesdist.infer.linear import Clip
+from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.shards import LocalShards
 from bayesdist.missions.wise.assess.contradictions import (
     contradictions_across,
@@ -39,7 +39,8 @@ from bayesdist.missions.wise.assess.published import (
     noise_of_bins,
     printed_rows,
 )
-from bayesdist.missions.wise.simulate import SAMPLE_SIZES, simulate_wise
+from bayesdist.missions.wise.published import SAMPLE_SIZES
+from bayesdist.missions.wise.simulate import simulate_wise
 
 SIZE = (60.0, 60.0)
 

@@ -12,7 +12,6 @@ from scipy import stats
 from bayesdist.diagnose.tables.between_nodes import between_nodes
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.nodes import Matern, NodeGrid, field_table
-from bayesdist.infer.nodes.sums import interpolation
 from bayesdist.model import Chip
 
 CHIP = Chip(1, "A", (512.0, 512.0), (256.0, 256.0))
@@ -50,7 +49,7 @@ def measured(kind, seed):
     grid = found.grid
 
     def fitted(px, py):
-        W, phi = interpolation(grid, px, py), grid.basis.evaluate(px, py)
+        W, phi = grid.interpolation(px, py), grid.basis.evaluate(px, py)
         return np.stack([W @ a.mean + phi @ a.polynomial for a in found.axes], axis=1)
 
     def taken(px, py):
@@ -71,7 +70,7 @@ def measured(kind, seed):
     )
     # what the best table of all leaves, had every pixel a star without error
     px, py = (a.ravel() for a in np.meshgrid(*[np.arange(2.5, 512, 4.0)] * 2))
-    W = grid.without_polynomials(interpolation(grid, px, py).toarray().T).T
+    W = grid.without_polynomials(grid.interpolation(px, py).toarray().T).T
     A, b = np.hstack([W, grid.basis.evaluate(px, py)]), truth.evaluate(px, py)
     left = b - A @ np.linalg.lstsq(A, b, rcond=None)[0]
     return seen, (left**2).mean(axis=0)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+from bayesdist.diagnose.selfcal.leverage import taken_by_stars
 from bayesdist.diagnose.selfcal.misfit import _shifts, dithered_misfit
 from bayesdist.infer.selfcal import self_calibrate
-from bayesdist.infer.selfcal.following import taken_by_stars
-from bayesdist.infer.selfcal.normal import memberships
+from bayesdist.infer.selfcal.elimination import memberships
 from bayesdist.simulate.dithers import simulate_dithers, smooth_distortion
 from tests.infer.selfcal.fields import SIZE, chips, field
 
@@ -23,7 +23,7 @@ def _solved(simulated, detections=None):
         simulated.theta,
         match_radius=1.0,
         start_radius=2.0,
-    ).solution
+    ).mode
 
 
 def _simulated(seed, **more):
@@ -51,7 +51,7 @@ def test_noise_is_no_structure(more, full):
 def test_a_wave_is_found_with_its_size():
     simulated = _simulated(5)
     found = dithered_misfit(_solved(simulated, _waved(simulated.unlabelled, 0.01)))
-    assert found.significant and found.partition == "columns" and found.told > 0.95
+    assert found.significant and found.partition == "columns" and found.power > 0.95
     # means over columns of 150 / 1024 * 64 bins hold nearly all of the wave
     assert abs(found.structure - 0.01) < 0.0015
 
@@ -81,7 +81,7 @@ def test_what_small_dithers_hide_is_said():
         sigma=(0.01, 0.05),
     )
     found = dithered_misfit(_solved(simulated, _waved(simulated.unlabelled, 0.01)))
-    assert found.told < 0.2 and found.hidden
+    assert found.power < 0.2 and found.underpowered
     assert not found.significant
 
 
@@ -95,7 +95,7 @@ def test_a_star_of_as_many_numbers_as_detections_takes_all():
         match_radius=1.0,
         start_radius=2.0,
         motion="proper_motion",
-    ).solution
+    ).mode
     counts = found.problem.counts
     assert (counts == 2).any() and counts.max() == 6
     taken = taken_by_stars(found)

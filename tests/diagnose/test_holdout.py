@@ -23,11 +23,12 @@ from bayesdist.diagnose.holdout.predictive import (
 )
 from bayesdist.diagnose.holdout.spread import SpreadMoments, sum_tails
 from bayesdist.diagnose.holdout.sums import _beyond
-from bayesdist.diagnose.holdout.validation import DOUBTFUL, held_out_truth
+from bayesdist.diagnose.holdout.validation import holdout_validation
 from bayesdist.diagnose.significance import holm
 from bayesdist.infer import GaussianPriors, OutlierMixture, fit_linear, load
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target
+from bayesdist.limits import HELD_OUT_DOUBTFUL
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
 
@@ -96,7 +97,7 @@ def judged(seed, n, model=None, *, fitted=None, aside=None, mixture=None, **opti
     model, matches = stars(seed, n, model, **options)
     split = split_matches(matches, aside or SetAside(0.3, (), seed))
     solution = posterior_of(fitted or model, split.kept, mixture or OutlierMixture(jitter=0.0))
-    return held_out_truth(solution, split.held, whole=aside.exposures if aside else ())
+    return holdout_validation(solution, split.held, whole=aside.exposures if aside else ())
 
 
 def collected(results) -> dict[tuple[str, str], np.ndarray]:
@@ -156,7 +157,7 @@ def test_an_exposure_is_found_whatever_its_roll():
         matches, _ = simulate_matches(model, theta, 2400, rng=rng, **options)
         split = split_matches(matches, SetAside(0.0, ("c",)))
         solution = posterior_of(model, split.kept, OutlierMixture(jitter=0.0))
-        found = held_out_truth(solution, split.held, whole=("c",))
+        found = holdout_validation(solution, split.held, whole=("c",))
         assert found.n == len(split.held) == 800
         return found
 
@@ -374,4 +375,4 @@ def test_sums_of_squares_have_their_exact_probability():
 def test_correction_for_the_number_of_tests():
     """The example of Holm's procedure worked by hand."""
     np.testing.assert_allclose(holm(np.array([0.01, 0.04, 0.03, 0.005])), [0.03, 0.06, 0.06, 0.02])
-    assert DOUBTFUL < 0.01
+    assert HELD_OUT_DOUBTFUL.value < 0.01

@@ -16,7 +16,7 @@ from scipy.stats import binom, kstest
 
 from bayesdist.data.holdout import SetAside, split_matches
 from bayesdist.diagnose.holdout.frames import frames_for
-from bayesdist.diagnose.holdout.validation import held_out_truth
+from bayesdist.diagnose.holdout.validation import holdout_validation
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_errors import star_covariance
 from bayesdist.infer.catalogue.star_influence import star_influence
@@ -78,7 +78,7 @@ def test_errors_of_stars_that_are_taken_for_independent_would_be_alarms() -> Non
     split = split_matches(one.matches, SetAside(0.25, (), 1))
     _, right = solved(one, split, ())
     wrong = replace(right, stars=None)
-    found = [held_out_truth(p, split.held) for p in (right, wrong)]
+    found = [holdout_validation(p, split.held) for p in (right, wrong)]
     assert not found[0].doubtful and found[1].doubtful
 
 
@@ -194,11 +194,7 @@ def test_influence_of_stars_is_what_the_fit_does_with_their_errors() -> None:
     n = joint.model.n_distortion
     variance = one.errors.variances[:, codes]
     total = np.einsum("lasd,lsa,lase->de", found.by, variance, found.by)
-    e = one.errors
-    expected = star_covariance(
-        joint.fit, kept, *e.position.T, motion_u=e.motion[:, 0], motion_v=e.motion[:, 1],
-        epoch0=e.epoch,
-    ).total[:n, :n]  # fmt: skip
+    expected = star_covariance(joint.fit, kept, one.errors).total[:n, :n]
     np.testing.assert_allclose(total, expected, rtol=1e-8, atol=1e-12 * np.abs(expected).max())
     assert not found.with_solution(np.array([10**6]), np.array([2004.0])).any()
 
@@ -208,4 +204,4 @@ def test_a_posterior_without_its_scatter_is_refused() -> None:
     split = split_matches(one.matches, SetAside(0.3, ()))
     _, predictive = solved(one, split, ())
     with pytest.raises(InputError, match="how exposures scatter"):
-        held_out_truth(replace(predictive, deviations=None), split.held)
+        holdout_validation(replace(predictive, deviations=None), split.held)

@@ -9,7 +9,7 @@ from scipy.stats import binom, kstest
 
 from bayesdist.data import MatchTable
 from bayesdist.diagnose.holdout.predictive import Predictive
-from bayesdist.diagnose.holdout.validation import held_out_truth
+from bayesdist.diagnose.holdout.validation import holdout_validation
 from bayesdist.model import Chip, DistortionModel, LookupTable
 
 SIZE, CELL = (1000.0, 800.0), (25.0, 25.0)
@@ -41,7 +41,7 @@ def predictive() -> Predictive:
 
 def test_right_predictions_raise_no_alarm() -> None:
     """Offsets in 64 regions have uniform probabilities, and all tests together are calm."""
-    judged = [held_out_truth(predictive(), held(seed)) for seed in range(RUNS)]
+    judged = [holdout_validation(predictive(), held(seed)) for seed in range(RUNS)]
     p = [t.p_value for one in judged for t in one.tests if t.name == "offset" and t.index >= 0]
     assert len(p) > 60 * RUNS and kstest(p, "uniform").pvalue > 1e-3
     assert sum(one.p_value < 0.05 for one in judged) <= binom.ppf(0.999, RUNS, 0.05)
@@ -51,7 +51,7 @@ def test_stars_that_are_taken_for_independent_would_be_alarms() -> None:
     """The same errors at the same places, of which it is not known that stars share them."""
     alone = replace(predictive(), cell=None)
     for seed in range(3):
-        assert held_out_truth(alone, held(seed)).p_value < 1e-6
+        assert holdout_validation(alone, held(seed)).p_value < 1e-6
 
 
 def test_few_large_cells_raise_no_alarm_about_distributions() -> None:
@@ -71,7 +71,7 @@ def test_few_large_cells_raise_no_alarm_about_distributions() -> None:
         )
         table = LookupTable(1, np.full((2, 7, 9), local), first=(1.0, 1.0), step=side)
         cov = np.zeros((MODEL.n_params,) * 2)
-        found = held_out_truth(Predictive(MODEL, THETA, cov, local=(table,), cell=side), stars)
+        found = holdout_validation(Predictive(MODEL, THETA, cov, local=(table,), cell=side), stars)
         return [t.p_value for t in found.tests if t.name == "distribution"]
 
     p = np.array([one(seed) for seed in range(60)])

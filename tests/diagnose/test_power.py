@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.diagnose import score_tests
-from bayesdist.diagnose.score.result import FAMILY_LEVEL
+from bayesdist.limits import SCORE_TESTS
 
 from .. import seeds
 from ..infer.patterned import moved
@@ -209,7 +209,7 @@ def is_found(scene: Scene, name: str, pattern, seed: int) -> bool:
     """A pattern as large as the data without it say, at the level at which it is alone."""
     smallest = scene.tests(seed)[name].smallest
     found = scene.with_pattern(seed, pattern(smallest, seed))
-    return found[name].p_value < FAMILY_LEVEL / len(found)
+    return found[name].p_value < SCORE_TESTS.value / len(found)
 
 
 def next_order(order):
@@ -292,4 +292,4 @@ def noise_is_found(seed: int) -> bool:
         u=uv[:, 0] + (table.u - uv[:, 0]) * stretch, v=uv[:, 1] + (table.v - uv[:, 1]) * stretch
     )
     found = by_name(score_tests(truth, scene.solve(model, truth)))
-    return found["noise by exposure"].p_value < FAMILY_LEVEL / len(found)
+    return found["noise by exposure"].p_value < SCORE_TESTS.value / len(found)

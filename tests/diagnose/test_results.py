@@ -8,6 +8,7 @@ from scipy import stats
 
 from bayesdist.diagnose import score_tests
 from bayesdist.diagnose.score import sample as sample_module
+from bayesdist.diagnose.score.families import Family
 from bayesdist.diagnose.score.result import Outcome, corrected, noncentrality
 from bayesdist.diagnose.score.sample import SAMPLE, scored_sample
 from bayesdist.errors import InputError
@@ -20,7 +21,8 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def outcome(p: float, name: str = "a test") -> Outcome:
-    return Outcome(name, 1.0, 2, None, p, 0.5, lambda level: level, "pix", "x", "something", "none")
+    family = Family(name, "x", "something", "none")
+    return Outcome(family, 1.0, 2, None, p, 0.5, lambda level: level, "pix")
 
 
 def test_holm_steps_down_and_stops_at_the_first_that_fails():

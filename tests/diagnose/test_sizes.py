@@ -24,8 +24,9 @@ from .test_results import outcome
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 NULL = dict(scenes_of_null())
-# by construction: a test that looks at several radii, and those of few stars
-CONSERVATIVE = {"truncation"}
+# by construction: one that looks at several radii, and one that asks two tests to agree (edges
+# alone, and edges beside the orders)
+CONSERVATIVE = {"truncation", "edges"}
 
 
 def p_values(name: str, seed: int) -> tuple[dict[str, float], bool]:

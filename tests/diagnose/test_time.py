@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.diagnose.score.gap import visit_codes
-from bayesdist.diagnose.score.result import FAMILY_LEVEL
+from bayesdist.limits import SCORE_TESTS
 from bayesdist.model import TimeDependence
 
 from .. import seeds
@@ -48,7 +48,7 @@ def test_a_gap_that_opens_is_found(frames):
 
 def test_a_chip_that_turns_is_found():
     gap = [Dated(turn=TURNING).of_time(k)["gap"] for k in FEW]
-    assert all("in rotation" in one.present for one in gap)
+    assert all("in rotation" in one.family.present for one in gap)
     assert np.median([one.p_value for one in gap]) < 1e-4
     assert np.median([one.size for one in gap]) == pytest.approx(TURNING, rel=0.15)
 
@@ -129,7 +129,7 @@ def test_probabilities_are_even(full):
 
 def is_found(name: str, seed: int) -> bool:
     """An effect as large as the data without it say, at the level at which it is alone."""
-    level = FAMILY_LEVEL / 20
+    level = SCORE_TESTS.value / 20
     scene = Dated()
     smallest = scene.of_time(seed)[name].smallest(level)
     with_it = {

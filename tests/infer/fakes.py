@@ -13,8 +13,8 @@ from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.sampler.checkpoints import Walkers
 from bayesdist.infer.sampler.ensembles import Ensembles, Whitening
-from bayesdist.infer.sampler.lookahead import Page
-from bayesdist.infer.sampler.move_schedule import Plan, Stretch
+from bayesdist.infer.sampler.move_schedule import Plan, StepRange
+from bayesdist.infer.sampler.proposal_batch import ProposalBatch
 
 
 class FakeTarget:
@@ -41,8 +41,8 @@ def gaussian_proposal(mean, cov) -> GridProposal:
     return GridProposal(Split(n, (), ()), (node,))
 
 
-def empty_page(ensembles: int, n_params: int) -> Page:
-    return Page(np.empty((ensembles, 0, n_params)), *np.empty((2, ensembles, 0)))
+def empty_page(ensembles: int, n_params: int) -> ProposalBatch:
+    return ProposalBatch(np.empty((ensembles, 0, n_params)), *np.empty((2, ensembles, 0)))
 
 
 def ensembles_of(target, proposal, draws, weights, walkers, seeds, step=0.5) -> Ensembles:
@@ -65,4 +65,4 @@ def advanced(runs: Ensembles, first: np.ndarray, steps: int):
         log_prob, log_q = runs.target.log_density(psi), runs.proposal.log_density(psi)
         random = np.random.RandomState(seed).get_state()
         states.append(Walkers(coords, log_prob, log_q, random))
-    return runs.advance(states, Stretch(0, steps, steps), runs.pilot)
+    return runs.advance(states, StepRange(0, steps, steps), runs.pilot)

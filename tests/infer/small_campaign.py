@@ -9,8 +9,9 @@ import numpy as np
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer import LinearFit
-from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance
-from bayesdist.infer.posterior.recoloured import Recoloured
+from bayesdist.infer.catalogue.star_errors import StarCovariance, StarErrors, star_covariance
+from bayesdist.infer.posterior.covariance import with_covariance
+from bayesdist.infer.solution import Solution, TransformedSolution
 from bayesdist.infer.transforms import lines, without_frames
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.frames import CHIP_DEVIATIONS
@@ -179,10 +180,9 @@ class SharedStars:
 
     def covariance(self, fit: LinearFit) -> StarCovariance:
         """What the catalogue's errors make of a fit to the matches."""
-        position, motion = self.position, self.motion
-        return star_covariance(
-            fit, self.matches, position, position, motion_u=motion, motion_v=motion, epoch0=2004.0
-        )
+        n = int(self.matches.star.max()) + 1
+        position, motion = np.full((n, 2), self.position), np.full((n, 2), self.motion)
+        return star_covariance(fit, self.matches, StarErrors(position, motion, np.full(n, 2004.0)))
 
 
 def shared_stars(
@@ -215,7 +215,7 @@ def shared_stars(
     return SharedStars(model, theta, matches, position, motion)
 
 
-class Truth:
+class Truth(Solution):
     """True parameters as a solution without errors."""
 
     def __init__(self, model: DistortionModel, theta: np.ndarray) -> None:
@@ -226,9 +226,9 @@ class Truth:
         return np.tile(self.mean, (n, 1))
 
 
-def with_star_errors(solution, stars: StarCovariance) -> Recoloured:
+def with_star_errors(solution, stars: StarCovariance) -> TransformedSolution:
     """A solution whose covariance and draws know that a star has one error."""
-    return Recoloured(solution, np.asarray(solution.cov) + stars.extra)
+    return with_covariance(solution, np.asarray(solution.cov) + stars.extra)
 
 
 def seen_by(exposure: str, epoch: float | None, model: DistortionModel, theta: np.ndarray) -> Truth:

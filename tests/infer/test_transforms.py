@@ -9,13 +9,8 @@ import pytest
 from scipy import stats
 
 from bayesdist.errors import InputError
-from bayesdist.infer.transforms import (
-    linear_terms,
-    lines,
-    reference_gauge,
-    segment,
-    without_frames,
-)
+from bayesdist.infer.solution import Solution
+from bayesdist.infer.transforms import linear_terms, lines, reference_gauge, segment, without_frames
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
 from .small_campaign import seen_by
@@ -42,7 +37,7 @@ TERMS = (("u", 1, 0, "A_2"), ("v", 0, 1, "B_3"), ("v", 1, 0, "B_2"))
 
 
 @dataclass(frozen=True, eq=False)
-class Gaussian:
+class Gaussian(Solution):
     """A solution of given mean and covariance."""
 
     model: DistortionModel
@@ -359,10 +354,10 @@ def test_without_frames_is_the_head_of_theta():
 
 
 def test_a_view_of_a_posterior_says_so():
-    """What is asked of posteriors by attribute is there for posteriors alone."""
+    """A transformed posterior has its convergence, a transformed fit has none."""
     assert reference_gauge(acs(kind=Judged)).convergence == "judged"
     assert segment(reference_gauge(acs(kind=Judged)), 1).approximation == ""
-    assert not hasattr(reference_gauge(acs()), "convergence")
+    assert reference_gauge(acs()).convergence is None
 
 
 def test_wrong_places():

@@ -233,6 +233,30 @@ def test_jacobian_by_differences(frames, gauge):
     np.testing.assert_allclose(np.moveaxis((plus - minus) / (2 * step), 0, -1), J, atol=3e-5)
 
 
+@in_every_gauge
+def test_slopes_by_differences(frames, gauge):
+    model = model_of(frames, **gauge)
+    theta, stars = some_theta(model), some_stars(25)
+    slopes = model.slopes(theta, **stars)
+    for axis, name in enumerate("xy"):
+        sides = [model.predict(theta, **stars | {name: stars[name] + d}) for d in (1.0, -1.0)]
+        # of a cubic, exact but for the third derivative / 6: 5 a^3 of its term, a = 2 / 200
+        np.testing.assert_allclose((sides[0] - sides[1]) / 2, slopes[..., axis], atol=2e-3)
+    groups = model.groups(25, **{k: stars[k] for k in ("epoch", "exposure", "chip")})
+    position, again = model.linearised(theta, groups, stars["x"], stars["y"])
+    np.testing.assert_allclose(position, model.predict(theta, **stars), rtol=1e-12)
+    np.testing.assert_array_equal(again, slopes)
+
+
+def test_quadrature_over_a_chip():
+    chip = CHIPS[0]
+    x, y, weight = chip.quadrature(3)
+    (nx, ny), low = chip.size, 0.5
+    for i, j in ((0, 0), (1, 0), (2, 3), (5, 5)):
+        exact = [((n + low) ** (k + 1) - low ** (k + 1)) / (k + 1) for n, k in ((nx, i), (ny, j))]
+        assert (weight * x**i * y**j).sum() == pytest.approx(np.prod(exact), rel=1e-12)
+
+
 def test_layout():
     model = model_of("shift_rotation_scale", order=2)
     assert model.n_polynomial == 2 * 2 * 6

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.orientation import lay_on, oriented
 from bayesdist.calibration.plane import Orientation
+from bayesdist.infer import Solution
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.products import IdcTab
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
@@ -24,7 +25,7 @@ WFC_SIZE, WFC_REF = (4096.0, 2048.0), (2048.0, 1024.0)
 
 
 @dataclass(frozen=True, eq=False)
-class StandIn:
+class StandIn(Solution):
     """A solution: a model, values and their covariance."""
 
     model: DistortionModel

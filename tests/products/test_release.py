@@ -11,8 +11,7 @@ import pytest
 from astropy.io import fits
 from numpy.testing import assert_allclose
 
-from bayesdist.assess.solution import kind_of
-from bayesdist.calibration.calibration import calibration_of, gaussian_solution
+from bayesdist.calibration.calibration import GaussianSolution, calibration_of
 from bayesdist.calibration.plane import Orientation
 from bayesdist.errors import InputError
 from bayesdist.infer.transforms import reference_gauge
@@ -20,7 +19,6 @@ from bayesdist.missions.acs.simulate import acs_solution
 from bayesdist.missions.acs.simulate.tables import detector_tables, filter_tables
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.products import idctab_from_solution, lint_idctab, read_idctab
-from bayesdist.products.formats.idctab.build import build_idctab
 from bayesdist.products.formats.idctab.drift import storable
 from bayesdist.products.formats.idctab.hst import combination_of
 from bayesdist.products.release import Period, Release, write_release
@@ -260,7 +258,7 @@ def test_covariance_over_filters_by_steps(solutions) -> None:
             )  # fmt: skip
         first, _ = storable(turned_by(a, o), years=(2002.2, 2009.4), limit_mas=9.0)
         second, _ = storable(turned_by(b, o), years=(2002.2, 2009.4), like=first, limit_mas=9.0)
-        return build_idctab(
+        return idctab_from_solution(
             {"F606W": first, "F814W": second}, **ACS, scale_arcsec=0.05
         ).covariance, o
 
@@ -299,7 +297,7 @@ def test_the_gauge_of_the_fit_is_not_in_the_file(solutions) -> None:
     for solution in (base, reference_gauge(away, 2)):
         o = laid_on(solution, reference, **names, scale_arcsec=0.05)
         stored, _ = storable(turned_by(solution, o), years=(2009.4, 2015.0), segment=1)
-        made = build_idctab({"F606W": stored}, **ACS, scale_arcsec=0.05)
+        made = idctab_from_solution({"F606W": stored}, **ACS, scale_arcsec=0.05)
         covariances.append(made.covariance)
     a, b = covariances
     assert_allclose(a["VALUE"], b["VALUE"], rtol=1e-11)
@@ -351,11 +349,11 @@ def test_draws_and_convergence_come_through(solutions) -> None:
     o = laid_on(sampled, reference_of(base), epoch=2004.5, reference_drift=False)
     held, _ = storable(turned_by(sampled, o), years=(2009.5, 2015.0), segment=1)
     stored = held.solution
-    assert kind_of(stored) == "posterior"
-    header = build_idctab({"F606W": held}, **ACS, scale_arcsec=0.05).header
+    assert stored.kind == "posterior"
+    header = idctab_from_solution({"F606W": held}, **ACS, scale_arcsec=0.05).header
     assert header["BDCONV"] == "NO" and "Laplace" in str(header["COMMENT"])
     plain, _ = storable(turned_by(base, o), years=(2009.5, 2015.0), segment=1)
-    assert kind_of(plain.solution) == "least squares"
+    assert plain.solution.kind == "least squares"
     n = 3000
     draws = stored.draws(n, np.random.default_rng(7))
     ratio = draws.std(axis=0) / np.sqrt(np.diag(stored.cov))
@@ -412,24 +410,24 @@ def test_solutions_that_do_not_go_into_one_table_are_refused(solutions, orientat
     mean, cov = base.solution.mean, base.solution.cov
     moved = mean.copy()
     moved[base.model.tdd_slice(1).start] *= 1.01
-    other = replace(base, solution=gaussian_solution(base.model, moved, cov))
+    other = replace(base, solution=GaussianSolution(base.model, moved, cov))
     with pytest.raises(InputError, match="drifts otherwise than the first one"):
-        build_idctab({"F606W": base, "F814W": other}, **ACS)
+        idctab_from_solution({"F606W": base, "F814W": other}, **ACS)
     with pytest.raises(InputError, match="stands twice"):
-        build_idctab({"F606W": base, ("F606W", "CLEAR2L"): base}, **ACS)
+        idctab_from_solution({"F606W": base, ("F606W", "CLEAR2L"): base}, **ACS)
     with pytest.raises(InputError, match="filters are given twice"):
-        build_idctab({"F606W": base}, **ACS, filters=("F606W", "CLEAR2L"))
+        idctab_from_solution({"F606W": base}, **ACS, filters=("F606W", "CLEAR2L"))
     with pytest.raises(InputError, match="no filter is given"):
-        build_idctab({}, **ACS)
+        idctab_from_solution({}, **ACS)
     chips = (base.model.chips[1],)
     n = 2 * base.model.n_terms
     single = calibration_of(
         StandIn(replace(base.model, chips=chips, time=None), mean[:n], np.eye(n))
     )
     with pytest.raises(InputError, match="another order or other chips"):
-        build_idctab({"F606W": base, "F814W": single}, **ACS)
+        idctab_from_solution({"F606W": base, "F814W": single}, **ACS)
     # the very same drift is no difference
-    same = build_idctab(
+    same = idctab_from_solution(
         {"F606W": base, "F814W": replace(base, solution=replace(base.solution))}, **ACS
     )
     assert len(same.rows) == 4

@@ -12,7 +12,8 @@ from numpy.testing import assert_allclose
 from bayesdist.calibration.inverse import FIT_NODES, detector_grid
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.missions.wise.simulate import WISE_COEFFICIENTS, wise_solution
+from bayesdist.missions.wise.published import WISE_COEFFICIENTS
+from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.products import (
     lint_sip,

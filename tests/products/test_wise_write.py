@@ -15,7 +15,8 @@ from numpy.polynomial import polynomial
 from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer import fit_linear
-from bayesdist.missions.wise.simulate import WISE_COEFFICIENTS, wise_set, wise_solution
+from bayesdist.missions.wise.published import WISE_COEFFICIENTS
+from bayesdist.missions.wise.simulate import wise_set, wise_solution
 from bayesdist.products import (
     describe,
     lint_wise_band,

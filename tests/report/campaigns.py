@@ -8,9 +8,9 @@ from functools import lru_cache
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.campaign.overlap import _aligned, _binned
 from bayesdist.assess import binned_residuals
 from bayesdist.data import MagnitudeErrors
+from bayesdist.diagnose.overlap import OverlapTest, _aligned, _binned
 from bayesdist.model import LookupTable
 from bayesdist.report.campaign import (
     CampaignResults,
@@ -19,7 +19,6 @@ from bayesdist.report.campaign import (
     Detections,
     Footprints,
     LinearSeries,
-    OverlapTest,
 )
 from bayesdist.report.context import ReportInput
 

@@ -26,15 +26,17 @@ from bayesdist.assess import (
 )
 from bayesdist.assess.budget.detector import detector_budget
 from bayesdist.assess.mosaic import chip_places
+from bayesdist.checks import Check
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.data.matches import MatchTable
+from bayesdist.infer.checks import fit_checks, sampling_checks
 from bayesdist.infer.convergence import Convergence, Limits
 from bayesdist.infer.linear import LinearFit, fit_linear, residuals
 from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import load
 from bayesdist.model import Chip, DistortionModel, TimeDependence
-from bayesdist.report.context import Check, ChipResults, Product, ReportInput
+from bayesdist.report.context import ChipResults, Product, ReportInput
 
 SIZE = (1016.0, 1016.0)
 CENTRE = (508.5, 508.5)
@@ -266,12 +268,19 @@ def report_input(
                 "sip.hdr",
                 "SIP header, order 4, with inverse of order 5",
                 (
-                    Check("worst closure of the inverse [pix]", 3.1e-6, "at most 0.001", "pass"),
-                    Check("A_DMAX [pix]", 2.21),
+                    Check(
+                        "Products",
+                        "worst closure of the inverse [pix]",
+                        3.1e-6,
+                        "at most 0.001",
+                        "pass",
+                    ),
+                    Check("Products", "A_DMAX [pix]", 2.21),
                 ),
             ),
             Product("maps.fits", "uncertainty maps"),
         ),
+        checks=(*sampling_checks(posterior), *fit_checks(fit)),
         magnitude_errors=estimate(mag, *residual.T),
         flagged=None if posterior is None else flagged_by_exposure(shards, posterior),
         provenance={

@@ -59,7 +59,7 @@ def asked():
     )
     mag, residual = (a[run.stars.used] for a in (run.stars.table.mag, run.stars.fit_residual))
     centroids = Centroids(estimate(mag, *residual.T))
-    model = error_model(solution, (*terms, centroids), pixel_scale=SCALE)
+    model = error_model(solution, terms=(*terms, centroids), pixel_scale=SCALE)
     errors = model.drawn(DRAWS, np.random.default_rng(9))
     budget = detector_budget(
         solution,

@@ -7,10 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bayesdist.app.campaign.overlap import _aligned, _at_first_epoch, chosen_exposures
 from bayesdist.app.campaign.report import _residuals
+from bayesdist.app.kinds.errors import ErrorLaw
+from bayesdist.app.kinds.table_file import StoredLookupTables
 from bayesdist.data import MatchTable
-from bayesdist.infer.nodes.alternation import inside_chips, with_columns
+from bayesdist.diagnose.overlap import _aligned, _at_first_epoch, chosen_exposures
+from bayesdist.infer.nodes.corrected import inside_chips, with_columns
 from bayesdist.model import Chip, DistortionModel, LookupTable, corrected
 
 SIZE = (1024.0, 512.0)
@@ -54,16 +56,17 @@ def test_residuals_show_the_pattern_of_the_detector_whatever_the_roll(margin):
     moved = with_columns(pairs, x=x, y=y)
     kept = inside_chips(moved, model)
     assert kept.all() == (margin > 0)
-    session = SimpleNamespace(
-        pairs=pairs,
-        matches=moved.select(kept),
-        inside_with_tables=kept,
-        plain_model=model,
-        magnitude_errors=None,
-        config=SimpleNamespace(fit=SimpleNamespace(clip_abs=2.0)),
-        tables=(table,),
+    data = SimpleNamespace(
+        stars=moved.select(kept),
+        fitted=SimpleNamespace(
+            tables=StoredLookupTables((table,)),
+            errors=ErrorLaw(),
+            inside=lambda stars: kept,
+        ),
     )
-    (found,) = _residuals(session)
+    matched = SimpleNamespace(stars=pairs, affine_model=lambda config: model)
+    config = SimpleNamespace(fit=SimpleNamespace(clip_abs=2.0))
+    (found,) = _residuals(data, matched, config)
     pairs = pairs.select(kept)
     without, after = found.binned_without, found.binned_with
     shift = table.evaluate(pairs.x, pairs.y)

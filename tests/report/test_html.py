@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 from lxml import html as lxml_html
 
+from bayesdist.checks import Check
 from bayesdist.diagnose import ScoreTest
+from bayesdist.diagnose.checks import structure_checks
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.errors import InputError
-from bayesdist.report.context import Check, Product
+from bayesdist.infer.checks import sampling_checks
+from bayesdist.report.context import Product
 from bayesdist.report.run_report import render_report, write_report
 from bayesdist.report.sections import REPORT
 from bayesdist.report.sections.run.coefficients import coefficient_tables
@@ -218,7 +221,9 @@ def test_verdict_in_words(converged, not_converged):
     assert "No requirement" in " ".join(verdict(_only(converged)).sentences)
     assert verdict(_only(not_converged)).level == "fail"
     assert verdict(_only(report_input(sampler=False))).level == "warn"
-    broken = Product("x.fits", "x", (Check("closure [pix]", 1.0, "at most 0.001", "fail"),))
+    broken = Product(
+        "x.fits", "x", (Check("Products", "closure [pix]", 1.0, "at most 0.001", "fail"),)
+    )
     assert verdict(replace(_only(converged), products=(broken,))).level == "fail"
 
 
@@ -227,8 +232,8 @@ def test_one_limit_missed_is_one_failure(converged):
     rhat = c.rhat.copy()
     rhat[5] = 1.02
     worse = replace(c, rhat=rhat, converged=False, reasons=("R-hat of u_0_2 is 1.02",))
-    run = replace(converged, posterior=replace(converged.posterior, convergence=worse))
-    failed = [check.name for check in status_checks(run)["Sampling"] if check.level == "fail"]
+    checks = sampling_checks(replace(converged.posterior, convergence=worse))
+    failed = [check.name for check in checks if check.level == "fail"]
     assert len(failed) == 2 and "Converged" in failed  # the criterion itself, and the sum of them
 
 
@@ -238,7 +243,8 @@ def test_structure_in_the_residuals_has_a_row(converged):
     for p, level in ((0.3, "pass"), (2e-4, "pass"), (1e-5, "warn")):
         found = Misfit(p, "columns", 0.0021, "pix", chip)
         assert found.significant == (level == "warn")
-        *_, row = status_checks(replace(converged, misfits=(found,)))["Fit"]
+        checks = (*converged.checks, *structure_checks((found,)))
+        *_, row = status_checks(replace(converged, checks=checks))["Fit"]
         assert row.name.startswith("Structure in the residuals of the fit") and row.level == level
         assert row.value.startswith("0.0021\u202fpix rms in columns of W2, p ")
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 from lxml import html as lxml_html
 
+from bayesdist.checks import Check
 from bayesdist.report.run_report import render_markdown, render_report, write_report
 
 
@@ -57,7 +58,14 @@ def test_every_row_of_a_table_has_as_many_cells_as_its_head(text):
 
 def test_what_a_user_writes_does_not_become_markup(converged, drawings):
     evil = "a|b *c* <script> [x](y)"
-    out = render_markdown(replace(converged, name=evil, warnings=(evil,)), drawings)
+    out = render_markdown(
+        replace(
+            converged,
+            name=evil,
+            checks=(*converged.checks, Check("Fit", level="warn", sentence=evil)),
+        ),
+        drawings,
+    )
     assert "<script" not in out and "[x](y)" not in out.replace("\\[x](y)", "")
     assert "a\\|b \\*c\\*" in out
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bayesdist.report.numbers import (
+from bayesdist.numbers import (
     MISSING,
     count,
     display_scale,

@@ -10,8 +10,8 @@ from lxml import html as lxml_html
 from matplotlib.colors import to_hex
 from matplotlib.quiver import Quiver
 
-from bayesdist.assess.periods import time_variation
 from bayesdist.data import MatchTable
+from bayesdist.diagnose.periods import PeriodSettings, time_variation
 from bayesdist.infer import fit_linear
 from bayesdist.infer.compare.order import select_order
 from bayesdist.model import Chip, DistortionModel
@@ -45,7 +45,8 @@ def pairs():
 @pytest.fixture(scope="module")
 def found(pairs):
     fit = fit_linear(pairs, MODEL)
-    return time_variation(fit, pairs, SPANS, rng=np.random.default_rng(1), bins=8, tolerance=0.5)
+    settings = PeriodSettings(SPANS, bins=8, tolerance=0.5)
+    return time_variation(fit, pairs, settings, rng=np.random.default_rng(1))
 
 
 def designed(x, y):
@@ -91,7 +92,7 @@ def test_the_section_has_what_was_found(converged, drawings, found):
         "Patterns of the residuals",
     ]
     assert [row[0] for row in tables[1].rows] == [*SPANS, "55312.5 against 55212.5"]
-    assert tables[0].rows[0][1] == found.verdict and found.significant and not found.matters
+    assert tables[0].rows[0][1] == found.verdict and found.significant and not found.is_material
     names = [row[k] for k in (0, 5) for row in tables[2].rows]
     assert names == list(MODEL.names)
     page = lxml_html.fromstring(render_report(inputs, drawings))
@@ -103,7 +104,7 @@ def test_the_section_has_what_was_found(converged, drawings, found):
 
 
 def test_orders_are_drawn_as_they_were_found(pairs):
-    chosen = select_order(pairs, MODEL, orders=(1, 2, 3), bins=12, regions=4, shares=20)
+    chosen = select_order(pairs, MODEL, orders=(1, 2, 3), bins=12, regions=4, folds=20)
     left, right = order_comparison(chosen).axes
     by = {line.get_label(): line.get_ydata() for line in left.lines}
     np.testing.assert_allclose(by["u"], chosen.surfaces.rms[:, 0])

@@ -8,7 +8,8 @@ import numpy as np
 
 from bayesdist.data import MatchTable
 from bayesdist.infer import Rejection, fit_linear, sample
-from bayesdist.missions.wise.simulate import WISE_BANDS, PairChunk, WiseSet, wise_set
+from bayesdist.missions.wise.published import WISE_BANDS
+from bayesdist.missions.wise.simulate import PairChunk, WiseSet, wise_set
 
 CLIP_ABS = 3.0  # pixels: the match circle in the corners
 

@@ -11,12 +11,8 @@ import pytest
 
 from bayesdist.assess import distortion_vectors
 from bayesdist.infer import Rejection, fit_linear
-from bayesdist.missions.wise.simulate import (
-    LARGEST_CORRECTIONS,
-    LONGEST_VECTORS,
-    WISE_BANDS,
-    wise_set,
-)
+from bayesdist.missions.wise.published import LARGEST_CORRECTIONS, LONGEST_VECTORS, WISE_BANDS
+from bayesdist.missions.wise.simulate import wise_set
 from bayesdist.products import read_wise_meta, sip_from_solution, write_wise_meta
 from bayesdist.products.formats.common.coefficients import evaluate
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest, chi2, kstest, norm
 
-from bayesdist.missions.wise.simulate import WISE_BANDS
+from bayesdist.missions.wise.published import WISE_BANDS
 from tests.infer.calibration import over_seeds
 
 from .support import with_pattern, without_pattern

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from bayesdist.assess.wise import (
+from bayesdist.diagnose.residuals import (
     WISE_ARCSEC,
     band_bins,
     band_to_band_table,
@@ -22,7 +22,8 @@ from bayesdist.assess.wise import (
 )
 from bayesdist.infer import Rejection, fit_linear, load
 from bayesdist.missions.wise.assess.histograms import band_sums
-from bayesdist.missions.wise.simulate import RESIDUAL_SIGMAS, WISE_BANDS, wise_set
+from bayesdist.missions.wise.published import RESIDUAL_SIGMAS, WISE_BANDS
+from bayesdist.missions.wise.simulate import wise_set
 
 from .support import matches_of, pairs_of
 

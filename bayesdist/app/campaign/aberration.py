@@ -10,15 +10,13 @@ All of it makes exposures scatter in scale, and that scatter is measured: the te
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesdist.assess.solution import Solution
+from bayesdist.app.kinds.exposures import ExposureScatter
 from bayesdist.assess.terms.parameters import EXPOSURE_SCATTER, ScaleError
-
-if TYPE_CHECKING:
-    from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.data import ExposureLog
+from bayesdist.infer.solution import Solution
 
 __all__ = ["ABERRATION", "aberration_term", "scale_error"]
 
@@ -50,29 +48,35 @@ def scale_error(exptime: float | None) -> float:
     return min(spread, spread * 2 * math.pi / PERIOD * exptime / math.sqrt(12))
 
 
-def aberration_term(session: CampaignSession, solution: Solution) -> ScaleError:
+def aberration_term(
+    scatter: ExposureScatter, log: ExposureLog, solution: Solution, *, corrected: bool
+) -> ScaleError:
     """The error of the scale that VAFACTOR leaves, at most as large as exposures scatter.
 
     Parameters
     ----------
-    session : CampaignSession
+    scatter : ExposureScatter
+    log : ExposureLog
+        Of the exposures.
     solution : Solution
         Whose positions it moves.
+    corrected : bool
+        The velocity in the orbit is in VAFACTOR.
     """
     source = PUBLISHED
-    if session.block.aberration == "earth":
+    if not corrected:
         sigma = scale_error(None)
         source += ", not corrected"
     else:
-        given = [one.exptime for one in session.inputs.log if one.exptime is not None]
+        given = [one.exptime for one in log if one.exptime is not None]
         seconds = math.sqrt(np.mean(np.square(given))) if given else LONGEST
         sigma = scale_error(seconds)
         source += f", over {seconds:.0f} s"
         if not given:
             source += " (assumed: the log has no times)"
-    kinds, tau = session.scatter
-    if "scale" in kinds:
-        measured = float(np.sqrt(np.mean(tau[:, kinds.index("scale")] ** 2)))
+    if "scale" in scatter.kinds:
+        found = scatter.tau[:, scatter.kinds.index("scale")]
+        measured = float(np.sqrt(np.mean(found**2)))
         if measured < sigma:
             sigma, source = measured, f"{source}, and no more than exposures scatter"
     source = f"{source}; part of {EXPOSURE_SCATTER}"

@@ -6,34 +6,30 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bayesdist.app.campaign.inputs import cuts_of
-from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.campaign.inputs import Inputs, campaign_block, cuts_of
 from bayesdist.app.campaign.soundness import (
-    input_doubts,
-    refuse_unsound,
+    input_warnings,
     segment_counts,
-    shear_doubts,
+    shear_warnings,
 )
-from bayesdist.app.campaign.stages import rehearse_campaign
+from bayesdist.app.config import Config
+from bayesdist.data import StarCuts
 
 __all__ = ["campaign_lines"]
 
 
-def campaign_lines(session: CampaignSession) -> Iterator[str]:
+def campaign_lines(inputs: Inputs, config: Config) -> Iterator[str]:
     """Inputs, dates and roll angles of a campaign, as lines of text."""
-    refuse_unsound(session)
-    rehearse_campaign(session)
-    inputs, config = session.inputs, session.config
-    log, catalog = inputs.log, inputs.catalog
+    log, catalog, block = inputs.log, inputs.catalog, campaign_block(config)
     epochs, rolls = log.values("epoch"), log.values("pa_v3")
     yield f"exposures    {len(log.names)} in {', '.join(log.filters)}"
-    yield f"detections   {_detections(session)}"
+    yield f"detections   {_detections(inputs, cuts_of(block))}"
     yield f"catalogue    {len(catalog)} of {inputs.n_catalog} stars, in {catalog.unit}"
     for text in (*([inputs.plane] if inputs.plane else []), *catalog.notes):
         yield f"             {text}"
     yield f"epochs       {epochs.min():.2f} to {epochs.max():.2f}"
     factors = log.values("vafactor")
-    how = ", of the Earth alone" if session.block.aberration == "earth" else ""
+    how = ", of the Earth alone" if block.vafactor_source == "earth" else ""
     yield f"VAFACTOR     {factors.min():.7f} to {factors.max():.7f}{how}"
     yield f"PA_V3        {_rolls(rolls)}"
     time = config.time()
@@ -42,18 +38,17 @@ def campaign_lines(session: CampaignSession) -> Iterator[str]:
         yield f"segments     {', '.join(str(k) for k in counts)} exposures"
     chips = ", ".join(chip.name for chip in config.chips())
     yield f"model        order {config.model.order}, chips {chips}, tables: {config.tables.method}"
-    for number, names in _without(session).items():
+    for number, names in _without(inputs, config).items():
         yield f"chip {number}       no detections that pass the cuts in {', '.join(names)}"
-    for text in [*input_doubts(session), *shear_doubts(rolls, "PA_V3")]:
+    for text in [*input_warnings(config, inputs), *shear_warnings(rolls, "PA_V3")]:
         yield f"WARNING      {text[0].upper() + text[1:]}"
 
 
-def _detections(session: CampaignSession) -> str:
+def _detections(inputs: Inputs, cuts: StarCuts) -> str:
     """How many there are, and how many the cuts leave."""
-    cuts = cuts_of(session.block)
     total = passed = 0
     reasons: dict[str, int] = {}
-    for one in session.inputs.lists:
+    for one in inputs.lists:
         good, rejected = cuts.passed(one)
         total, passed = total + len(one), passed + int(good.sum())
         for reason, count in rejected.items():
@@ -71,13 +66,13 @@ def _rolls(rolls: np.ndarray) -> str:
     return text + (f", not known of {missing} exposures" if missing else "")
 
 
-def _without(session: CampaignSession) -> dict[int, list[str]]:
+def _without(inputs: Inputs, config: Config) -> dict[int, list[str]]:
     """Exposures that have nothing on a chip, by its number."""
-    cuts = cuts_of(session.block)
+    cuts = cuts_of(campaign_block(config))
     out: dict[int, list[str]] = {}
-    for one in session.inputs.lists:
+    for one in inputs.lists:
         seen = set(one.chip[cuts.passed(one)[0]].tolist())
-        for chip in session.config.chips():
+        for chip in config.chips():
             if chip.number not in seen:
                 out.setdefault(chip.number, []).append(one.exposure)
     return out

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.assess.solution import Solution
+from bayesdist.app.kinds.fitted import Fitted, required
+from bayesdist.infer.solution import Solution
 from bayesdist.infer.transforms import lines, reference_gauge, without_frames
 
 __all__ = ["draw_filters"]
@@ -18,7 +18,7 @@ TERMS = ("A_2", "B_3", "B_2")
 
 def draw_filters(
     folder: Path,
-    sessions: Mapping[str, CampaignSession],
+    fits: Mapping[str, Fitted],
     solutions: Mapping[str, Solution],
 ) -> tuple[str, ...]:
     """Write filters_A_2.png and the like, and return their names.
@@ -26,7 +26,7 @@ def draw_filters(
     Parameters
     ----------
     folder : Path
-    sessions : mapping of filter to CampaignSession
+    fits : mapping of filter to Fitted
         The reference filter first.
     solutions : mapping of filter to Solution
         As they are released.
@@ -35,21 +35,22 @@ def draw_filters(
     from bayesdist.report.drawing import save_figures
     from bayesdist.report.filters import FilterTerm, filters_figure
 
-    first = next(iter(sessions.values()))
-    time = first.posterior.model.time
-    if time is None or len(sessions) < 2:
+    model = next(iter(fits.values())).linear.model
+    time = model.time
+    if time is None or len(fits) < 2:
         return ()
     views = {
-        name: reference_gauge(without_frames(one), first.reference_chip)
+        name: reference_gauge(without_frames(one), model.chips[0].number)
         for name, one in solutions.items()
     }
     edges = np.asarray(time.breaks)
     figures = {}
     for term in TERMS:
         courses = []
-        for chip in sorted(first.model.chips, key=lambda c: c.name):
-            for name, session in sessions.items():
-                label, series = f"{chip.name}.{term}", session.terms
+        for chip in sorted(model.chips, key=lambda c: c.name):
+            for name, fitted in fits.items():
+                label = f"{chip.name}.{term}"
+                series = required(fitted.alone, "fits of single exposures")
                 if label not in series.coefficients:
                     continue
                 found = [lines(views[name], s, chip=chip.number) for s in range(time.n_segments)]

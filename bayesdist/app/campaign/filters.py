@@ -12,10 +12,11 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError
-from bayesdist.infer.series import Course, FilterDependence, Series, filter_dependence
+from bayesdist.infer.series import FilterDependence, Series, TrendModel, filter_dependence
+from bayesdist.infer.solution import Solution
 from bayesdist.infer.transforms import linear_terms, reference_gauge
+from bayesdist.limits import DIFFERENCE
 from bayesdist.model import TimeDependence
 
 __all__ = ["FilterComparison", "compare_filters", "comparison_table"]
@@ -23,7 +24,6 @@ __all__ = ["FilterComparison", "compare_filters", "comparison_table"]
 Float = NDArray[np.float64]
 Measured = tuple[float, float]  # value and standard deviation
 
-DOUBTFUL = 0.01  # p-value below which the drift is not taken to be the same
 # places of the linear terms: power of x, power of y
 POWERS = {"2": (1, 0), "3": (0, 1)}
 
@@ -56,7 +56,7 @@ class FilterComparison:
     @property
     def alike(self) -> bool:
         """Whether one drift serves all filters."""
-        return not self.depends and self.p_value >= DOUBTFUL
+        return not self.depends and DIFFERENCE.met_by(self.p_value)
 
     @property
     def sentence(self) -> str:
@@ -98,7 +98,7 @@ def compare_filters(
     if time is None:
         raise InputError("nothing drifts", where="model.tdd", do="give the terms that do")
     reference = next(iter(series))
-    course = Course("lines" if time.breaks else "line", time.breaks, reference=time.epoch0)
+    trend = TrendModel("lines" if time.breaks else "line", time.breaks, reference=time.epoch0)
     by_chip: dict[str, list[str]] = {}
     for term in series[reference].coefficients:
         in_all = all(term in one.coefficients for one in series.values())
@@ -116,7 +116,7 @@ def compare_filters(
     found = []
     # chips scatter together: fitted jointly their chains hardly move, and would say little more
     for terms in by_chip.values():
-        one = filter_dependence(_pooled(series, terms), course, seed=seed)
+        one = filter_dependence(_pooled(series, terms), trend, seed=seed)
         offsets |= _against(one, one.common.group_offset, reference)
         rates |= _against(one, one.separate.group_slope, reference)
         found.append(one)

@@ -1,102 +1,152 @@
-"""Stage 1 of a campaign: tables, errors, every exposure alone, and all of them jointly."""
+"""The fit of a campaign: tables, errors, all exposures jointly, and every one alone."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Iterator
+from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from astropy.table import Table
-from numpy.typing import NDArray
 
 from bayesdist.app.campaign.gap import gap_priors, with_gap
-from bayesdist.app.campaign.lines import FIXED, summarise_lines
-from bayesdist.app.campaign.session import HIERARCHY, CampaignSession
-from bayesdist.app.campaign.tables import fit_tables, tables_summary
-from bayesdist.app.session import ERROR_COLUMNS, write_table
-from bayesdist.app.stages.fit import summarise_fit
-from bayesdist.data import MatchTable, centroid_errors
-from bayesdist.infer import load, save_fit
+from bayesdist.app.campaign.inputs import unit_arcsec_of
+from bayesdist.app.campaign.lines import FIXED, line_sections
+from bayesdist.app.campaign.matched import CampaignMatched
+from bayesdist.app.campaign.reference import rate_priors
+from bayesdist.app.campaign.soundness import frames_not_set
+from bayesdist.app.campaign.tables import fit_tables, scatter_by_magnitude, tables_section
+from bayesdist.app.config import Config
+from bayesdist.app.kinds.errors import ErrorLaw, read_magnitude_errors
+from bayesdist.app.kinds.exposures import FIT_AGAIN, ExposureScatter, read_hierarchy, read_series
+from bayesdist.app.kinds.fitted import FIT, TABLES, Fitted
+from bayesdist.app.kinds.table_file import read_tables
+from bayesdist.data import centroid_errors
+from bayesdist.data.matches import MatchTable
+from bayesdist.infer import load, load_fit
 from bayesdist.infer.exposures.alone import ExposureSolutions, fit_exposures
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
 from bayesdist.infer.exposures.trends import trend_p_values
 from bayesdist.infer.linear import Rejection
-from bayesdist.infer.sampler.checkpoints import write_arrays
+from bayesdist.infer.nodes import corrected_matches, on_the_chips
 from bayesdist.infer.series import Series
-from bayesdist.model import Chip
+from bayesdist.limits import TREND
+from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.frames import RIGID
 
-__all__ = ["run_campaign_fit"]
+__all__ = ["fit_campaign", "load_fitted_campaign"]
 
-Float = NDArray[np.float64]
-
-log = logging.getLogger("bayesdist")
-
-TREND = 1e-3  # probability of a trend by chance, over all kinds of deviation
 SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
+SECTIONS = (  # of summary.json, which only the making of the fit knows
+    *("gauge", "lines", "tables", "scatter"),
+    *("deviations", "exposures_skipped", "exposures_outlying"),
+)
 
 
-def run_campaign_fit(session: CampaignSession) -> None:
-    tables = fit_tables(session)
-    _fit_errors(session)
-    matches = session.matches
-    assert isinstance(matches, MatchTable)
-    rejection = Rejection(session.config.fit.clip_chi2, session.config.fit.clip_abs)
-    number = session.reference_chip
-    asked = session.config.time()
-    drifting = with_gap(replace(session.plain_model, time=asked))
-    model = replace(held_in_reference(matches, drifting, number), chip_deviations=True)
-    shards = load(model, matches, session.config.resources())
-    pixel = (session.scale_arcsec or session.unit_arcsec) / session.unit_arcsec
-    joint = fit_hierarchical(
-        shards,
-        model,
-        priors=session.rate_priors(model) or gap_priors(model, asked, pixel),
-        pixel=pixel,
-        seed=session.config.sampler.seed,
-        rejection=rejection,
-    )
-    shards.close()
-    save_fit(joint.fit, session.run / "fit.nc")
-    write_arrays(
-        session.run / HIERARCHY,
-        "",
-        {
-            "kinds": np.array([kind.encode() for kind in joint.scatter.kinds]),
-            "tau_draws": joint.tau_draws,
-            "prior_centre": joint.priors.centre,
-            "prior_precision": joint.priors.precision,
-            **joint.settling.to_arrays(),
-        },
-    )
-    session.fit_changed()
-    alone = fit_exposures(matches, session.plain_model, chip=number, skip=True, rejection=rejection)
-    session.keep_terms(_series(alone, model.chips[0]))
-    summarise_fit(session, joint.fit)
-    summarise_lines(session, joint)
-    session.run.summarise(
-        tables=tables_summary(session, tables),
-        scatter={name: _scatter(joint, name) for name in joint.tau},
-        deviations={"warnings": _trends(joint, matches)},
-        exposures_skipped=dict(alone.skipped),
-        exposures_outlying=list(joint.outlying),
-    )
-    log.info(
-        "fit: scatter of the exposures %s",
-        ", ".join(f"{name} {tau:.2g}" for name, tau in joint.tau.items()),
+def fit_campaign(matched: CampaignMatched, config: Config, base: Path) -> Fitted:
+    """Tables, errors, all exposures jointly, and every one alone.
+
+    Parameters
+    ----------
+    matched : CampaignMatched
+    config : Config
+        With a section [campaign].
+    base : Path
+        Folder that its files are relative to.
+
+    Returns
+    -------
+    Fitted
+
+    Raises
+    ------
+    BayesdistError
+        For what the exposures do not determine, runs of other filters that do not fit to this one,
+        and stars that have outrun their catalogue.
+    """
+    with frames_not_set():
+        return _fitted(matched, config, base)
+
+
+def _fitted(matched: CampaignMatched, config: Config, base: Path) -> Fitted:
+    affine = matched.affine_model(config)
+    tables = fit_tables(matched, affine, config, base)
+    pairs = matched.stars
+    if tables.stored.tables:
+        pairs = on_the_chips(corrected_matches(tables.stored.tables, pairs), affine)
+    _, _, total = scatter_by_magnitude(pairs, affine, matched.inputs)
+    errors = ErrorLaw(by_magnitude=centroid_errors(pairs, total), with_catalogue=True)
+    stars = errors.applied(pairs)
+    rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs)
+    joint = _joint(stars, affine, config, base, rejection)
+    number = config.chips()[0].number
+    alone = fit_exposures(stars, affine, chip=number, skip=True, rejection=rejection)
+    facts = {
+        **line_sections(joint, number),
+        "tables": tables_section(config, tables),
+        "scatter": {name: _scatter(joint, name) for name in joint.tau},
+        "deviations": {"warnings": _trends(joint, stars)},
+        "exposures_skipped": dict(alone.skipped),
+        "exposures_outlying": list(joint.outlying),
+    }
+    return Fitted(
+        joint.fit,
+        errors,
+        joint.priors,
+        tables=tables.stored,
+        scatter=ExposureScatter(joint.scatter.kinds, joint.tau_draws, joint.settling),
+        alone=_series(alone, joint.model.chips[0]),
+        facts=facts,
     )
 
 
-def _fit_errors(session: CampaignSession) -> None:
-    """Errors of the centroids by magnitude, from the scatter that the tables leave."""
-    pairs = session.raw_matches
-    assert isinstance(pairs, MatchTable)
-    _, _, total = session.errors_by_magnitude(pairs)
-    errors = centroid_errors(pairs, total)
-    table = Table({name: getattr(errors, name) for name in ERROR_COLUMNS})
-    write_table(table, session.run / "magnitude_errors.ecsv")
-    session.errors_changed()
+def _joint(
+    stars: MatchTable, affine: DistortionModel, config: Config, base: Path, rejection: Rejection
+) -> HierarchicalFit:
+    """All exposures jointly, deviating from the model as they are found to scatter."""
+    asked = config.time()
+    drifting = with_gap(replace(affine, time=asked))
+    held = held_in_reference(stars, drifting, config.chips()[0].number)
+    model = replace(held, chip_deviations=True)
+    unit, scale = unit_arcsec_of(affine.unit, config), config.detector.scale_mas
+    pixel = 1.0 if scale is None else scale / 1000 / unit
+    with closing(load(model, stars, config.resources())) as shards:
+        return fit_hierarchical(
+            shards,
+            model,
+            priors=rate_priors(config, model, base) or gap_priors(model, asked, pixel),
+            pixel=pixel,
+            seed=config.sampler.seed,
+            rejection=rejection,
+        )
+
+
+def load_fitted_campaign(folder: Path, summary: Mapping[str, Any]) -> Fitted:
+    """The fit of an earlier stage.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the run.
+    summary : mapping
+        Content of summary.json.
+
+    Raises
+    ------
+    InputError
+        For missing or damaged files.
+    """
+    scatter, priors = read_hierarchy(folder)
+    return Fitted(
+        load_fit(folder / FIT),
+        ErrorLaw(by_magnitude=read_magnitude_errors(folder), with_catalogue=True),
+        priors,
+        tables=read_tables(folder / TABLES, do=FIT_AGAIN),
+        scatter=scatter,
+        alone=read_series(folder),
+        facts={name: summary[name] for name in SECTIONS if name in summary},
+    )
 
 
 def _series(alone: ExposureSolutions, reference: Chip) -> Series:
@@ -107,40 +157,28 @@ def _series(alone: ExposureSolutions, reference: Chip) -> Series:
     return Series(epoch, values, cov, tuple(labels), alone.names, source="exposures")
 
 
-def _trends(joint: HierarchicalFit, matches: MatchTable) -> list[str]:
+def _trends(joint: HierarchicalFit, stars: MatchTable) -> list[str]:
     """Deviations that go with time although they are taken to scatter, each as a clause.
 
-    Those of scale and shears: how the chips move against each other has a test of its own
+    Only scale and shears: how the chips move against each other has a test of its own
     (`bayesdist.diagnose.score.gap`).
     """
+    if stars.epoch is None:
+        return []
     model = joint.model
-    assert matches.epoch is not None
-    names = np.array(model.exposures)
-    code = {name: k for k, name in enumerate(matches.exposure_names)}
-    first = {int(k): float(matches.epoch[row]) for k, row in _first_rows(matches)}
-    kept = [k for k, name in enumerate(names) if name not in joint.outlying]
-    epoch = np.array([first[code[str(names[k])]] for k in kept])
-    values = joint.fit.mean[joint.index].reshape(len(joint.scatter.kinds), -1).T[kept]
+    codes, rows = np.unique(stars.exposure, return_index=True)
+    dates = dict(zip((stars.exposure_names[k] for k in codes), stars.epoch[rows], strict=True))
+    typical = [k for k, name in enumerate(model.exposures) if name not in joint.outlying]
+    epoch = np.array([dates[model.exposures[k]] for k in typical])
+    values = joint.fit.mean[joint.index].reshape(len(joint.scatter.kinds), -1).T[typical]
     breaks = () if model.time is None else model.time.breaks
     p = trend_p_values(values, epoch, breaks)
-    out = [
+    return [
         f"the {kind} of the exposures drifts with time (p = {one:.1g}), and is taken to scatter "
         "between exposures: extend model.tdd.terms"
         for kind, one in zip(joint.scatter.kinds, p, strict=True)
-        if kind.split(".")[-1] not in RIGID and one * len(p) < TREND
+        if kind.split(".")[-1] not in RIGID and one * len(p) < TREND.value
     ]
-    for text in out:
-        log.warning("fit: WARNING: %s", text)
-    return out
-
-
-def _first_rows(matches: MatchTable) -> Iterator[tuple[int, int]]:
-    """Code of each exposure, and a row of it."""
-    codes, rows = np.unique(matches.exposure, return_index=True)
-    yield from zip(codes.tolist(), rows.tolist(), strict=True)
-
-
-# -- summary.json ---------------------------------------------------------------------------------
 
 
 def _scatter(joint: HierarchicalFit, name: str) -> dict[str, object]:

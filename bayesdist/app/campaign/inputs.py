@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.config import CampaignBlock, StarListsBlock
+from bayesdist.app.config import Config
+from bayesdist.app.config.campaign import CampaignBlock, StarListsBlock
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.data import (
     ExposureLog,
@@ -23,19 +24,23 @@ from bayesdist.data import (
 )
 from bayesdist.data.sky.tangent import mean_direction, tangent_plane
 from bayesdist.data.tables.files import read_table
-from bayesdist.errors import InputError
+from bayesdist.errors import ConfigError, InputError
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.products import IdcTab, read_idctab
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
 from bayesdist.products.formats.idctab.hst import parity_of
 
 __all__ = [
     "Inputs",
+    "campaign_block",
     "cuts_of",
+    "errors_by_star",
     "lists_of",
     "parities_of",
+    "read_campaign",
     "read_campaign_catalog",
-    "read_inputs",
     "start_of",
+    "unit_arcsec_of",
 ]
 
 Float = NDArray[np.float64]
@@ -69,13 +74,44 @@ class Inputs:
     plane: str = ""
 
     @property
+    def largest_vafactor(self) -> float:
+        """By which the catalogue's errors are divided: all factors are nearly the same."""
+        return float(self.log.values("vafactor").max())
+
+    @property
     def filter(self) -> str:
         """The one filter of the exposures."""
         return self.log.filters[0]
 
 
-def read_inputs(block: CampaignBlock, base: Path) -> Inputs:
+def campaign_block(config: Config) -> CampaignBlock:
+    """The campaign's part of a configuration.
+
+    Raises
+    ------
+    ConfigError
+        Where it has none.
+    """
+    if config.campaign is None:
+        raise ConfigError("names no star lists", where="campaign", do="give the section [campaign]")
+    return config.campaign
+
+
+def unit_arcsec_of(unit: str, config: Config) -> float:
+    """Size of a unit of u and v; of pixels that of the detector's, or 0.05 arcsec."""
+    scale = {"arcsec": 1.0, "mas": 1e-3, "deg": 3600.0}.get(unit)
+    return scale or (config.detector.scale_mas or 50.0) / 1000
+
+
+def read_campaign(config: Config, base: Path) -> Inputs:
     """Read catalogue, exposures and star lists.
+
+    Parameters
+    ----------
+    config : Config
+        With a section [campaign].
+    base : Path
+        Folder that its files are relative to.
 
     Raises
     ------
@@ -83,6 +119,7 @@ def read_inputs(block: CampaignBlock, base: Path) -> Inputs:
         For files that cannot be read, lists without an entry in the log, a filter without
         exposures, and exposures without VAFACTOR.
     """
+    block = campaign_block(config)
     log = read_exposures(base / block.exposures)
     catalog, plane = read_campaign_catalog(block, base, log)
     logged = set(log.names)
@@ -100,7 +137,7 @@ def read_inputs(block: CampaignBlock, base: Path) -> Inputs:
         )
     if block.filter is not None:
         log = log.select(filter=block.filter)
-    if block.aberration == "earth":
+    if block.vafactor_source == "earth":
         bare = tuple(replace(one, vafactor=None) for one in log)
         log = ExposureLog(bare, log.source).with_aberration()
     log.require("vafactor")
@@ -116,7 +153,7 @@ def read_inputs(block: CampaignBlock, base: Path) -> Inputs:
         )
     strangers = dict.fromkeys(one.exposure for one in lists if one.exposure not in logged)
     n = len(catalog)
-    if block.motions == "reliable" and catalog.sigma_pm_u is not None:
+    if block.pm_selection == "reliable" and catalog.sigma_pm_u is not None:
         catalog = select_motions(catalog)
     return Inputs(catalog, n, log, wanted, tuple(strangers), plane)
 
@@ -162,11 +199,10 @@ def read_campaign_catalog(
         )
     if catalog.tangent_point is None:
         return catalog, ""
-    point, middle = _middle_of(log, catalog), "stars"
+    (ra, dec), middle = catalog.tangent_point, "stars"
+    point = _middle_of(log, catalog)
     if point is not None:
-        catalog, middle = read(point), "exposures"
-    assert catalog.tangent_point is not None
-    ra, dec = catalog.tangent_point
+        catalog, (ra, dec), middle = read(point), point, "exposures"
     return catalog, (
         f"tangent plane at RA {ra:.5f}, Dec {dec:+.5f} (the middle of the {middle}), arcsec"
     )
@@ -188,7 +224,7 @@ def _middle_of(log: ExposureLog, catalog: ReferenceCatalog) -> tuple[float, floa
 
 
 def parities_of(block: CampaignBlock, catalog: ReferenceCatalog, tab: IdcTab) -> tuple[bool, ...]:
-    """Whether the catalogue is taken mirrored, the more probable first.
+    """Parities of the catalogue to try, the more probable first: True is mirrored.
 
     V2 and V3 lie on the sky as east and north do but for a rotation, and the table says how its
     axes lie along V2 and V3.
@@ -252,3 +288,36 @@ def known_calibration(tab: IdcTab | Path, filter: str | None) -> Calibration:
     known = read_idctab(tab) if isinstance(tab, Path) else tab
     names = {name for row in known.filters() for name in row}
     return idctab_calibration(known, filter if filter in names else None)
+
+
+def errors_by_star(catalog: ReferenceCatalog, largest_vafactor: float = 1.0) -> StarErrors | None:
+    """Errors of the catalogue by code of the star; None where it has none.
+
+    Parameters
+    ----------
+    catalog : ReferenceCatalog
+    largest_vafactor : float
+        By which catalogue positions were divided; a star in many exposures has one error, and the
+        factors differ by less than a ten-thousandth.
+    """
+    if catalog.sigma_u is None or not (np.any(catalog.sigma_u) or np.any(catalog.sigma_v)):
+        return None
+
+    def by_code(name: str) -> Float | None:
+        values = getattr(catalog, name)
+        if values is None:
+            return None
+        out = np.zeros(int(catalog.star.max()) + 1)
+        out[catalog.star] = values
+        return out
+
+    position, motion = (
+        [by_code(f"{name}_{axis}") for axis in "uv"] for name in ("sigma", "sigma_pm")
+    )
+    return StarErrors(
+        np.stack([one for one in position if one is not None], axis=1) / largest_vafactor,
+        None
+        if motion[0] is None or motion[1] is None
+        else np.stack([motion[0], motion[1]], axis=1) / largest_vafactor,
+        by_code("epoch"),
+    )

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import MEASURED
 from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.data import MatchTable
@@ -16,11 +16,16 @@ from bayesdist.diagnose.tables.between_nodes import BetweenNodes, between_nodes
 from bayesdist.diagnose.tables.mean_square import MeanSquare
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import LinearFit
-from bayesdist.infer.nodes import TablePosterior, pixel_shifts
-from bayesdist.infer.nodes.alternation import with_columns
-from bayesdist.infer.nodes.table_fit import held_sigma
-from bayesdist.infer.nodes.trust import Trust, fitted_trust
-from bayesdist.model import Chip, LookupTable, corrected
+from bayesdist.infer.nodes import (
+    ResidualMixture,
+    TablePosterior,
+    corrected_matches,
+    fit_mixture,
+    held_sigma,
+    pixel_shifts,
+)
+from bayesdist.infer.solution import Solution
+from bayesdist.model import Chip, LookupTable
 from bayesdist.model.grid import grid_pixels, mesh
 
 __all__ = ["INTERPOLATION", "interpolation_term", "measured_between"]
@@ -42,7 +47,7 @@ def measured_between(
     *,
     filter: str,
     posteriors: Sequence[TablePosterior] = (),
-    trust: Trust | None = None,
+    mixture: ResidualMixture | None = None,
     fitted: bool = True,
 ) -> tuple[BetweenNodes, ...]:
     """What tables leave of the distortion at a place, for each chip where it can be told.
@@ -58,7 +63,7 @@ def measured_between(
         Of the pairs.
     posteriors : sequence of TablePosterior
         Of the tables that were fitted to these pairs.
-    trust : Trust, optional
+    mixture : ResidualMixture, optional
         Of the pairs; by default that of their residuals.
     fitted : bool
         Whether the tables were fitted to these pairs.  Those that were not err by themselves.
@@ -70,10 +75,9 @@ def measured_between(
     if pairs.star is None:
         return ()
     numbers = pairs.chip_number
-    px, py = corrected(tables, pairs.x, pairs.y, chip=numbers, filter=filter)
-    left = pixel_shifts(fit, with_columns(pairs, x=px, y=py))
-    trust = trust or fitted_trust(left.shift, left.variance)
-    jitter = np.full(len(pairs), trust.jitter)
+    left = pixel_shifts(fit, corrected_matches(tables, pairs))
+    mixture = mixture or fit_mixture(left.shift, left.variance)
+    jitter = np.full(len(pairs), mixture.jitter)
     for one in posteriors:
         jitter[numbers == one.table.chip] = one.jitter
     total = left.variance + jitter[:, None] ** 2

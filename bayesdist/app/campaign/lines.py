@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
-from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.infer.transforms import (
-    LinearTerms,
-    Solution,
-    View,
-    lines,
-    reference_gauge,
-    without_frames,
-)
+from bayesdist.infer.solution import ReferenceGauge, Solution, TransformedSolution
+from bayesdist.infer.transforms import LinearTerms, lines, reference_gauge, without_frames
 
-__all__ = ["FIXED", "summarise_lines"]
+__all__ = ["FIXED", "line_sections"]
 
 FIXED = ("A_1", "B_1", "A_3")  # by the gauge, on the reference chip
 
 
-def summarise_lines(session: CampaignSession, solution: Solution) -> None:
-    """Write the gauge, and alpha and beta of each term, to summary.json."""
-    view = reference_gauge(without_frames(solution), session.reference_chip)
-    session.run.summarise(gauge=_gauge(view), lines=_lines(view))
+def line_sections(solution: Solution, chip: int) -> dict[str, object]:
+    """Sections 'gauge' and 'lines' of summary.json: alpha and beta of each term.
+
+    Parameters
+    ----------
+    solution : Solution
+    chip : int
+        Number of the reference chip.
+    """
+    view = reference_gauge(without_frames(solution), chip)
+    return {"gauge": _gauge(view.gauge), "lines": _lines(view)}
 
 
-def _gauge(view: View) -> dict[str, object]:
-    gauge = view.gauge
-    assert gauge is not None
+def _gauge(gauge: ReferenceGauge | None) -> dict[str, object] | None:
+    """Section 'gauge'; None for a solution in no gauge of its own."""
+    if gauge is None:
+        return None
     return {
         "chip": gauge.chip,
         "fixed": list(FIXED),
@@ -37,7 +38,7 @@ def _gauge(view: View) -> dict[str, object]:
     }
 
 
-def _lines(view: View) -> list[dict[str, object]]:
+def _lines(view: TransformedSolution) -> list[dict[str, object]]:
     """alpha and beta of the joint fit in the reference gauge, as Tables 1 to 3 of the report."""
     time = view.model.time
     if time is None:

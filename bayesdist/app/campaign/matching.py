@@ -1,114 +1,161 @@
-"""Stage 0 of a campaign: star lists to pairs."""
+"""Star lists of a campaign, matched with its catalogue."""
 
 from __future__ import annotations
 
 import logging
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from astropy.table import Table
 
-from bayesdist.app.campaign.inputs import cuts_of, parities_of, start_of
-from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.app.campaign.soundness import input_doubts, refuse_few, shear_doubts
-from bayesdist.app.session import write_table
-from bayesdist.app.star_files import PAIRS, part_files
+from bayesdist.app.campaign.inputs import (
+    Inputs,
+    campaign_block,
+    cuts_of,
+    parities_of,
+    start_of,
+    unit_arcsec_of,
+)
+from bayesdist.app.campaign.matched import CampaignMatched, matched_campaign
+from bayesdist.app.campaign.reference import free_rates
+from bayesdist.app.campaign.soundness import input_warnings, refuse_few, shear_warnings
+from bayesdist.app.config import Config
 from bayesdist.data import (
+    ExposureLog,
     MatchTable,
     StarCuts,
     StarList,
     match_campaign,
     neutralise_aberration,
-    write_partitioned,
 )
+from bayesdist.data.matching.campaign import CampaignMatches
 from bayesdist.errors import InputError
 from bayesdist.model import Chip
 from bayesdist.products import read_idctab
 
-__all__ = ["run_match"]
+__all__ = ["match_lists"]
 
 log = logging.getLogger("bayesdist")
 
 
-def run_match(session: CampaignSession) -> None:
-    block, run, inputs = session.block, session.run, session.inputs
+def match_lists(inputs: Inputs, config: Config, base: Path) -> CampaignMatched:
+    """Star lists matched with a catalogue, exposure by exposure.
+
+    Parameters
+    ----------
+    inputs : Inputs
+        As `read_campaign` reads them.
+    config : Config
+        With a section [campaign].
+    base : Path
+        Folder that its files are relative to.
+
+    Returns
+    -------
+    CampaignMatched
+
+    Raises
+    ------
+    BayesdistError
+        For files that cannot be read or do not go together, chips without matches, and too few
+        exposures.
+    """
+    block = campaign_block(config)
     cuts = cuts_of(block)
-    tab = read_idctab(session.base / block.start)
+    tab = read_idctab(base / block.initial_distortion)
     parities = parities_of(block, inputs.catalog, tab)
     for text in (*([inputs.plane] if inputs.plane else []), *inputs.catalog.notes):
         log.info("match: catalogue: %s", text)
     found = match_campaign(
-        _gauge_first(inputs.lists, cuts, session.reference_chip),
+        _gauge_first(inputs.lists, cuts, config.chips()[0].number),
         inputs.log,
         inputs.catalog,
-        start_of(tab, session.unit_arcsec, block.filter),
+        start_of(tab, unit_arcsec_of(inputs.catalog.unit, config), block.filter),
         cuts=cuts,
         radius=block.radius,
         mirrored=parities,
         skip=True,
     )
-    _refuse_bare(found.table, session.config.chips(), inputs.catalog.source)
-    left = inputs.log.select(names=found.table.exposure_names)
+    _refuse_bare(found.table, config.chips(), inputs.catalog.source)
     if found.left_out:
-        refuse_few(left.values("epoch"), session.config.time())
-    summary = found.summary()
-    order = [list(inputs.log.names).index(name) for name in summary["exposure"]]
-    for name in ("vafactor", "pa_v3"):
-        summary[name] = inputs.log.values(name)[order]
+        left = inputs.log.select(names=found.table.exposure_names)
+        refuse_few(left.values("epoch"), config.time())
+    table = _table(found, inputs.log)
     warnings = [
         *_doubtful_parity(found.mirrored, parities, f"{tab.instrument}/{tab.detector}"),
         *found.warnings(inputs.log),
-        *input_doubts(session),
+        *input_warnings(config, inputs),
         # as the stars show them, for the log need not have them
-        *shear_doubts(np.asarray(summary["rotation"]), "of the matches"),
+        *shear_warnings(np.asarray(table["rotation"]), "of the matches"),
     ]
-    write_table(summary, run / "matching.ecsv")
-    for stale in part_files(run / PAIRS):
-        stale.unlink()
-    write_partitioned([neutralise_aberration(found.table, inputs.log)], run / PAIRS)
-    session.forget()
-    if session.config.holdout is not None:
-        _refuse_bare(session.pairs, session.config.chips(), "what is not held out")
-        some = inputs.log.select(names=session.pairs.exposure_names)
-        refuse_few(some.values("epoch"), session.config.time() if session.free_rates else None)
-    false = float(np.sum(summary["false_share"] * summary["matched"]) / summary["matched"].sum())
-    run.summarise(
-        matching={
-            "n_exposures": len(found.reports),
-            "n_detections": sum(len(one) for one in inputs.lists),
-            "n_pairs": len(found.table),
-            "n_catalog": inputs.n_catalog,
-            "n_catalog_used": len(inputs.catalog),
-            "left_out": dict(found.left_out),
-            "completeness": {
-                "median": float(np.median(summary["completeness"])),
-                "least": float(np.min(summary["completeness"])),
-            },
-            "false_share": false,
-            "parity": "mirrored" if found.mirrored else "direct",
-            "tangent_point": inputs.catalog.tangent_point,
-            "radius": [float(summary["radius_min"].min()), float(summary["radius_max"].max())],
-            "warnings": warnings,
-        }
-    )
+    pairs = neutralise_aberration(found.table, inputs.log)
+    facts = _facts(found, table, inputs, warnings)
+    matched = matched_campaign(pairs, config, inputs, facts=facts, table=table)
+    if matched.held is not None:
+        _refuse_bare(matched.stars, config.chips(), "what is not held out")
+        some = inputs.log.select(names=matched.stars.exposure_names)
+        refuse_few(some.values("epoch"), config.time() if free_rates(config) else None)
+    _log(matched, int(table["detected"].sum()))
+    return matched
+
+
+def _table(found: CampaignMatches, exposures: ExposureLog) -> Table:
+    """One row for each exposure, with its VAFACTOR and roll angle."""
+    table = found.summary()
+    names = list(exposures.names)
+    order = [names.index(name) for name in table["exposure"]]
+    for name in ("vafactor", "pa_v3"):
+        table[name] = exposures.values(name)[order]
+    return table
+
+
+def _facts(
+    found: CampaignMatches, table: Table, inputs: Inputs, warnings: list[str]
+) -> dict[str, Any]:
+    """Section 'matching' of summary.json."""
+    false = np.sum(table["false_share"] * table["matched"]) / table["matched"].sum()
+    return {
+        "n_exposures": len(found.reports),
+        "n_detections": sum(len(one) for one in inputs.lists),
+        "n_pairs": len(found.table),
+        "n_catalog": inputs.n_catalog,
+        "n_catalog_used": len(inputs.catalog),
+        "left_out": dict(found.left_out),
+        "completeness": {
+            "median": float(np.median(table["completeness"])),
+            "least": float(np.min(table["completeness"])),
+        },
+        "false_share": float(false),
+        "parity": "mirrored" if found.mirrored else "direct",
+        "tangent_point": inputs.catalog.tangent_point,
+        "radius": [float(table["radius_min"].min()), float(table["radius_max"].max())],
+        "warnings": warnings,
+    }
+
+
+def _log(matched: CampaignMatched, n_detected: int) -> None:
+    facts = matched.facts
     log.info(
         "match: %d pairs of %d detections in %d exposures, median completeness %.3f, %.2g false",
-        len(found.table),
-        int(summary["detected"].sum()),
-        len(found.reports),
-        float(np.median(summary["completeness"])),
-        false,
+        facts["n_pairs"],
+        n_detected,
+        facts["n_exposures"],
+        facts["completeness"]["median"],
+        facts["false_share"],
     )
-    if found.mirrored:
+    if matched.mirrored:
         log.info(
             "match: the catalogue is mirrored against the detector's axes: u is taken with the "
             "opposite sign%s",
-            "" if inputs.catalog.tangent_point is None else " and grows to the west",
+            "" if facts["tangent_point"] is None else " and grows to the west",
         )
-    for text in warnings:
+    for text in matched.warnings:
         log.warning("match: WARNING: %s", text)
 
 
 def _doubtful_parity(mirrored: bool, parities: tuple[bool, ...], detector: str) -> list[str]:
-    """Whether the stars have another parity than the known distortion says, as a clause."""
+    """A warning, as a clause, of stars with another parity than the known distortion says."""
     if mirrored == parities[0]:
         return []
     return [

@@ -8,16 +8,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.campaign.inputs import campaign_block
+from bayesdist.app.config import Config
+from bayesdist.app.kinds.errors import read_magnitude_errors
+from bayesdist.app.kinds.fitted import Fitted, required
+from bayesdist.app.results import Results
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.star_files import PAIRS, part_files
 from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
-from bayesdist.infer.catalogue.star_influence import StarErrors
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.compare.monitoring import NewFit, fit_new, with_star_errors_of
 from bayesdist.infer.linear import Rejection
-from bayesdist.infer.nodes.alternation import on_the_chips, with_columns
+from bayesdist.infer.nodes.corrected import on_the_chips, with_columns
 from bayesdist.model import corrected
 
 __all__ = ["NewExposures", "fit_exposures_of", "read_new_exposures"]
@@ -50,13 +54,13 @@ class NewExposures:
     left_out: tuple[str, ...]
 
 
-def read_new_exposures(session: CampaignSession, new: Path) -> NewExposures:
+def read_new_exposures(release: Results, new: Path) -> NewExposures:
     """Matched pairs of new exposures: those of another run, or a table.
 
     Parameters
     ----------
-    session : CampaignSession
-        The release.
+    release : Results
+        Of a campaign.
     new : Path
         Run directory of a campaign whose stage 'match' has been run, or pairs in a file or folder
         as a run keeps them.
@@ -71,13 +75,13 @@ def read_new_exposures(session: CampaignSession, new: Path) -> NewExposures:
         For star lists, which have to be matched first; pairs in another unit or filter, without
         epochs, or without a way to errors; when all exposures are those of the release.
     """
-    released = session.signed
+    released = release.solution
     run = RunDirectory(new) if (new / "run.json").exists() else None
     pairs = _pairs(run, new, released.model.unit)
     where = ", ".join(pairs.sources)
     if not pairs.has_epoch:
         raise InputError("has no epochs", where=str(new), do="give a column 'epoch'")
-    _refuse_other_filters(session, pairs, where)
+    _refuse_other_filters(release.config, pairs, where)
     seen = np.isin(pairs.exposure_names, released.model.exposures)
     left_out = tuple(np.asarray(pairs.exposure_names)[seen].tolist())
     fresh = ~seen[pairs.exposure]
@@ -92,58 +96,57 @@ def read_new_exposures(session: CampaignSession, new: Path) -> NewExposures:
     code = {name: k for k, name in enumerate(names)}
     codes = np.array([code.get(name, -1) for name in pairs.exposure_names])[pairs.exposure]
     pairs = replace(pairs, exposure=codes, exposure_names=names)
-    own = None if run is None else CampaignSession(run).kept_errors()
+    own = None if run is None else read_magnitude_errors(run.path)
     return NewExposures(
         released,
-        prepared(session, pairs, own or session.kept_errors()),
+        prepared(release.fitted, pairs, own or release.fitted.errors.by_magnitude),
         _catalogue_errors(pairs),
-        run is not None and _catalogue_of(run) == _catalogue_of(session.run),
+        run is not None and _catalogue_of(run) == _catalogue_of(release.run),
         left_out,
     )
 
 
-def prepared(
-    session: CampaignSession, pairs: MatchTable, errors: MagnitudeErrors | None
-) -> MatchTable:
+def prepared(release: Fitted, pairs: MatchTable, errors: MagnitudeErrors | None) -> MatchTable:
     """Pairs at the pixels that the release's tables have corrected, with errors of centroids."""
-    if session.tables:
+    tables = release.tables.tables
+    if tables:
         names = np.asarray(pairs.filter_names)[pairs.filter]
-        own = next((table.filter for table in session.tables if table.filter), "")
+        own = next((table.filter for table in tables if table.filter), "")
         x, y = corrected(
-            session.tables,
+            tables,
             pairs.x,
             pairs.y,
             chip=pairs.chip_number,
             filter=np.where(names == "", own, names),
         )
-        pairs = on_the_chips(with_columns(pairs, x=x, y=y), session.fit.model)
+        pairs = on_the_chips(with_columns(pairs, x=x, y=y), release.linear.model)
     if pairs.mag is None or errors is None:
         return pairs
     return with_centroid_errors(pairs, errors)
 
 
-def fit_exposures_of(session: CampaignSession, new: NewExposures) -> NewFit:
+def fit_exposures_of(release: Results, new: NewExposures) -> NewFit:
     """The new exposures fitted by themselves, deviating as those of the release scatter.
 
     What a star's error in the catalogue does to all its exposures is added, and where the release
     has the same catalogue, what it did to the release is taken into account.
     """
-    config = session.config
-    kinds, tau = session.scatter
+    config = release.config
+    scatter = required(release.fitted.scatter, "joint fit of exposures")
     found = fit_new(
         new.released,
         new.matches,
         rejection=Rejection(config.fit.clip_chi2, config.fit.clip_abs),
         compute=config.resources(),
-        scatter=dict(zip(kinds, np.sqrt((tau**2).mean(axis=0)), strict=True)),
+        scatter=dict(zip(scatter.kinds, np.sqrt((scatter.tau**2).mean(axis=0)), strict=True)),
     )
     if new.errors is None:
         return found
     released = None
     if new.same_catalogue:
-        old = session.matches
+        old = release.data.stars
         assert isinstance(old, MatchTable)
-        released = (session.fit, old)
+        released = (release.fit, old)
     return with_star_errors_of(new.errors, found, new.matches, released)
 
 
@@ -170,8 +173,8 @@ def _pairs(run: RunDirectory | None, new: Path, unit: str) -> MatchTable:
     return found
 
 
-def _refuse_other_filters(session: CampaignSession, pairs: MatchTable, where: str) -> None:
-    mine = session.config.campaign.filter if session.config.campaign is not None else None
+def _refuse_other_filters(config: Config, pairs: MatchTable, where: str) -> None:
+    mine = campaign_block(config).filter
     others = sorted({name for name in pairs.filter_names if name} - {mine})
     if mine is not None and others:
         raise InputError(

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from bayesdist.app.campaign.config import TablesBlock
 from bayesdist.app.campaign.gap import with_gap
-from bayesdist.app.campaign.table_file import read_tables
+from bayesdist.app.config import Config
+from bayesdist.app.config.campaign import TablesBlock
+from bayesdist.app.kinds.table_file import read_tables
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Posterior, load_posterior
 from bayesdist.infer.exposures.shared_drift import drift_priors
 from bayesdist.model import Chip, DistortionModel, LookupTable
 from bayesdist.products import read_d2im
 
-if TYPE_CHECKING:
-    from bayesdist.app.config import Config
-
-__all__ = ["FREE", "held_tables", "rate_priors", "reference_files", "rehearse_references"]
+__all__ = [
+    "FREE",
+    "free_rates",
+    "held_tables",
+    "rate_priors",
+    "reference_files",
+    "rehearse_references",
+]
 
 FREE = "free"  # rates that no other run says anything of
 TABLES, POSTERIOR = "tables.h5", "posterior.nc"
@@ -83,19 +87,20 @@ def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tupl
     return tuple(sorted(ours, key=lambda table: table.chip))
 
 
-def rate_priors(
-    rates: str, model: DistortionModel, *, chip: int, base: Path
-) -> GaussianPriors | None:
+def free_rates(config: Config) -> bool:
+    """Truth of a drift that is that of this run's own exposures."""
+    return config.model.tdd is None or config.model.tdd.rates == FREE
+
+
+def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianPriors | None:
     """Priors on the drift of a model from the posterior of another run; None where it is free.
 
     Parameters
     ----------
-    rates : str
-        `model.tdd.rates`.
+    config : Config
     model : DistortionModel
-    chip : int
-        Number of the reference chip.
     base : Path
+        What the configuration's paths are relative to.
 
     Raises
     ------
@@ -103,9 +108,10 @@ def rate_priors(
         For a folder that is no finished run, a run that has not converged, and one of other chips,
         units, drifting terms, or reference dates.
     """
-    if rates == FREE:
+    tdd, chip = config.model.tdd, config.chips()[0].number
+    if tdd is None or tdd.rates == FREE:
         return None
-    path = _file_of_run(base / rates, POSTERIOR, "model.tdd.rates")
+    path = _file_of_run(base / tdd.rates, POSTERIOR, "model.tdd.rates")
     posterior: Posterior = load_posterior(path)
     if not posterior.convergence.converged:
         raise InputError(
@@ -135,11 +141,11 @@ def rehearse_references(config: Config, unit: str, base: Path) -> None:
     InputError
         As `held_tables` and `rate_priors`.
     """
-    chips, tdd = config.chips(), config.model.tdd
+    chips = config.chips()
     held_tables(config.tables, chips, base)
-    if tdd is not None:
+    if not free_rates(config):
         model = with_gap(DistortionModel(config.model.order, chips, unit, config.time()))
-        rate_priors(tdd.rates, model, chip=chips[0].number, base=base)
+        rate_priors(config, model, base)
 
 
 def _tables_file(path: Path) -> Path:

@@ -7,10 +7,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.config import Config
 from bayesdist.calibration.calibration import calibration_of
 from bayesdist.calibration.orientation import lay_on
-from bayesdist.infer.transforms import Solution, reference_gauge, without_frames
+from bayesdist.infer.solution import Solution
+from bayesdist.infer.transforms import reference_gauge, without_frames
 from bayesdist.model import LookupTable
 from bayesdist.products import (
     Period,
@@ -22,28 +23,12 @@ from bayesdist.products import (
     write_release,
 )
 
-__all__ = ["release", "write_files"]
-
-
-def release(session: CampaignSession, solution: Solution) -> list[dict[str, Any]]:
-    """Write IDCTABs, D2IMFILE and NPOLFILE of one run into its folder, and say what was written.
-
-    Parameters
-    ----------
-    session : CampaignSession
-    solution : LinearFit or Posterior
-
-    Returns
-    -------
-    list of dict
-        Entries of summary.json.
-    """
-    own = {session.inputs.filter: solution}
-    return write_files(session, session.run.path, own, session.published_tables)
+__all__ = ["write_files"]
 
 
 def write_files(
-    session: CampaignSession,
+    config: Config,
+    base: Path,
     folder: Path,
     solutions: Mapping[str, Solution],
     tables: Sequence[LookupTable],
@@ -53,11 +38,13 @@ def write_files(
 
     Parameters
     ----------
-    session : CampaignSession
-        Whose [products.release] it is.
+    config : Config
+        With a section [products.release].
+    base : Path
+        Folder that its files are relative to.
     folder : Path
     solutions : mapping of filter to Solution
-        The session's own first: V2 and V3 lie as the reference says of it.
+        The configuration's own first: V2 and V3 lie as the reference says of it.
     tables : sequence of LookupTable
         The detector's, and those of filters.
     history : sequence of str
@@ -68,9 +55,9 @@ def write_files(
     list of dict
         One entry for each file: path, kind, findings, and of an IDCTAB period and lost.
     """
-    block = session.config.products.release
+    block = config.products.release
     assert block is not None
-    number = session.reference_chip
+    number = config.chips()[0].number  # its axes and zero point define the gauge
     calibrations = {
         filter: calibration_of(
             reference_gauge(without_frames(solution), number), filter, filter=filter
@@ -81,7 +68,7 @@ def write_files(
     time = first.model.time
     orientation = lay_on(
         first,
-        read_calibration(session.base / block.reference),
+        read_calibration(base / block.reference),
         chip=number,
         epoch=None if time is None else time.epoch0[0],
         scale_arcsec=block.scale_arcsec,

@@ -1,24 +1,34 @@
-"""What the report shows of a campaign, put together from its session."""
+"""What the report shows of a campaign, put together from its results."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.inputs import cuts_of, read_campaign_catalog
-from bayesdist.app.campaign.overlap import overlap_test
-from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.app.rundir import as_json
+from bayesdist.app.campaign.inputs import (
+    Inputs,
+    campaign_block,
+    cuts_of,
+    read_campaign_catalog,
+)
+from bayesdist.app.campaign.matched import CampaignMatched, campaign_matches
+from bayesdist.app.config import Config
+from bayesdist.app.config.campaign import CampaignBlock
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.results import Results
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store import as_json
 from bayesdist.data import MatchTable, with_centroid_errors
 from bayesdist.data.motions import motion_error_line
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
-from bayesdist.infer import GaussianPriors, LinearFit, fit_linear
+from bayesdist.infer import GaussianPriors, LinearFit, Posterior, fit_linear
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import Rejection
-from bayesdist.infer.nodes import pixel_shifts
-from bayesdist.infer.nodes.alternation import inside_chips, with_columns
-from bayesdist.model import corrected
+from bayesdist.infer.nodes import corrected_matches, inside_chips, pixel_shifts
+from bayesdist.model import DistortionModel
 from bayesdist.model.grid import outline_pixels
 from bayesdist.report.campaign import (
     CampaignResults,
@@ -40,38 +50,36 @@ HELD = 0.99  # of the prior's sigma: what narrows it by less is no measurement
 WIDEST = 8  # cells of this many times the size, however few stars there are
 
 
-def campaign_results(session: CampaignSession) -> CampaignResults:
+def campaign_results(results: Results) -> CampaignResults:
     """What a campaign adds to the report of its run.
 
     Parameters
     ----------
-    session : CampaignSession
+    results : Results
         Of a run that has been assessed.
 
     Returns
     -------
     CampaignResults
     """
-    run = session.run
-    matching = Table.read(run / "matching.ecsv")
+    run, config, fitted = results.run, results.config, results.fitted
+    matched, matching = campaign_matches(results.matched), Table.read(run / "matching.ecsv")
     return CampaignResults(
         summary=dict(run.summary),
-        config=as_json(session.config.model_dump(exclude_none=True)),
-        filter=session.block.filter or session.inputs.log.filters[0],
+        config=as_json(config.model_dump(exclude_none=True)),
+        filter=campaign_block(config).filter or matched.filter,
         matching=matching,
-        chips=tuple(session.posterior.model.chips),
-        unit=session.posterior.model.unit,
-        catalog=_catalog_stars(session, matching),
-        centroids=session.magnitude_errors,
-        detections=_detections(session),
-        footprints=_footprints(session),
-        residuals=_residuals(session),
-        tables=session.tables,
-        series=_series(session, matching),
-        overlap=overlap_test(session),
-        doubts=tuple(session.doubts),
-        misfits=session.misfits,
-        held=held_parameters(session.fit, session.priors),
+        chips=tuple(results.posterior.model.chips),
+        unit=results.posterior.model.unit,
+        catalog=_catalog_stars(matched.inputs, campaign_block(config), results.base, matching),
+        centroids=fitted.errors.by_magnitude,
+        detections=_detections(matched.inputs, campaign_block(config)),
+        footprints=_footprints(results.posterior, matched),
+        residuals=_residuals(results.data, matched, config),
+        tables=fitted.tables.tables,
+        series=_series(run, fitted.linear.model, matching),
+        overlap=results.diagnostics.overlap,
+        held=held_parameters(fitted.linear, fitted.priors),
     )
 
 
@@ -103,8 +111,10 @@ def _some(n: int, most: int) -> slice:
     return slice(None, None, max(1, -(-n // most)))
 
 
-def _catalog_stars(session: CampaignSession, matching: Table) -> CatalogStars | None:
-    catalog, _ = read_campaign_catalog(session.block, session.base, session.inputs.log)
+def _catalog_stars(
+    inputs: Inputs, block: CampaignBlock, base: Path, matching: Table
+) -> CatalogStars | None:
+    catalog, _ = read_campaign_catalog(block, base, inputs.log)
     if catalog.mag is None or (catalog.sigma_u is None and catalog.sigma_pm_u is None):
         return None
     shift = float(np.nan_to_num(np.nanmedian(np.asarray(matching["zero_point"], float))))
@@ -114,7 +124,7 @@ def _catalog_stars(session: CampaignSession, matching: Table) -> CatalogStars | 
         sigma = np.hypot(catalog.sigma_u, catalog.sigma_v)[rows]
     if catalog.sigma_pm_u is not None and catalog.sigma_pm_v is not None:
         motion = np.maximum(catalog.sigma_pm_u, catalog.sigma_pm_v)[rows]
-        if session.block.motions == "reliable":
+        if block.pm_selection == "reliable":
             line = motion_error_line(catalog)
             limit = (line.mag - shift, line.sigma)
     return CatalogStars(
@@ -123,13 +133,13 @@ def _catalog_stars(session: CampaignSession, matching: Table) -> CatalogStars | 
         sigma_motion=motion,
         limit=limit,
         unit=catalog.unit,
-        n_used=len(session.inputs.catalog),
+        n_used=len(inputs.catalog),
     )
 
 
-def _detections(session: CampaignSession) -> Detections | None:
+def _detections(inputs: Inputs, block: CampaignBlock) -> Detections | None:
     """Quality against magnitude, of some detections of every exposure."""
-    lists, cuts = session.inputs.lists, cuts_of(session.block)
+    lists, cuts = inputs.lists, cuts_of(block)
     if any(one.mag is None or one.q is None for one in lists):
         return None
     passed = [cuts.passed(one)[0] for one in lists]
@@ -147,15 +157,15 @@ def _detections(session: CampaignSession) -> Detections | None:
         n_total=n_total,
         n_kept=int(sum(p.sum() for p in passed)),
         mag_cuts=(*edges, *(() if cuts.saturation is None else (cuts.saturation,))),
-        q_max=session.block.q_max,
+        q_max=block.q_max,
     )
 
 
-def _footprints(session: CampaignSession) -> Footprints:
-    model, theta, catalog = session.posterior.model, session.posterior.mean, session.inputs.catalog
+def _footprints(posterior: Posterior, matched: CampaignMatched) -> Footprints:
+    model, theta, catalog = posterior.model, posterior.mean, matched.inputs.catalog
     outlines, epochs = [], []
     for name in model.exposures:
-        exposure = session.inputs.log[name]
+        exposure = matched.inputs.log[name]
         for chip in model.chips:
             x, y = outline_pixels(chip.size)
             place = {"exposure": name, "chip": chip.number}
@@ -163,30 +173,32 @@ def _footprints(session: CampaignSession) -> Footprints:
             outlines.append(model.predict(theta, x, y, epoch=when, **place))
             epochs.append(exposure.epoch)
     rows = _some(len(catalog), DRAWN // 2)
-    u = -catalog.u if session.mirrored else catalog.u
+    u = -catalog.u if matched.mirrored else catalog.u
     return Footprints(u[rows], catalog.v[rows], tuple(outlines), np.array(epochs), catalog.unit)
 
 
 @one_thread
-def _residuals(session: CampaignSession) -> tuple[ChipResiduals, ...]:
+def _residuals(
+    data: FitData, matched: CampaignMatched, config: Config
+) -> tuple[ChipResiduals, ...]:
     """Pairs of each chip without the tables and with them, along the detector's axes."""
-    pairs, moved, model = session.pairs, session.matches, session.plain_model
+    pairs, moved, model = matched.stars, data.stars, matched.affine_model(config)
     assert isinstance(moved, MatchTable)
-    errors, farthest = session.magnitude_errors, session.config.fit.clip_abs
+    tables = data.fitted.tables.tables
+    errors, farthest = data.fitted.errors.by_magnitude, config.fit.clip_abs
     plain = pairs if errors is None else with_centroid_errors(pairs, errors)
-    if any(table.filter for table in session.tables):  # those of the detector are not of this run
-        detector = [table for table in session.tables if not table.filter]
-        x, y = corrected(detector, pairs.x, pairs.y, chip=pairs.chip_number)
-        plain = with_columns(plain, x=x, y=y)
+    if any(table.filter for table in tables):  # those of the detector are not of this run
+        detector = [table for table in tables if not table.filter]
+        plain = corrected_matches(detector, plain)
     # the stars that neither has moved off their chip
-    kept = session.inside_with_tables
+    kept = data.fitted.inside(pairs)
     both = kept & inside_chips(plain, model)
     pairs, plain, moved = (
         one if rows.all() else one.select(rows, reason="moved off the chip")
         for one, rows in ((pairs, both), (plain, both), (moved, both[kept]))
     )
     numbers, left = pairs.chip_number, []
-    for table in (plain, moved) if session.tables else (plain,):
+    for table in (plain, moved) if tables else (plain,):
         # errors are those of the centroids: beside what the tables take out, chi-square is no guide
         fit = fit_linear(table, model, rejection=Rejection(np.inf, farthest))
         left.append(pixel_shifts(fit, table).shift)
@@ -198,7 +210,7 @@ def _residuals(session: CampaignSession) -> tuple[ChipResiduals, ...]:
         binned = [_binned(pairs, r, here, bins, chip.size) for r in left]
         rows = _some(int(here.sum()), DRAWN // (2 * len(model.chips)))
         points = [r[here][rows] for r in left]
-        again = (points[-1], binned[-1]) if session.tables else (None, None)
+        again = (points[-1], binned[-1]) if tables else (None, None)
         out.append(ChipResiduals(chip, points[0], again[0], binned[0], again[1]))
     return tuple(out)
 
@@ -223,8 +235,8 @@ def _binned(
     return binned_residuals(x, y, *residual[rows].T, bins=bins, size=size)
 
 
-def _series(session: CampaignSession, matching: Table) -> LinearSeries | None:
-    time, run = session.model.time, session.run
+def _series(run: RunDirectory, model: DistortionModel, matching: Table) -> LinearSeries | None:
+    time = model.time
     if time is None or "time_dependence" not in run.summary:
         return None
     exposures = Table.read(run / "series.ecsv")

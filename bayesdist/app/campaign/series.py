@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.app.session import write_table
+from bayesdist.app.campaign.reference import free_rates
+from bayesdist.app.config import Config
+from bayesdist.app.kinds.fitted import Fitted, required
+from bayesdist.app.output import write_table
+from bayesdist.app.rundir import RunDirectory
 from bayesdist.errors import DegenerateError
-from bayesdist.infer.series import Course, Series, SeriesPosterior, describe, fit_series
+from bayesdist.infer.series import Series, SeriesPosterior, TrendModel, describe, fit_series
 
-__all__ = ["run_series"]
+__all__ = ["write_series_tables"]
 
 log = logging.getLogger("bayesdist")
 
@@ -22,27 +25,35 @@ MOST_SWEEPS = 6000  # chips that scatter nearly alike make slow chains
 FEWEST = 8  # exposures below which nothing is said of time
 
 
-def run_series(session: CampaignSession) -> None:
-    """Write series.ecsv and drift.ecsv, and a section of summary.json."""
-    series, time = session.terms, session.model.time
+def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> None:
+    """Write series.ecsv and drift.ecsv, and a section of summary.json.
+
+    Parameters
+    ----------
+    run : RunDirectory
+    fitted : Fitted
+        With exposures that were each fitted alone.
+    config : Config
+    """
+    series = required(fitted.alone, "fits of single exposures")
+    time, seed = fitted.linear.model.time, config.sampler.seed
     if time is None or len(series.names) < FEWEST:
         return
-    seed = session.config.sampler.seed
-    course = Course("lines" if time.breaks else "line", time.breaks, reference=time.epoch0)
+    trend = TrendModel("lines" if time.breaks else "line", time.breaks, reference=time.epoch0)
     try:
-        posterior = fit_series(series, course, seed=seed, max_sweeps=MOST_SWEEPS)
+        posterior = fit_series(series, trend, seed=seed, max_sweeps=MOST_SWEEPS)
     except DegenerateError as error:
-        if session.free_rates:
+        if free_rates(config):
             raise
         log.info("assess: no drift from these exposures alone: %s", error.cause)
         return
-    write_table(_exposures(series, posterior), session.run / "series.ecsv")
-    write_table(_predictions(posterior), session.run / "drift.ecsv")
+    write_table(_exposures(series, posterior), run / "series.ecsv")
+    write_table(_predictions(posterior), run / "drift.ecsv")
     outlying = [
         name for name, p in zip(series.names, posterior.outlier_probability, strict=True) if p > 0.5
     ]
     verdicts = [_verdict(series, k, time.breaks, seed) for k in range(len(series.coefficients))]
-    session.run.summarise(
+    run.summarise(
         time_dependence={
             "converged": posterior.convergence.converged,
             "lines": _lines(posterior),
@@ -54,7 +65,7 @@ def run_series(session: CampaignSession) -> None:
                 )
             ),
             "outlying_exposures": outlying,
-            "warnings": list(_doubts(session, outlying)),
+            "warnings": list(_doubts(fitted.facts["exposures_outlying"], outlying)),
             "breaks": _changes(posterior),
             "verdicts": verdicts,
         }
@@ -63,19 +74,18 @@ def run_series(session: CampaignSession) -> None:
         log.info("assess: %s: %s", row["term"], row["claim"])
 
 
-def _doubts(session: CampaignSession, outlying: list[str]) -> Iterator[str]:
-    """Where the exposures alone and the joint fit do not say the same."""
-    known = session.run.summary.get("exposures_outlying", [])
+def _doubts(known: Sequence[str], outlying: Sequence[str]) -> Iterator[str]:
+    """Where the exposures alone and the joint fit, which knows of outlying ones, disagree."""
     missed = [name for name in outlying if name not in known]
     if missed:
         yield (
             f"{', '.join(missed)}, each fitted alone, {'lie' if len(missed) > 1 else 'lies'} off "
-            "the course of the others, and the joint fit counts them as scatter"
+            "the trend of the others, and the joint fit counts them as scatter"
         )
 
 
 def _verdict(series: Series, k: int, breaks: tuple[float, ...], seed: int) -> dict[str, object]:
-    """Which course one term takes, by held-out exposures."""
+    """Which trend one term takes, by held-out exposures."""
     verdict = describe(series.only(series.coefficients[k]), breaks=breaks, seed=seed)
     return {"term": series.coefficients[k], "claim": verdict.claim, "text": verdict.text}
 
@@ -99,12 +109,12 @@ def _lines(posterior: SeriesPosterior) -> list[dict[str, object]]:
 
 def _changes(posterior: SeriesPosterior) -> list[dict[str, object]]:
     out: list[dict[str, object]] = []
-    for number in range(posterior.course.n_breaks):
+    for number in range(posterior.trend.n_breaks):
         level, slope = posterior.change(number)
         for k, name in enumerate(posterior.series.coefficients):
             out.append(
                 {
-                    "break": posterior.course.breaks[number],
+                    "break": posterior.trend.breaks[number],
                     "term": name,
                     "step": float(level.value[k]),
                     "sigma_step": float(level.sigma[k]),

@@ -1,34 +1,36 @@
-"""Does what a campaign begins with go together, and what can it not tell?"""
+"""Validation of what a campaign begins with: refusals, and warnings of what it cannot tell."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.config import ReleaseBlock
-from bayesdist.app.campaign.inputs import cuts_of
-from bayesdist.data import StarList
+from bayesdist.app.campaign.inputs import Inputs, campaign_block, cuts_of
+from bayesdist.app.campaign.reference import free_rates, rehearse_references
+from bayesdist.app.config import Config
+from bayesdist.app.config.campaign import ReleaseBlock
+from bayesdist.data import StarCuts, StarList
+from bayesdist.data.holdout import refuse_strangers
 from bayesdist.data.matching.reports import check_campaign
 from bayesdist.errors import ConfigError, DegenerateError, InputError
 from bayesdist.model import Chip, TimeDependence
-
-if TYPE_CHECKING:
-    from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.products import read_idctab
 
 __all__ = [
     "frames_not_set",
-    "input_doubts",
+    "input_warnings",
+    "refuse_campaign",
     "refuse_few",
     "refuse_unsound",
     "segment_counts",
     "segment_text",
-    "shear_doubts",
+    "shear_warnings",
 ]
 
 Float = NDArray[np.float64]
@@ -43,20 +45,42 @@ NAMED = 5  # exposures in a sentence
 STILL = 1.0  # years over which stars may stand still
 
 
-def refuse_unsound(session: CampaignSession) -> None:
+def refuse_campaign(inputs: Inputs, config: Config, base: Path) -> None:
+    """Refuse inputs that do not go together, and files of others that cannot be used.
+
+    Parameters
+    ----------
+    inputs : Inputs
+    config : Config
+    base : Path
+        Folder that its files are relative to.
+
+    Raises
+    ------
+    BayesdistError
+        As `refuse_unsound`, `rehearse_references` and `read_idctab`.
+    """
+    refuse_unsound(config, inputs)
+    read_idctab(base / campaign_block(config).initial_distortion)
+    rehearse_references(config, inputs.catalog.unit, base)
+    if config.products.release is not None:
+        read_idctab(base / config.products.release.reference)
+
+
+def refuse_unsound(config: Config, inputs: Inputs) -> None:
     """Refuse exposures, lists and catalogue that a run could not use; nothing is matched.
 
     Raises
     ------
     InputError
         For chips that only one side knows, detections off their chip, lists that stand twice, a
-        catalogue without errors, and cuts that leave nothing in any exposure.
+        catalogue without errors, cuts that leave nothing in any exposure, and exposures to be held
+        out that there are not.
     DegenerateError
         For too few exposures, and for segments of the drift without exposures or with one epoch.
     ConfigError
         For periods of the release outside the segment that they are to hold.
     """
-    inputs, config = session.inputs, session.config
     _refuse_chips(inputs.lists, config.chips())
     check_campaign(inputs.lists, inputs.log, inputs.catalog)
     if inputs.catalog.sigma_u is None:
@@ -65,17 +89,20 @@ def refuse_unsound(session: CampaignSession) -> None:
             where=inputs.catalog.source,
             do="give the columns sigma_u and sigma_v",
         )
-    _refuse_cuts(session)
-    refuse_few(inputs.log.values("epoch"), config.time() if session.free_rates else None)
+    _refuse_cuts(inputs.lists, cuts_of(campaign_block(config)))
+    refuse_few(inputs.log.values("epoch"), config.time() if free_rates(config) else None)
     _refuse_periods(config.products.release, config.time())
+    held = config.holdout
+    if held is not None and not isinstance(held.exposures, int):
+        refuse_strangers(held.exposures, inputs.log.names, inputs.log.source)
 
 
-def input_doubts(session: CampaignSession) -> list[str]:
-    """What a campaign will not be able to tell, or takes on trust, each as a clause."""
-    log, catalog = session.inputs.log, session.inputs.catalog
+def input_warnings(config: Config, inputs: Inputs) -> list[str]:
+    """Warnings of what a campaign cannot tell, or takes on trust, each as a clause."""
+    log, catalog = inputs.log, inputs.catalog
     out = []
-    if session.inputs.strangers:
-        out.append(_said_of_strangers(session.inputs.strangers, log.source))
+    if inputs.strangers:
+        out.append(_unlogged(inputs.strangers, log.source))
     epochs = log.values("epoch")
     span = float(np.ptp(epochs))
     if catalog.pm_u is None and span > STILL:
@@ -88,8 +115,8 @@ def input_doubts(session: CampaignSession) -> list[str]:
             "the catalogue has no errors of the proper motions: its positions count as equally "
             "good at all epochs"
         )
-    asked = {"assess.epoch": session.config.assess.epoch} | {
-        f"requirement {one.name!r}": one.epoch for one in session.config.requirements()
+    asked = {"assess.epoch": config.assess.epoch} | {
+        f"requirement {one.name!r}": one.epoch for one in config.requirements()
     }
     for where, epoch in asked.items():
         if epoch is not None and not epochs.min() - span <= epoch <= epochs.max() + span:
@@ -97,7 +124,7 @@ def input_doubts(session: CampaignSession) -> list[str]:
                 f"{where} asks for {epoch:g}, and the exposures are from {epochs.min():.2f} to "
                 f"{epochs.max():.2f}: the drift is extrapolated by more than they span"
             )
-    if session.block.aberration == "earth":
+    if campaign_block(config).vafactor_source == "earth":
         out.append(
             "VAFACTOR was computed from the motion of the Earth: that of the telescope about it, "
             "up to 2.5e-5, is in the scales of the exposures"
@@ -105,7 +132,7 @@ def input_doubts(session: CampaignSession) -> list[str]:
     return out
 
 
-def _said_of_strangers(names: tuple[str, ...], log: str) -> str:
+def _unlogged(names: tuple[str, ...], log: str) -> str:
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     several = len(names) > 1
     return (
@@ -116,7 +143,7 @@ def _said_of_strangers(names: tuple[str, ...], log: str) -> str:
 
 
 def one_roll_angle(angles: Float) -> bool:
-    """Whether exposures at these angles (E,), in radians, see a shear of the catalogue alike.
+    """Truth of roll angles (E,), in radians, that see a shear of the catalogue alike.
 
     An exposure at roll angle a sees a shear of the catalogue as one of its detector turned by 2a:
     at one angle, or at angles half a turn apart, nothing tells the two apart.
@@ -125,7 +152,7 @@ def one_roll_angle(angles: Float) -> bool:
     return bool(spread < 2.0 * np.radians(ONE_ROLL) ** 2)
 
 
-def shear_doubts(rolls: Float, of: str) -> list[str]:
+def shear_warnings(rolls: Float, of: str) -> list[str]:
     """Warnings of exposures at roll angles, in degrees, that leave a catalogue's shear open."""
     known = np.asarray(rolls, float)
     known = known[np.isfinite(known)]
@@ -270,12 +297,11 @@ def _refuse_off_chip(x: Float, y: Float, chip: Chip, where: str) -> None:
         )
 
 
-def _refuse_cuts(session: CampaignSession) -> None:
+def _refuse_cuts(lists: Sequence[StarList], cuts: StarCuts) -> None:
     """Refuse cuts that leave nothing anywhere; single exposures are left out when they match."""
-    cuts = cuts_of(session.block)
     total: dict[str, int] = {}
     n = 0
-    for one in session.inputs.lists:
+    for one in lists:
         good, rejected = cuts.passed(one)
         if good.any():
             return
@@ -283,9 +309,8 @@ def _refuse_cuts(session: CampaignSession) -> None:
         for reason, count in rejected.items():
             total[reason] = total.get(reason, 0) + count
     counts = ", ".join(f"{count} {reason}" for reason, count in total.items())
-    n_lists = len(session.inputs.lists)
     raise InputError(
-        f"the cuts leave none of {n} detections in {n_lists} exposures ({counts})",
+        f"the cuts leave none of {n} detections in {len(lists)} exposures ({counts})",
         where="campaign",
         do="widen mag, saturation or q_max, or correct the columns that they go by",
     )

@@ -1,164 +1,239 @@
-"""Look-up tables of a campaign: fitted with the polynomial, kept for the stages that follow."""
+"""Look-up tables of a campaign: fitted with the polynomial, or held as another run has them."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.app.campaign.inputs import Inputs
 from bayesdist.app.campaign.interpolation import measured_between
+from bayesdist.app.campaign.matched import CampaignMatched
+from bayesdist.app.campaign.outrun import refuse_outrun_stars
 from bayesdist.app.campaign.reference import held_tables
-from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.data import MatchTable
+from bayesdist.app.config import Config
+from bayesdist.app.config.campaign import TablesBlock
+from bayesdist.app.kinds.table_file import StoredLookupTables
+from bayesdist.data.magnitude_errors import MagnitudeErrors
+from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
-from bayesdist.infer import LinearFit
-from bayesdist.infer.nodes import Round, TableFit, fit_with_tables, pixel_jacobian
-from bayesdist.infer.nodes.table_fit import held_sigma
-from bayesdist.model import LookupTable, corrected
+from bayesdist.infer import LinearFit, fit_by_magnitude
+from bayesdist.infer.nodes import (
+    Iteration,
+    TableFit,
+    corrected_matches,
+    fit_with_tables,
+    held_sigma,
+    on_the_chips,
+)
+from bayesdist.model import DistortionModel, LookupTable, corrected
 from bayesdist.model.grid import grid_pixels, mesh
 
-__all__ = ["fit_tables", "tables_summary"]
+__all__ = ["FittedTables", "fit_tables", "scatter_by_magnitude", "tables_section"]
 
 Float = NDArray[np.float64]
+ErrorsAt = Callable[[Float, Float, int], Float]  # of positions (n, 2), at pixels of a chip
 
 log = logging.getLogger("bayesdist")
 
-ROUGH = 1  # rounds of the tables from whose residuals the errors of the stars are taken
+ROUGH = 1  # iterations of the tables from whose residuals the errors of the stars are taken
 
 
-def fit_tables(session: CampaignSession) -> TableFit | None:
-    """Fit the tables that are asked for and keep them; None where none are fitted.
+@dataclass(frozen=True, eq=False)
+class FittedTables:
+    """Look-up tables of a fit.
 
-    They are the detector's, unless these are taken from another run: then they are the filter's.
+    Parameters
+    ----------
+    stored : StoredLookupTables
+        With their errors, as other stages take them.
+    fit : TableFit or None
+        None where none were fitted.
     """
-    block, base = session.config.tables, session.base
-    held = held_tables(block, session.config.chips(), base)
-    session.keep_tables(held)
+
+    stored: StoredLookupTables
+    fit: TableFit | None = None
+
+
+def fit_tables(
+    matched: CampaignMatched, model: DistortionModel, config: Config, base: Path
+) -> FittedTables:
+    """The look-up tables that are asked for, and those that are held.
+
+    Fitted are the detector's, unless these are taken from another run: then the filter's.
+
+    Parameters
+    ----------
+    matched : CampaignMatched
+    model : DistortionModel
+        With a free linear part of each exposure.
+    config : Config
+    base : Path
+        Folder that the configuration's files are relative to.
+    """
+    block, grid, filter = config.tables, config.assess.grid, matched.inputs.filter
+    held = held_tables(block, config.chips(), base)
     if block.method == "none":
-        if held:
-            fit, _, errors = session.errors_by_magnitude(session.raw_matches)
-            pairs = session.pairs.with_errors_by_magnitude(errors)
-            between = measured_between(pairs, fit, held, filter=session.inputs.filter, fitted=False)
-            session.keep_tables(held, _held_errors(session, fit, held), between)
-        return None
-    pairs = _with_errors(session, held)
+        if not held:
+            return FittedTables(StoredLookupTables())
+        placed = on_the_chips(corrected_matches(held, matched.stars), model)
+        fit, _, errors = scatter_by_magnitude(placed, model, matched.inputs)
+        pairs = matched.stars.with_errors_by_magnitude(errors)
+        between = measured_between(pairs, fit, held, filter=filter, fitted=False)
+        of_nodes = _on_the_grid(model, grid, _errors_of(held, fit))
+        return FittedTables(_stored(held, of_nodes, between))
+    pairs = _with_errors(matched, model, held, block)
     found = fit_with_tables(
         pairs,
-        session.plain_model,
-        base=session.inputs.filter,
-        detector=held,
+        model,
+        filter=filter if held else "",
+        beneath=held,
         method=block.method,
         step=block.step,
-        rounds=block.rounds,
+        max_iterations=block.max_iterations,
         report=_say,
     )
-    part = found.part()
-    if part.posteriors:
-        errors = _on_the_grid(session, lambda x, y, chip: found.table_sigma(x, y, chip=chip))
-    else:
-        errors = _held_errors(session, part.fit, found.tables)
+
+    def by_covariance(x: Float, y: Float, chip: int) -> Float:
+        return found.table_sigma(x, y, chip=chip)
+
+    errors_at = by_covariance if found.posteriors else _errors_of(found.tables, found.solution)
     between = measured_between(
         pairs,
-        part.fit,
+        found.solution,
         found.tables,
-        filter=part.filter,
-        posteriors=part.posteriors,
-        trust=part.trust,
+        filter=found.filter,
+        posteriors=found.posteriors,
+        mixture=found.mixture,
     )
-    session.keep_tables(found.tables, errors, between)
-    return found
+    of_nodes = _on_the_grid(model, grid, errors_at)
+    return FittedTables(_stored(found.tables, of_nodes, between), found)
 
 
-def _with_errors(session: CampaignSession, held: tuple[LookupTable, ...]) -> MatchTable:
+def scatter_by_magnitude(
+    pairs: MatchTable, model: DistortionModel, inputs: Inputs
+) -> tuple[LinearFit, MatchTable, MagnitudeErrors]:
+    """Fit of every exposure by itself and scatter by magnitude, as `fit_by_magnitude`.
+
+    Raises
+    ------
+    InputError
+        Where stars have outrun a catalogue without proper motions.
+    """
+    fit, _, errors = fit_by_magnitude(pairs, model)
+    scattered = pairs.with_errors_by_magnitude(errors)
+    refuse_outrun_stars(inputs, fit, scattered)
+    return fit, scattered, errors
+
+
+def _with_errors(
+    matched: CampaignMatched,
+    model: DistortionModel,
+    held: tuple[LookupTable, ...],
+    block: TablesBlock,
+) -> MatchTable:
     """Pairs with errors by magnitude, free of the pattern that the tables are to describe.
 
     The scatter of the residuals before any table is twice that of the stars: with errors from
     there the tables would be smoothed too much, and their own errors twice too large.
     """
-    pairs, model = session.pairs, session.plain_model
-    _, rough_errors, _ = session.errors_by_magnitude(pairs)
-    assert isinstance(rough_errors, MatchTable)
+    pairs, inputs = matched.stars, matched.inputs
+    _, rough_errors, _ = scatter_by_magnitude(pairs, model, inputs)
     rough = fit_with_tables(
         rough_errors,
         model,
-        base=session.inputs.filter,
-        detector=held,
-        method=session.config.tables.method,
-        step=session.config.tables.step,
-        rounds=ROUGH,
+        filter=inputs.filter if held else "",
+        beneath=held,
+        method=block.method,
+        step=block.step,
+        max_iterations=ROUGH,
     )
-    _, _, errors = session.errors_by_magnitude(rough.corrected(pairs))
+    _, _, errors = scatter_by_magnitude(rough.corrected(pairs), model, inputs)
     return pairs.with_errors_by_magnitude(errors)
 
 
-def _say(one: Round) -> None:
+def _stored(
+    tables: Sequence[LookupTable], of_nodes: Mapping[int, Float], between: Sequence[BetweenNodes]
+) -> StoredLookupTables:
+    """Tables in the order in which their file has them: the detector's first, chips by number."""
+    return StoredLookupTables(
+        tuple(sorted(tables, key=lambda table: (table.filter != "", table.chip))),
+        dict(sorted(of_nodes.items())),
+        {one.chip: one for one in sorted(between, key=lambda one: one.chip)},
+    )
+
+
+def _say(one: Iteration) -> None:
     log.info(
         "fit: tables, round %d: moved %.2g px, residuals %.4f px", one.number, one.moved, one.rms
     )
 
 
-def _on_the_grid(session, sigma) -> dict[int, Float]:  # type: ignore[no-untyped-def]
+def _on_the_grid(
+    model: DistortionModel, grid: tuple[int, int], errors_at: ErrorsAt
+) -> dict[int, Float]:
     """Errors (ny, nx, 2) of positions on the grid of the assessment, by chip."""
-    grid, out = session.config.assess.grid, {}
-    for chip in session.plain_model.chips:
+    out = {}
+    for chip in model.chips:
         x, y = mesh(*grid_pixels(chip.size, grid))
-        out[chip.number] = sigma(x, y, chip.number).reshape(grid[1], grid[0], 2)
+        out[chip.number] = errors_at(x, y, chip.number).reshape(grid[1], grid[0], 2)
     return out
 
 
-def _held_errors(
-    session: CampaignSession, fit: LinearFit, held: tuple[LookupTable, ...]
-) -> dict[int, Float]:
-    """Errors of positions by those of tables that have no covariance, or are held."""
+def _errors_of(tables: tuple[LookupTable, ...], fit: LinearFit) -> ErrorsAt:
+    """Errors of positions (n, 2) by those of tables that have no covariance, or are held."""
 
-    def sigma(x: Float, y: Float, chip: int) -> Float:
-        px, py = corrected(held, x, y, chip=chip)
-        J = pixel_jacobian(fit.model, fit.mean, px, py, chip=chip)
-        return np.sqrt(np.einsum("nab,nb->na", J**2, held_sigma(held, x, y, chip=chip) ** 2))
+    def errors_at(x: Float, y: Float, chip: int) -> Float:
+        px, py = corrected(tables, x, y, chip=chip)
+        J = fit.model.slopes(fit.mean, px, py, chip=chip)
+        sigma = held_sigma(tables, x, y, chip=chip)
+        return np.asarray(np.sqrt(np.einsum("nab,nb->na", J**2, sigma**2)))
 
-    return _on_the_grid(session, sigma)
+    return errors_at
 
 
-def _doubts(session: CampaignSession, found: TableFit | None) -> Iterator[str]:
-    """What is to be known of the tables' errors, each as a clause."""
-    block = session.config.tables
-    if block.detector is not None and any(t.sigma is None for t in session.tables if not t.filter):
+def _warnings(config: Config, found: FittedTables) -> Iterator[str]:
+    """Warnings of the tables' errors, each as a clause."""
+    block, stored, fit = config.tables, found.stored, found.fit
+    if block.detector is not None and any(t.sigma is None for t in stored.tables if not t.filter):
         yield "the detector's tables have no errors, and none are counted"
-    if session.tables and len(session.between_nodes) < len(session.config.chips()):
+    if stored.tables and len(stored.between) < len(config.chips()):
         yield (
             "too few stars lie near each other to tell what the look-up tables leave between "
             "their nodes, and no error is counted for it"
         )
-    if found is None:
+    if fit is None:
         return
     if block.method == "binned":
         yield (
             "the tables are smoothed bins: their errors are those of the bins; what smoothing "
             "takes off the pattern is among what lies between the nodes"
         )
-    if not found.converged:
+    if not fit.converged:
         yield (
-            f"the look-up tables still moved by {found.progress[-1].moved:.2g} pixels in the last "
-            f"of {len(found.progress)} rounds"
+            f"the look-up tables still moved by {fit.progress[-1].moved:.2g} pixels in the last "
+            f"of {len(fit.progress)} rounds"
         )
 
 
-def tables_summary(session: CampaignSession, found: TableFit | None) -> dict[str, object]:
-    """What summary.json says of the tables."""
+def tables_section(config: Config, found: FittedTables) -> dict[str, object]:
+    """Section 'tables' of summary.json."""
     out: dict[str, object] = {
-        "method": session.config.tables.method,
-        "detector": session.config.tables.detector,
-        "chips": [_row(table) for table in session.tables],
-        "between_nodes": [_between(one) for one in session.between_nodes.values()],
-        "warnings": list(_doubts(session, found)),
+        "method": config.tables.method,
+        "detector": config.tables.detector,
+        "chips": [_row(table) for table in found.stored.tables],
+        "between_nodes": [_between(one) for one in found.stored.between.values()],
+        "warnings": list(_warnings(config, found)),
     }
-    if found is not None:
+    if found.fit is not None:
         out |= {
-            "converged": found.converged,
-            "rms_before": found.progress[0].rms,
-            "rms_after": found.progress[-1].rms,
+            "converged": found.fit.converged,
+            "rms_before": found.fit.progress[0].rms,
+            "rms_after": found.fit.progress[-1].rms,
         }
     return out
 

@@ -76,13 +76,12 @@ def run(
         raise click.UsageError("--resume and --force exclude each other.")
     from bayesdist.app.run import run as whole_job
     from bayesdist.app.rundir import RunDirectory
-    from bayesdist.app.session import Session
     from bayesdist.app.summary_text import results_text
 
     path = whole_job(
         config, output, resume=resume, force=force, strict=strict, seed=seed, command=line
     )
-    click.echo(results_text(Session(RunDirectory(path))))  # its input was checked when it began
+    click.echo(results_text(RunDirectory(path)))  # its input was checked when it began
 
 
 @command()

@@ -9,17 +9,15 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.folder import whole_folder
+from bayesdist.app.folder import record_folder
+from bayesdist.app.output import write_table
 from bayesdist.app.patterns.config import PlanConfig, load_plan
-from bayesdist.app.rundir import versions, write_json
 from bayesdist.app.screen import table_text
-from bayesdist.app.session import write_table
 from bayesdist.assess.planning.dithers import KINDS, PlannedPattern, compare_patterns
 from bayesdist.assess.planning.words import lacking, nearly_free
 
 __all__ = ["plan_patterns"]
 
-SCHEMA = 1
 LEGEND = (
     "reach: largest distance of two pointings, pix; free: directions that detections leave free; "
     "the rest is errors of positions over the detector, radial, 1 sigma, pix; gauge-free: without "
@@ -112,18 +110,11 @@ def _write(output: Path, found: Sequence[PlannedPattern], config: PlanConfig, co
     from bayesdist.report.drawing import save_figures  # figures take seconds to import
     from bayesdist.report.patterns import pattern_maps
 
-    with whole_folder(output) as folder:
+    with record_folder(output, "plan.json", command) as (folder, record):
         write_table(_table(found), folder / "patterns.ecsv")
         save_figures({"patterns": pattern_maps(found)}, folder / "figures")
-        record = {
-            "schema": SCHEMA,
-            "command": command,
-            "versions": versions(),
-            "config": config.model_dump(),
-            "unit": "pix",
-            "patterns": [_record(one) for one in found],
-        }
-        write_json(folder / "plan.json", record)
+        record |= {"config": config.model_dump(), "unit": "pix"}
+        record["patterns"] = [_record(one) for one in found]
 
 
 def _table(found: Sequence[PlannedPattern]) -> Table:

@@ -19,7 +19,7 @@ from bayesdist.app.config import (
     require_own_names,
     validated,
 )
-from bayesdist.app.section import Section
+from bayesdist.app.config.section import Section
 from bayesdist.assess.planning.dithers import Beforehand, Camera, PlannedStars
 from bayesdist.model import Chip
 from bayesdist.simulate.dithers import dither_pattern
@@ -54,7 +54,7 @@ class PlannedSelfcal(Section):
     """What of a self-calibration matters before there are detections."""
 
     frames: Literal["shift", "shift_rotation", "shift_rotation_scale"] = "shift_rotation"
-    least_detections: Annotated[int, Field(ge=2)] = 2
+    min_detections: Annotated[int, Field(ge=2)] = 2
 
 
 class PlannedScale(Section):
@@ -191,7 +191,7 @@ class PlanConfig(Section):
 
     def stars_planned(self) -> PlannedStars:
         """The field of stars."""
-        s, least = self.stars, self.selfcal.least_detections
+        s, least = self.stars, self.selfcal.min_detections
         return PlannedStars(s.per_detector, s.sigma, s.false, least, s.seed)
 
     def known(self) -> Beforehand:

@@ -8,20 +8,20 @@ import numpy as np
 
 from bayesdist.app.screen import number
 from bayesdist.app.selfcal.gauge import CONVENTION, fixed_by
-from bayesdist.app.selfcal.matching import matching_of
-from bayesdist.app.selfcal.session import SelfcalSession
+from bayesdist.app.selfcal.given import Given
+from bayesdist.app.selfcal.matching import calibrated, matching_of
 
 __all__ = ["selfcal_lines"]
 
 
-def selfcal_lines(session: SelfcalSession) -> Iterator[str]:
+def selfcal_lines(given: Given) -> Iterator[str]:
     """Stars and free directions of a self-calibration, as lines of text: nothing is sampled."""
-    found = session.calibrated(lambda text: None)
-    s, gauge, model = found.solution, found.gauge, found.solution.problem.model
-    matching = matching_of(found, session.inputs, session.block.least_detections)
+    found = calibrated(given, lambda text: None)
+    s, gauge, model = found.mode, found.gauge, found.mode.problem.model
+    matching = matching_of(found, given.inputs, given.block.min_detections)
     matching.refuse_strangers()
     summary = matching.summary
-    fixed = fixed_by(gauge, s, session.known_for(model))
+    fixed = fixed_by(gauge, s, given.known_for(model))
     d = summary["detections"]
     cut = "".join(f", {count} {reason}" for reason, count in d["cut"].items())
     yield f"exposures    {summary['n_exposures']}"
@@ -33,7 +33,7 @@ def selfcal_lines(session: SelfcalSession) -> Iterator[str]:
         f"{number(summary['per_star']['median'])} at the median; "
         f"{summary['n_ambiguous']} ambiguous groups"
     )
-    if session.tangent_plane is None:
+    if given.tangent_plane is None:
         yield "sky          taken as flat: detector.scale_mas, the size of a pixel, is not given"
     else:
         moved = summary["tangent_planes_pix"]

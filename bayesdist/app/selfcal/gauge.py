@@ -1,4 +1,4 @@
-"""What fixes the gauge of a self-calibration, and how its directions are told."""
+"""What fixes the gauge of a self-calibration, and its directions in words."""
 
 from __future__ import annotations
 
@@ -13,26 +13,24 @@ from scipy.stats import chi2
 from bayesdist.app.config import Config
 from bayesdist.app.selfcal.inputs import Commanded
 from bayesdist.errors import InputError
-from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.priors import GaussianPriors, Prior
 from bayesdist.infer.selfcal.gauge import FAR, Gauge, NamedDirection, find_gauge
-from bayesdist.infer.selfcal.information import (
-    Information,
-    frame_information,
-    pointing_information,
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode, curvatures
+from bayesdist.infer.selfcal.prior import (
+    frame_prior,
+    pointing_prior,
     tie,
 )
-from bayesdist.infer.selfcal.moves import functionals
-from bayesdist.infer.selfcal.settled import curvatures
-from bayesdist.infer.selfcal.solve import Solution
+from bayesdist.infer.selfcal.sky_moves import functionals
+from bayesdist.limits import GAUGE_CONTRADICTION
 from bayesdist.model import DistortionModel
 
 __all__ = ["CONVENTION", "Known", "fixed_by", "gauge_summary", "gauge_table", "gauge_words"]
 
 Float = NDArray[np.float64]
-Piece = Callable[[Float], Information]
+Piece = Callable[[Float], Prior]
 
 CONVENTION, DETECTIONS, REFERENCES = "convention", "detections", "reference stars"
-CONTRADICTS = 1e-4  # probability of a chi-square at which a piece and the detections do not agree
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,14 +40,14 @@ class Known:
     Parameters
     ----------
     pieces : mapping of str to callable
-        Information linearised at parameters (D,), by what it is from.
+        Prior linearised at parameters (D,), by what it is from.
     """
 
     pieces: Mapping[str, Piece]
 
-    def __call__(self, theta: Float) -> Information:
+    def __call__(self, theta: Float) -> Prior:
         """All of it, linearised at theta (D,)."""
-        out = Information.none(theta)
+        out = Prior.none(theta)
         for piece in self.pieces.values():
             out = out + piece(theta)
         return out
@@ -62,7 +60,7 @@ class Known:
             measured = values > 1e-10 * values[-1]
             right = vectors[:, measured].T @ known.right
             square, n = float(np.sum(right**2 / values[measured])), int(measured.sum())
-            if chi2.sf(square, n) < CONTRADICTS:
+            if chi2.sf(square, n) < GAUGE_CONTRADICTION.value:
                 yield (
                     f"the {name} contradict the detections: chi-square {square:.4g} of {n}; an "
                     "error is too small, or a value is wrong"
@@ -86,7 +84,10 @@ class Known:
         """
         block, pieces = config.gauge, dict[str, Piece]()
         if commanded is not None and commanded.offsets is not None:
-            pieces["commanded offsets"] = lambda theta: _offsets(model, theta, commanded)
+            offsets, errors, groups = commanded.offsets, commanded.sigma, commanded.group
+            pieces["commanded offsets"] = lambda theta: pointing_prior(
+                model, theta, offsets, errors, group=groups
+            )
         if block.roll_sigma_deg is not None:
             if commanded is None or commanded.roll is None:
                 raise InputError(
@@ -99,31 +100,21 @@ class Known:
         if block.exposure_scale_sigma is not None:
             scatter = block.exposure_scale_sigma
             same = np.zeros(len(model.exposures))  # scales are deviations from one
-            pieces["scatter of the scales"] = lambda theta: frame_information(
+            pieces["scatter of the scales"] = lambda theta: frame_prior(
                 model, theta, "scale", same, scatter
             )
-        if block.scale is not None:
-            assert unit_arcsec is not None
+        if block.scale is not None and unit_arcsec is not None:
             size, sigma = block.scale.mas / 1000 / unit_arcsec, block.scale.sigma
             name = f"scale of {block.scale.detector}" if block.scale.detector else "given scale"
             pieces[name] = lambda theta: _scale(model, theta, size, sigma)
         if config.prior:
             named = {p.parameter: (p.mean, p.sigma) for p in config.prior}
             priors = GaussianPriors.of(model, named)
-            pieces["priors"] = lambda theta: Information(
-                theta, np.diag(priors.precision), priors.pull(theta)
-            )
+            pieces["priors"] = priors.about
         return cls(pieces)
 
 
-def _offsets(model: DistortionModel, theta: Float, commanded: Commanded) -> Information:
-    assert commanded.offsets is not None
-    return pointing_information(
-        model, theta, commanded.offsets, commanded.sigma, group=commanded.group
-    )
-
-
-def _rolls(model: DistortionModel, theta: Float, roll: Float, sigma: float) -> Information:
+def _rolls(model: DistortionModel, theta: Float, roll: Float, sigma: float) -> Prior:
     """Commanded rolls, each with its error; the first one's is shared by all the differences."""
     now = np.zeros(len(model.exposures))
     for e in range(1, len(now)):
@@ -133,32 +124,32 @@ def _rolls(model: DistortionModel, theta: Float, roll: Float, sigma: float) -> I
     off = np.exp(1j * (roll - now))  # of each, all by one unknown zero point
     # that is where the angles lie on average, and no angle is far from it
     zero = np.nanmean(off)
-    return frame_information(model, theta, "rotation", now + np.angle(off / zero), sigma)
+    return frame_prior(model, theta, "rotation", now + np.angle(off / zero), sigma)
 
 
-def _scale(model: DistortionModel, theta: Float, size: float, sigma: float) -> Information:
+def _scale(model: DistortionModel, theta: Float, size: float, sigma: float) -> Prior:
     """A tie of the pixel at the first chip's reference pixel to a size."""
     row = functionals(model, theta)["scale"]
     return tie(theta, row, float(np.log(size / model.linear_scale(theta))), sigma)
 
 
-# -- told -----------------------------------------------------------------------------------------
+# -- in words -------------------------------------------------------------------------------------
 
 
-def fixed_by(gauge: Gauge, solution: Solution, pieces: Known) -> dict[str, str]:
+def fixed_by(gauge: Gauge, solution: SelfCalibrationMode, pieces: Known) -> dict[str, str]:
     """What fixes each property of the solution, by its name.
 
     Parameters
     ----------
     gauge : Gauge
-    solution : Solution
+    solution : SelfCalibrationMode
     pieces : Known
     """
     problem, theta = solution.problem, solution.theta
     alone, known = curvatures(problem, theta, solution.mixture, solution.stars)
     found = {name: piece(theta) for name, piece in pieces.pieces.items()}
     sigmas: dict[str, dict[str, float]] = {}
-    none = Information.none(theta)
+    none = Prior.none(theta)
     for name, information in found.items():
         one = find_gauge(problem, theta, alone, information)
         sigmas[name] = {d.name: d.sigma_fixed for d in one.directions}
@@ -226,7 +217,7 @@ def _state(d: NamedDirection) -> str:
 def gauge_summary(
     gauge: Gauge, fixed: Mapping[str, str], model: DistortionModel
 ) -> dict[str, object]:
-    """The same for summary.json; what is infinite is null there."""
+    """Part 'gauge' of the section 'selfcal' of summary.json; infinite sigmas are null there."""
     return {
         "n_free": int(gauge.null.shape[1]),
         "n_by_convention": int(gauge.open.shape[1]),

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bayesdist.app.campaign.inputs import cuts_of, lists_of
 from bayesdist.app.chips import check_chips
 from bayesdist.app.config import Config
+from bayesdist.app.config.selfcal import SelfcalBlock
 from bayesdist.data import ReferenceCatalog, StarList, read_catalog, read_exposures
 from bayesdist.data.detections import Detections, detections_of
 from bayesdist.data.matching.frames import refuse_duplicates
@@ -20,9 +21,16 @@ from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import find_columns
 from bayesdist.data.tables.units import conversion
-from bayesdist.errors import InputError
+from bayesdist.errors import ConfigError, InputError
 
-__all__ = ["Commanded", "Inputs", "read_commanded", "read_inputs", "read_references"]
+__all__ = [
+    "Commanded",
+    "Inputs",
+    "read_commanded",
+    "read_inputs",
+    "read_references",
+    "selfcal_block",
+]
 
 log = logging.getLogger("bayesdist")
 
@@ -85,6 +93,19 @@ class Commanded:
     group: Int
 
 
+def selfcal_block(config: Config) -> SelfcalBlock:
+    """The self-calibration's part of a configuration.
+
+    Raises
+    ------
+    ConfigError
+        Where it has none.
+    """
+    if config.selfcal is None:
+        raise ConfigError("names no star lists", where="selfcal", do="give the section [selfcal]")
+    return config.selfcal
+
+
 def read_inputs(config: Config, base: Path) -> Inputs:
     """Read the lists of a self-calibration.
 
@@ -94,9 +115,8 @@ def read_inputs(config: Config, base: Path) -> Inputs:
         For files that cannot be read, a single exposure, one that stands there twice, chips without
         stars, and exposures that the log does not have.
     """
-    block = config.selfcal
-    assert block is not None
-    cuts, rejected, kept = cuts_of(block), dict[str, int](), list[StarList]()
+    block = selfcal_block(config)
+    cuts, rejected, used = cuts_of(block), dict[str, int](), list[StarList]()
     lists = lists_of(block, base)
     for one in lists:
         good, reasons = cuts.passed(one)
@@ -108,34 +128,34 @@ def read_inputs(config: Config, base: Path) -> Inputs:
                 where=one.source,
                 do="widen them, or leave the exposure out",
             )
-        kept.append(one.select(good))
-    if len(kept) < 2:
+        used.append(one.select(good))
+    if len(used) < 2:
         raise InputError(
-            f"there is one exposure, {kept[0].exposure}, and distortion shows between exposures",
-            where=kept[0].source,
+            f"there is one exposure, {used[0].exposure}, and distortion shows between exposures",
+            where=used[0].source,
             do="give dithered exposures of one field",
         )
-    check_chips(config.chips(), sorted({int(n) for one in kept for n in one.chips}))
+    check_chips(config.chips(), sorted({int(n) for one in used for n in one.chips}))
     refuse_duplicates(
-        [np.column_stack([one.x, one.y, one.chip]) for one in kept],
-        [one.exposure for one in kept],
+        [np.column_stack([one.x, one.y, one.chip]) for one in used],
+        [one.exposure for one in used],
         source="selfcal.lists",
     )
-    epoch, dilation = _of_log(config, base, [one.exposure for one in kept])
-    if epoch is None and all(one.epoch is not None for one in kept):
-        epoch = np.array([one.epoch for one in kept], float)
+    epoch, dilation = _of_log(config, base, [one.exposure for one in used])
+    if epoch is None and all(one.epoch is not None for one in used):
+        epoch = np.array([one.epoch for one in used], float)
     sigma = None if block.sigma == "measured" else float(block.sigma)
-    detections = detections_of(kept, epoch=epoch, sigma=sigma)
-    sources = tuple(dict.fromkeys(one.source for one in kept))
+    detections = detections_of(used, epoch=epoch, sigma=sigma)
+    sources = tuple(dict.fromkeys(one.source for one in used))
     return Inputs(detections, sum(len(one) for one in lists), rejected, sources, dilation)
 
 
 def _of_log(config: Config, base: Path, names: Sequence[str]) -> tuple[Float | None, Float | None]:
     """Dates and VAFACTOR of the exposures, where there is a log."""
-    assert config.selfcal is not None
-    if config.selfcal.exposures is None:
+    exposures = selfcal_block(config).exposures
+    if exposures is None:
         return None, None
-    log = read_exposures(base / config.selfcal.exposures)
+    log = read_exposures(base / exposures)
     found = [log[name] for name in names]
     factors = np.array([np.nan if one.vafactor is None else one.vafactor for one in found])
     known = np.isfinite(factors)
@@ -251,9 +271,8 @@ def read_references(
         As `read_catalog`, and for stars without errors.
     """
     block = config.gauge.reference
-    if block is None:
+    if block is None or unit_arcsec is None:  # the configuration asks for a scale with references
         return None
-    assert unit_arcsec is not None
     catalog = read_catalog(
         base / block.catalog,
         block.columns,
@@ -261,20 +280,19 @@ def read_references(
         epoch=block.epoch,
         tangent_point=block.tangent_point,
     )
-    if catalog.sigma_u is None:
+    if catalog.sigma_u is None or catalog.sigma_v is None:
         raise InputError(
             "the reference stars have no errors",
             where=catalog.source,
             do="give the columns sigma_u and sigma_v, or ra_error and dec_error",
         )
-    if not ((catalog.sigma_u > 0) & (catalog.sigma_v > 0)).all():  # type: ignore[operator]
+    if not ((catalog.sigma_u > 0) & (catalog.sigma_v > 0)).all():
         raise InputError(
             "a reference star has the error zero", where=catalog.source, do="drop it, or correct it"
         )
     catalog = _with_motions(catalog)
     own = {"arcsec": 1.0, "mas": 1e-3, "deg": 3600.0}.get(catalog.unit, unit_arcsec)
-    assert config.selfcal is not None
-    return catalog.rescaled(own / unit_arcsec, config.selfcal.unit)
+    return catalog.rescaled(own / unit_arcsec, selfcal_block(config).unit)
 
 
 def _with_motions(catalog: ReferenceCatalog) -> ReferenceCatalog:

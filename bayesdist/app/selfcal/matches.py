@@ -14,35 +14,40 @@ from numpy.typing import NDArray
 from bayesdist.app.selfcal.inputs import Inputs
 from bayesdist.data import MagnitudeErrors, MatchTable
 from bayesdist.data.detections import Detections
-from bayesdist.infer.linear import Clip, LinearFit
-from bayesdist.infer.selfcal import Solution
-from bayesdist.infer.selfcal.errors import scatter_by_magnitude
-from bayesdist.infer.selfcal.normal import memberships
+from bayesdist.infer.selfcal import SelfCalibrationMode
+from bayesdist.infer.selfcal.calibrate import scatter_by_magnitude
+from bayesdist.infer.selfcal.elimination import memberships
+from bayesdist.infer.selfcal.problem import Problem
 
-__all__ = ["fit_of", "magnitude_errors_of", "matches_of"]
+__all__ = ["magnitude_errors_of", "matches_of"]
 
 Float = NDArray[np.float64]
 
-CHI2 = 25.0  # of both axes, beyond which a detection counts as rejected in the statistics
-
 
 def matches_of(
-    solution: Solution, detections: Detections, inputs: Inputs, unused: Mapping[str, int]
+    problem: Problem,
+    stars: Float,
+    detections: Detections,
+    inputs: Inputs,
+    unused: Mapping[str, int],
 ) -> MatchTable:
     """Detections of the stars beside these, in the frame of each exposure's own VAFACTOR.
 
     Parameters
     ----------
-    solution : Solution
+    problem : Problem
+        Linearised at a solution.
+    stars : ndarray, shape (S, q)
+        Of the solution.
     detections : Detections
-        Of which the solution has some.
+        Of which the problem has some.
     inputs : Inputs
     unused : mapping of str to int
         Detections that are of no star, by reason.
     """
-    p, d = solution.problem, detections
+    p, d = problem, detections
     rows, model = p.rows, p.model
-    places = p.star_places(solution.stars)
+    places = p.star_places(stars)
     if p.dilation is not None:
         o = np.asarray(model.origin)
         places = o + (places - o) / p.dilation[d.exposure[rows], None]
@@ -78,43 +83,9 @@ def _axes(W: Float) -> Float:
     return np.sqrt(np.stack([W[:, 2], W[:, 0]], axis=1) / det[:, None])
 
 
-def fit_of(solution: Solution) -> LinearFit:
-    """The solution as a fit, with the statistics of its residuals.
-
-    The covariance is that of the curvature at the mode, with the stars eliminated; zero for what
-    the gauge holds.
-    """
-    p, theta = solution.problem, solution.theta
-    pixel = p.model.pixel_size(theta)
-    wider = 1.0 + solution.mixture.jitter**2 / p.sigma**2
-    clip = Clip(theta, CHI2 * wider, p.match_radius * pixel)
-    square = p.squares(theta, solution.stars) / p.var
-    residual = p.places(theta) - p.star_places(solution.stars)
-    far = np.hypot(*residual.T) > clip.abs_limit
-    used = (square <= clip.chi2_limit) & ~far
-    n, n_used = len(p), int(used.sum())
-    precision = solution.precision
-    scale = np.sqrt(np.diag(precision))
-    uu, vv = (residual[used] ** 2).mean(axis=0)
-    lost = p.n_star * p.n_stars + len(solution.free)
-    return LinearFit(
-        model=p.model,
-        mean=theta,
-        cov=solution.cov,
-        clip=clip,
-        n_rows=n,
-        n_used=n_used,
-        rms_u=float(np.sqrt(uu)),
-        rms_v=float(np.sqrt(vv)),
-        rms_rejected=float(np.sqrt((residual[~used] ** 2).mean())) if n > n_used else 0.0,
-        rejected={"chi-square": int((~used & ~far).sum()), "absolute residual": int(far.sum())},
-        chi2=float(square[used].sum()),
-        dof=max(2 * n_used - lost, 1),
-        condition=float(np.linalg.cond(precision / np.outer(scale, scale))),
-    )
-
-
-def magnitude_errors_of(solution: Solution, matches: MatchTable) -> MagnitudeErrors | None:
+def magnitude_errors_of(
+    solution: SelfCalibrationMode, matches: MatchTable
+) -> MagnitudeErrors | None:
     """Errors of centroids by magnitude, in the unit of u, v; None without magnitudes."""
     if matches.mag is None:
         return None

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
+from bayesdist.app.config import Config
+from bayesdist.app.selfcal.given import Given
 from bayesdist.app.selfcal.inputs import Inputs
+from bayesdist.app.selfcal.matched import SelfcalMatched, matched_of
 from bayesdist.data.detections import NO_STAR, Detections
 from bayesdist.data.matching.pairs import hull_of, inside_hull
-from bayesdist.errors import InputError
+from bayesdist.errors import DegenerateError, InputError, NotSettledError
 from bayesdist.infer.selfcal import SelfCalibration
-from bayesdist.infer.selfcal.normal import memberships
+from bayesdist.infer.selfcal.calibrate import self_calibrate
+from bayesdist.infer.selfcal.elimination import memberships
 from bayesdist.infer.selfcal.tangent import places_of
 from bayesdist.model import DistortionModel
 
-__all__ = ["TURN_BACK", "Matching", "half_turned", "matching_of"]
+__all__ = ["Matching", "calibrated", "half_turned", "match_dithers", "matching_of"]
+
+log = logging.getLogger("bayesdist")
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -31,7 +40,7 @@ AMBIGUOUS = 0.05  # share of groups of which it is not clear what they are, that
 
 @dataclass(frozen=True, eq=False)
 class Matching:
-    """What was found.
+    """How detections became stars.
 
     Parameters
     ----------
@@ -47,7 +56,7 @@ class Matching:
 
     @property
     def sentence(self) -> str:
-        """What was found, in a line."""
+        """Stars, detections and exposures, in a line."""
         n = self.summary
         return (
             f"{n['n_stars']} stars of {n['detections']['used']} of {n['detections']['read']} "
@@ -72,15 +81,95 @@ class Matching:
         k = int(np.nanargmin(np.where(strange, share / usual, np.nan)))
         name = str(self.table["exposure"][k])
         half = k in half_turned(np.radians(np.asarray(self.table["rotation"], float)))
-        told = ", and it lies half a turn from all the others" if half else ""
+        turned = ", and it lies half a turn from all the others" if half else ""
         raise InputError(
             f"exposure {name} has {100 * share[k]:.0f} % of its detections where others look in "
-            f"common with them, and the usual share is {100 * usual[k]:.0f} %{told}",
+            f"common with them, and the usual share is {100 * usual[k]:.0f} %{turned}",
             where="selfcal.lists",
             do=TURN_BACK
             if half
             else "check its pixels and its commanded offset and roll, or leave it out",
         )
+
+
+def match_dithers(given: Given, config: Config, base: Path) -> SelfcalMatched:
+    """Detections of dithered exposures with their stars, and a first solution.
+
+    Parameters
+    ----------
+    given : Given
+        As `read_given` reads it.
+    config : Config
+        With a section [selfcal].
+    base : Path
+        Folder that its files are relative to.
+
+    Returns
+    -------
+    SelfcalMatched
+
+    Raises
+    ------
+    BayesdistError
+        As `calibrated`, and for an exposure that hardly shares stars with the others.
+    """
+    found = calibrated(given, lambda text: log.info("match: %s", text))
+    matching = matching_of(found, given.inputs, given.block.min_detections)
+    matching.refuse_strangers()
+    for text in matching.summary["warnings"]:
+        log.warning("match: WARNING: %s", text)
+    log.info("match: %s", matching.sentence)
+    if given.tangent_plane is not None:
+        moved = matching.summary["tangent_planes_pix"]
+        log.info("match: detections moved by up to %.2g pix onto one tangent plane", moved)
+    return matched_of(found, given, matching.summary, matching.table)
+
+
+def calibrated(given: Given, report: Callable[[str], None]) -> SelfCalibration:
+    """Stars and solution of a self-calibration.
+
+    Parameters
+    ----------
+    given : Given
+    report : callable
+        Called with what happens, in words.
+
+    Raises
+    ------
+    BayesdistError
+        As `self_calibrate`; where that does not settle and one exposure lies half a turn from
+        all the others, naming it.
+    """
+    (model, theta), block = given.start, given.block
+    try:
+        return self_calibrate(
+            model,
+            given.inputs.detections,
+            theta,
+            prior_at=given.known_for(model),
+            match_radius=block.match_radius,
+            start_radius=block.start_radius,
+            min_detections=block.min_detections,
+            motion=block.motion,
+            parallax_factors=given.parallax_factors,
+            dilation=given.inputs.dilation,
+            jitter=given.jitter,
+            references=given.references,
+            plane=given.tangent_plane,
+            max_iterations=block.max_iterations,
+            log=report,
+        )
+    except (NotSettledError, DegenerateError) as error:
+        frames = [model.frame(theta, e)[0] for e in range(len(model.exposures))]
+        turned = half_turned(np.array([np.arctan2(M[1, 0], M[0, 0]) for M in frames]))
+        if not turned:
+            raise
+        name = model.exposures[turned[0]]
+        raise InputError(
+            f"{error.cause}, and exposure {name} lies half a turn from all the others",
+            where="selfcal.lists",
+            do=TURN_BACK,
+        ) from error
 
 
 def half_turned(rolls: Float) -> list[int]:
@@ -102,7 +191,7 @@ def matching_of(found: SelfCalibration, inputs: Inputs, least: int) -> Matching:
     least : int
         Fewest detections of a star.
     """
-    s, d, friends = found.solution, found.detections, found.friends
+    s, d, friends = found.mode, found.detections, found.friends
     p, model = s.problem, s.problem.model
     E = len(d.exposure_names)
     used = np.zeros(len(d), bool)
@@ -157,7 +246,7 @@ def matching_of(found: SelfCalibration, inputs: Inputs, least: int) -> Matching:
         "n_ambiguous": friends.n_ambiguous,
         "n_doubled": friends.n_doubled,
         "n_chains": friends.n_chains,
-        "rounds": found.rounds,
+        "rounds": found.iterations,
         "match_radius": p.match_radius,
         "tangent_planes_pix": _moved(d, inputs),
         "detections": {
@@ -181,7 +270,7 @@ def _moved(detections: Detections, inputs: Inputs) -> float:
 def _seen_by_others(
     model: DistortionModel, theta: Float, places: Float, exposure: NDArray[np.int64]
 ) -> Bool:
-    """Which detections lie on the sky where another exposure has a chip."""
+    """Boolean mask (N,) of detections that lie on the sky where another exposure has a chip."""
     E = len(model.exposures)
     outlines = [
         [hull_of(_corners(model, theta, e, chip.number, chip.size))[0] for chip in model.chips]

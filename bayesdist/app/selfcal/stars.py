@@ -8,12 +8,16 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 from astropy.units import Unit
+from numpy.typing import NDArray
 
-from bayesdist.app.selfcal.session import SelfcalSession
-from bayesdist.app.session import write_table
-from bayesdist.app.trust import labelled, trust
+from bayesdist.app.checks import provenance_notes
+from bayesdist.app.kinds.fitted import required
+from bayesdist.app.output import write_table
+from bayesdist.app.results import Results
+from bayesdist.app.selfcal.matched import selfcal_matches
+from bayesdist.data import ReferenceCatalog
 from bayesdist.data.write import write_columns
-from bayesdist.infer.selfcal import StarCatalogue, star_catalogue
+from bayesdist.infer.selfcal import SelfCalibrationMode, StarCatalogue, star_catalogue
 
 __all__ = ["FLAGS", "star_table", "write_stars"]
 
@@ -28,22 +32,28 @@ MEMBERS = 2 / 3  # of the detections, below which a star is doubtful
 MANY = 100_000  # stars, above which there is a Parquet file beside the table
 
 
-def write_stars(session: SelfcalSession) -> dict[str, Any]:
+def write_stars(results: Results) -> dict[str, Any]:
     """Write stars.ecsv, and of many stars stars.parquet.
+
+    Parameters
+    ----------
+    results : Results
+        Of a self-calibration.
 
     Returns
     -------
     dict
         For summary.json.
     """
-    solution = session.solved
-    left_out = session.discrepancy
-    cov = None if left_out is None else left_out.found.covariance
+    solved = required(results.fitted.solved, "solution of detections")
+    solution, references = solved.solution, selfcal_matches(results.matched).given.catalog
+    correlated = results.diagnostics.correlated
+    cov = None if correlated is None else correlated.covariance
     found = star_catalogue(solution, cov)
-    table = star_table(session, found)
-    table.meta |= trust(session) | labelled(session)
-    write_table(table, session.run / "stars.ecsv")
-    path = session.run / "stars.parquet"
+    table = star_table(solution, found, solved.matches.mag, references)
+    table.meta |= provenance_notes(results.posterior, results.gauge_words)
+    write_table(table, results.run / "stars.ecsv")
+    path = results.run / "stars.parquet"
     path.unlink(missing_ok=True)
     if len(table) > MANY:
         columns = {name: np.asarray(table[name]) for name in table.colnames}
@@ -64,14 +74,27 @@ def write_stars(session: SelfcalSession) -> dict[str, Any]:
     }
 
 
-def star_table(session: SelfcalSession, found: StarCatalogue) -> Table:
+def star_table(
+    solution: SelfCalibrationMode,
+    found: StarCatalogue,
+    mag: NDArray[np.float64] | None = None,
+    references: ReferenceCatalog | None = None,
+) -> Table:
     """Stars with their covariance: one row for each.
 
     Columns u, v (and pm_u, pm_v), sigma_u and so on with the errors of distortion and frames in
     the gauge of the run, cov_u_v and so on, sigma_own_u, sigma_own_v of the star's detections
     alone, n, n_members, mag (the median), flags.
+
+    Parameters
+    ----------
+    solution : SelfCalibrationMode
+        With its stars.
+    found : StarCatalogue
+    mag : ndarray, shape (N,), optional
+        Magnitudes of the detections.
+    references : ReferenceCatalog, optional
     """
-    solution = session.solved
     q = found.values.shape[1]
     names = NAMES[:q]
     table = Table({"star": np.arange(len(found))})
@@ -91,7 +114,6 @@ def star_table(session: SelfcalSession, found: StarCatalogue) -> Table:
         table[f"sigma_own_{name}"].unit = found.unit
     table["n"] = found.n
     table["n_members"] = found.n_members
-    mag = session.raw_matches.mag
     if mag is not None:
         table["mag"] = solution.problem.medians(mag)
     flags = np.where(found.n == 2, FEW, 0)
@@ -101,6 +123,6 @@ def star_table(session: SelfcalSession, found: StarCatalogue) -> Table:
     table.meta = {"flags": {str(bit): text for bit, text in FLAGS.items()}}
     if found.epoch:
         table.meta["epoch"] = found.epoch
-    if session.reference_catalog is not None and session.reference_catalog.tangent_point:
-        table.meta["tangent_point"] = list(session.reference_catalog.tangent_point)
+    if references is not None and references.tangent_point:
+        table.meta["tangent_point"] = list(references.tangent_point)
     return table

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bayesdist.app.campaign.inputs import start_of
 from bayesdist.app.config import Config
-from bayesdist.app.selfcal.inputs import Commanded, Inputs
+from bayesdist.app.selfcal.inputs import Commanded, Inputs, selfcal_block
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matching.frames import mutual_frames
 from bayesdist.data.matching.linear_map import LinearMap, best_similarity
@@ -69,12 +69,11 @@ def started(
         Naming exposures that have no stars in common; for a start that cannot be read, and
         reference stars that are not found again.
     """
-    block, d = config.selfcal, inputs.detections
-    assert block is not None
+    block, d = selfcal_block(config), inputs.detections
     chips = chips_of(config, int(d.chip[0]))
     start = _first(config, base, chips, unit_arcsec)
     # each chip of each exposure by itself: without a start nobody knows how the chips lie
-    several = len(chips) > 1 and block.start is None
+    several = len(chips) > 1 and block.initial_distortion is None
     exposure, number, rows = _lists(inputs, apart=several)
     names = [d.exposure_names[e] for e in exposure]
     mags = None if d.mag is None else [d.mag[r] for r in rows]
@@ -137,15 +136,13 @@ def _placed(start: Start, x: Float, y: Float, chip: NDArray[np.int64]) -> Float:
 
 def _first(config: Config, base: Path, chips: tuple[Chip, ...], unit_arcsec: float | None) -> Start:
     """The known distortion: of an earlier run, an IDCTAB, or none."""
-    block = config.selfcal
-    assert block is not None
+    block, scale = selfcal_block(config), config.detector.scale_mas
     pixel = 1.0
-    if block.unit != "pix":
-        assert unit_arcsec is not None and config.detector.scale_mas is not None
-        pixel = config.detector.scale_mas / 1000 / unit_arcsec
-    if block.start is None:
+    if block.unit != "pix" and scale is not None and unit_arcsec is not None:
+        pixel = scale / 1000 / unit_arcsec
+    if block.initial_distortion is None:
         return undistorted(chips, pixel)
-    path = base / block.start
+    path = base / block.initial_distortion
     if path.is_dir() or path.suffix == ".nc":
         known = load_fit(path) if path.name == "fit.nc" else load_posterior(path)
         if known.model.unit != block.unit:

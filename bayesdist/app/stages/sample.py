@@ -1,110 +1,45 @@
-"""Stage 2: the posterior."""
+"""Stage 'sample': the posterior."""
 
 from __future__ import annotations
 
 import logging
-from dataclasses import asdict
 
-from bayesdist.app.session import Session
+from bayesdist.app.checks import in_circle
+from bayesdist.app.kinds.summary import sample_sections
+from bayesdist.app.results import Results
+from bayesdist.app.screen import progress_bar
 from bayesdist.app.star_files import FOLDER, write_star_files
 from bayesdist.data import MatchTable
-from bayesdist.infer import (
-    Posterior,
-    sample,
-    save_posterior,
-)
+from bayesdist.infer import Posterior, save_posterior
 
-__all__ = ["keep_posterior", "run_sample"]
+__all__ = ["run_sample", "save_sampled"]
 
 log = logging.getLogger("bayesdist")
 
 
-def run_sample(session: Session) -> None:
-    config, run = session.config, session.run
-    s = config.sampler
-    posterior = sample(
-        session.fit,
-        session.shards,
-        outliers=config.mixture(),
-        priors=session.priors,
-        seed=s.seed,
-        ensembles=s.ensembles,
-        walkers=s.walkers,
-        target_ess=s.target_ess,
-        target_rhat=s.target_rhat,
-        max_steps=s.max_steps,
-        checkpoint_every=s.checkpoint_every,
-        folder=run.path,
-        progress=session.progress,
-        method=s.method,
-        second_stage=s.second_stage,
-    )
-    keep_posterior(session, session.settled(posterior))
+def run_sample(results: Results) -> Results:
+    """Sample the posterior of the fit, and write it."""
+    data, config, folder = results.data, results.config, results.run.path
+    with progress_bar("sample") as progress:
+        posterior = results.kind.sample(data, config, folder=folder, progress=progress)
+    return save_sampled(results, posterior)
 
 
-def keep_posterior(session: Session, posterior: Posterior) -> None:
-    """Write a posterior, what it says of each star, and its part of summary.json."""
-    run = session.run
-    for name in ("stars", "systematics"):
-        session.__dict__.pop(name, None)
-    session.__dict__["posterior"] = posterior
+def save_sampled(results: Results, posterior: Posterior) -> Results:
+    """Take another posterior, and write it, its memberships and its part of summary.json."""
+    run, data, gauge = results.run, results.data, results.gauge_words
     record = run.record
     provenance = {k: record[k] for k in ("inputs", "seed", "versions", "created")}
-    provenance |= {"gauge": session.gauge_words} if session.gauge_words else {}
-    matches = session.matches
-    table = matches if isinstance(matches, MatchTable) else None
+    provenance |= {"gauge": gauge} if gauge else {}
+    table = data.stars if isinstance(data.stars, MatchTable) else None
     save_posterior(posterior, table, run / "posterior.nc", provenance=provenance)
-    write_star_files(matches, session.fit, posterior, run / FOLDER)
-    c, i = posterior.convergence, posterior.sampler
-    run.summarise(
-        outliers=_outliers(posterior, session.in_circle),
-        sampler={
-            "method": i.method,
-            "exact": i.exact,
-            "converged": c.converged,
-            "reasons": list(c.reasons),
-            "rhat_max": c.rhat_max,
-            "ess_bulk_min": c.ess_bulk_min,
-            "ess_tail_min": c.ess_tail_min,
-            "pareto_k": c.pareto_k,
-            "importance_efficiency": c.importance_efficiency,
-            "ensembles": i.ensembles,
-            "walkers": i.walkers,
-            "steps": i.steps,
-            "passes": i.passes,
-            "acceptance": i.acceptance,
-            "wall_s": i.wall_s,
-            **_certificate(posterior),
-        },
-    )
+    write_star_files(data.stars, data.fit, posterior, run / FOLDER)
+    run.summarise(**sample_sections(posterior, in_circle=in_circle(data, results.config)))
+    c, n = posterior.convergence, posterior.sampler
     if posterior.approximation:
         log.warning("sample: %s", posterior.approximation)
     elif c.converged:
-        log.info("sample: converged after %d steps, %d passes", i.steps, i.passes)
+        log.info("sample: converged after %d steps, %d passes", n.steps, n.passes)
     else:
-        log.warning("sample: NOT CONVERGED after %d steps: %s", i.steps, "; ".join(c.reasons))
-
-
-def _outliers(posterior: Posterior, in_circle: bool) -> dict[str, object]:
-    out: dict[str, object] = {"model": posterior.mixture.model, "unit": posterior.unit}
-    names = {"f": "fraction", "j": "jitter", "s_out": "scale"}
-    for key, name in names.items():
-        values = posterior.hyper.get(key)
-        if values is not None:
-            out[name] = {"mean": float(values.mean()), "sd": float(values.std(ddof=1))}
-        elif key == "j":
-            out[name] = {"mean": posterior.mixture.jitter, "sd": 0.0}
-        elif key == "f":
-            out[name] = {"mean": 0.0, "sd": 0.0}
-    out["n_flagged"] = posterior.n_flagged
-    if in_circle:
-        out["match_circle"] = posterior.mixture.match_radius
-    return out
-
-
-def _certificate(posterior: Posterior) -> dict[str, object]:
-    """What vouches for draws that were not made from the posterior itself."""
-    c = posterior.certificate
-    if c is None:
-        return {}
-    return {"certificate": asdict(c) | {"granted": c.granted, "statement": c.statement}}
+        log.warning("sample: NOT CONVERGED after %d steps: %s", n.steps, "; ".join(c.reasons))
+    return results.having(posterior=posterior)

@@ -25,31 +25,20 @@ TOGETHER = "all terms but products, combined by draws"
 
 @dataclass(frozen=True, eq=False)
 class BudgetTerm:
-    """One contribution to the position error.
-
-    Parameters
-    ----------
-    name : str
-    kind : str
-        'random', 'systematic' (as the parts of the model, which all stars share), 'local' (shared
-        by the stars at one place), or 'product' (of a file, known, and in no total).
-    u, v : ndarray, shape (P,)
-        Standard deviations, in the unit of the budget; of products the displacements' sizes.
-    source : str
-        Begins with 'measured in this run', 'given by the user' or 'published'.
-    relative_error : float or None
-        How well the standard deviations are known themselves, relative to their size: of draws the
-        Monte-Carlo error.  None where it is not known.
-    by_chip : mapping of int to float or None
-        The same by chip number, where that differs; `relative_error` is that of the first chip.
-    """
+    """One contribution to the position error."""
 
     name: str
+    # 'random', 'systematic' (as the parts of the model, which all stars share), 'local' (shared by
+    # the stars at one position), or 'product' (of a file, known, and in no total)
     kind: str
+    # (P,), standard deviations, in the unit of the budget; of products the displacements' sizes
     u: Float
-    v: Float
-    source: str
+    v: Float  # (P,)
+    source: str  # begins with 'measured in this run', 'given by the user' or 'published'
+    # how well the standard deviations are known themselves, relative to their size: of draws the
+    # Monte-Carlo error.  None where it is not known
     relative_error: float | None = None
+    # the same by chip number, where that differs; `relative_error` is that of the first chip
     by_chip: Mapping[int, float | None] = field(default_factory=dict)
 
     @property
@@ -58,7 +47,7 @@ class BudgetTerm:
         return np.hypot(self.u, self.v)
 
     def on(self, chip: int, rows: slice) -> BudgetTerm:
-        """The same on one chip, whose positions are some of the rows."""
+        """Budget on one chip, whose positions are some of the rows."""
         known = self.by_chip.get(chip, self.relative_error)
         return replace(self, u=self.u[rows], v=self.v[rows], relative_error=known, by_chip={})
 
@@ -211,19 +200,7 @@ def budget_of(errors: DrawnErrors, domain: EvaluationDomain) -> ErrorBudget:
     Terms are independent of each other, so that their squares add up to the total; rows of one term
     may be correlated, and the term counts as they do together.
 
-    Parameters
-    ----------
-    errors : DrawnErrors
-    domain : EvaluationDomain
-
-    Returns
-    -------
-    ErrorBudget
-
-    Raises
-    ------
-    InputError
-        For a missing epoch, and a magnitude where no errors by magnitude are known.
+    InputError for a missing epoch, and a magnitude where no errors by magnitude are known.
     """
     monte_carlo = (2.0 * effective_draws(errors.solution, errors.n_draws)) ** -0.5
     fields = errors.at(domain)
@@ -269,30 +246,12 @@ def place_budget(
 ) -> ErrorBudget:
     """The error budget of some positions, or of their differences to the first one.
 
-    Parameters
-    ----------
-    errors : DrawnErrors
-    x, y : array_like, shape (N,)
-        FITS 1-based pixels; two or more for relative errors.
-    chip : int
-        Chip number.
-    epoch : float, optional
-        Decimal years; needed by a model with time dependence.
-    magnitude : float, optional
-        Of the stars: their centroids' errors are a term then.
-    relative : bool
-        Errors of the differences to the first position, in one image: what all positions share
-        drops out, and what is independent counts twice.
-
-    Returns
-    -------
-    ErrorBudget
-
-    Raises
-    ------
-    InputError
-        For an unknown chip, a position off the chip, a missing epoch, a magnitude where no errors
-        by magnitude are known, and relative errors of one position.
+    `x`, `y`: (N,), FITS 1-based pixels; two or more for relative errors. `chip`: chip number.
+    `epoch`: decimal years; needed by a model with time dependence. `magnitude`: of the stars: their
+    centroids' errors are a term then. `relative`: errors of the differences to the first position,
+    in one image: what all positions share drops out, and what is independent counts twice.
+    InputError for an unknown chip, a position off the chip, a missing epoch, a magnitude where no
+    errors by magnitude are known, and relative errors of one position.
     """
     return budget_of(
         errors,

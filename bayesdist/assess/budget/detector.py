@@ -9,9 +9,10 @@ import numpy as np
 from bayesdist.assess.budget.budget import ErrorBudget
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.error_model import error_model
-from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.units import pixel_scale_of
+from bayesdist.infer.solution import Solution
 from bayesdist.model.grid import DEFAULT_GRID
 
 __all__ = ["detector_budget", "error_budget"]
@@ -90,26 +91,12 @@ def detector_budget(
 ) -> ErrorBudget:
     """The error budget of a solution over its chips, the same grid on each.
 
-    Parameters
-    ----------
-    solution : LinearFit or Posterior
-    chips : sequence of int, optional
-        Chip numbers; all by default.
-    terms, aligned, grid, epoch, n_draws, rng, pixel_scale
-        As in `error_budget`.
-
-    Returns
-    -------
-    ErrorBudget
-        In the unit of u, v.
-
-    Raises
-    ------
-    InputError
-        As `error_budget`.
+    `chips`: chip numbers; all by default. `terms`, `aligned`, `grid`, `epoch`, `n_draws`, `rng`,
+    `pixel_scale`: as in `error_budget`. The result is in the unit of u, v. InputError as
+    `error_budget`.
     """
     if pixel_scale is None:
         pixel_scale = pixel_scale_of(solution, None if chips is None else chips[0])
     domain = EvaluationDomain.of_chips(solution.model, grid, chips=chips, epoch=epoch)
-    errors = error_model(solution, terms, aligned=aligned, pixel_scale=pixel_scale)
+    errors = error_model(solution, terms=terms, aligned=aligned, pixel_scale=pixel_scale)
     return errors.at(domain, n=n_draws, rng=rng)

@@ -41,72 +41,41 @@ CONSTANT = 1e-9  # moments that change less, relative to the largest, do not dep
 
 @dataclass(frozen=True, eq=False)
 class BudgetSpan:
-    """Years within one segment of the drift.
+    """Years within one segment of the drift."""
 
-    Parameters
-    ----------
-    nodes : tuple of float
-        First, middle and last epoch, decimal years; empty for a model without time dependence.
-    moments : dict of int to dict of str to ndarray, shape (n, 2, K, K)
-        By chip number and part: mean products of the Legendre coefficients of the error in u and
-        in v, at each of the nodes; n = 1 for a part that does not depend on time.  The joint error
-        is the last part.
-    """
-
+    # first, middle and last epoch, decimal years; empty for a model without time dependence
     nodes: tuple[float, ...]
+    # (n, 2, K, K), by chip number and part: mean products of the Legendre coefficients of the error
+    # in u and in v, at each of the nodes; n = 1 for a part that does not depend on time.  The joint
+    # error is the last part
     moments: dict[int, dict[str, Float]]
 
 
 @dataclass(frozen=True, eq=False)
 class GridRow:
-    """A row that is no polynomial: values on the grid.
-
-    Parameters
-    ----------
-    row : Row
-    values : tuple of dict of int to ndarray, shape (n, N, 2)
-        For each span, by chip number: of an error its standard deviations, n = 1; of a file its
-        displacements at the nodes, linear in time between them, n = 1 for those that do not depend
-        on time.
-    """
+    """A row that is no polynomial: values on the grid."""
 
     row: Row
+    # (n, N, 2), for each span, by chip number: of an error its standard deviations, n = 1; of a
+    # file its displacements at the nodes, linear in time between them, n = 1 for those that do not
+    # depend on time
     values: tuple[dict[int, Float], ...]
 
 
 @dataclass(frozen=True, eq=False)
 class BudgetSurface:
-    """The error budget as a function of position, epoch and magnitude.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    epoch : float or None
-        At which the budget is quoted.
-    grid : tuple of int
-        Points on x and y of a chip over which it is averaged, and on which `local` is known.
-    spans : tuple of BudgetSpan
-        In the order of time.
-    parts : tuple of Row
-        Errors of parameters, whose moments are in the spans.
-    local : tuple of GridRow
-        Other errors, at the epoch at which the budget is quoted.
-    constant : tuple of (Row, ndarray of shape (2,))
-        Errors that are as large everywhere.
-    centroid : MagnitudeErrors or None
-    products : tuple of GridRow
-        In no total.
-    """
+    """The error budget as a function of position, epoch and magnitude."""
 
     model: DistortionModel
-    epoch: float | None
+    epoch: float | None  # at which the budget is quoted
+    # points on x and y of a chip over which it is averaged, and on which `local` is known
     grid: tuple[int, int]
-    spans: tuple[BudgetSpan, ...]
-    parts: tuple[Row, ...]
-    local: tuple[GridRow, ...]
-    constant: tuple[tuple[Row, Float], ...]
+    spans: tuple[BudgetSpan, ...]  # in the order of time
+    parts: tuple[Row, ...]  # errors of parameters, whose moments are in the spans
+    local: tuple[GridRow, ...]  # other errors, at the epoch at which the budget is quoted
+    constant: tuple[tuple[Row, Float], ...]  # (2,), errors that are as large everywhere
     centroid: MagnitudeErrors | None
-    products: tuple[GridRow, ...] = ()
+    products: tuple[GridRow, ...] = ()  # in no total
 
 
 def budget_surface(
@@ -118,25 +87,10 @@ def budget_surface(
 ) -> BudgetSurface:
     """Second moments of all errors of a position.
 
-    Parameters
-    ----------
-    errors : DrawnErrors
-        The same draws as those of a budget give the same numbers.
-    grid : tuple of int
-        Points on x and y of a chip.
-    epoch : float, optional
-        Decimal years, at which the budget is quoted; the first of the years by default.
-    years : tuple of float, optional
-        First and last epoch; needed by a model with time dependence.
-
-    Returns
-    -------
-    BudgetSurface
-
-    Raises
-    ------
-    InputError
-        For a model with time dependence and no years, or years that do not rise.
+    `errors`: the same draws as those of a budget give the same numbers. `grid`: points on x and y
+    of a chip. `epoch`: decimal years, at which the budget is quoted; the first of the years by
+    default. `years`: first and last epoch; needed by a model with time dependence. InputError for a
+    model with time dependence and no years, or years that do not rise.
     """
     model = errors.solution.model
     nodes = _nodes(model, years)
@@ -237,6 +191,6 @@ def _second(e: Float) -> Float:
 
 
 def _short(moments: Float) -> Float:
-    """Those of one node where all are the same."""
+    """Values of one node where all are the same."""
     change = np.abs(moments - moments[:1]).max()
     return moments[:1] if change <= CONSTANT * np.abs(moments).max() else moments

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import f as fisher
 
-from bayesdist.assess.comparison.compare import SIGNIFICANT, Comparison, compare
+from bayesdist.assess.comparison.compare import Comparison, compare
 from bayesdist.assess.comparison.sentences import probability
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.infer.compare.change_date import ChangeDate
 from bayesdist.infer.compare.monitoring import Change
+from bayesdist.limits import DIFFERENCE
 from bayesdist.model.grid import DEFAULT_GRID
 
 __all__ = ["Monitored", "change_maps", "is_late"]
@@ -20,30 +21,19 @@ __all__ = ["Monitored", "change_maps", "is_late"]
 
 @dataclass(frozen=True, eq=False)
 class Monitored:
-    """What new matches say of a release.
-
-    Parameters
-    ----------
-    change : Change
-    maps : tuple of Comparison
-        New minus released, one for each chip, in pixels: the mean change, or that from its date on.
-    date : ChangeDate, optional
-        None for matches without epochs.
-    misfit : Misfit
-        Structure that even the fit of the new matches leaves.
-    pixel_mas : float, optional
-    """
+    """Change of a release that new matches show."""
 
     change: Change
+    # new minus released, one for each chip, in pixels: the mean change, or that from its date on
     maps: tuple[Comparison, ...]
-    date: ChangeDate | None
-    misfit: Misfit
+    date: ChangeDate | None  # None for matches without epochs
+    misfit: Misfit  # structure that even the fit of the new matches leaves
     pixel_mas: float | None = None
 
     @property
     def scatters(self) -> bool:
-        """Whether periods scatter more than their errors, so that these are not independent."""
-        return self.date is not None and self.date.p_scatter < SIGNIFICANT
+        """True if periods scatter more than their errors, which then are not independent."""
+        return self.date is not None and self.date.p_scatter < DIFFERENCE.value
 
     @property
     def p_value(self) -> float:
@@ -77,12 +67,12 @@ class Monitored:
 
     @property
     def changed(self) -> bool:
-        """Whether the release no longer describes the matches."""
-        return self.p_either < SIGNIFICANT
+        """True if the release no longer describes the matches."""
+        return self.p_either < DIFFERENCE.value
 
     @property
     def since_a_date(self) -> bool:
-        """Whether the change is told from a date on, which is more significant than the mean."""
+        """True if the change from a date on is given, which is more significant than the mean."""
         return is_late(self.change, self.date)
 
     @property
@@ -102,16 +92,18 @@ class Monitored:
             f"{m.rms:.3g} pix rms where errors alone make {m.noise_rms:.2g}, at most "
             f"{m.largest:.3g} +- {m.sigma_of_largest:.2g} pix{mas} at ({x:.0f}, {y:.0f}){chip}"
         )
-        told = (
+        stated = (
             f"chi-square {test.chi2:.4g} for {test.dof} degrees of freedom, "
             f"{probability(self.p_either)}"
         )
         if self.date is not None and len(self.date.gain) > 1:
-            told += " with the search over dates"
+            stated += " with the search over dates"
         if not self.changed:
-            return f"The released solution still describes the new matches: change {size} ({told})."
+            return (
+                f"The released solution still describes the new matches: change {size} ({stated})."
+            )
         return (
-            f"The released solution no longer describes the new matches: change {size} ({told})"
+            f"The released solution no longer describes the new matches: change {size} ({stated})"
             f"{self._since}."
         )
 
@@ -131,7 +123,7 @@ class Monitored:
 
     @property
     def doubts(self) -> list[str]:
-        """What else a reader has to know."""
+        """Sentences on reasons for doubt."""
         out = []
         if self.scatters and self.date is not None:
             out.append(
@@ -144,10 +136,10 @@ class Monitored:
 
 
 def is_late(change: Change, date: ChangeDate | None) -> bool:
-    """Whether a change within the new matches is significant, and more so than the mean change."""
+    """True if a change within the new matches is significant, and more so than the mean one."""
     if date is None or not np.isfinite(date.after):
         return False
-    return date.p_value < min(SIGNIFICANT / 2, change.test.p_value)
+    return date.p_value < min(DIFFERENCE.value / 2, change.test.p_value)
 
 
 def change_maps(
@@ -159,18 +151,8 @@ def change_maps(
 ) -> tuple[Comparison, ...]:
     """The change of each chip over its grid.
 
-    Parameters
-    ----------
-    change : Change
-    rng : numpy.random.Generator
-    names : tuple of str
-        Of the new matches and of the release.
-    grid : tuple of int
-
-    Returns
-    -------
-    tuple of Comparison
-        New minus released; whose errors are both in the covariance of the first.
+    `names`: of the new matches and of the release. Returns new minus released; whose errors are
+    both in the covariance of the first.
     """
     model, out = change.model, []
     size = 2 * model.n_terms

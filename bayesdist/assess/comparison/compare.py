@@ -15,19 +15,18 @@ from numpy.typing import NDArray
 from bayesdist.assess.comparison.frame import CommonFrame, Similarity, common_frame
 from bayesdist.calibration.chip_map import ChipMap, position_moments
 from bayesdist.infer.equations.scaled import FieldTest, chi_square, known_terms
+from bayesdist.limits import DIFFERENCE
 from bayesdist.model.basis import point_blocks
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
 
-__all__ = ["SIGNIFICANT", "Comparison", "compare", "term_sigmas"]
+__all__ = ["Comparison", "compare", "term_sigmas"]
 
 Float = NDArray[np.float64]
-
-SIGNIFICANT = 0.01  # probability under which a difference is called one
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What remains between two calibrations, in pixels of A without distortion.
+    """Difference that remains between two calibrations, in pixels of A without distortion.
 
     Parameters
     ----------
@@ -124,8 +123,8 @@ class Comparison:
 
     @property
     def differs(self) -> bool | None:
-        """Whether the difference is more than the errors; None where these are not known."""
-        return None if self.field is None else self.field.p_value < SIGNIFICANT
+        """True if the difference is more than the errors; None where these are not known."""
+        return None if self.field is None else self.field.p_value < DIFFERENCE.value
 
 
 def compare(
@@ -150,7 +149,7 @@ def compare(
     keep : bool
         Leave shift, rotation and scale in.
     n_draws : int
-        Noise fields.  No share of them is told below 1 / (n_draws + 1).
+        Noise fields.  No fraction of them is stated below 1 / (n_draws + 1).
 
     Returns
     -------
@@ -236,7 +235,7 @@ def _root(cov: Float) -> Float:
 
 
 def _largest(difference: Float, noise: Float, sigma: Float) -> tuple[float, float]:
-    """Largest |z|, and the share of noise that has one as large."""
+    """Largest |z|, and the fraction of noise that has one as large."""
     known = sigma > 0
     z = [np.abs(d[:, known] / sigma[known]).max(axis=1, initial=0.0) for d in (difference, noise)]
     return float(z[0][0]), _share(z[1], float(z[0][0]))

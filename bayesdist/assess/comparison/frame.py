@@ -1,4 +1,4 @@
-"""Two calibrations laid on each other: the similarity between them, told apart from the rest.
+"""Two calibrations laid on each other: the similarity between them, separated from the rest.
 
 With w = u + i v, mean over the area of the detector,
 
@@ -38,73 +38,41 @@ NEAR = 0.1  # radians, or of the scale: axes that lie alike
 
 @dataclass(frozen=True)
 class Similarity:
-    """By what shift, rotation and scale A lies off B: w_A = shift + turn w_B.
+    """Shift, rotation and scale by which A lies off B: w_A = shift + turn w_B."""
 
-    Parameters
-    ----------
-    shift : tuple of float
-        Mean over the detector of A minus B, along x and y, pixels; None unless the axes of both lie
-        alike and their units agree.
-    rotation : float
-        Radians, from u towards v.
-    scale : float
-        Of A against B; without meaning where one is in pixels and the other in angles.
-    mirrored : bool
-    same_unit : bool
-        Whether both are in pixels or both in angles.
-    sigma_shift : tuple of float, optional
-    sigma_rotation, sigma_scale : float, optional
-        Standard errors; None where neither side has a covariance, or one has no correlations.
-    """
-
+    # mean over the detector of A minus B, along x and y, pixels; None unless the axes of both lie
+    # alike and their units agree
     shift: tuple[float, float] | None
-    rotation: float
-    scale: float
+    rotation: float  # radians, from u towards v
+    scale: float  # of A against B; without meaning where one is in pixels and the other in angles
     mirrored: bool
-    same_unit: bool
+    same_unit: bool  # True if both are in pixels or both in angles
     sigma_shift: tuple[float, float] | None
+    # standard errors; None where neither side has a covariance, or one has no correlations
     sigma_rotation: float | None
     sigma_scale: float | None
 
     @property
     def alike(self) -> bool:
-        """Whether the axes of both lie alike, so that shift and scale are a difference."""
+        """True if the axes of both lie alike, so that shift and scale are a difference."""
         turned = np.hypot(self.rotation, self.scale - 1.0)
         return self.same_unit and not self.mirrored and bool(turned < NEAR)
 
 
 @dataclass(frozen=True, eq=False)
 class CommonFrame:
-    """The difference A - B in pixels of A, and what was taken out of it.
+    """The difference A - B in pixels of A, and what was taken out of it."""
 
-    Parameters
-    ----------
-    basis : PolynomialBasis
-        Of the higher of both orders, with the reference pixel of A.
-    difference : ndarray, shape (2, K)
-        Legendre coefficients.
-    cov : ndarray, shape (2 K, 2 K), optional
-        Of the difference, u before v.
-    raw_cov : ndarray, shape (2 K, 2 K), optional
-        The same before anything was taken out.
-    taken : ndarray, shape (2 K, q)
-        Fields that were taken out: of the shift, the scale and the rotation; none where they are
-        kept.
-    shares : tuple of float
-        Share of A and of B in the variances.
-    similarity : Similarity
-    pixel_mas : float or None
-        Size of a pixel of A, where one side tells it.
-    """
-
-    basis: PolynomialBasis
-    difference: Float
-    cov: Float | None
-    raw_cov: Float | None
+    basis: PolynomialBasis  # of the higher of both orders, with the reference pixel of A
+    difference: Float  # (2, K), Legendre coefficients
+    cov: Float | None  # (2 K, 2 K), of the difference, u before v
+    raw_cov: Float | None  # (2 K, 2 K), the same before anything was taken out
+    # (2 K, q), fields that were taken out: of the shift, the scale and the rotation; none where
+    # they are kept
     taken: Float
-    shares: tuple[float, float]
+    shares: tuple[float, float]  # fractions of A and of B in the variances
     similarity: Similarity
-    pixel_mas: float | None
+    pixel_mas: float | None  # size of a pixel of A, where one side states it
 
     @property
     def norm(self) -> Float:
@@ -115,23 +83,10 @@ class CommonFrame:
 def common_frame(a: ChipMap, b: ChipMap, *, keep: bool = False) -> CommonFrame:
     """Bring two calibrations to one frame.
 
-    Parameters
-    ----------
-    a, b : ChipMap
-        Of one detector; of any order, reference pixel, orientation, parity and unit.  Their errors
-        are taken as independent.
-    keep : bool
-        Leave shift, rotation and scale in the difference.
-
-    Returns
-    -------
-    CommonFrame
-
-    Raises
-    ------
-    InputError
-        For detectors of different size, a calibration without linear part, or where shift, rotation
-        and scale are to be kept between frames that do not lie alike.
+    `a`, `b`: of one detector; of any order, reference pixel, orientation, parity and unit.  Their
+    errors are taken as independent. `keep`: leave shift, rotation and scale in the difference.
+    InputError for detectors of different size, a calibration without linear part, or where shift,
+    rotation and scale are to be kept between frames that do not lie alike.
     """
     if a.basis.size != b.basis.size:
         sizes = " and ".join(f"{c.basis.size[0]:g} x {c.basis.size[1]:g}" for c in (a, b))

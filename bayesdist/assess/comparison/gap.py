@@ -33,45 +33,27 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ChipPair:
-    """Two chips of one calibration in one plane.
+    """Two chips of one calibration in one plane."""
 
-    Parameters
-    ----------
-    reference, other : ChipMap
-        Of one order, in one system of u, v.
-    cov : ndarray, shape (4 K, 4 K), optional
-        Joint covariance of their coefficients: u and v of the reference chip, then of the other.
-    """
-
-    reference: ChipMap
+    reference: ChipMap  # of one order, in one system of u, v
     other: ChipMap
+    # (4 K, 4 K), joint covariance of their coefficients: u and v of the reference chip, then of the
+    # other
     cov: Float | None
 
 
 @dataclass(frozen=True, eq=False)
 class GapDifference:
-    """By what another chip lies off, A minus B, where the reference chips lie on each other.
+    """Offset of another chip, A minus B, where the reference chips lie on each other."""
 
-    Parameters
-    ----------
-    chip, reference : int
-        Chip numbers.
-    values : ndarray, shape (4,)
-        Mean shift over the chip along its x and y, in pixels of A without distortion; scale;
-        rotation from u towards v, radians.
-    cov : ndarray, shape (4, 4), optional
-    test : FieldTest, optional
-        Of all four at once; None without errors on either side.
-    errors_of : str
-        As in `Comparison`.
-    """
-
-    chip: int
+    chip: int  # chip numbers
     reference: int
+    # (4,), mean shift over the chip along its x and y, in pixels of A without distortion; scale;
+    # rotation from u towards v, radians
     values: Float
-    cov: Float | None
-    test: FieldTest | None
-    errors_of: str
+    cov: Float | None  # (4, 4)
+    test: FieldTest | None  # of all four at once; None without errors on either side
+    errors_of: str  # as in `Comparison`
 
     @property
     def sigma(self) -> Float | None:
@@ -84,18 +66,8 @@ def pair_of_chips(
 ) -> ChipPair:
     """Two chips of a calibration.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    reference, other : int
-        Chip numbers.
-    epoch : float, optional
-        Decimal years, for what depends on time.
-
-    Returns
-    -------
-    ChipPair
-        With a covariance where the calibration has one.
+    `reference`, `other`: chip numbers. `epoch`: decimal years, for what depends on time. The result
+    comes with a covariance where the calibration has one.
     """
     maps = calibration.at(epoch, origin="stated")
     cov = calibration.joint_covariance((reference, other), epoch, origin="stated")
@@ -105,20 +77,8 @@ def pair_of_chips(
 def gap_difference(a: ChipPair, b: ChipPair) -> GapDifference:
     """Compare where two calibrations have a chip against another one.
 
-    Parameters
-    ----------
-    a, b : ChipPair
-        Of the same chips; of any order, reference pixel, orientation, parity and unit.  Their
-        errors are taken as independent.
-
-    Returns
-    -------
-    GapDifference
-
-    Raises
-    ------
-    InputError
-        For chips of different size, or without linear part.
+    `a`, `b`: of the same chips; of any order, reference pixel, orientation, parity and unit.  Their
+    errors are taken as independent. InputError for chips of different size, or without linear part.
     """
     bases = []
     for of_a, of_b in ((a.reference, b.reference), (a.other, b.other)):

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import norm
 
-from bayesdist.assess.comparison.compare import SIGNIFICANT, Comparison
+from bayesdist.assess.comparison.compare import Comparison
 from bayesdist.assess.comparison.gap import GapDifference
 from bayesdist.assess.comparison.tables import comparison_table
+from bayesdist.limits import DIFFERENCE
 
 __all__ = ["comparison_lines", "gap_lines", "gap_verdict", "probability", "verdict"]
 
@@ -22,15 +23,7 @@ def probability(p: float) -> str:
 def verdict(found: Comparison, pixel_mas: float | None = None) -> str:
     """One sentence: whether the calibrations differ, by how much, and how sure that is.
 
-    Parameters
-    ----------
-    found : Comparison
-    pixel_mas : float, optional
-        Size of a pixel, where neither side tells it.
-
-    Returns
-    -------
-    str
+    `pixel_mas`: size of a pixel, where neither side states it.
     """
     size = (
         f"{_length(found.rms, found, pixel_mas)} rms, at most "
@@ -54,16 +47,7 @@ def verdict(found: Comparison, pixel_mas: float | None = None) -> str:
 
 
 def comparison_lines(found: Comparison) -> list[str]:
-    """What stands below the verdict.
-
-    Parameters
-    ----------
-    found : Comparison
-
-    Returns
-    -------
-    list of str
-    """
+    """Lines below the verdict."""
     kept = not found.frame.taken.shape[1]
     lines = [
         f"{letter}  {c.name}: order {c.basis.order}, in {c.unit}"
@@ -146,16 +130,7 @@ def _measured(value: float, sigma: float | None) -> str:
 
 
 def gap_verdict(gap: GapDifference) -> str:
-    """One sentence: whether a chip lies elsewhere against the reference chip.
-
-    Parameters
-    ----------
-    gap : GapDifference
-
-    Returns
-    -------
-    str
-    """
+    """One sentence: whether a chip lies elsewhere against the reference chip."""
     chips, d = f"against chip {gap.reference}", float(np.hypot(*gap.values[:2]))
     if np.abs(gap.values).max() < IDENTICAL:
         return f"Chip {gap.chip} lies alike {chips}, to rounding."
@@ -168,22 +143,13 @@ def gap_verdict(gap: GapDifference) -> str:
     )
     if gap.errors_of != "both":
         test += f", on the errors of {gap.errors_of} alone"
-    if gap.test.p_value < SIGNIFICANT:
+    if gap.test.p_value < DIFFERENCE.value:
         return f"Chip {gap.chip} lies elsewhere {chips}, significantly: {size} ({test})."
     return f"Chip {gap.chip} lies alike {chips} within the errors: {size} ({test})."
 
 
 def gap_lines(gap: GapDifference) -> list[str]:
-    """What stands below it: A minus B, the reference chips laid on each other.
-
-    Parameters
-    ----------
-    gap : GapDifference
-
-    Returns
-    -------
-    list of str
-    """
+    """Lines below this verdict: A minus B, the reference chips laid on each other."""
     sigma = [None] * 4 if gap.sigma is None else gap.sigma.tolist()
     shift_x, shift_y, scale, turn = zip(gap.values.tolist(), sigma, strict=True)
     degrees = [None if part is None else float(np.degrees(part)) for part in turn]
@@ -211,7 +177,7 @@ def _why_untested(found: Comparison) -> str:
 
 
 def _share(p: float) -> str:
-    return f"p = {p:.2g}" + (" (significant)" if p < SIGNIFICANT else "")
+    return f"p = {p:.2g}" + (" (significant)" if p < DIFFERENCE.value else "")
 
 
 def _length(value: float, found: Comparison, pixel_mas: float | None) -> str:

@@ -17,16 +17,9 @@ __all__ = ["comparison_table", "difference_table", "gap_table"]
 def comparison_table(found: Comparison) -> Table:
     """Difference of each coefficient.
 
-    Parameters
-    ----------
-    found : Comparison
-
-    Returns
-    -------
-    astropy.table.Table
-        Columns: form ('legendre': of products over the detector; 'monomial': of pixel offsets from
-        the reference pixel of A), axis, i, j, difference, sigma and z (NaN where no error is
-        known, or the term was taken out), unit.
+    Returns columns: form ('legendre': of products over the detector; 'monomial': of pixel offsets
+    from the reference pixel of A), axis, i, j, difference, sigma and z (NaN where no error is
+    known, or the term was taken out), unit.
     """
     frame = found.frame
     K, basis = frame.basis.n_terms, frame.basis
@@ -65,15 +58,8 @@ def _unit(order: int) -> str:
 def difference_table(found: Comparison) -> Table:
     """The difference over the grid, point by point.
 
-    Parameters
-    ----------
-    found : Comparison
-
-    Returns
-    -------
-    astropy.table.Table
-        Columns x, y, du, dv and, where errors are known, sigma_u, sigma_v, correlation, chi2; in
-        pixels.
+    Returns columns x, y, du, dv and, where errors are known, sigma_u, sigma_v, correlation, chi2;
+    in pixels.
     """
     X, Y = np.meshgrid(found.x, found.y)
     columns = {"x": X, "y": Y, "du": found.du, "dv": found.dv}
@@ -89,17 +75,10 @@ def difference_table(found: Comparison) -> Table:
 
 
 def gap_table(gaps: Sequence[GapDifference]) -> Table:
-    """Where chips lie against the reference chip, A minus B.
+    """Table of the offsets of chips from the reference chip, A minus B.
 
-    Parameters
-    ----------
-    gaps : sequence of GapDifference
-        One for each chip but the reference.
-
-    Returns
-    -------
-    astropy.table.Table
-        Columns: chip, reference, quantity, difference, sigma and z (NaN without errors), unit.
+    `gaps`: one for each chip but the reference. Returns columns: chip, reference, quantity,
+    difference, sigma and z (NaN without errors), unit.
     """
     quantities = (("shift_x", "pix"), ("shift_y", "pix"), ("scale", ""), ("rotation", "rad"))
     rows = []

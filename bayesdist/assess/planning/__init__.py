@@ -1,1 +1,1 @@
-"""What further exposures would give: how many are needed, and which dithers are best."""
+"""Planning of further exposures: their number, and the best dithers."""

@@ -17,14 +17,14 @@ from scipy.sparse.csgraph import connected_components
 from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
 from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
+from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.expected import ExpectedSolution, expected_solution
-from bayesdist.infer.selfcal.information import (
-    Information,
-    frame_information,
-    pointing_information,
+from bayesdist.infer.selfcal.prior import (
+    frame_prior,
+    pointing_prior,
     tie,
 )
-from bayesdist.infer.selfcal.moves import POINTS, functionals, moves
+from bayesdist.infer.selfcal.sky_moves import POINTS, functionals, moves
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import outline_pixels
 from bayesdist.simulate.dithers import dithered_model, sky_seen, stars_on_detector
@@ -49,20 +49,12 @@ MOST_STARS = 2_000_000  # of the sky that all patterns see together
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A detector as it is planned for.
-
-    Parameters
-    ----------
-    chips : tuple of Chip
-    coefficients : ndarray, shape (chips, 2, K)
-        Legendre coefficients of its distortion, in pixels: how chips lie matters most.
-    frames : str
-        What is free in each exposure.
-    """
+    """A detector as it is planned for."""
 
     chips: tuple[Chip, ...]
+    # (chips, 2, K), Legendre coefficients of its distortion, in pixels: how chips lie matters most
     coefficients: Float
-    frames: str = "shift_rotation"
+    frames: str = "shift_rotation"  # what is free in each exposure
 
     @property
     def pixels(self) -> float:
@@ -82,65 +74,38 @@ class Camera:
 
 @dataclass(frozen=True)
 class PlannedStars:
-    """A field of stars, and how well they are detected.
+    """A field of stars, and how well they are detected."""
 
-    Parameters
-    ----------
-    per_detector : float
-        Detections of one exposure, on average.
-    sigma : float
-        Error of a detection on one axis, pixels.
-    false : float
-        Share of the detections that are false: they say nothing.
-    least : int
-        Fewest detections of a star that is used.
-    seed : int
-    """
-
-    per_detector: float
-    sigma: float
-    false: float = 0.0
-    least: int = 2
+    per_detector: float  # detections of one exposure, on average
+    sigma: float  # error of a detection on one axis, pixels
+    false: float = 0.0  # fraction of the detections that are false: they say nothing
+    least: int = 2  # fewest detections of a star that is used
     seed: int = 1
 
 
 @dataclass(frozen=True)
 class Beforehand:
-    """What will be known beside the detections; None for what is not.
+    """Knowledge beside the detections; None for what is not known."""
 
-    Parameters
-    ----------
-    offset_sigma : float, optional
-        Error of a commanded offset on one axis, pixels.
-    roll_sigma : float, optional
-        Of a commanded roll, radians.
-    exposure_scale_sigma : float, optional
-        Scatter of the exposures' scales.
-    scale_sigma : float, optional
-        Relative error of the size of a pixel.
-    """
+    offset_sigma: float | None = None  # error of a commanded offset on one axis, pixels
+    roll_sigma: float | None = None  # of a commanded roll, radians
+    exposure_scale_sigma: float | None = None  # scatter of the exposures' scales
+    scale_sigma: float | None = None  # relative error of the size of a pixel
 
-    offset_sigma: float | None = None
-    roll_sigma: float | None = None
-    exposure_scale_sigma: float | None = None
-    scale_sigma: float | None = None
-
-    def information(
-        self, model: DistortionModel, theta: Float, pattern: DitherPattern
-    ) -> Information:
+    def prior(self, model: DistortionModel, theta: Float, pattern: DitherPattern) -> Prior:
         """All of it, at a truth."""
-        out, n = Information.none(theta), len(pattern)
+        out, n = Prior.none(theta), len(pattern)
         if self.offset_sigma is not None:
             # rolls are about the middle of all chips: a pixel elsewhere moves with the roll
             middles = [(c.number, (c.size[0] + 1) / 2, (c.size[1] + 1) / 2) for c in model.chips]
             sigma = np.full(n, self.offset_sigma)
-            out = out + pointing_information(model, theta, pattern.offsets, sigma, pixels=middles)
+            out = out + pointing_prior(model, theta, pattern.offsets, sigma, pixels=middles)
         if self.roll_sigma is not None:
             rolls = pattern.rolls
-            out = out + frame_information(model, theta, "rotation", rolls, self.roll_sigma)
+            out = out + frame_prior(model, theta, "rotation", rolls, self.roll_sigma)
         if self.exposure_scale_sigma is not None:
             scatter = self.exposure_scale_sigma
-            out = out + frame_information(model, theta, "scale", np.zeros(n), scatter)
+            out = out + frame_prior(model, theta, "scale", np.zeros(n), scatter)
         if self.scale_sigma is not None:
             out = out + tie(theta, functionals(model, theta)["scale"], 0.0, self.scale_sigma)
         return out
@@ -148,30 +113,18 @@ class Beforehand:
 
 @dataclass(frozen=True, eq=False)
 class PlannedPattern:
-    """What a pattern would give.
-
-    Parameters
-    ----------
-    pattern : DitherPattern
-    camera : Camera
-    solution : ExpectedSolution
-    maps : dict of str to tuple of UncertaintyMap, or None
-        Of each chip, by kind:
-
-        'gauge-free'   without whatever the detections of this pattern leave free;
-        'shape'        without shift, rotation and scale of the sky: the same for all patterns;
-        'absolute'     without the zero point alone.
-
-        None where nothing bounds the errors.
-    """
+    """Errors that a pattern would leave."""
 
     pattern: DitherPattern
     camera: Camera
     solution: ExpectedSolution
+    # of each chip, by kind: 'gauge-free'   without whatever the detections of this pattern leave
+    # free; 'shape'        without shift, rotation and scale of the sky: the same for all patterns;
+    # 'absolute'     without the zero point alone. None where nothing bounds the errors
     maps: dict[str, tuple[UncertaintyMap, ...] | None]
 
     def radii(self, kind: str) -> Float:
-        """Radial errors (1 sigma) at all places of the grid, pixels; infinite where unbounded."""
+        """Radial errors (1 sigma) at all points of the grid, pixels; infinite where unbounded."""
         maps = self.maps[kind]
         return (
             np.array([np.inf]) if maps is None else np.concatenate([m.radius.ravel() for m in maps])
@@ -213,10 +166,10 @@ class PlannedPattern:
         degree = terms.sum(axis=1)
         of_term = np.zeros(len(terms))
         for chip in model.chips:
-            share = np.prod(chip.size) / self.camera.pixels
+            fraction = np.prod(chip.size) / self.camera.pixels
             for axis in (0, 1):
                 of_term += (
-                    share * variance[model.coefficient_slice(chip.number, axis)] * mean_square
+                    fraction * variance[model.coefficient_slice(chip.number, axis)] * mean_square
                 )
         return {
             int(k): float(np.sqrt(of_term[degree == k].sum())) for k in range(1, model.order + 1)
@@ -224,7 +177,7 @@ class PlannedPattern:
 
     @cached_property
     def chips_share_stars(self) -> bool:
-        """Whether some star is seen on two chips."""
+        """True if some star is seen on two chips."""
         p = self.solution.problem
         chip = p.groups.chip[p.groups.index]
         low, high = (f.reduceat(chip, p.starts[:-1]) for f in (np.minimum, np.maximum))
@@ -237,23 +190,9 @@ def compare_patterns(
     stars: PlannedStars,
     known: Beforehand,
 ) -> tuple[PlannedPattern, ...]:
-    """What each of some patterns would give, on one sky, the best one first.
+    """Outcomes of several patterns on one sky, the best one first.
 
-    Parameters
-    ----------
-    patterns : sequence of DitherPattern
-    camera : Camera
-    stars : PlannedStars
-    known : Beforehand
-
-    Returns
-    -------
-    tuple of PlannedPattern
-
-    Raises
-    ------
-    InputError
-        For a pattern whose exposures do not overlap, and for too many stars.
+    InputError for a pattern whose exposures do not overlap, and for too many stars.
     """
     truths = [
         dithered_model(camera.chips, camera.coefficients, p.offsets, p.rolls, frames=camera.frames)
@@ -300,8 +239,8 @@ def _planned(
     detections = Detections(
         x, y, exposure, model.exposures, chip, sigma=sigma, star=star, source=pattern.name
     )
-    information = known.information(model, truth, pattern)
-    solution = expected_solution(model, truth, detections, information, least=stars.least)
+    prior = known.prior(model, truth, pattern)
+    solution = expected_solution(model, truth, detections, prior, min_detections=stars.least)
     move = moves(model, truth)
     without = {
         "gauge-free": solution.gauge.null,

@@ -1,4 +1,4 @@
-"""How many more exposures, and when, would meet a requirement."""
+"""Number and dates of further exposures that would meet a requirement."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.solution import Solution
 from bayesdist.infer.compare.planning import with_information
+from bayesdist.infer.solution import Solution
 
 __all__ = ["Need", "Schedule", "exposures_needed"]
 
@@ -20,35 +20,20 @@ MOST = 4096  # exposures beyond which more are no plan
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """When exposures would be taken.
-
-    Parameters
-    ----------
-    name : str
-    information : ndarray, shape (d, d)
-        Of one exposure about polynomials and drift, on average over the dates of the schedule.
-    """
+    """Dates at which exposures would be taken."""
 
     name: str
+    # (d, d), of one exposure about polynomials and drift, on average over the dates of the schedule
     information: Float
 
 
 @dataclass(frozen=True)
 class Need:
-    """What a schedule takes.
-
-    Parameters
-    ----------
-    schedule : str
-    exposures : int or None
-        Fewest that meet the requirement; None where even very many would not.
-    probability : float
-        Of meeting the limit, with so many; with very many where none suffice.
-    """
+    """Number of exposures that a schedule takes."""
 
     schedule: str
-    exposures: int | None
-    probability: float
+    exposures: int | None  # fewest that meet the requirement; None where even very many would not
+    probability: float  # of meeting the limit, with so many; with very many where none suffice
 
     @property
     def sentence(self) -> str:
@@ -75,19 +60,8 @@ def exposures_needed(
 ) -> tuple[Need, ...]:
     """The fewest exposures of each schedule with which a requirement is met.
 
-    Parameters
-    ----------
-    solution : Solution
-        As it is now.
-    schedules : sequence of Schedule
-    probability_met : callable
-        Probability of meeting the requirement with a solution; with the same random numbers each
-        time, so that it rises with the number of exposures.
-    asked : float
-
-    Returns
-    -------
-    tuple of Need
+    `solution`: as it is now. `probability_met`: probability of meeting the requirement with a
+    solution; with the same random numbers each time, so that it rises with the number of exposures.
     """
     now = probability_met(solution)
     if now >= asked:

@@ -1,4 +1,4 @@
-"""What a dither pattern lacks, in words."""
+"""Shortcomings of a dither pattern, in words."""
 
 from __future__ import annotations
 
@@ -15,16 +15,9 @@ MOST = 4  # parameters that are named
 
 
 def lacking(found: PlannedPattern) -> tuple[str, ...]:
-    """What a pattern does not have, and what that costs.
+    """Sentences on offsets and rolls that a pattern lacks, and what that costs.
 
-    Parameters
-    ----------
-    found : PlannedPattern
-
-    Returns
-    -------
-    tuple of str
-        Empty for a pattern of large offsets in both directions and with rolls.
+    The result is empty for a pattern of large offsets in both directions and with rolls.
     """
     pattern, gauge = found.pattern, found.solution.gauge
     no_rolls = gauge.spread < SAME_ROLL

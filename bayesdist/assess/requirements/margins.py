@@ -13,20 +13,18 @@ from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.error_model import error_model
 from bayesdist.assess.requirements.remedy import Remedy, find_remedy
 from bayesdist.assess.requirements.requirement import Requirement
-from bayesdist.assess.requirements.verdict import (
-    Caveat,
-    counting_error,
-    effective_draws,
-    verdict_of,
-)
-from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.requirements.verdict import counting_error, effective_draws, verdict_of
+from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.units import convert, pixel_scale_of
+from bayesdist.checks import Check, doubts_of
 from bayesdist.errors import InputError
+from bayesdist.infer.checks import convergence_check
+from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import DEFAULT_GRID
 
-__all__ = ["Margin", "Requirement", "check_requirements", "domains_of"]
+__all__ = ["Margin", "Requirement", "check_requirements", "domains_of", "judge"]
 
 Float = NDArray[np.float64]
 
@@ -35,7 +33,7 @@ EPOCHS = 9  # of a range that are judged, its ends and what lies evenly between
 
 @dataclass(frozen=True, eq=False)
 class Margin:
-    """How a solution stands against a requirement.  All lengths are in `unit`.
+    """Margin of a solution against a requirement.  All lengths are in `unit`.
 
     Parameters
     ----------
@@ -106,7 +104,7 @@ def check_requirements(
     n_draws: int = 2000,
     rng: np.random.Generator,
     pixel_scale: float | None = None,
-    caveats: Sequence[Caveat] = (),
+    checks: Sequence[Check] = (),
 ) -> tuple[Margin, ...]:
     """Judge requirements on draws of the position error.
 
@@ -120,9 +118,9 @@ def check_requirements(
     The field is that of all chips: the same grid on each of them, so that each has the same weight.
     A draw of the solution and an offset are common to all chips.
 
-    Of a relative error the statistic is that of the differences between two places, over all pairs
-    of points.  Over a range of epochs the draws of everything are the same throughout, and that of
-    the statistic is the largest over nine epochs and the breaks between them.
+    Of a relative error the statistic is that of the differences between two positions, over all
+    pairs of points.  Over a range of epochs the draws of everything are the same throughout, and
+    that of the statistic is the largest over nine epochs and the breaks between them.
 
     Parameters
     ----------
@@ -143,9 +141,9 @@ def check_requirements(
     rng : numpy.random.Generator
     pixel_scale : float, optional
         Size of one pixel in mas; `pixel_scale_of` the solution by default.
-    caveats : sequence of Caveat
-        Reasons why the errors may not be as stated, beside a posterior that is not converged: its
-        verdicts are all 'undecided'.
+    checks : sequence of Check
+        Reasons why the errors may not be as stated are among them, beside a posterior that is not
+        converged: its verdicts are all 'undecided'.
 
     Returns
     -------
@@ -159,16 +157,45 @@ def check_requirements(
         scale that is not known, an unknown chip, a bad grid, a region without points of the grid, a
         magnitude without errors by magnitude, or fewer than two draws.
     """
-    unit = solution.model.unit
     if pixel_scale is None:
         pixel_scale = pixel_scale_of(solution, chip)
     for r in requirements:
-        convert(r.limit, r.unit, unit, pixel_scale, where=r.where)
-    model = error_model(solution, terms, aligned=aligned, pixel_scale=pixel_scale)
+        convert(r.limit, r.unit, solution.model.unit, pixel_scale, where=r.where)
+    model = error_model(solution, terms=terms, aligned=aligned, pixel_scale=pixel_scale)
+    if not requirements:  # terms in units that need a scale are refused all the same
+        return ()
+    return judge(
+        model.drawn(n_draws, rng),
+        requirements,
+        grid=grid,
+        epoch=epoch,
+        chip=chip,
+        pixel_scale=pixel_scale,
+        checks=(*_convergence(solution), *checks),
+    )
+
+
+def judge(
+    errors: DrawnErrors,
+    requirements: Sequence[Requirement],
+    *,
+    grid: tuple[int, int] = DEFAULT_GRID,
+    epoch: float | None = None,
+    chip: int | None = None,
+    pixel_scale: float | None = None,
+    checks: Sequence[Check] = (),
+) -> tuple[Margin, ...]:
+    """Judge requirements on draws that are there.
+
+    `requirements`, `grid`, `epoch`, `chip`, `pixel_scale`: as `check_requirements`. `checks`: that
+    of convergence among them. InputError as `check_requirements`.
+    """
     if not requirements:
         return ()
-    cases = [domains_of(r, solution.model, grid, epoch=epoch, chip=chip) for r in requirements]
-    errors = model.drawn(n_draws, rng)
+    model, unit = errors.solution.model, errors.unit
+    for r in requirements:
+        convert(r.limit, r.unit, unit, pixel_scale, where=r.where)
+    cases = [domains_of(r, model, grid, epoch=epoch, chip=chip) for r in requirements]
     wanted: dict[EvaluationDomain, set[str]] = {}
     for r, case in zip(requirements, cases, strict=True):
         for domain in case:
@@ -183,24 +210,21 @@ def check_requirements(
                 error.cause, where=f"{owner.where}, {error.where}", do=error.do
             ) from None
 
-    caveats = (*_not_converged(solution), *caveats)
-    n_effective = effective_draws(solution, n_draws)
+    doubts = doubts_of(checks)
+    n_effective = effective_draws(errors.solution, errors.n_draws)
+    varying = [t.rows[0].name for t in errors.terms if getattr(t, "varies", False)]
     margins = []
     for r, case in zip(requirements, cases, strict=True):
         factor = convert(1.0, unit, r.unit, pixel_scale)
         extremes = [
-            _margin(r, case, draws, way, factor, n_effective, caveats)
+            _margin(r, case, draws, way, factor, n_effective, doubts)
             for way, *draws in zip(
                 ways,
                 *([factor * one[r.statistic] for one in found[domain]] for domain in case),
                 strict=True,
             )
         ]
-        margins.append(
-            _of_extremes(
-                extremes, [t.rows[0].name for t in terms if getattr(t, "varies", False)], caveats
-            )
-        )
+        margins.append(_of_extremes(extremes, varying, doubts))
     return tuple(margins)
 
 
@@ -212,27 +236,12 @@ def domains_of(
     epoch: float | None = None,
     chip: int | None = None,
 ) -> tuple[EvaluationDomain, ...]:
-    """Where and when a requirement is judged: one for each epoch.
+    """Domains in which a requirement is judged: one for each epoch.
 
-    Parameters
-    ----------
-    requirement : Requirement
-    model : DistortionModel
-    grid : tuple of int
-        Points on x and y of a chip.
-    epoch, chip
-        For a requirement that names none.
-
-    Returns
-    -------
-    tuple of EvaluationDomain
-
-    Raises
-    ------
-    InputError
-        For an unknown chip, a missing epoch, a range of epochs where nothing depends on time, a
-        polygon that is not said to lie on one of several chips, and a region that holds fewer than
-        four points of the grid.
+    `grid`: points on x and y of a chip. `epoch`, `chip`: for a requirement that names none.
+    InputError for an unknown chip, a missing epoch, a range of epochs where nothing depends on
+    time, a polygon that is not said to lie on one of several chips, and a region that holds fewer
+    than four points of the grid.
     """
     r = requirement
     epochs: list[float | None] = [r.epoch if r.epoch is not None else epoch]
@@ -295,7 +304,7 @@ def _chips_of(
 
 
 def _of_extremes(
-    margins: Sequence[Margin], names: Sequence[str], caveats: Sequence[Caveat]
+    margins: Sequence[Margin], names: Sequence[str], doubts: Sequence[Check]
 ) -> Margin:
     """The less favourable margin, with a verdict that holds for all of them."""
     worse = min(margins, key=lambda m: m.probability_met)
@@ -308,18 +317,14 @@ def _of_extremes(
         f"field, or independent errors, P(met) is {worse.probability_met:.3g} to "
         f"{better.probability_met:.3g}"
     )
-    texts = [*(one.text for one in caveats), reason]
+    texts = [*(one.sentence for one in doubts), reason]
     return replace(worse, verdict="undecided", reason="; ".join(texts))
 
 
-def _not_converged(solution: Solution) -> tuple[Caveat, ...]:
-    """Why draws cannot be trusted, where they cannot."""
-    convergence = getattr(solution, "convergence", None)
-    if convergence is None or convergence.converged:
-        return ()
-    reasons = "; ".join(getattr(convergence, "reasons", ()))
-    text = "the posterior is not converged" + (f": {reasons}" if reasons else "")
-    return (Caveat(text, larger=False),)
+def _convergence(solution: Solution) -> tuple[Check, ...]:
+    """Check that draws can be relied on, of a solution that has draws of its own."""
+    convergence = solution.convergence
+    return () if convergence is None else (convergence_check(convergence),)
 
 
 def _margin(
@@ -329,7 +334,7 @@ def _margin(
     errors: DrawnErrors,
     factor: float,
     n_effective: float,
-    caveats: Sequence[Caveat],
+    doubts: Sequence[Check],
 ) -> Margin:
     asked = requirement.probability
     draws = np.max(by_epoch, axis=0)
@@ -338,11 +343,11 @@ def _margin(
     low, median, high = np.quantile(draws, [0.025, 0.5, 0.975])
     # the empirical quantile without interpolation, so that its side of the limit agrees with `met`
     reached = np.quantile(draws, asked, method="inverted_cdf")
-    verdict, reason = verdict_of(met, n_effective, asked, caveats)
+    verdict, reason = verdict_of(met, n_effective, asked, doubts)
     axis = requirement.statistic[0] if requirement.statistic[:2] in ("u_", "v_") else ""
-    place = errors.worst(worst_epoch, axis)
+    position = errors.worst(worst_epoch, axis)
     remedy = None
-    if verdict == "missed" and not caveats:
+    if verdict == "missed" and not doubts:
         remedy = find_remedy(errors, requirement, worst_epoch, factor)
     return Margin(
         requirement=requirement,
@@ -357,6 +362,6 @@ def _margin(
         epoch=worst_epoch.epoch,
         n_effective=n_effective,
         draws=draws,
-        worst=replace(place, rms=factor * place.rms),
+        worst=replace(position, rms=factor * position.rms),
         remedy=remedy,
     )

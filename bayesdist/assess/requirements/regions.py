@@ -25,23 +25,9 @@ _INNER = re.compile(r"inner\s+(\d+(?:\.\d*)?)\s*%")
 def check_region(region: Region | Sequence[Sequence[float]], where: str) -> Region:
     """A region as it is kept: in a form that can be compared.
 
-    Parameters
-    ----------
-    region : str or sequence of (x, y)
-        'whole'; 'inner 80 %', the rectangle of so much of both sides around the middle of the
-        chip; a quadrant: 'lower left', 'lower right', 'upper left', 'upper right'; or the corners
-        of a polygon in FITS 1-based pixels.
-    where : str
-        For the message.
-
-    Returns
-    -------
-    str or tuple of (x, y)
-
-    Raises
-    ------
-    InputError
-        For anything else.
+    `region`: 'whole'; 'inner 80 %', the rectangle of so much of both sides around the middle of the
+    chip; a quadrant: 'lower left', 'lower right', 'upper left', 'upper right'; or the corners of a
+    polygon in FITS 1-based pixels. `where`: for the message. InputError for anything else.
     """
     if isinstance(region, str):
         text = " ".join(region.lower().split())
@@ -67,20 +53,10 @@ def check_region(region: Region | Sequence[Sequence[float]], where: str) -> Regi
 
 
 def in_region(region: Region, size: tuple[float, float], x: Float, y: Float) -> NDArray[np.bool_]:
-    """Which pixels lie in a region; its edge belongs to rectangles.
+    """Boolean mask of the pixels in a region; its edge belongs to rectangles.
 
-    Parameters
-    ----------
-    region : str or tuple of (x, y)
-        As `check_region` gives it.
-    size : tuple of float
-        Columns and rows of the chip.
-    x, y : ndarray, shape (N,)
-        FITS 1-based pixels.
-
-    Returns
-    -------
-    ndarray of bool, shape (N,)
+    `region`: as `check_region` gives it. `size`: columns and rows of the chip. `x`, `y`: (N,), FITS
+    1-based pixels. Returns (N,).
     """
     if not isinstance(region, str):
         return _in_polygon(np.array(region), x, y)

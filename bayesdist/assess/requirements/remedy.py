@@ -1,4 +1,4 @@
-"""Which term of the error would have to shrink, and how far, for a requirement to be met."""
+"""Reduction of an error term that would meet a requirement."""
 
 from __future__ import annotations
 
@@ -18,26 +18,14 @@ STEPS = 9  # halvings of the interval in which the factor lies
 
 @dataclass(frozen=True)
 class Remedy:
-    """What would have to shrink.
+    """Error term that would have to shrink."""
 
-    Parameters
-    ----------
-    term : str
-        Where one term can do it alone, that which has to shrink least; else the largest one.
-    factor : float
-        By which its error must be multiplied; 0 where it cannot do it alone.
-    now, needed : float
-        Its radial rms over the places that are domain, in the requirement's unit.
-    enough : bool
-        Whether the requirement is met then, the other terms being as they are.
-    unit : str
-    """
-
+    # where one term can do it alone, that which has to shrink least; else the largest one
     term: str
-    factor: float
-    now: float
+    factor: float  # by which its error must be multiplied; 0 where it cannot do it alone
+    now: float  # its radial rms over the positions judged, in the requirement's unit
     needed: float
-    enough: bool
+    enough: bool  # True if the requirement is met then, the other terms being as they are
     unit: str
 
     @property
@@ -61,18 +49,8 @@ def find_remedy(
 
     Each term by itself is multiplied by a number between 0 and 1, with the same draws throughout.
 
-    Parameters
-    ----------
-    errors : DrawnErrors
-    requirement : Requirement
-    domain : EvaluationDomain
-        Where, and at the worst epoch.
-    factor : float
-        Unit of the solution, in the unit of the requirement.
-
-    Returns
-    -------
-    Remedy
+    `domain`: where, and at the worst epoch. `factor`: unit of the solution, in the unit of the
+    requirement.
     """
     n = min(DRAWS, errors.n_draws)
     statistic = requirement.statistic

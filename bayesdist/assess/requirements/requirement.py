@@ -5,11 +5,20 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from bayesdist.assess.names import require_known
-from bayesdist.assess.requirements.regions import WHOLE, Region, check_region, region_words
+from bayesdist.assess.requirements.regions import (
+    WHOLE,
+    Region,
+    check_region,
+    in_region,
+    region_words,
+)
 from bayesdist.assess.statistics import STATISTICS
 from bayesdist.assess.units import UNITS
+from bayesdist.diagnose.residuals.coverage import Coverage
 from bayesdist.errors import InputError
+from bayesdist.limits import BEYOND_STARS
+from bayesdist.model.grid import grid_pixels, mesh
+from bayesdist.names import require_known
 
 __all__ = ["Requirement"]
 
@@ -108,12 +117,12 @@ class Requirement:
 
     @property
     def where(self) -> str:
-        """How messages name it."""
+        """Name in messages."""
         return f"requirement {self.name!r}"
 
     @property
     def scope(self) -> str:
-        """What the statistic is taken of, beside chip and epoch, in words; may be empty."""
+        """Words on the scope of the statistic beside chip and epoch; may be empty."""
         words = region_words(self.region)
         if self.relative:
             apart = "" if self.separation is None else f" up to {self.separation:g} px apart"
@@ -121,3 +130,26 @@ class Requirement:
         if self.magnitude is not None:
             words += f" of a star of magnitude {self.magnitude:g}"
         return words.strip()
+
+    def reaches_beyond(self, covered: Coverage, grid: tuple[int, int]) -> bool:
+        """True if the requirement is judged on a chip where there are no stars.
+
+        Parameters
+        ----------
+        covered : Coverage
+            Of the chip.
+        grid : tuple of int
+            Points on x and y.
+
+        Returns
+        -------
+        bool
+            Only where what is not covered is significant.
+        """
+        chip = covered.chip
+        if not covered.significant or self.chip not in (None, chip.number):
+            return False
+        x, y = mesh(*grid_pixels(chip.size, grid))
+        judged = in_region(self.region, chip.size, x, y)
+        far = covered.beyond(x, y) > BEYOND_STARS.value * max(chip.size)
+        return bool((judged & far).any())

@@ -24,36 +24,23 @@ BAND = 0.95
 
 @dataclass(frozen=True, eq=False)
 class Horizon:
-    """The probability of meeting a requirement, epoch by epoch.
-
-    Parameters
-    ----------
-    requirement : Requirement
-    epoch : ndarray, shape (n,)
-        Decimal years, rising.
-    probability : ndarray, shape (n,)
-        Fraction of draws that meet the limit.
-    low, high : ndarray, shape (n,)
-        Its central 95 % interval from the number of draws (Clopper-Pearson).
-    value : ndarray, shape (n,)
-        Median of the statistic, in the unit of the requirement.
-    """
+    """The probability of meeting a requirement, epoch by epoch."""
 
     requirement: Requirement
-    epoch: Float
-    probability: Float
-    low: Float
-    high: Float
-    value: Float
+    epoch: Float  # (n,), decimal years, rising
+    probability: Float  # (n,), fraction of draws that meet the limit
+    low: Float  # (n,), its central 95 % interval from the number of draws (Clopper-Pearson)
+    high: Float  # (n,)
+    value: Float  # (n,), median of the statistic, in the unit of the requirement
 
     @property
     def date(self) -> float | None:
-        """When the probability falls below what is asked; None if it does not."""
+        """Date at which the probability falls below what is asked; None if it does not."""
         return self._fall(self.probability)
 
     @property
     def interval(self) -> tuple[float | None, float | None]:
-        """The same for both ends of the probability's interval, the earlier date first."""
+        """Such dates for both ends of the probability's interval, the earlier one first."""
         return self._fall(self.low), self._fall(self.high)
 
     @property
@@ -105,29 +92,11 @@ def horizon_of(
     covariance, and with the curvature that the data and its prior leave open, where the errors hold
     it.
 
-    Parameters
-    ----------
-    errors : DrawnErrors
-        One set of draws for all epochs: the curve has no noise of its own between them.
-    requirement : Requirement
-        Its own epoch is not used.
-    epochs : array_like, shape (n,)
-        Decimal years, rising.
-    grid : tuple of int
-        Points on x and y of a chip.
-    n_effective : float, optional
-        Independent draws that the draws are worth; their number by default.
-    pixel_scale : float, optional
-        As `check_requirements`.
-
-    Returns
-    -------
-    Horizon
-
-    Raises
-    ------
-    InputError
-        For a model that does not depend on time, and epochs that do not rise.
+    `errors`: one set of draws for all epochs: the curve has no noise of its own between them.
+    `requirement`: its own epoch is not used. `epochs`: (n,), decimal years, rising. `grid`: points
+    on x and y of a chip. `n_effective`: independent draws that the draws are worth; their number by
+    default. `pixel_scale`: as `check_requirements`. InputError for a model that does not depend on
+    time, and epochs that do not rise.
     """
     model = errors.solution.model
     at = np.atleast_1d(np.asarray(epochs, float))

@@ -4,40 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-from scipy.stats import beta, chi2
+from scipy.stats import beta
 
-from bayesdist.assess.solution import Solution
+from bayesdist.checks import LARGER, Check, doubts_of
+from bayesdist.infer.solution import Solution
+from bayesdist.limits import CONFIDENCE
 
 __all__ = [
-    "LEAST_CHI2",
     "VERDICTS",
-    "Caveat",
     "clopper_pearson",
     "counting_error",
     "effective_draws",
-    "scatter_too_small",
     "verdict_of",
 ]
 
 VERDICTS = ("met", "missed", "undecided")
-
-CONFIDENCE = 0.99
-LEAST_CHI2, CHANCE = 0.8, 1e-3  # per degree of freedom, and probability of as little
-
-
-def scatter_too_small(total: float, dof: float) -> bool:
-    """Whether residuals scatter less than their quoted errors say.
-
-    Parameters
-    ----------
-    total : float
-        Chi-square.
-    dof : float
-        Its degrees of freedom.
-    """
-    return total < LEAST_CHI2 * dof and float(chi2.cdf(total, max(dof, 1))) < CHANCE
 
 
 def effective_draws(solution: Solution, n_draws: int) -> float:
@@ -46,28 +28,20 @@ def effective_draws(solution: Solution, n_draws: int) -> float:
     Drawing n rows from a chain worth `ess` independent samples adds the chain's own Monte-Carlo
     variance to that of the drawing: 1 / n_eff = 1 / n + 1 / ess.
 
-    Parameters
-    ----------
-    solution : LinearFit or Posterior
-        Draws of a fit are independent; a posterior is worth the smaller of its bulk and tail
-        effective sample sizes (a probability far from a half is a matter of the tails).
-    n_draws : int
-
-    Returns
-    -------
-    float
-        At least 1.
+    `solution`: draws of a fit are independent; a posterior is worth the smaller of its bulk and
+    tail effective sample sizes (a probability far from a half is a matter of the tails). The result
+    is at least 1.
     """
-    convergence = getattr(solution, "convergence", None)
+    convergence = solution.convergence
     if convergence is None:
         return float(n_draws)
-    sizes = [float(convergence.ess_bulk_min), float(getattr(convergence, "ess_tail_min", math.inf))]
+    sizes = [convergence.ess_bulk_min, convergence.ess_tail_min]
     ess = 1.0 if any(math.isnan(s) for s in sizes) else max(min(sizes), 1.0)
     return max(1.0 / (1.0 / n_draws + 1.0 / ess), 1.0)
 
 
 def clopper_pearson(
-    fraction: float, n: float, confidence: float = CONFIDENCE
+    fraction: float, n: float, confidence: float = CONFIDENCE.value
 ) -> tuple[float, float]:
     """Exact central interval of a binomial probability.
 
@@ -100,47 +74,17 @@ def counting_error(fraction: float, n: float) -> float:
     return float(beta.std(k + 0.5, n - k + 0.5))
 
 
-@dataclass(frozen=True)
-class Caveat:
-    """Reason why the actual errors may not be as stated.
-
-    Parameters
-    ----------
-    text : str
-        A clause.
-    larger : bool
-        Whether the actual errors can only be larger for it: what is missed all the same is then
-        missed for sure.
-    """
-
-    text: str
-    larger: bool = True
-
-
 def verdict_of(
-    fraction: float, n: float, asked: float, caveats: Sequence[Caveat] = ()
+    fraction: float, n: float, asked: float, checks: Sequence[Check] = ()
 ) -> tuple[str, str]:
     """Verdict on the probability of meeting a limit, and its reason.
 
-    Parameters
-    ----------
-    fraction : float
-        Of draws that meet the limit.
-    n : float
-        Effective number of draws.
-    asked : float
-        The probability asked for.
-    caveats : sequence of Caveat
-        Nothing is met while there is one.
-
-    Returns
-    -------
-    verdict : str
-        'met' or 'missed' where the 99 % Clopper-Pearson interval lies wholly above or below the
-        probability asked for, else 'undecided'.  With caveats 'missed' where the interval says so
-        and all of them make errors larger, else 'undecided'.
-    reason : str
-        What decided, and with caveats what the draws alone point to.
+    `fraction`: of draws that meet the limit. `n`: effective number of draws. `asked`: the
+    probability asked for. `checks`: nothing is met while one of them is a doubt. Returns `verdict`:
+    'met' or 'missed' where the 99 % Clopper-Pearson interval lies wholly above or below the
+    probability asked for, else 'undecided'.  With doubts 'missed' where the interval says so and
+    all of them make errors larger, else 'undecided'. `reason`: what decided, and with doubts what
+    the draws alone point to.
     """
     low, high = clopper_pearson(fraction, n)
     interval = f"the probability is {low:.4g} to {high:.4g} (99 % Monte-Carlo interval)"
@@ -152,9 +96,10 @@ def verdict_of(
         verdict = "undecided"
         reason = f"{interval}, on both sides of the {asked:g} asked for: too few effective draws"
         reason += f" ({n:.0f})"
-    if not caveats or (verdict == "missed" and all(c.larger for c in caveats)):
+    doubts = doubts_of(checks)
+    if not doubts or (verdict == "missed" and all(one.doubt == LARGER for one in doubts)):
         return verdict, reason
-    texts = "; ".join(c.text for c in caveats)
+    texts = "; ".join(one.sentence for one in doubts)
     alone = {
         "met": f"the stated errors alone would meet it ({reason})",
         "missed": f"the stated errors alone would miss it ({reason})",

@@ -12,83 +12,45 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
+from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.preparing import MIN_CENTROID_FRACTION
-from bayesdist.diagnose.residuals.sample import StarSample
+from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError
 
-__all__ = ["centroid_scatter", "without"]
-
-FEWEST = 50  # stars whose scatter says anything by magnitude
-CERTAIN = 0.5  # probability of a false match from which on a star is left out
+__all__ = ["centroid_errors", "centroids_of", "without"]
 
 
-def centroid_scatter(
-    stars: StarSample, contained: Sequence[tuple[str, float, float]] = (), *, n_params: int = 0
-) -> MagnitudeErrors | None:
-    """Scatter of the residuals by magnitude, less other errors that are in it.
+def centroid_errors(
+    scatter: MagnitudeErrors, contained: Sequence[tuple[str, float, float]] = ()
+) -> MagnitudeErrors:
+    """Scatter of residuals by magnitude, less other errors that are in it.
 
-    Parameters
-    ----------
-    stars : StarSample
-        With a posterior its likely false matches are left out, else what the fit rejected.
-    contained : sequence of (name, sigma_u, sigma_v)
-        Errors that the residuals hold beside those of the centroids, in their unit.
-    n_params : int
-        Parameters of the fit, for all stars there are.
-
-    Returns
-    -------
-    MagnitudeErrors or None
-        At least a quarter of the scatter: the other errors are not that well known.  None where the
-        stars have no magnitudes, or too few of them.
-
-    Raises
-    ------
-    InputError
-        Where an error that is said to be in the residuals is larger than these.
+    `contained`: errors that the residuals hold beside those of the centroids, in their unit. The
+    result is at least a quarter of the scatter: the other errors are not that well known.
+    InputError where an error that is said to be in the residuals is larger than these.
     """
-    mag = stars.table.mag
-    if mag is None:
-        return None
-    good = np.isfinite(mag) & (
-        stars.used if stars.outlier_probability is None else stars.outlier_probability < CERTAIN
-    )
-    if good.sum() < FEWEST:
-        return None
-    share = round(n_params * len(stars) / max(stars.n_total, 1))
-    total = estimate(mag[good], *stars.residual[good].T, n_params=share)
     left = {}
     for axis, name in ((1, "sigma_u"), (2, "sigma_v")):
-        sigma = getattr(total, name)
+        sigma = getattr(scatter, name)
         known = np.sqrt(sum(one[axis] ** 2 for one in contained))
         # the median of n absolute residuals is known to 1.17 / sqrt(n)
-        too_small = sigma * (1.0 + 3.0 * 1.17 / np.sqrt(total.n)) < known
+        too_small = sigma * (1.0 + 3.0 * 1.17 / np.sqrt(scatter.n)) < known
         if too_small.any():
             k = int(np.argmax(too_small))
             raise InputError(
                 f"errors of {known:.3g} are said to be in residuals that scatter by "
-                f"{sigma[k]:.3g} at magnitude {total.mag[k]:.2f}",
+                f"{sigma[k]:.3g} at magnitude {scatter.mag[k]:.2f}",
                 where=f"budget term {contained[0][0]!r}",
-                do="correct them, or set in_residuals = false",
+                do="correct them, or set included_in_scatter = false",
             )
         left[name] = known
-    return without(total, left["sigma_u"], left["sigma_v"])
+    return without(scatter, left["sigma_u"], left["sigma_v"])
 
 
 def without(errors: MagnitudeErrors, sigma_u: float, sigma_v: float) -> MagnitudeErrors:
     """Errors by magnitude, less an error that all of them hold.
 
-    Parameters
-    ----------
-    errors : MagnitudeErrors
-    sigma_u, sigma_v : float
-        In their unit.
-
-    Returns
-    -------
-    MagnitudeErrors
-        At least a quarter of what they were.
+    `sigma_u`, `sigma_v`: in their unit. The result is at least a quarter of what they were.
     """
     left = {
         name: np.sqrt(np.maximum(sigma**2 - known**2, (MIN_CENTROID_FRACTION * sigma) ** 2))
@@ -98,3 +60,22 @@ def without(errors: MagnitudeErrors, sigma_u: float, sigma_v: float) -> Magnitud
         )
     }
     return replace(errors, **left)
+
+
+def centroids_of(
+    diagnostics: Diagnostics, contained: Sequence[tuple[str, float, float]] = ()
+) -> MagnitudeErrors | None:
+    """Errors of centroids by magnitude: the scatter of residuals less what has a term of its own.
+
+    Of structure that is among the residuals the median of its size is taken off: a prior's tail is
+    in no residual.
+
+    `contained`: as `centroid_errors`. Returns None where the stars have no magnitudes. InputError
+    as `centroid_errors`.
+    """
+    if diagnostics.centroid is None:
+        return None
+    errors = centroid_errors(diagnostics.centroid, contained) if contained else diagnostics.centroid
+    correlated = diagnostics.correlated
+    median = None if correlated is None else correlated.structure_median
+    return errors if median is None else without(errors, *median)

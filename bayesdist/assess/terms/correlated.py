@@ -1,4 +1,4 @@
-"""What a calibration may leave out, as terms of the error model."""
+"""Correlated errors that a calibration leaves, as terms of the error model."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from bayesdist.assess.terms.forms import (
     Row,
     Together,
 )
-from bayesdist.infer.discrepancy import Discrepancy
-from bayesdist.infer.discrepancy.linear import LinearDeviations
+from bayesdist.diagnose.correlated import Discrepancy
+from bayesdist.diagnose.correlated.deviations import LinearDeviations
 
 __all__ = ["DEVIATIONS", "STRUCTURE", "STRUCTURE_IN_FIT", "Deviations", "StructureErrors"]
 
@@ -34,24 +34,16 @@ SOURCE = f"{MEASURED}, with a prior on its size"
 
 @dataclass(frozen=True, eq=False)
 class StructureErrors:
-    """What the model leaves out at a position, and the error of the parameters that followed it.
+    """Structure that the model leaves out, and the error of the parameters that followed it.
 
     The fit was drawn towards the structure, so that the two errors are correlated: row k of both is
     draw k of the posterior.  What is left counts as much as both together have beyond the error of
     the parameters.
-
-    Parameters
-    ----------
-    discrepancy : Discrepancy
-    frames : bool
-        Whether errors of the exposures' frames count.
-    left : bool
-        Whether what is left at a position counts; False where errors of look-up tables stand for
-        it.
     """
 
     discrepancy: Discrepancy
-    frames: bool = False
+    frames: bool = False  # True if errors of the exposures' frames count
+    # True if what is left at a position counts; False where errors of look-up tables stand for it
     left: bool = True
 
     @property
@@ -86,22 +78,13 @@ class StructureErrors:
 
 @dataclass(frozen=True, eq=False)
 class Deviations:
-    """Error by deviations of single exposures, and by a curvature of the drift.
+    """Error by deviations of single exposures, and by a curvature of the drift."""
 
-    Parameters
-    ----------
-    discrepancy : Discrepancy
-        With `linear`.
-    single : bool
-        Whether the position is one in a single exposure that is yet to come, whose own deviation
-        is in the error; else one in the mean of the exposures.
-    frames : bool
-        As of `StructureErrors`.
-    """
-
-    discrepancy: Discrepancy
+    discrepancy: Discrepancy  # with `linear`
+    # True if the position is one in a single exposure that is yet to come, whose own deviation is
+    # in the error; else one in the mean of the exposures
     single: bool = False
-    frames: bool = False
+    frames: bool = False  # as of `StructureErrors`
 
     @property
     def rows(self) -> tuple[Row, ...]:

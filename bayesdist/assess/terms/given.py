@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.names import require_known
 from bayesdist.assess.terms.forms import (
     GIVEN,
     PUBLISHED,
@@ -25,6 +24,7 @@ from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
+from bayesdist.names import require_known
 
 __all__ = ["CENTROID", "TERM_KINDS", "Centroids", "SmoothTerm", "UserTerm", "said_by_user"]
 
@@ -39,7 +39,7 @@ BEYOND = 0.5  # magnitudes by which the outermost bins may be left
 
 
 def said_by_user(source: str) -> str:
-    """What a user says of where a number comes from, as a source of a budget's row.
+    """Source of a budget's row, as a user gives it.
 
     It begins with one of the three kinds of source: a publication that is named so stays one.
     """
@@ -51,7 +51,7 @@ def said_by_user(source: str) -> str:
 
 @dataclass(frozen=True)
 class UserTerm:
-    """A Gaussian error given by the user, the same at every place of the detector.
+    """A Gaussian error given by the user, the same at every position of the detector.
 
     Parameters
     ----------
@@ -65,9 +65,9 @@ class UserTerm:
     source : str
         Where the number comes from: 'given by the user', or a publication.
     varies : bool
-        Of a systematic term: whether it may differ from place to place in a way that is not known,
-        as the errors of a catalogue do.  Requirements are then judged for one offset of the whole
-        field, for a smooth field, and for independent errors at every position.
+        Of a systematic term: true if it may differ from position to position in a way that is not
+        known, as the errors of a catalogue do.  Requirements are then judged for one offset of the
+        whole field, for a smooth field, and for independent errors at every position.
 
     Raises
     ------
@@ -103,7 +103,7 @@ class UserTerm:
         return float(su), float(sv)
 
     def in_unit(self, unit: str, pixel_scale: float | None = None) -> UserTerm:
-        """The same with its standard deviations in another unit."""
+        """Term with its standard deviations in another unit."""
         su, sv = self.sigma(unit, pixel_scale)
         return replace(self, sigma_u=su, sigma_v=sv, unit=unit)
 
@@ -154,19 +154,11 @@ class SmoothTerm:
     """A user's error as a smooth field over each chip, larger at the edges than inside.
 
     As the distortion of a catalogue, or of another camera, would be.
-
-    Parameters
-    ----------
-    term : UserTerm
-        In the unit of the model.
-    model : DistortionModel
-    grid : tuple of int
-        Points of each chip over which the mean square is that of the term.
     """
 
-    term: UserTerm
+    term: UserTerm  # in the unit of the model
     model: DistortionModel
-    grid: tuple[int, int]
+    grid: tuple[int, int]  # points of each chip over which the mean square is that of the term
 
     @property
     def rows(self) -> tuple[Row, ...]:
@@ -193,15 +185,9 @@ class SmoothTerm:
 
 @dataclass(frozen=True, eq=False)
 class Centroids:
-    """Errors of the centroids of stars of a stated magnitude.
+    """Errors of the centroids of stars of a stated magnitude."""
 
-    Parameters
-    ----------
-    errors : MagnitudeErrors or None
-        In the unit of the solution; None where none are known.
-    """
-
-    errors: MagnitudeErrors | None
+    errors: MagnitudeErrors | None  # in the unit of the solution; None where none are known
 
     @property
     def rows(self) -> tuple[Row, ...]:
@@ -221,10 +207,7 @@ class Centroids:
     def at(self, magnitude: float) -> Float:
         """Errors (2,) of the centroid of a star.
 
-        Raises
-        ------
-        InputError
-            Where no errors by magnitude are known, or none near this one.
+        InputError where no errors by magnitude are known, or none near this one.
         """
         if self.errors is None:
             raise InputError(

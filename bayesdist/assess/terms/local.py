@@ -30,7 +30,7 @@ def table_of(chip: int, size: tuple[float, float], values: Float) -> LookupTable
 
 @dataclass(frozen=True, eq=False)
 class LocalErrors:
-    """A Gaussian error that all stars at a place share.
+    """A Gaussian error that all stars at a position have in common.
 
     Such is the error of a look-up table: its nodes are closer than positions at which errors are
     evaluated, and there the errors count as independent.

@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.names import require_known
-from bayesdist.assess.solution import Solution, place_of
-from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorDraws, Polynomials, Row, Together
+from bayesdist.assess.solution import place_of
+from bayesdist.assess.terms.forms import (
+    GIVEN,
+    MEASURED,
+    ErrorDraws,
+    ErrorTerm,
+    Polynomials,
+    Row,
+    Together,
+)
 from bayesdist.errors import InputError
+from bayesdist.infer.catalogue.star_errors import StarCovariance
+from bayesdist.infer.solution import Solution
+from bayesdist.mission import load_object, missions
 from bayesdist.model import DistortionModel
+from bayesdist.names import require_known
 
 __all__ = [
     "CATALOGUE",
@@ -22,6 +34,9 @@ __all__ = [
     "CatalogueErrors",
     "ExposureVariation",
     "ScaleError",
+    "catalogue_terms",
+    "one_size_kinds",
+    "one_size_term",
 ]
 
 Float = NDArray[np.float64]
@@ -35,32 +50,23 @@ LINEAR_KINDS = ("scale", "rotation")
 
 @dataclass(frozen=True, eq=False)
 class CatalogueErrors:
-    """What the errors of the reference catalogue do to polynomials and drift.
+    """Effect of the errors of the reference catalogue on polynomials and drift.
 
     A star has one error in however many exposures it is matched.  The solution that is assessed
     has this error; the one without it took the catalogue's errors for independent from match to
     match, and shows the rows of the budget beside this one.  So what independent errors of the
     catalogue would do stands in those rows, and all of what the true ones do in this row: the
     squares of the rows add up to more than the total, which is drawn from the solution.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    mean : ndarray, shape (D,)
-        Of its parameters.
-    covariance : ndarray, shape (D, D)
-        Of the error of its parameters that the catalogue causes: `total` of a `StarCovariance`, or
-        its part for the positions, and the one for the motions in a term of its own.
-    name : str
-    source : str
-        Where the errors of the catalogue come from.
     """
 
     model: DistortionModel
-    mean: Float
+    mean: Float  # (D,), of its parameters
+    # (D, D), of the error of its parameters that the catalogue causes: `total` of a
+    # `StarCovariance`, or its part for the positions, and the one for the motions in a term of its
+    # own
     covariance: Float
     name: str = CATALOGUE
-    source: str = GIVEN
+    source: str = GIVEN  # where the errors of the catalogue come from
 
     @property
     def rows(self) -> tuple[Row, ...]:
@@ -80,6 +86,25 @@ class CatalogueErrors:
         return Polynomials(self.rows[0], self.model, mean, theta)
 
 
+def catalogue_terms(
+    solution: Solution, stars: StarCovariance, catalogue: str
+) -> tuple[CatalogueErrors, ...]:
+    """Terms of the errors of a catalogue: of its positions, and of its motions where it has some.
+
+    `solution`: that takes them for independent. `catalogue`: name of the file that states the
+    errors.
+    """
+    source = f"{GIVEN}: errors of {{}} in {catalogue}"
+    model, mean = solution.model, np.asarray(solution.mean, float)
+    moved = 0.0 if stars.motions is None else stars.motions
+    of_positions = source.format("positions")
+    positions = CatalogueErrors(model, mean, stars.total - moved, source=of_positions)
+    if stars.motions is None:
+        return (positions,)
+    of_motions = source.format("proper motions")
+    return positions, CatalogueErrors(model, mean, stars.motions, MOTIONS, of_motions)
+
+
 @dataclass(frozen=True, eq=False)
 class ScaleError:
     """A Gaussian error of scale or orientation about the reference pixel of the first chip.
@@ -87,31 +112,15 @@ class ScaleError:
     Velocity aberration that is left out, or known only as far as the header knows the spacecraft's
     velocity, is an error of the scale: VAFACTOR differs from 1 by up to 1e-4.
 
-    Parameters
-    ----------
-    name : str
-    kind : str
-        'scale' or 'rotation'.
-    sigma : float
-        Standard deviation: relative, or in radians.
-    solution : Solution
-        Whose positions it moves.
-    source : str
-    in_total : bool
-        False where another row holds this error.
-
-    Raises
-    ------
-    InputError
-        For an unknown kind, or a sigma that is negative or not finite.
+    InputError for an unknown kind, or a sigma that is negative or not finite.
     """
 
     name: str
-    kind: str
-    sigma: float
-    solution: Solution
+    kind: str  # 'scale' or 'rotation'
+    sigma: float  # standard deviation: relative, or in radians
+    solution: Solution  # whose positions it moves
     source: str = GIVEN
-    in_total: bool = True
+    in_total: bool = True  # False where another row holds this error
 
     def __post_init__(self) -> None:
         where = f"budget term {self.name!r}"
@@ -146,34 +155,34 @@ class ScaleError:
         return Polynomials(self.rows[0], model, mean, mean + sizes * moved)
 
 
+def one_size_kinds() -> tuple[str, ...]:
+    """Kinds of error terms that have one size, those that missions add among them."""
+    return (*LINEAR_KINDS, *(kind for one in missions().values() for kind in one.error_terms))
+
+
+def one_size_term(name: str, kind: str, sigma: float, solution: Solution, source: str) -> ErrorTerm:
+    """Error term of a kind; parameters as of `ScaleError`."""
+    make: Callable[..., ErrorTerm] = ScaleError
+    for mission in missions().values():
+        if kind in mission.error_terms:
+            make = load_object(mission.error_terms[kind])
+    return make(name, kind, sigma, solution, source)
+
+
 @dataclass(frozen=True, eq=False)
 class ExposureVariation:
-    """How a new exposure deviates from the polynomials that all exposures have in common.
+    """Deviation of a new exposure from the polynomials that all exposures have in common.
 
-    Parameters
-    ----------
-    model : DistortionModel
-        With frames in gauge 'held', in which exposures deviate from the polynomials.
-    mean : ndarray, shape (D,)
-        Of its parameters.
-    kinds : tuple of str, length k
-        Deviations that scatter, as an exposure's parameters are named: 'scale', 'shear_plus', ...
-    tau : ndarray, shape (m, k)
-        Draws of the scatter of each kind.
-    aberration : ScaleError, optional
-        What of it is known to be velocity aberration: shown beside, as this scatter holds it.
-    name, source : str
-
-    Raises
-    ------
-    InputError
-        For a kind that is no parameter of an exposure, or another number of kinds in `tau`.
+    InputError for a kind that is no parameter of an exposure, or another number of kinds in `tau`.
     """
 
+    # with frames in gauge 'held', in which exposures deviate from the polynomials
     model: DistortionModel
-    mean: Float
+    mean: Float  # (D,), of its parameters
+    # (k,), deviations that scatter, named as an exposure's parameters: 'scale', 'shear_plus', ...
     kinds: tuple[str, ...]
-    tau: Float
+    tau: Float  # (m, k), draws of the scatter of each kind
+    # what of it is known to be velocity aberration: shown beside, as this scatter holds it
     aberration: ScaleError | None = None
     name: str = EXPOSURE_SCATTER
     source: str = MEASURED

@@ -22,18 +22,9 @@ def without_rigid(
     Whoever uses a calibration on an exposure fits where the telescope pointed.  What this takes up
     is no error, and depends on the gauge: without it, a field is the same in every gauge.
 
-    Parameters
-    ----------
-    errors : mapping of int to ndarray, shape (n, 2, K)
-        By chip number, for all chips of the model: Legendre coefficients of each error.
-    positions : mapping of int to ndarray, shape (2, K)
-        Those of the positions (u, v), in the same orientation.
-    model : DistortionModel
-
-    Returns
-    -------
-    dict of int to ndarray, shape (n, 2, K)
-        The residual errors: least squares over stars that cover all chips evenly.
+    `errors`: (n, 2, K), by chip number, for all chips of the model: Legendre coefficients of each
+    error. `positions`: (2, K), those of the positions (u, v), in the same orientation. Returns (n,
+    2, K), the residual errors: least squares over stars that cover all chips evenly.
     """
     chips = model.chips
     basis = model.basis(chips[0].number)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import (
     Image,
     PolynomialField,
@@ -19,6 +19,7 @@ from bayesdist.assess.terms.forms import (
     polynomial_errors,
 )
 from bayesdist.assess.terms.parameters import CatalogueErrors
+from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["COEFFICIENTS", "EXPOSURE_FRAME", "TIME_DEPENDENCE", "SolutionErrors"]
@@ -36,18 +37,12 @@ class SolutionErrors:
 
     The parts add up to the joint error (to first order) along the axes of the polynomials, however
     the field turned between exposures.  They are correlated.
-
-    Parameters
-    ----------
-    solution : Solution
-    without : Solution, optional
-        The solution that lacks the errors of the catalogue, and shows the rows of the parts.
-    catalogue : tuple of CatalogueErrors
-        What the errors of the catalogue do, which the solution's draws hold: shown beside.
     """
 
     solution: Solution
+    # the solution that lacks the errors of the catalogue, and shows the rows of the parts
     without: Solution | None = None
+    # what the errors of the catalogue do, which the solution's draws hold: shown beside
     catalogue: tuple[CatalogueErrors, ...] = ()
 
     @property

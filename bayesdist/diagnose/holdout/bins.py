@@ -1,4 +1,4 @@
-"""How held-out stars are divided: by place, magnitude, date and exposure.
+"""Division of held-out stars by position, magnitude, date and exposure.
 
 An exposure that was held out whole is also divided by place: what bends it alone leaves its mean
 where it was.
@@ -24,51 +24,34 @@ Int = NDArray[np.int64]
 
 ALL = "all"
 STARS_PER_BIN = 60
-MOST_CELLS = 8  # along each side of a chip
-MOST_BINS = 8  # of magnitudes, and of dates
-MOST_PLACES = 4  # along each side of a chip of one exposure
-MOST_CELLS_IN_ALL = 512  # of all such exposures
-MOST_EXPOSURES = 60  # beyond it only those that were held out whole are looked at one by one
+MAX_CELLS = 8  # along each side of a chip
+MAX_BINS = 8  # of magnitudes, and of dates
+MAX_PLACES = 4  # along each side of a chip of one exposure
+MAX_CELLS_IN_ALL = 512  # of all such exposures
+MAX_EXPOSURES = 60  # beyond it only those that were held out whole are looked at one by one
 
 
 @dataclass(frozen=True)
 class Bin:
-    """One part of the held-out stars.
+    """One part of the held-out stars."""
 
-    Parameters
-    ----------
-    words : str
-        Where it is, as a clause: 'at x 1 to 512, y 1 to 512'.
-    chip : Chip or None
-        Of a region.
-    limits : tuple of float
-        x and y of a region's edges, pixels; lowest and highest magnitude or date.
-    """
-
-    words: str
-    chip: Chip | None = None
+    words: str  # where it is, as a clause: 'at x 1 to 512, y 1 to 512'
+    chip: Chip | None = None  # of a region
+    # x and y of a region's edges, pixels; lowest and highest magnitude or date
     limits: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class Partition:
-    """Bins that hold each star once, or not at all.
+    """Bins that hold each star once, or not at all."""
 
-    Parameters
-    ----------
-    kind : str
-        'all', 'region', 'magnitude', 'epoch', 'exposure' or 'place in exposure'.
-    bins : tuple of Bin
-    code : callable
-        Of a table and some of its rows: bin of each, negative where there is none.
-    """
-
-    kind: str
+    kind: str  # 'all', 'region', 'magnitude', 'epoch', 'exposure' or 'place in exposure'
     bins: tuple[Bin, ...]
+    # of a table and some of its rows: bin of each, negative where there is none
     code: Callable[[MatchTable, Int], Int]
 
     def codes(self, table: MatchTable, rows: Int) -> Int:
-        """Bin of each of some rows."""
+        """Bins (n,) of some rows."""
         return self.code(table, rows)
 
 
@@ -77,30 +60,20 @@ def partitions_of(
 ) -> tuple[Partition, ...]:
     """The parts in which held-out stars are judged.
 
-    Parameters
-    ----------
-    model : DistortionModel
-    held : MatchTable or PartitionedMatches
-    sample : MatchTable
-        Some of them, evenly spread: they say where bins end.
-    whole : sequence of str
-        Exposures that were held out whole.
-
-    Returns
-    -------
-    tuple of Partition
+    `sample` are some of the held-out stars, evenly spread, which say where bins end; `whole` are
+    the exposures that were held out whole.
     """
     n = len(held)
     out = [Partition(ALL, (Bin("over the whole detector"),), lambda _, rows: rows * 0)]
-    out.append(_regions(model, _cells(model, n, MOST_CELLS)))
+    out.append(_regions(model, _cells(model, n, MAX_CELLS)))
     share = n // STARS_PER_BIN
     if sample.mag is not None:
-        out += _quantiles("magnitude", "mag", sample.mag, min(share, MOST_BINS))
+        out += _quantiles("magnitude", "mag", sample.mag, min(share, MAX_BINS))
     if sample.epoch is not None:
-        out += _quantiles("epoch", "epoch", sample.epoch, min(share, MOST_BINS))
+        out += _quantiles("epoch", "epoch", sample.epoch, min(share, MAX_BINS))
     out += _places(model, sample, n / len(sample), whole)
     names = held.exposure_names
-    if len(names) > MOST_EXPOSURES:
+    if len(names) > MAX_EXPOSURES:
         names = tuple(name for name in names if name in set(whole))
     if len(held.exposure_names) > 1 and names:
         out.append(_exposures(names, set(whole)))
@@ -118,13 +91,13 @@ def _places(
     """Cells of each exposure that was held out whole; none where stars are few."""
     if len(np.unique(sample.exposure)) < 2:
         return []  # its places are those of all stars
-    names = tuple(name for name in sample.exposure_names if name in set(whole))[:MOST_EXPOSURES]
+    names = tuple(name for name in sample.exposure_names if name in set(whole))[:MAX_EXPOSURES]
     if not names:
         return []
     codes = [sample.exposure_names.index(name) for name in names]
     n = min(float((sample.exposure == k).sum()) * share for k in codes)
-    few = np.sqrt(MOST_CELLS_IN_ALL / (len(model.chips) * len(names)))
-    side = _cells(model, n, min(MOST_PLACES, int(few)))
+    few = np.sqrt(MAX_CELLS_IN_ALL / (len(model.chips) * len(names)))
+    side = _cells(model, n, min(MAX_PLACES, int(few)))
     if side * len(model.chips) < 2:
         return []
     cells = _regions(model, side)

@@ -1,4 +1,4 @@
-"""Whether an exposure that was held out whole deviates from the others as these scatter.
+"""Deviations of exposures that were held out whole, against the scatter of the others.
 
 Its scale and shears, and where its chips lie, are fitted to its own stars before these are judged:
 what is wrong with them does not show in residuals.  With b and v the estimate of one deviation
@@ -26,21 +26,13 @@ __all__ = ["deviation_tests"]
 
 Float = NDArray[np.float64]
 
-LEAST_TOLD = 0.5  # of a deviation's variance beforehand: where stars tell less, nothing is tested
+MIN_INFORMATION = 0.5  # fraction of the prior variance that stars take off, to be tested
 
 
 def deviation_tests(predictive: Predictive, frames: Mapping[str, Frame]) -> list[HeldTest]:
-    """Each deviation of each exposure that was held out whole.
+    """Tests of each deviation of each exposure that was held out whole.
 
-    Parameters
-    ----------
-    predictive : Predictive
-    frames : mapping of str to Frame
-
-    Returns
-    -------
-    list of HeldTest
-        Their `limit` is the scatter.
+    Their `limit` is the scatter.
     """
     known = predictive.deviations
     if known is None:
@@ -48,16 +40,16 @@ def deviation_tests(predictive: Predictive, frames: Mapping[str, Frame]) -> list
     n = predictive.model.n_distortion
     C, out = predictive.cov[:n, :n], []
     for name, frame in frames.items():
-        told = 1 - frame.precision * np.diag(frame.spent)
+        taken = 1 - frame.precision * np.diag(frame.spent)
         by_solution = frame.spent @ frame.shared
         extra = np.einsum("qn,nm,qm->q", by_solution, C, by_solution)
         for kind, tau in zip(known.kinds, known.tau.T, strict=True):
             k = frame.names.index(kind)
-            if told[k] < LEAST_TOLD:
+            if taken[k] < MIN_INFORMATION:
                 continue
             # without what its own prior has said
-            b = frame.values[k] / told[k]
-            v = frame.spent[k, k] / told[k] + extra[k] / told[k] ** 2
+            b = frame.values[k] / taken[k]
+            v = frame.spent[k, k] / taken[k] + extra[k] / taken[k] ** 2
             p = float(np.mean(2 * norm.sf(abs(b) / np.sqrt(tau**2 + v))))
             where = f"the {kind.replace('_', ' ')} of exposure {name}, held out whole"
             scatter = float(np.sqrt(np.mean(tau**2)))

@@ -17,17 +17,16 @@ from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.pieces import Piece
+from bayesdist.diagnose.holdout.predictions import Prediction, groups_of, noise_of, predictions
 from bayesdist.diagnose.holdout.predictive import Predictive, scores_of
-from bayesdist.infer.stars.stars import errors_of
-from bayesdist.model import DistortionModel, Groups
+from bayesdist.model import DistortionModel
 from bayesdist.model.frames import RIGID, frame_names, nearest_frame
 
-__all__ = ["AT_ONCE", "Bare", "Frame", "framed", "frames_for", "noise_of"]
+__all__ = ["Frame", "framed", "frames_for"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-AT_ONCE = 2**14
 SOFT, EXACT = 10, 6  # steps with weights that reach far, and with those of the mixture
 REACH = 4.0  # chi-square at which the former are one half
 STARS_PER_FRAME = 20
@@ -35,121 +34,45 @@ STARS_PER_FRAME = 20
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """The frame of an exposure that was held out whole.
+    """Frame of an exposure that was held out whole."""
 
-    Parameters
-    ----------
-    names : tuple of str, length q
-        Of its parameters, deviations of single chips among them.
-    values : ndarray, shape (q,)
-    spent : ndarray, shape (q, q)
-        Covariance of their errors: inverse of what its stars and the scatter say of it.
-    shared : ndarray, shape (q, n)
-        What its stars say of it and of the solution's polynomials and drift together.
-    precision : ndarray, shape (q,)
-        What the scatter says of each.
-    n : int
-        Stars.
-    """
-
-    names: tuple[str, ...]
-    values: Float
+    names: tuple[str, ...]  # of its parameters, deviations of single chips among them
+    values: Float  # (q,)
+    # (q, q) covariance of their errors: inverse of what its stars and the scatter say of it
     spent: Float
+    # (q, n) what its stars say of it and of the solution's polynomials and drift together
     shared: Float
-    precision: Float
-    n: int
+    precision: Float  # (q,) what the scatter says of each
+    n: int  # stars
 
 
 @dataclass(frozen=True, eq=False)
-class Bare:
-    """Stars of one exposure and chip under a frame that belongs to no solution.
+class FramedPrediction:
+    """Stars of one exposure and chip under a frame that belongs to no solution."""
 
-    Parameters
-    ----------
-    index : ndarray of int, shape (n,)
-        Rows of their table.
-    residual : ndarray, shape (n, 2)
-        Data minus prediction.
-    by_solution : ndarray, shape (n, 2, n_distortion)
-        Derivatives of the prediction by polynomials and drift.
-    by_frame : ndarray, shape (n, 2, q)
-    matrix : ndarray, shape (2, 2)
-        Linear part of the frame.
-    """
-
-    index: Int
-    residual: Float
-    by_solution: Float
-    by_frame: Float
-    matrix: Float
-
-
-def noise_of(predictive: Predictive, table: MatchTable, index: Int) -> Float:
-    """uu, vv and uv (n, 3) of the errors of stars without those of the solution's parameters."""
-    var = np.stack(errors_of(table), axis=1)[index] ** 2 + predictive.jitter2
-    if predictive.local and not predictive.local_in_noise:
-        place = (table.x[index], table.y[index], table.chip_number[index])
-        var = var + predictive.local_variance(*place)[:, None]
-    return np.column_stack([var, np.zeros(len(var))])
+    prediction: Prediction
+    by_solution: Float  # derivatives (n, 2, n_distortion) by polynomials and drift
+    by_frame: Float  # (n, 2, q)
 
 
 def _alone(model: DistortionModel) -> DistortionModel:
-    """The model of one exposure, behind another one that defines the gauge and has no stars."""
+    """Model of one exposure, behind another one that defines the gauge and has no stars."""
     return replace(model, exposures=("(release)", "(held out)"))
 
 
-def framed(predictive: Predictive, table: MatchTable, index: Int, values: Float) -> Iterator[Bare]:
-    """Rows of an exposure under a frame, chip by chip and date by date.
-
-    Parameters
-    ----------
-    predictive : Predictive
-    table : MatchTable
-    index : ndarray of int, shape (n,)
-        Rows of one exposure.
-    values : ndarray, shape (q,)
-        Of the frame.
-
-    Yields
-    ------
-    Bare
-    """
+def framed(
+    predictive: Predictive, table: MatchTable, index: Int, values: Float
+) -> Iterator[FramedPrediction]:
+    """Iterator over rows (n,) of one exposure under a frame of its own, by its parameters (q,)."""
     model, n = _alone(predictive.model), predictive.model.n_distortion
     theta = np.zeros(model.n_params)
     theta[:n] = predictive.mean[:n]
     own = model.frame_slice(1)
     theta[own] = values
-    groups = _groups(model, table, index, exposure=1)
-    effective = model.effective(theta, groups)
-    jacobians = model.effective_jacobian(theta, groups)
-    matrix, _ = model.frame(theta, 1)
-    data = np.stack([table.u, table.v], axis=1)
-    for g, members in enumerate(groups.members()):
-        columns, d = jacobians[g]
-        basis = model.basis(model.chips[groups.chip[g]].number)
-        for start in range(0, len(members), AT_ONCE):
-            rows = index[members[start : start + AT_ONCE]]
-            phi = basis.evaluate(table.x[rows], table.y[rows])
-            derivative = np.zeros((len(rows), 2, model.n_params))
-            derivative[:, :, columns] = np.einsum("nk,akm->nam", phi, d)
-            yield Bare(
-                rows,
-                data[rows] - phi @ effective[g].T,
-                derivative[:, :, :n],
-                derivative[:, :, own],
-                matrix,
-            )
-
-
-def _groups(
-    model: DistortionModel, table: MatchTable, index: Int, *, exposure: int | None
-) -> Groups:
-    return model.groups(
-        len(index),
-        epoch=None if table.epoch is None else table.epoch[index],
-        exposure=exposure,
-        chip=table.chip_number[index],
-    )
+    for one in predictions(model, theta, table, index, 1):
+        derivative = np.zeros((len(one.index), 2, model.n_params))
+        derivative[:, :, one.columns] = one.jacobian
+        yield FramedPrediction(one, derivative[:, :, :n], derivative[:, :, own])
 
 
 def frames_for(
@@ -157,17 +80,8 @@ def frames_for(
 ) -> dict[str, Frame]:
     """Frames of exposures that the solution does not know, fitted to their own stars.
 
-    Parameters
-    ----------
-    predictive : Predictive
-    pieces : sequence of Piece
-        Of the held-out stars; they are gone through once for every step.
-    names : sequence of str
-
-    Returns
-    -------
-    dict of str to Frame
-        Of the exposures that have enough stars.
+    The pieces of the held-out stars are gone through once for every step. Exposures with too few
+    stars are left out.
     """
     unknown = [name for name in names if name not in set(predictive.model.exposures)]
     if not predictive.model.n_frame or not unknown:
@@ -235,7 +149,7 @@ def _first_guess(
     normal = {name: np.zeros((3, 3)) for name in names}
     right = {name: np.zeros((3, 2)) for name in names}
     for name, table, rows in _of_exposures(pieces, names):
-        groups = _groups(model, table, rows, exposure=None)
+        groups = groups_of(model, table, rows, None)
         effective = model.effective(predictive.mean, groups)
         for g, members in enumerate(groups.members()):
             index = rows[members]
@@ -269,27 +183,23 @@ def _frame_sums(
     out = {name: [np.zeros(shape) for shape in shapes] for name in values}
     count = dict.fromkeys(values, 0)
     for name, table, index in _of_exposures(pieces, list(values)):
-        for rows in framed(predictive, table, index, values[name]):
-            var = noise_of(predictive, table, rows.index)[:, :2]
+        for one in framed(predictive, table, index, values[name]):
+            residual, A = one.prediction.residual, one.by_frame
+            noise = noise_of(predictive, table, one.prediction.index)
+            var = noise[:, :2]
+            chi2 = (residual**2 / var).sum(axis=1)
             if soft:
-                weight = 1 / (1 + (rows.residual**2 / var).sum(axis=1) / REACH)
-                score = weight[:, None] * rows.residual / var
+                score = residual / var / (1 + chi2 / REACH)[:, None]
             else:
-                cov = np.column_stack([var, np.zeros(len(var))])
-                score = scores_of(predictive, rows.residual, cov).place
+                score = scores_of(predictive, residual, noise).place
             # curvature as of a Gaussian of the same weights: steps never overshoot
-            share = np.clip(
-                (score * rows.residual).sum(axis=1)
-                / np.maximum((rows.residual**2 / var).sum(axis=1), 1e-300),
-                0.0,
-                1.0,
-            )
-            A = rows.by_frame
+            share = (score * residual).sum(axis=1) / np.maximum(chi2, 1e-300)
+            share = np.clip(share, 0.0, 1.0)
             along = np.einsum("na,nam->nm", score, A)
             gradient, curvature, information, shared = out[name]
             gradient += along.sum(axis=0)
             curvature += np.einsum("n,na,nam,nak->mk", share, 1 / var, A, A)
             information += along.T @ along
-            shared += along.T @ np.einsum("na,nam->nm", score, rows.by_solution)
-            count[name] += len(rows.index)
+            shared += along.T @ np.einsum("na,nam->nm", score, one.by_solution)
+            count[name] += len(residual)
     return {name: (a, b, c, d, count[name]) for name, (a, b, c, d) in out.items()}

@@ -1,4 +1,4 @@
-"""What a solution predicts of a star that it has not seen: mean, covariance, and false matches.
+"""Prediction of a star that a solution has not seen: mean, covariance, and false matches.
 
     p(r) = (1 - f) N(r; 0, S) + f p_out(r)      S = diag(s_u^2 + j^2, s_v^2 + j^2) + J C J^T
 
@@ -39,18 +39,10 @@ SCALES = np.geomspace(0.5, 4.0, 13)  # of the errors, at which scores are taken
 
 @dataclass(frozen=True, eq=False)
 class ExposureDeviations:
-    """How the exposures of a campaign deviate from what they have in common.
+    """Scatter of the exposures of a campaign about what they have in common."""
 
-    Parameters
-    ----------
-    kinds : tuple of str, length k
-        As an exposure's parameters are named: 'scale', ...
-    tau : ndarray, shape (m, k)
-        Draws of the scatter of each.
-    """
-
-    kinds: tuple[str, ...]
-    tau: Float
+    kinds: tuple[str, ...]  # as an exposure's parameters are named
+    tau: Float  # (m, k) draws of the scatter of each
 
     def precision(self, names: tuple[str, ...]) -> Float:
         """Inverse variances (q,) of an exposure's parameters; zero for those that are free."""
@@ -60,53 +52,30 @@ class ExposureDeviations:
 
 @dataclass(frozen=True, eq=False)
 class Predictive:
-    """A solution as it predicts.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    mean : ndarray, shape (D,)
-    cov : ndarray, shape (D, D)
-    outliers : str
-        'none', 'gaussian' or 'uniform'.
-    fraction : float
-        Of false matches.
-    jitter2 : float
-        Squared jitter.
-    scale : float
-        Standard deviation of false matches on each axis, or the radius of the match circle.
-    free : tuple of str
-        Those of 'j', 'f', 's_out' that are not known exactly.
-    free_cov : ndarray, shape (h, h)
-        Their covariance, as squared jitter, fraction and log scale.
-    deviations : ExposureDeviations or None
-        None where exposures that were held out whole have frames of which nothing is known.
-    stars : StarInfluence or None
-        Errors of the catalogue, which the quoted errors contain; None where each match has an
-        error of its own.
-    local : tuple of LookupTable
-        Standard errors of positions that belong to places on the detector, in the unit of u and v:
-        of look-up tables, or what the model leaves out.
-    cell : tuple of float or None
-        Pixels along x and y over which stars share these errors.
-    local_in_noise : bool
-        Whether quoted errors and jitter hold them already.
-    """
+    """A solution as it predicts."""
 
     model: DistortionModel
-    mean: Float
-    cov: Float
-    outliers: str = "none"
-    fraction: float = 0.0
-    jitter2: float = 0.0
+    mean: Float  # (D,)
+    cov: Float  # (D, D)
+    outliers: str = "none"  # 'none', 'gaussian' or 'uniform'
+    fraction: float = 0.0  # of false matches
+    jitter2: float = 0.0  # squared jitter
+    # standard deviation of false matches on each axis, or the radius of the match circle
     scale: float = 1.0
-    free: tuple[str, ...] = ()
+    free: tuple[str, ...] = ()  # those of 'j', 'f', 's_out' that are not known exactly
+    # (h, h) their covariance, as squared jitter, fraction and log scale
     free_cov: Float = field(default_factory=lambda: np.zeros((0, 0)))
+    # None where exposures that were held out whole have frames of which nothing is known
     deviations: ExposureDeviations | None = None
+    # errors of the catalogue, which the quoted errors contain; None where each match has an error
+    # of its own
     stars: StarInfluence | None = None
+    # standard errors of positions that belong to places on the detector, in the unit of u and v: of
+    # look-up tables, or what the model leaves out
     local: tuple[LookupTable, ...] = ()
+    # pixels along x and y over which stars share these errors
     cell: tuple[float, float] | None = None
-    local_in_noise: bool = False
+    local_in_noise: bool = False  # True where quoted errors and jitter hold them
 
     def local_variance(self, x: Float, y: Float, chip: Int) -> Float:
         """Variance (n,) on each axis of positions by errors that belong to places."""
@@ -133,16 +102,7 @@ class Predictive:
 
 
 def predictive_of(posterior: Posterior) -> Predictive:
-    """A posterior as it predicts: means and covariances of its draws.
-
-    Parameters
-    ----------
-    posterior : Posterior
-
-    Returns
-    -------
-    Predictive
-    """
+    """Prediction by means and covariances of the draws of a posterior."""
     mixture, hyper = posterior.mixture, posterior.hyper
     as_sampled: dict[str, Callable[[Float], Float]] = {
         "j": np.square,
@@ -168,42 +128,22 @@ def predictive_of(posterior: Posterior) -> Predictive:
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Derivatives of the log predictive density of some stars.
+    """Derivatives of the log predictive density of some stars."""
 
-    Parameters
-    ----------
-    place : ndarray, shape (n, 2)
-        By the predicted position.
-    spread : ndarray, shape (n, SCALES)
-        By the logarithm of a factor on the errors of true matches, at each of several factors.
-    one : ndarray, shape (n,)
-        The same at the factor 1.
-    axes : ndarray, shape (n, 2)
-        By the logarithm of a factor on the errors along one axis alone.
-    axes_spread : ndarray, shape (n, 2, SCALES)
-        The same at each of several factors.
-    free : ndarray, shape (n, h)
-        By what is not known exactly of the mixture.
-    """
-
-    place: Float
+    place: Float  # (n, 2) by the predicted position
+    # (n, SCALES) by the logarithm of a factor on the errors of true matches, at each of several
+    # factors
     spread: Float
-    one: Float
-    axes: Float
-    axes_spread: Float
-    free: Float
+    one: Float  # (n,) at the factor 1
+    axes: Float  # (n, 2) by the logarithm of a factor on the errors along one axis alone
+    axes_spread: Float  # (n, 2, SCALES) at each of several factors
+    free: Float  # (n, h) by what is not known exactly of the mixture
 
 
 def scores_of(predictive: Predictive, residual: Float, cov: Float) -> Scores:
     """Scores of stars.
 
-    Parameters
-    ----------
-    predictive : Predictive
-    residual : ndarray, shape (n, 2)
-        Data minus prediction.
-    cov : ndarray, shape (n, 3)
-        uu, vv and uv of S.
+    `residual` (n, 2) is data minus prediction, `cov` (n, 3) the uu, vv and uv of S.
     """
     a, b, c = cov.T
     det = a * b - c * c
@@ -253,53 +193,31 @@ def _along_each(log_core: Float, of_axis: Float, far: Float) -> Float:
 def marginals_of(predictive: Predictive, residual: Float, cov: Float) -> Float:
     """Predictive probabilities (2, n) of less in u and in v, whatever the other is.
 
-    Parameters
-    ----------
-    predictive, residual, cov
-        As of `scores_of`.
+    `residual` and `cov` as of `scores_of`.
     """
-    f, s = predictive.fraction, predictive.scale
-    out = []
+    f, out = predictive.fraction, []
     for r, var in zip(residual.T, cov[:, :2].T, strict=True):
-        far = np.zeros_like(r)
-        if predictive.outliers == "gaussian":
-            far = ndtr(r / s)
-        elif predictive.outliers == "uniform":
-            x = np.clip(r / s, -1.0, 1.0)
-            far = 0.5 + (x * np.sqrt(1 - x * x) + np.arcsin(x)) / np.pi
-        out.append((1 - f) * ndtr(r / np.sqrt(var)) + f * far)
+        out.append((1 - f) * ndtr(r / np.sqrt(var)) + f * _false_along(predictive, r)[1])
     return np.stack(out)
 
 
 def uniforms_of(predictive: Predictive, residual: Float, cov: Float) -> Float:
-    """Predictive probabilities of less, uniform where the prediction is right.
+    """Predictive probabilities (3, n) of less, uniform where the prediction is right.
 
-    Parameters
-    ----------
-    predictive, residual, cov
-        As of `scores_of`.
-
-    Returns
-    -------
-    ndarray, shape (3, n)
-        Of u; of v where u is what it is (Rosenblatt 1952), which is independent of the first; and
-        of the distance that both make once they are brought to normal variables.
+    Of u; of v where u is what it is (Rosenblatt 1952), which is independent of the first; and of
+    the distance that both make once they are brought to normal variables.  `predictive`, `residual`
+    and `cov` as of `scores_of`.
     """
     a, b, c = cov.T
     u, v = residual.T
     f, s = predictive.fraction, predictive.scale
     core = np.exp(-0.5 * u * u / a) / np.sqrt(2 * np.pi * a)
-    if predictive.outliers == "gaussian":
-        far = np.exp(-0.5 * (u / s) ** 2) / (np.sqrt(2 * np.pi) * s)
-        below_u, below_v = ndtr(u / s), ndtr(v / s)
-    elif predictive.outliers == "uniform":
-        x = np.clip(u / s, -1.0, 1.0)
-        half = np.sqrt(1 - x * x)
-        far = 2 * half / (np.pi * s)
-        below_u = 0.5 + (x * half + np.arcsin(x)) / np.pi
+    far, below_u = _false_along(predictive, u)
+    if predictive.outliers == "uniform":
+        half = np.sqrt(1 - np.clip(u / s, -1.0, 1.0) ** 2)
         below_v = np.clip(0.5 + 0.5 * v / np.maximum(s * half, NEVER), 0.0, 1.0)
     else:
-        far, below_u, below_v = np.zeros_like(u), np.zeros_like(u), np.zeros_like(u)
+        below_v = _false_along(predictive, v)[1]
     w = (1 - f) * core
     w = np.where(f * far > 0, w / np.maximum(w + f * far, NEVER), 1.0)
     first = (1 - f) * ndtr(u / np.sqrt(a)) + f * below_u
@@ -308,7 +226,19 @@ def uniforms_of(predictive: Predictive, residual: Float, cov: Float) -> Float:
     return np.stack([first, second, _radial(first, second)])
 
 
+def _false_along(predictive: Predictive, x: Float) -> tuple[Float, Float]:
+    """Density (n,) of false matches along one axis, and probability of less."""
+    s = predictive.scale
+    if predictive.outliers == "gaussian":
+        return np.exp(-0.5 * (x / s) ** 2) / (np.sqrt(2 * np.pi) * s), ndtr(x / s)
+    if predictive.outliers == "uniform":
+        z = np.clip(x / s, -1.0, 1.0)
+        half = np.sqrt(1 - z * z)
+        return 2 * half / (np.pi * s), 0.5 + (z * half + np.arcsin(z)) / np.pi
+    return np.zeros_like(x), np.zeros_like(x)
+
+
 def _radial(first: Float, second: Float) -> Float:
-    """Of the sum of squares of the two normal variables that two uniform ones make."""
+    """Probability of a smaller sum of squares of the normal variables of two uniform ones."""
     z = ndtri(np.clip(np.stack([first, second]), 1e-300, 1 - 1e-16))
     return np.asarray(-np.expm1(-0.5 * (z**2).sum(axis=0)))

@@ -1,9 +1,9 @@
-"""What matches have in common: the star, and the place on the detector.
+"""Errors that matches have in common: by the star, and by the position on the detector.
 
-A star of the catalogue has one error in all of its exposures, and a place on the detector, be it a
-cell of a look-up table or a patch of what the model leaves out, one on all stars there.  Sums over
-matches then vary by more than those of independent ones: scores of the position by the squares of
-their sums over each star, those of the spread by
+A star of the catalogue has one error in all of its exposures, and a cell on the detector, be it of
+a look-up table or of what the model leaves out, one on all stars there.  Sums over matches then
+vary by more than those of independent ones: scores of the position by the squares of their sums
+over each star, those of the spread by
 
     cov(q_i, q_j) = 4 c_i c_j      c = (error that is shared)^2 / (whole error)^2
 
@@ -12,45 +12,34 @@ for two matches i, j of a star (two axes, Gaussian errors), and counts by those 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data import MatchTable
-from bayesdist.diagnose.clusters import joint_clusters, products_over, sums_over
+from bayesdist.diagnose.clusters import joint_clusters, products_over, squares_over, sums_over
 from bayesdist.diagnose.holdout.predictive import Predictive
-from bayesdist.diagnose.holdout.rows import Rows
+from bayesdist.diagnose.holdout.rows import HeldRows
 
-if TYPE_CHECKING:
-    from bayesdist.diagnose.holdout.sums import BinSums
-
-__all__ = ["ClusterSums"]
+__all__ = ["SharedErrors"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
-class ClusterSums:
-    """Sums of matches over stars and cells, which take the place of those of single matches.
+class SharedErrors:
+    """Matches with the stars and cells that they share errors with.
 
-    Collects matches, and changes their sums once all are there.
-
-    Parameters
-    ----------
-    predictive : Predictive
-        With errors of the catalogue, of places, or both.
-    n_bins : int
-        Of the predictive probabilities.
-    tails : sequence of float
-        Limits, in sigma.
+    `predictive` has errors of the catalogue, of positions on the detector, or both; predictive
+    probabilities are counted in `n_bins`.
     """
 
-    def __init__(self, predictive: Predictive, n_bins: int, tails: Sequence[float]) -> None:
-        self._predictive = predictive
-        self._n_bins, self._limits = n_bins, tuple(tails)
-        self._parts: list[dict[str, NDArray[np.generic]]] = []
+    def __init__(self, predictive: Predictive, n_bins: int) -> None:
+        self._predictive, self._n_bins = predictive, n_bins
+        self._parts: list[dict[str, NDArray[Any]]] = []
         self._codes: dict[str, list[Int]] = {}
         self._step = predictive.cell if predictive.local else None
         self._n = 0
@@ -58,13 +47,13 @@ class ClusterSums:
     def add(
         self,
         table: MatchTable,
-        rows: Rows,
+        rows: HeldRows,
         place: Float,
         uniforms: Float,
         size: Float,
         codes: Mapping[str, Int],
     ) -> None:
-        """Some matches, with their scores and the bins that they lie in."""
+        """Add matches, with their scores and the bins that they lie in."""
         stars, index = self._predictive.stars, rows.index
         if stars is None or table.star is None:
             star = -1 - self._n - np.arange(len(index))  # each by itself
@@ -75,7 +64,7 @@ class ClusterSums:
             variance = stars.errors.at(star, epoch).mean(axis=1)
         self._n += len(index)
         whole = rows.cov[:, :2].mean(axis=1)
-        part: dict[str, NDArray[np.generic]] = {
+        part: dict[str, NDArray[Any]] = {
             "star": star,
             "place": place,
             "share": np.minimum(variance / whole, 1.0),
@@ -98,41 +87,61 @@ class ClusterSums:
         for kind, code in codes.items():
             self._codes.setdefault(kind, []).append(code)
 
-    def settle(self, bins: Mapping[str, BinSums]) -> None:
-        """Put the sums of clusters into the place of those of single matches."""
-        self._all = {k: np.concatenate([part[k] for part in self._parts]) for k in self._parts[0]}
-        star = np.unique(self._all["star"], return_inverse=True)[1]
-        self._star = star
-        self._cell = None
-        if self._step is not None:
-            self._cell = np.unique(self._all["cell"], return_inverse=True)[1]
-        for kind, parts in self._codes.items():
-            self._settle_bins(bins[kind], np.concatenate(parts))
+    @cached_property
+    def _all(self) -> dict[str, NDArray[Any]]:
+        """Columns of all matches; stars and cells numbered from 0."""
+        out = {k: np.concatenate([part[k] for part in self._parts]) for k in self._parts[0]}
+        for k in {"star", "cell"} & set(out):
+            out[k] = np.unique(out[k], return_inverse=True)[1]
+        return out
 
-    def _settle_bins(self, sums: BinSums, code: Int) -> None:
+    def _inside(self, kind: str, *names: str) -> list[NDArray[Any]]:
+        """Bins (n,) and columns of the matches that lie in a bin of a partition."""
+        code = np.concatenate(self._codes[kind])
         inside = np.flatnonzero(code >= 0)
-        n_bins, at = len(sums.n), code[inside]
-        sums.place_cov = products_over(at, self._star[inside], self._all["place"][inside], n_bins)
-        for b in range(n_bins):
-            sums.place_2[b] = sums.place_cov[2 * b : 2 * b + 2, 2 * b : 2 * b + 2]
-        owner = _spread_together(sums, at, self._star[inside], self._all["share"][inside])
-        sums.independent[:] = np.bincount(owner, minlength=n_bins)
-        if self._cell is not None:
-            _spread_together(sums, at, self._cell[inside], self._all["local_share"][inside])
-            local = self._all["local"][inside]
-            extra = products_over(at, self._cell[inside], local[:, None], n_bins)
-            extra[np.diag_indices(n_bins)] -= np.bincount(at, local**2, n_bins)
-            sums.place_cov += np.kron(extra, np.eye(2))
+        return [code[inside], *(self._all[name][inside] for name in names)]
+
+    def place_covariance(self, kind: str, n: int) -> tuple[Float, Float]:
+        """Covariances (2 n, 2 n) of scores of positions in n bins: by stars, and by cells too."""
+        at, star, place = self._inside(kind, "star", "place")
+        by_star = products_over(at, star, place, n)
+        if self._step is None:
+            return by_star, by_star
+        at, cell, local = self._inside(kind, "cell", "local")
+        extra = products_over(at, cell, local[:, None], n)
+        extra[np.diag_indices(n)] -= np.bincount(at, local**2, n)
+        return by_star, by_star + np.kron(extra, np.eye(2))
+
+    def spread_moments(self, kind: str, n: int) -> tuple[Float, Float]:
+        """Second and third moments (n,) that matches of a star or cell add to those of spreads."""
+        out = np.zeros((2, n))
+        pairs = [("star", "share")]
+        if self._step is not None:
+            pairs.append(("cell", "local_share"))
+        for names in pairs:
+            at, member, share = self._inside(kind, *names)
+            owner, of = joint_clusters(at, member)
+            p1, p2, p3 = (sums_over(of, share**k) for k in (1, 2, 3))
+            two = np.maximum(p1**2 - p2, 0.0)
+            three = np.maximum(p1**3 - 3 * p1 * p2 + 2 * p3, 0.0)
+            out[0] += np.bincount(owner, 4 * two, n)
+            out[1] += np.bincount(owner, 16 * (3 * two + three), n)
+        return out[0], out[1]
+
+    def independent(self, kind: str, n: int) -> Float:
+        """Number (n,) of stars in each bin, each once in however many exposures it is."""
+        at, star = self._inside(kind, "star")
+        return np.bincount(joint_clusters(at, star)[0], minlength=n).astype(np.float64)
 
     @property
     def stars_repeat(self) -> bool:
-        """Whether matches of one star share its error: else each match is by itself."""
-        return self.n_stars < len(self._star)
+        """True where matches of one star share its error."""
+        return self.n_stars < self._n
 
-    @property
+    @cached_property
     def n_stars(self) -> int:
-        """Stars, each once."""
-        return int(self._star.max()) + 1
+        """Number of stars."""
+        return int(self._all["star"].max()) + 1
 
     def pit_covariance(self, k: int, merge: int) -> Float:
         """Covariance (m, m) of the counts of predictive probabilities, in merged bins.
@@ -144,39 +153,23 @@ class ClusterSums:
         m = self._n_bins // merge
         code = self._all["pit"][:, k] // merge
         if self.stars_repeat:
-            out = _outer(code, self._star, m)
+            by = _by_bin(code, self._all["star"], m, np.ones(len(code)))
+            out = by.T @ by
         else:
             out = len(code) * (np.eye(m) / m - 1 / m**2)
-        if self._cell is not None:
+        if self._step is not None:
             for score in (self._all["place"] * self._all["local_size"][:, None]).T:
-                by = _by_bin(code, self._cell, m, score)
+                by = _by_bin(code, self._all["cell"], m, score)
                 out += by.T @ by
-        return out
+        return np.asarray(out)
 
     def overdispersion(self, limit: float) -> float:
-        """How much more the number of stars beyond a limit varies than that of independent ones."""
+        """Variance of the number of stars beyond a limit over that of independent ones."""
         far = (self._all["size"] > limit).astype(float)
         rest = far - far.mean()
         single = float((rest**2).sum())
-        return max(1.0, float((sums_over(self._star, rest) ** 2).sum()) / single) if single else 1.0
-
-
-def _spread_together(sums: BinSums, code: Int, member: Int, share: Float) -> Int:
-    """Add what members of a cluster scatter together; the bin of each cluster."""
-    n_bins = len(sums.n)
-    owner, of = joint_clusters(code, member)
-    p1, p2, p3 = (sums_over(of, share**k) for k in (1, 2, 3))
-    pairs = np.maximum(p1**2 - p2, 0.0)
-    triples = np.maximum(p1**3 - 3 * p1 * p2 + 2 * p3, 0.0)
-    sums.spread_2 += np.bincount(owner, 4 * pairs, n_bins)
-    sums.spread_3 += np.bincount(owner, 16 * (3 * pairs + triples), n_bins)
-    return owner
-
-
-def _outer(code: Int, cluster: Int, m: int) -> Float:
-    """Sum of squares (m, m) of counts in m bins less their expectation, cluster by cluster."""
-    counts = _by_bin(code, cluster, m, np.ones(len(code)))
-    return np.asarray(counts.T @ counts)
+        whole = float(squares_over(self._all["star"], rest)[0])
+        return max(1.0, whole / single) if single else 1.0
 
 
 def _by_bin(code: Int, cluster: Int, m: int, values: Float) -> Float:

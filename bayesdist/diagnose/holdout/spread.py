@@ -1,4 +1,4 @@
-"""How much the scores of the scale of errors scatter by themselves, and sums of them against it."""
+"""Moments of the scores of the scale of errors, and tails of their sums."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["SpreadMoments", "scale_of", "sum_tails"]
 Float = NDArray[np.float64]
 
 KNOTS, POINTS, LAST = 48, 2000, 60.0
-LEAST_SKEW = 1e-4
+MIN_SKEW = 1e-4
 
 
 class SpreadMoments:
@@ -23,10 +23,6 @@ class SpreadMoments:
     in which true matches fall as exp(-t) and false ones as k exp(-k t) or not at all, tabulated in
     k, the ratio of their variances; errors that differ between the axes count as their geometric
     mean.
-
-    Parameters
-    ----------
-    predictive : Predictive
     """
 
     def __init__(self, predictive: Predictive) -> None:
@@ -60,7 +56,7 @@ class SpreadMoments:
         )
 
     def of_axis(self, cov: Float) -> tuple[Float, Float]:
-        """The same of the score of an axis: both axes have the same."""
+        """Moments (n,) of the score of an axis: both axes have the same."""
         log_k = self._ratio(cov)
         return (
             np.interp(log_k, self._log_k, self._axis_second),
@@ -83,7 +79,7 @@ def sum_tails(value: float, variance: float, third: float) -> float:
         return 1.0
     z = value / np.sqrt(variance)
     skew = third / variance**1.5
-    if abs(skew) < LEAST_SKEW:
+    if abs(skew) < MIN_SKEW:
         return float(2 * norm.sf(abs(z)))
     shape = 4 / skew**2
     x = shape + np.sign(skew) * z * np.sqrt(shape)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,21 +15,21 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.data.pieces import Piece
 from bayesdist.diagnose.holdout.bins import ALL, Partition
 from bayesdist.diagnose.holdout.frames import Frame
+from bayesdist.diagnose.holdout.grouped import GroupedScores, ScaleSums, StarScores, membership
 from bayesdist.diagnose.holdout.predictive import (
-    SCALES,
     Predictive,
-    Scores,
     marginals_of,
     scores_of,
     uniforms_of,
 )
-from bayesdist.diagnose.holdout.rows import Rows, predicted_rows
-from bayesdist.diagnose.holdout.shared import ClusterSums
+from bayesdist.diagnose.holdout.rows import HeldRows, predicted_rows
+from bayesdist.diagnose.holdout.shared import SharedErrors
 from bayesdist.diagnose.holdout.spread import SpreadMoments
 
-__all__ = ["LEVELS", "PIT_BINS", "TAILS", "AxisSums", "BinSums", "HeldSums", "held_sums"]
+__all__ = ["LEVELS", "PIT_BINS", "TAILS", "BinSums", "HeldSums", "held_sums"]
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
 PIT_BINS = 20
 TAILS = (3.0, 4.0, 5.0)  # sigma
@@ -39,133 +39,68 @@ STEP = 0.5  # of a standard deviation of the mixture's parameters: for derivativ
 
 @dataclass(eq=False)
 class BinSums:
-    """Sums over the stars of each bin of a partition; B bins.
+    """Sums over the stars of each bin of a partition; B bins."""
 
-    Attributes
-    ----------
-    n : ndarray, shape (B,)
-    place : ndarray, shape (B, 2)
-        Scores of the position.
-    place_2 : ndarray, shape (B, 2, 2)
-        Their squares.
-    place_cov : ndarray, shape (2 B, 2 B) or None
-        Covariance of all sums where matches share errors, in place of these squares.
-    weight : ndarray, shape (B, 2)
-        Inverse variances, each times the share that its star counts.
-    place_by : ndarray, shape (B, 2, D)
-        What they have in common with the solution's parameters.
-    place_with : ndarray, shape (B, 2, D)
-        Covariance of their sums with these parameters, by way of the catalogue's errors.
-    lost : dict of str to ndarray, shape (B, 2, q)
-        ... and with the frames that were fitted to these stars.
-    spread, spread_2, spread_3 : ndarray, shape (B,)
-        Scores of the scale of the errors, and their expected second and third moments.
-    spread_by : ndarray, shape (B, h)
-    scales : ndarray, shape (B, SCALES)
-        Those scores for other errors.
-    independent : ndarray, shape (B,)
-        Stars, each once in however many exposures it is; as `n` where they share no errors.
-    """
+    n: Float  # stars (B,)
+    independent: Float  # stars (B,), each once in however many exposures it shares errors
+    place: GroupedScores  # scores of the position (2 B,): u and v of one bin after the other
+    place_2: Float  # their squares (B, 2, 2)
+    place_cov: Float  # covariance (2 B, 2 B) of these sums by what is the matches' own
+    weight: Float  # inverse variances (B, 2), each times the share that its star counts
+    scale: ScaleSums
 
-    n: Float
-    place: Float
-    place_2: Float
-    weight: Float
-    place_by: Float
-    place_with: Float
-    spread: Float
-    spread_2: Float
-    spread_3: Float
-    spread_by: Float
-    scales: Float
-    independent: Float
-    lost: dict[str, Float] = field(default_factory=dict)
-    place_cov: Float | None = None
+    @classmethod
+    def empty(cls, n: int, n_params: int, n_free: int) -> BinSums:
+        """Sums over nothing."""
+        return cls(
+            np.zeros(n),
+            np.zeros(n),
+            GroupedScores.empty(2 * n, n_params, n_free),
+            np.zeros((n, 2, 2)),
+            np.zeros((0, 0)),
+            np.zeros((n, 2)),
+            ScaleSums.empty(n, n_free),
+        )
 
     @property
-    def own_cov(self) -> Float:
-        """Covariance (2 B, 2 B) of the sums by what is the matches' own."""
-        if self.place_cov is not None:
-            return self.place_cov
-        return np.asarray(block_diag(*self.place_2))
+    def offset_scores(self) -> Float:
+        """Scores (B, 2) of the position."""
+        return self.place.sums.reshape(-1, 2)
 
-    @classmethod
-    def empty(cls, n_bins: int, n_params: int, n_free: int) -> BinSums:
-        """Sums over nothing."""
-        by = (2, n_params)
-        shapes = ((), (2,), (2, 2), (2,), by, by, (), (), (), (n_free,), (SCALES.size,), ())
-        sums: list[Float] = [np.zeros((n_bins, *shape)) for shape in shapes]
-        return cls(*sums)  # type: ignore[arg-type]
-
-
-@dataclass(eq=False)
-class AxisSums:
-    """Sums over all stars along u and along v.
-
-    Attributes
-    ----------
-    score, second, third : ndarray, shape (2,)
-        Scores of the scale of the errors along the axis, and their expected moments.
-    by_free : ndarray, shape (2, h)
-    scales : ndarray, shape (2, SCALES)
-        Those scores for other errors.
-    within : ndarray, shape (2, LEVELS)
-        Stars in the middle of their predictive distribution along the axis: in so much of it as a
-        normal variable has within so many sigma.
-    """
-
-    score: Float
-    second: Float
-    third: Float
-    by_free: Float
-    scales: Float
-    within: Float
-
-    @classmethod
-    def empty(cls, n_free: int) -> AxisSums:
-        """Sums over nothing."""
-        shapes = ((), (), (), (n_free,), (SCALES.size,), (len(LEVELS),))
-        return cls(*(np.zeros((2, *shape)) for shape in shapes))
+    def close(self, kind: str, shared: SharedErrors | None) -> None:
+        """Take the sums of matches that share errors for those of single ones."""
+        n = len(self.n)
+        if shared is None:
+            self.independent = self.n
+            self.place_cov = np.asarray(block_diag(*self.place_2))
+            return
+        self.independent = shared.independent(kind, n)
+        by_star, self.place_cov = shared.place_covariance(kind, n)
+        pairs = np.arange(n)
+        self.place_2 = by_star.reshape(n, 2, n, 2)[pairs, :, pairs]
+        second, third = shared.spread_moments(kind, n)
+        self.scale.second += second
+        self.scale.third += third
 
 
 @dataclass(eq=False)
 class HeldSums:
-    """Sums over all held-out stars.
+    """Sums over all held-out stars."""
 
-    Attributes
-    ----------
-    n, n_left_out : int
-        Stars that were predicted, and those of exposures with too few for a frame.
-    bins : dict of str to BinSums
-        By the name of the partition.
-    axes : AxisSums
-    pit : ndarray, shape (3, PIT_BINS)
-        Counts of the predictive probabilities of u, of v given u, and of the distance.
-    pit_by : ndarray, shape (3, PIT_BINS, D)
-    pit_free : ndarray, shape (3, PIT_BINS, h)
-    beyond : ndarray, shape (TAILS,)
-        Stars beyond so many sigma on either axis.
-    expected : ndarray, shape (TAILS, 1 + 2 h)
-        Expected ones; then with each parameter of the mixture a little lower and higher.
-    frames : mapping of str to Frame
-    pit_lost : dict of str to ndarray, shape (3, PIT_BINS, q)
-        What the counts have in common with these frames.
-    shared : ClusterSums or None
-        What else matches have in common; None where each has an error of its own.
-    """
-
-    bins: dict[str, BinSums]
-    axes: AxisSums
-    pit: Float
-    pit_by: Float
-    pit_free: Float
-    beyond: Float
+    bins: dict[str, BinSums]  # by the kind of the partition
+    axes: tuple[ScaleSums, ScaleSums]  # of all stars, along u and along v
+    # stars (2, LEVELS) in the middle of their predictive distribution along each axis: in so much
+    # of it as a normal variable has within so many sigma
+    within: Float
+    # counts (PIT_BINS,) of the predictive probabilities of u, of v given u, and of the distance
+    pit: tuple[GroupedScores, ...]
+    beyond: Float  # stars (TAILS,) beyond so many sigma on either axis
+    # expected ones (TAILS, 1 + 2 h); then with each parameter of the mixture a little lower, higher
     expected: Float
     frames: Mapping[str, Frame]
-    pit_lost: dict[str, Float] = field(default_factory=dict)
-    shared: ClusterSums | None = None
-    n: int = 0
-    n_left_out: int = 0
+    shared: SharedErrors | None  # None where each match has an error of its own
+    n: int = 0  # stars that were predicted
+    n_left_out: int = 0  # stars of exposures with too few for a frame
 
 
 def held_sums(
@@ -174,32 +109,19 @@ def held_sums(
     partitions: Sequence[Partition],
     frames: Mapping[str, Frame],
 ) -> HeldSums:
-    """Go through held-out stars once.
-
-    Parameters
-    ----------
-    predictive : Predictive
-    pieces : sequence of Piece
-    partitions : sequence of Partition
-    frames : mapping of str to Frame
-
-    Returns
-    -------
-    HeldSums
-    """
+    """Sums over held-out stars, in one pass over the pieces of the data."""
     D, h = predictive.model.n_params, len(predictive.free)
+    several = predictive.stars is not None or predictive.cell is not None
     out = HeldSums(
         {p.kind: BinSums.empty(len(p.bins), D, h) for p in partitions},
-        AxisSums.empty(h),
-        np.zeros((3, PIT_BINS)),
-        np.zeros((3, PIT_BINS, D)),
-        np.zeros((3, PIT_BINS, h)),
+        (ScaleSums.empty(1, h), ScaleSums.empty(1, h)),
+        np.zeros((2, len(LEVELS))),
+        tuple(GroupedScores.empty(PIT_BINS, D, h) for _ in range(3)),
         np.zeros(len(TAILS)),
         np.zeros((len(TAILS), 1 + 2 * h)),
         frames,
+        SharedErrors(predictive, PIT_BINS) if several else None,
     )
-    if predictive.stars is not None or predictive.cell is not None:
-        out.shared = ClusterSums(predictive, PIT_BINS, TAILS)
     moments = SpreadMoments(predictive)
     around = [predictive, *_around(predictive)]
     for piece in pieces:
@@ -210,20 +132,19 @@ def held_sums(
             _add(out, predictive, moments, around, partitions, table, rows)
         out.n += seen
         out.n_left_out += len(table) - seen
-    for sums in out.bins.values():
-        sums.independent[:] = sums.n
+    for kind, sums in out.bins.items():
+        sums.close(kind, out.shared)
     if out.shared is not None:
-        whole = out.bins[ALL]
-        alone = whole.spread_2[0], whole.spread_3[0]
-        out.shared.settle(out.bins)
         # what stars scatter together they do alike along both axes
-        out.axes.second += (whole.spread_2[0] - alone[0]) / 2
-        out.axes.third += (whole.spread_3[0] - alone[1]) / 2
+        second, third = out.shared.spread_moments(ALL, 1)
+        for axis in out.axes:
+            axis.second += second / 2
+            axis.third += third / 2
     return out
 
 
 def _around(predictive: Predictive) -> list[Predictive]:
-    """The prediction with each parameter of the mixture a little lower and higher."""
+    """Predictions with each parameter of the mixture a little lower, and higher."""
     out = []
     sd = np.sqrt(np.diag(predictive.free_cov))
     for key, step in zip(predictive.free, STEP * sd, strict=True):
@@ -243,113 +164,54 @@ def _add(
     predictive: Predictive,
     moments: SpreadMoments,
     around: Sequence[Predictive],
-    partitions: Sequence[Partition],
+    partitions: Iterable[Partition],
     table: MatchTable,
-    rows: Rows,
+    rows: HeldRows,
 ) -> None:
+    """Add some stars to all sums."""
     scores = scores_of(predictive, rows.residual, rows.cov)
-    second, third = moments.of(rows.cov)
-    along = np.einsum("na,nam->nm", scores.place, rows.jacobian)
+    carried = StarScores.of(rows, scores.place, scores.free)
     weight = np.divide(
         (scores.place * rows.residual).sum(axis=1)[:, None],
         (rows.residual**2 / rows.cov[:, :2]).sum(axis=1)[:, None] * rows.cov[:, :2],
     )
-    lost = _Lost.of(table, rows, scores.place)
     place = scores.place
     if rows.frame is not None and rows.by_frame is not None:
         # as they would scatter if they had lost nothing to the frame
         A = rows.by_frame
         taken = np.einsum("nam,mk,nak->na", A, rows.frame.spent, A)
         place = place * np.sqrt(1 + taken / rows.cov[:, :2])
-    shares = None
-    if rows.with_solution is not None:
-        shares = np.einsum("na,nam->nm", scores.place, rows.with_solution)
+    squares = (place[:, :, None] * place[:, None, :]).reshape(-1, 4)
     codes = {p.kind: p.codes(table, rows.index) for p in partitions}
-    for partition in partitions:
-        sums = out.bins[partition.kind]
-        member = _member(codes[partition.kind], len(partition.bins))
-        sums.n += _sum(member, np.ones(len(rows.index)))
-        sums.place += member @ scores.place
-        outer = place[:, :, None] * place[:, None, :]
-        sums.place_2 += (member @ outer.reshape(-1, 4)).reshape(-1, 2, 2)
+    of_spread = moments.of(rows.cov)
+    for kind, code in codes.items():
+        sums = out.bins[kind]
+        n = len(sums.n)
+        member = membership(code, n)
+        sums.n += np.asarray(member.sum(axis=1)).ravel()
+        sums.place.add(membership(code, n, scores.place), carried)
+        sums.place_2 += (member @ squares).reshape(-1, 2, 2)
         sums.weight += member @ weight
-        sums.spread += _sum(member, scores.one)
-        sums.spread_2 += _sum(member, second)
-        sums.spread_3 += _sum(member, third)
-        sums.spread_by += member @ (scores.one[:, None] * scores.free)
-        sums.scales += member @ scores.spread
-        for axis in (0, 1):
-            by = member @ (scores.place[:, axis, None] * along)
-            sums.place_by[:, axis, rows.columns] += by
-            if shares is not None:
-                common = member @ (scores.place[:, axis, None] * shares)
-                sums.place_with[:, axis, rows.columns] += common
-        if lost is not None:
-            shared = lost.among(sums.lost, len(partition.bins), 2)
-            for axis in (0, 1):
-                shared[:, axis] += member @ (scores.place[:, axis, None] * lost.along)
-    _add_axes(out.axes, predictive, moments, scores, rows)
+        sums.scale.add(member, scores.one, of_spread, scores.free, scores.spread)
+    every = csr_matrix(np.ones((1, len(rows.index))))
+    of_axis = moments.of_axis(rows.cov)
+    for a, axis in enumerate(out.axes):
+        axis.add(every, scores.axes[:, a], of_axis, scores.free, scores.axes_spread[:, a])
+    aside = np.abs(2 * marginals_of(predictive, rows.residual, rows.cov) - 1)
+    for k, level in enumerate(LEVELS):
+        out.within[:, k] += (aside < erf(level / np.sqrt(2))).sum(axis=1)
     uniforms = uniforms_of(predictive, rows.residual, rows.cov)
-    for k, values in enumerate(uniforms):
+    for counts, values in zip(out.pit, uniforms, strict=True):
         code = np.clip((values * PIT_BINS).astype(np.int64), 0, PIT_BINS - 1)
-        member = _member(code, PIT_BINS)
-        out.pit[k] += np.bincount(code, minlength=PIT_BINS)
-        out.pit_by[k][:, rows.columns] += member @ along - along.sum(axis=0) / PIT_BINS
-        out.pit_free[k] += member @ scores.free - scores.free.sum(axis=0) / PIT_BINS
-        if lost is not None:
-            shared = lost.among(out.pit_lost, 3, PIT_BINS)
-            shared[k] += member @ lost.along - lost.along.sum(axis=0) / PIT_BINS
-    size = np.abs(rows.residual) / np.sqrt(rows.cov[:, :2])
+        counts.add(membership(code, PIT_BINS), replace(carried, catalogue=None))
+    size = (np.abs(rows.residual) / np.sqrt(rows.cov[:, :2])).max(axis=1)
     if out.shared is not None:
-        out.shared.add(table, rows, place, uniforms, size.max(axis=1), codes)
+        out.shared.add(table, rows, place, uniforms, size, codes)
     for k, limit in enumerate(TAILS):
-        out.beyond[k] += (size.max(axis=1) > limit).sum()
+        out.beyond[k] += (size > limit).sum()
         for m, one in enumerate(around):
             extra = one.jitter2 - predictive.jitter2
             out.expected[k, m] += _beyond(one, limit * np.sqrt(rows.cov[:, :2]), extra, rows.cov)
-
-
-def _add_axes(
-    axes: AxisSums, predictive: Predictive, moments: SpreadMoments, scores: Scores, rows: Rows
-) -> None:
-    second, third = moments.of_axis(rows.cov)
-    axes.score += scores.axes.sum(axis=0)
-    axes.second += second.sum()
-    axes.third += third.sum()
-    axes.by_free += scores.axes.T @ scores.free
-    axes.scales += scores.axes_spread.sum(axis=0)
-    aside = np.abs(2 * marginals_of(predictive, rows.residual, rows.cov) - 1)
-    for k, level in enumerate(LEVELS):
-        axes.within[:, k] += (aside < erf(level / np.sqrt(2))).sum(axis=1)
-
-
-@dataclass(frozen=True, eq=False)
-class _Lost:
-    """Scores (n, q) by the frame that was fitted to the exposure of these stars."""
-
-    name: str
-    along: Float
-
-    @classmethod
-    def of(cls, table: MatchTable, rows: Rows, place: Float) -> _Lost | None:
-        if rows.by_frame is None:
-            return None
-        name = table.exposure_names[table.exposure[rows.index[0]]]
-        return cls(name, np.einsum("na,naq->nq", place, rows.by_frame))
-
-    def among(self, sums: dict[str, Float], *shape: int) -> Float:
-        """The exposure's own sums, zero at first."""
-        return sums.setdefault(self.name, np.zeros((*shape, self.along.shape[1])))
-
-
-def _member(codes: NDArray[np.int64], n_bins: int) -> csr_matrix:
-    """Matrix (n_bins, n) that sums over the stars of each bin; negative codes are of none."""
-    rows = np.flatnonzero(codes >= 0)
-    return csr_matrix((np.ones(rows.size), (codes[rows], rows)), shape=(n_bins, len(codes)))
-
-
-def _sum(member: csr_matrix, values: Float) -> Float:
-    return np.asarray(member @ values)
 
 
 def _beyond(one: Predictive, half: Float, extra: float, cov: Float) -> float:
@@ -367,7 +229,7 @@ def _beyond(one: Predictive, half: Float, extra: float, cov: Float) -> float:
 
 
 def _in_circle(half: Float) -> Float:
-    """Share of the unit circle inside boxes of half sides (n, 2)."""
+    """Fraction (n,) of the unit circle inside boxes of half sides (n, 2)."""
     a, b = np.minimum(half, 1.0).T
 
     def under(x: Float) -> Float:  # area under the arc from 0 to x

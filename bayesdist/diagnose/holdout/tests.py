@@ -16,9 +16,11 @@ from scipy.special import betainc, erf
 from scipy.stats import beta, chi2
 
 from bayesdist.diagnose.holdout.bins import ALL, Partition
+from bayesdist.diagnose.holdout.grouped import ScaleSums
 from bayesdist.diagnose.holdout.predictive import Predictive
-from bayesdist.diagnose.holdout.spread import scale_of, sum_tails
 from bayesdist.diagnose.holdout.sums import LEVELS, PIT_BINS, STEP, TAILS, BinSums, HeldSums
+from bayesdist.diagnose.significance import hotelling_p
+from bayesdist.limits import HELD_OUT_DISTRIBUTION, HELD_OUT_RATIO, HELD_OUT_TAILS
 
 __all__ = ["AXIS", "AxisCoverage", "HeldTest", "all_tests", "coverage_of"]
 
@@ -26,99 +28,60 @@ Float = NDArray[np.float64]
 
 AXIS = "axis"  # a part: the stars along one axis
 
-LEAST_STARS = 20  # of a bin that is judged by itself
+MIN_STARS = 20  # of a bin that is judged by itself
 STARS_PER_PIT_BIN = 20
 SINGULAR = 0.05  # of a variance: what is left where frames have taken up nearly all
-RATIO = 1.05  # of predicted errors: less does not matter, however significant
-DEPARTURE = 0.02  # of a distribution function
-EXCESS = 1.5  # of stars in the tails
 
 
 @dataclass(frozen=True)
 class HeldTest:
-    """One question that held-out stars were asked.
+    """One question that held-out stars were asked."""
 
-    Parameters
-    ----------
-    name : str
-        'offset', 'spread', 'distribution', 'tails' or 'deviation'.
-    part : str
-        'all', 'axis', 'region', 'magnitude', 'epoch', 'exposure' or 'place in exposure'.
-    where : str
-        In words.
-    index : int
-        Of the bin in its partition; -1 for all bins together.
-    n : int
-        Stars.
-    value : float
-        Distance from the prediction in the unit of u, v; factor on the predicted errors; largest
-        difference of distribution functions; fraction of stars beyond the limit; deviation of an
-        exposure.
-    expected : float
-        0, 1, 0, the expected fraction, or 0.
-    interval : tuple of float
-        Of a fraction, 95 %; else NaN.
-    p_value : float
-    p_corrected : float
-        For the number of tests (Holm 1979).
-    limit : float
-        Of the tails, in sigma; else NaN.
-    wider : bool
-        Of distributions: whether stars lie farther out than predicted.
-    """
-
-    name: str
-    part: str
-    where: str
-    index: int
-    n: int
+    name: str  # 'offset', 'spread', 'distribution', 'tails' or 'deviation'
+    part: str  # 'all', 'axis', 'region', 'magnitude', 'epoch', 'exposure' or 'place in exposure'
+    where: str  # in words
+    index: int  # of the bin in its partition; -1 for all bins together
+    n: int  # stars
+    # distance from the prediction in the unit of u, v; factor on the predicted errors; largest
+    # difference of distribution functions; fraction of stars beyond the limit; deviation of an
+    # exposure
     value: float
-    expected: float
+    expected: float  # 0, 1, 0, the expected fraction, or 0
     p_value: float
-    p_corrected: float = 1.0
-    interval: tuple[float, float] = (np.nan, np.nan)
-    limit: float = np.nan
-    wider: bool = True
+    p_corrected: float = 1.0  # for the number of tests (Holm 1979)
+    interval: tuple[float, float] = (np.nan, np.nan)  # of a fraction, 95 %; else NaN
+    limit: float = np.nan  # of the tails, in sigma; else NaN
+    wider: bool = True  # of distributions: True where stars lie farther out than predicted
 
     @property
-    def together(self) -> bool:
-        """Whether all bins of the part are tested at once; `where` and `value` are of the worst."""
+    def is_omnibus(self) -> bool:
+        """True where all bins are tested at once; `where` and `value` are of the worst."""
         return self.index < 0
 
     @property
-    def matters(self) -> bool:
-        """Whether errors would be larger than predicted, if it is no chance."""
+    def is_material(self) -> bool:
+        """True where errors would be larger than predicted, if it is no chance."""
         if self.name == "spread":
-            return self.value > RATIO
+            return not HELD_OUT_RATIO.met_by(self.value)
         if self.name == "distribution":
-            return self.wider and self.value > DEPARTURE
-        return self.name in ("offset", "deviation") or self.value > EXCESS * self.expected
+            return self.wider and not HELD_OUT_DISTRIBUTION.met_by(self.value)
+        return (
+            self.name in ("offset", "deviation")
+            or self.value > HELD_OUT_TAILS.value * self.expected
+        )
 
 
 @dataclass(frozen=True)
 class AxisCoverage:
-    """How many held-out stars lie in the middle of what is predicted of them along an axis.
+    """Fraction of held-out stars in the middle of their predictions along an axis."""
 
-    Parameters
-    ----------
-    axis : str
-        'u' or 'v'.
-    level : float
-        In sigma of a normal variable.
-    n : int
-        Stars.
-    value, expected : float
-        Fraction of them, and the predicted one.
-    interval : tuple of float
-        Of the fraction, 95 %.
-    """
-
-    axis: str
-    level: float
-    n: int
+    axis: str  # 'u' or 'v'
+    level: float  # in sigma of a normal variable
+    n: int  # stars
+    # value, expected: fraction of them, and the predicted one
     value: float
     expected: float
-    interval: tuple[float, float]
+    interval: tuple[float, float]  # of the fraction, 95 %
 
 
 def coverage_of(sums: HeldSums) -> tuple[AxisCoverage, ...]:
@@ -128,9 +91,9 @@ def coverage_of(sums: HeldSums) -> tuple[AxisCoverage, ...]:
             axis,
             level,
             sums.n,
-            float(sums.axes.within[a, k]) / sums.n,
+            float(sums.within[a, k]) / sums.n,
             float(erf(level / np.sqrt(2))),
-            _interval(int(sums.axes.within[a, k]), sums.n),
+            _interval(int(sums.within[a, k]), sums.n),
         )
         for a, axis in enumerate("uv")
         for k, level in enumerate(LEVELS)
@@ -140,18 +103,7 @@ def coverage_of(sums: HeldSums) -> tuple[AxisCoverage, ...]:
 def all_tests(
     sums: HeldSums, predictive: Predictive, partitions: Sequence[Partition]
 ) -> list[HeldTest]:
-    """Every test that there are enough stars for, without correction.
-
-    Parameters
-    ----------
-    sums : HeldSums
-    predictive : Predictive
-    partitions : sequence of Partition
-
-    Returns
-    -------
-    list of HeldTest
-    """
+    """Tests that there are enough stars for, without correction."""
     out = []
     for partition in partitions:
         found = sums.bins[partition.kind]
@@ -161,50 +113,36 @@ def all_tests(
     return [*out, *_distributions(sums, predictive), *_tails(sums, predictive)]
 
 
-def _of_clusters(t: float, dof: int, n: int) -> float:
-    """Probability of a larger chi-square whose covariance is the sum of squares of n stars.
-
-    Hotelling 1931, for squares about zero.
-    """
-    return float(beta.sf(min(t / n, 1.0), dof / 2, max(n - dof, 1) / 2))
-
-
 def _offsets(
     found: BinSums, sums: HeldSums, predictive: Predictive, partition: Partition
 ) -> list[HeldTest]:
-    """Whether stars lie about their predictions: each bin, then all together."""
-    n_bins = len(found.n)
-    by = found.place_by.reshape(2 * n_bins, -1)
-    common = found.place_with.reshape(2 * n_bins, -1) @ by.T
-    cov = by @ predictive.cov @ by.T - common - common.T + found.own_cov
-    for name, lost in found.lost.items():
-        along = lost.reshape(2 * n_bins, -1)
-        cov -= along @ sums.frames[name].spent @ along.T
+    """Tests of the mean offsets from the predictions: each bin, then all together."""
+    # a score of the position is odd: on average the mixture's parameters do not move it
+    cov = found.place.covariance(predictive, sums.frames, mixture=False) + found.place_cov
     out, good = [], []
-    for b in range(n_bins):
+    for b, bin_ in enumerate(partition.bins):
         pair = slice(2 * b, 2 * b + 2)
         least = np.linalg.eigvalsh(cov[pair, pair])[0]
         n = found.independent[b]
-        if n < LEAST_STARS or least < 2 * SINGULAR * np.trace(found.place_2[b]):
+        if n < MIN_STARS or least < 2 * SINGULAR * np.trace(found.place_2[b]):
             continue
         good.append(b)
-        score = found.place[b]
+        score = found.offset_scores[b]
         t = float(score @ np.linalg.solve(cov[pair, pair], score))
         # their variance is their own, as in Hotelling's test about zero
-        p = _of_clusters(t, 2, int(n))
+        p = hotelling_p(t, 2, int(n))
         size = float(np.hypot(*(score / found.weight[b])))
-        bin_ = partition.bins[b]
         out.append(HeldTest("offset", partition.kind, bin_.words, b, int(found.n[b]), size, 0.0, p))
     if len(good) > 1:
         rows = np.ravel([[2 * b, 2 * b + 1] for b in good])
         root = np.sqrt(np.diag(cov)[rows])
         values, vectors = np.linalg.eigh(cov[np.ix_(rows, rows)] / np.outer(root, root))
-        along = vectors.T @ (found.place.ravel()[rows] / root)
+        along = vectors.T @ (found.place.sums[rows] / root)
         known = values > SINGULAR
         t, dof = float((along[known] ** 2 / values[known]).sum()), int(known.sum())
         p = float(chi2.sf(t, dof))
         if sums.shared is not None:
-            p = _of_clusters(t, dof, sums.shared.n_stars)
+            p = hotelling_p(t, dof, sums.shared.n_stars)
         worst = min(out, key=lambda one: (one.p_value, -one.value))
         out.append(
             HeldTest(
@@ -215,73 +153,61 @@ def _offsets(
 
 
 def _spreads(found: BinSums, predictive: Predictive, partition: Partition) -> list[HeldTest]:
-    """Whether true matches scatter as predicted, in each bin."""
-    out = []
-    for b, bin_ in enumerate(partition.bins):
-        if found.n[b] < LEAST_STARS:
-            continue
-        g = found.spread_by[b]
-        variance = float(found.spread_2[b] + g @ predictive.free_cov @ g)
-        p = sum_tails(float(found.spread[b]), variance, float(found.spread_3[b]))
-        out.append(
-            HeldTest(
-                "spread",
-                partition.kind,
-                bin_.words,
-                b,
-                int(found.n[b]),
-                scale_of(found.scales[b]),
-                1.0,
-                p,
-            )
-        )
-    return out
+    """Tests of the scatter of true matches, in each bin."""
+    return [
+        _spread(found.scale, b, predictive, (partition.kind, bin_.words, b, int(found.n[b])))
+        for b, bin_ in enumerate(partition.bins)
+        if found.n[b] >= MIN_STARS
+    ]
+
+
+def _spread(
+    sums: ScaleSums, k: int, predictive: Predictive, stars: tuple[str, str, int, int]
+) -> HeldTest:
+    """Test of the scatter of one group: part, words, index and number of its stars."""
+    p = sums.p_value(k, predictive.free_cov)
+    return HeldTest("spread", *stars, sums.factor(k), 1.0, p)
 
 
 def _axes(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
-    """Whether true matches scatter as predicted along each axis by itself."""
-    out, axes = [], sums.axes
-    for a, axis in enumerate("uv"):
-        g = axes.by_free[a]
-        variance = float(axes.second[a] + g @ predictive.free_cov @ g)
-        p = sum_tails(float(axes.score[a]), variance, float(axes.third[a]))
-        scale = scale_of(axes.scales[a])
-        out.append(HeldTest("spread", AXIS, f"along {axis}", a, sums.n, scale, 1.0, p))
-    return out
+    """Tests of the scatter of true matches along each axis by itself."""
+    return [
+        _spread(axis, 0, predictive, (AXIS, f"along {'uv'[a]}", a, sums.n))
+        for a, axis in enumerate(sums.axes)
+    ]
 
 
 def _distributions(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
-    """Whether the predictive probabilities are uniform."""
+    """Tests of the predictive probabilities against uniform ones."""
     merge, shared = 1, sums.shared
     n = sums.n if shared is None else shared.n_stars
     while merge < PIT_BINS // 4 and n * merge < STARS_PER_PIT_BIN * PIT_BINS:
         merge = {1: 2, 2: 4, 4: 5}[merge]
     m = PIT_BINS // merge
-    wider = bool(sums.pit[2] @ (np.arange(PIT_BINS) + 0.5) > sums.n * PIT_BINS / 2)
+    # in merged bins, less the mean over all
+    merged = np.asarray(np.kron(np.eye(m), np.ones(merge)) - 1 / m, np.float64)
+    middle = sums.pit[2].sums @ (np.arange(PIT_BINS) + 0.5)
+    wider = bool(middle > sums.n * PIT_BINS / 2)
     out = []
     for k, what in enumerate(("of u", "of v", "of their distances")):
-        counts = sums.pit[k].reshape(m, merge).sum(axis=1)
-        by = sums.pit_by[k].reshape(m, merge, -1).sum(axis=1)
-        free = sums.pit_free[k].reshape(m, merge, -1).sum(axis=1)
+        counts = sums.pit[k].mapped(merged)
         cov = sums.n * (np.eye(m) / m - 1 / m**2)
         if shared is not None:
             cov = shared.pit_covariance(k, merge)
-        cov += by @ predictive.cov @ by.T + free @ predictive.free_cov @ free.T
-        for name, several in sums.pit_lost.items():
-            along = several[k].reshape(m, merge, -1).sum(axis=1)
-            cov -= along @ sums.frames[name].spent @ along.T
-        rest = (counts - sums.n / m)[:-1]
+        cov += counts.covariance(predictive, sums.frames, mixture=True)
+        rest = counts.sums[:-1]
         t = float(rest @ np.linalg.solve(cov[:-1, :-1], rest))
         p = float(chi2.sf(t, m - 1))
         if shared is not None and shared.stars_repeat:
-            p = _of_clusters(t, m - 1, n)
-        size = float(np.abs(np.cumsum(sums.pit[k]) / sums.n - np.arange(1, 21) / PIT_BINS).max())
+            p = hotelling_p(t, m - 1, n)
+        below = np.cumsum(sums.pit[k].sums) / sums.n
+        size = float(np.abs(below - np.arange(1, PIT_BINS + 1) / PIT_BINS).max())
         out.append(HeldTest("distribution", ALL, what, k, sums.n, size, 0.0, p, wider=wider))
     return out
 
 
 def _tails(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
-    """Whether as many stars lie far out as predicted, false matches among them."""
+    """Tests of the number of stars that lie far out, false matches among them."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(15)
     weights = weights / weights.sum()
     sd = np.sqrt(np.diag(predictive.free_cov))
@@ -316,7 +242,7 @@ def _tails(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
 
 
 def _interval(seen: int, n: int) -> tuple[float, float]:
-    """Of a fraction, 95 % (Clopper and Pearson 1934)."""
+    """Interval of 95 % of a fraction (Clopper and Pearson 1934)."""
     return (
         float(beta.ppf(0.025, seen, n - seen + 1)) if seen else 0.0,
         float(beta.ppf(0.975, seen + 1, n - seen)) if seen < n else 1.0,

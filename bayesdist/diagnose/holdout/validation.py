@@ -12,63 +12,40 @@ from bayesdist.diagnose.holdout.bins import Bin, partitions_of
 from bayesdist.diagnose.holdout.deviations import deviation_tests
 from bayesdist.diagnose.holdout.frames import frames_for
 from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
-from bayesdist.diagnose.holdout.spread import scale_of
 from bayesdist.diagnose.holdout.sums import held_sums
 from bayesdist.diagnose.holdout.tests import AxisCoverage, HeldTest, all_tests, coverage_of
 from bayesdist.diagnose.significance import holm, p_words
 from bayesdist.errors import InputError
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.stars.shards import Matches
+from bayesdist.limits import HELD_OUT, HELD_OUT_DOUBTFUL, HELD_OUT_UNUSUAL
 
-__all__ = ["DOUBTFUL", "LEAST_HELD", "UNUSUAL", "HeldOutTruth", "held_out_truth"]
+__all__ = ["HoldoutValidation", "holdout_validation"]
 
 Float = NDArray[np.float64]
 
-LEAST_HELD = 50  # stars, without which nothing can be said
 SAMPLE = 200_000  # stars that say where bins end
-UNUSUAL, DOUBTFUL = 0.01, 1e-3  # probability, over all tests together
 ORDER = ("offset", "deviation", "spread", "tails", "distribution")  # of what tells most
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOutTruth:
-    """What held-out stars say of a solution.
+class HoldoutValidation:
+    """Results of held-out stars against a solution."""
 
-    Parameters
-    ----------
-    unit : str
-        Of u and v.
-    n : int
-        Stars that were predicted.
-    n_left_out : int
-        Of exposures with too few stars for a frame of their own.
-    exposures : tuple of str
-        Held out whole.
-    tests : tuple of HeldTest
-        The most telling first.
-    pit : ndarray, shape (3, bins)
-        Counts of the predictive probabilities: of u, of v given u, of the distance.
-    regions : tuple of Bin
-    region_n : ndarray, shape (B,)
-    region_scale : ndarray, shape (B,)
-        Factor on the predicted errors in each region; NaN where there are too few stars.
-    region_offset : ndarray, shape (B, 2)
-        Mean offset from the prediction, in units of its own predicted error.
-    coverage : tuple of AxisCoverage
-        Along each axis.
-    """
-
-    unit: str
-    n: int
-    n_left_out: int
-    exposures: tuple[str, ...]
-    tests: tuple[HeldTest, ...]
+    unit: str  # of u and v
+    n: int  # stars that were predicted
+    n_left_out: int  # of exposures with too few stars for a frame of their own
+    exposures: tuple[str, ...]  # held out whole
+    tests: tuple[HeldTest, ...]  # the most telling first
+    # (3, bins) counts of the predictive probabilities: of u, of v given u, of the distance
     pit: Float
     regions: tuple[Bin, ...]
-    region_n: Float
+    region_n: Float  # (B,)
+    # (B,) factor on the predicted errors in each region; NaN where there are too few stars
     region_scale: Float
+    # (B, 2) mean offset from the prediction, in units of its own predicted error
     region_offset: Float
-    coverage: tuple[AxisCoverage, ...] = ()
+    coverage: tuple[AxisCoverage, ...] = ()  # along each axis
 
     @property
     def coverage_words(self) -> str:
@@ -89,18 +66,18 @@ class HeldOutTruth:
         """'pass', 'warn' or 'fail'."""
         if self.doubtful:
             return "fail"
-        return "warn" if self.p_value < UNUSUAL else "pass"
+        return "warn" if not HELD_OUT_UNUSUAL.met_by(self.p_value) else "pass"
 
     @property
     def doubtful(self) -> bool:
-        """Whether errors are larger than the solution says, beyond chance."""
-        return self._telling(DOUBTFUL) is not None
+        """True where errors are larger than the solution states, beyond chance."""
+        return self._telling(HELD_OUT_DOUBTFUL.value) is not None
 
     @property
     def verdict(self) -> str:
         """One clause."""
-        found = self._telling(DOUBTFUL)
-        if found is None and self.p_value < UNUSUAL:
+        found = self._telling(HELD_OUT_DOUBTFUL.value)
+        if found is None and not HELD_OUT_UNUSUAL.met_by(self.p_value):
             found = self.tests[0]
         if found is None:
             return f"held-out stars agree with the prediction (p = {self.p_value:.2g})"
@@ -108,7 +85,7 @@ class HeldOutTruth:
 
     def _telling(self, level: float) -> HeldTest | None:
         """The test that tells most of those that matter."""
-        found = [t for t in self.tests if t.p_corrected < level and t.matters]
+        found = [t for t in self.tests if t.p_corrected < level and t.is_material]
         places = [t for t in found if t.name in ("offset", "spread", "deviation")]
         return min(places or found, key=_rank, default=None)
 
@@ -138,35 +115,21 @@ class HeldOutTruth:
 
 
 def _rank(test: HeldTest) -> tuple[float, int, float, bool]:
-    """Where a test stands among others: tails of distributions underflow together.
+    """Key by which tests are sorted: tails of distributions underflow together.
 
-    Of an exposure that is alone at its date it is the exposure that is told.
+    Of an exposure that is alone at its date the exposure is named.
     """
     size = -abs(test.value - test.expected)
     return test.p_value, ORDER.index(test.name), size, test.part == "epoch"
 
 
-def held_out_truth(
+def holdout_validation(
     solution: Posterior | Predictive, held: Matches, *, whole: Sequence[str] = ()
-) -> HeldOutTruth:
-    """Judge a solution by stars that it has not seen.
+) -> HoldoutValidation:
+    """Results of stars that a solution has not seen.
 
-    Parameters
-    ----------
-    solution : Posterior or Predictive
-    held : MatchTable or PartitionedMatches
-        Held-out stars, with errors.
-    whole : sequence of str
-        Exposures all of whose stars were held out.
-
-    Returns
-    -------
-    HeldOutTruth
-
-    Raises
-    ------
-    InputError
-        For too few stars, and for a campaign's posterior of which only the draws are given.
+    Of the exposures `whole` all stars were held out. Raises InputError for too few stars, and for a
+    campaign's posterior of which only the draws are given.
     """
     predictive = solution if isinstance(solution, Predictive) else predictive_of(solution)
     where = ", ".join(held.sources)
@@ -180,11 +143,11 @@ def held_out_truth(
     partitions = partitions_of(predictive.model, held, held.sample(SAMPLE), whole)
     frames = frames_for(predictive, pieces, held.exposure_names)
     sums = held_sums(predictive, pieces, partitions, frames)
-    if sums.n < LEAST_HELD:
+    if not HELD_OUT.met_by(sums.n):
         raise InputError(
             f"{sums.n} held-out stars say too little of the solution",
             where=where,
-            do=f"hold out at least {LEAST_HELD}: raise holdout.fraction",
+            do=f"hold out at least {HELD_OUT.value}: raise holdout.fraction",
         )
     tests = [*all_tests(sums, predictive, partitions), *deviation_tests(predictive, frames)]
     corrected = holm(np.array([t.p_value for t in tests]))
@@ -193,20 +156,20 @@ def held_out_truth(
     found = sums.bins["region"]
     seen = found.n >= 1
     error = np.sqrt(np.einsum("bii->bi", found.place_2))
-    return HeldOutTruth(
+    return HoldoutValidation(
         unit=predictive.model.unit,
         n=sums.n,
         n_left_out=sums.n_left_out,
         exposures=tuple(whole),
         tests=tuple(sorted(tests, key=_rank)),
-        pit=sums.pit,
+        pit=np.stack([counts.sums for counts in sums.pit]),
         regions=regions.bins,
         region_n=found.n,
         region_scale=np.array(
-            [scale_of(s) if n else np.nan for s, n in zip(found.scales, seen, strict=True)]
+            [found.scale.factor(b) if some else np.nan for b, some in enumerate(seen)]
         ),
         region_offset=np.divide(
-            found.place, error, out=np.full_like(error, np.nan), where=error > 0
+            found.offset_scores, error, out=np.full_like(error, np.nan), where=error > 0
         ),
         coverage=coverage_of(sums),
     )

@@ -1,7 +1,8 @@
-"""What is left after the fit: residuals averaged over the detector, and their statistics."""
+"""Residuals averaged over the detector, and their statistics."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,10 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
+from bayesdist.names import require_known
 
 __all__ = [
+    "BAND_AXES",
+    "BinValues",
     "BinnedResiduals",
     "BinnedSums",
+    "band_bins",
     "binned_residuals",
     "binned_sums",
     "residual_statistics",
@@ -20,6 +25,8 @@ __all__ = [
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+
+BAND_AXES = ("X", "Y", "radial")
 
 _BLOCK = 2**16  # stars
 
@@ -54,6 +61,34 @@ class BinnedResiduals:
 
 
 @dataclass(frozen=True, eq=False)
+class BinValues:
+    """Means of one quantity in bins."""
+
+    # mean, sem (ny, nx): means and their standard errors; NaN where there are too few stars
+    mean: Float
+    sem: Float
+    dof: Float  # (ny, nx) degrees of freedom of the standard errors: stars less one
+
+    @property
+    def good(self) -> NDArray[np.bool_]:
+        """Bins whose mean has a standard error."""
+        return np.isfinite(self.mean) & np.isfinite(self.sem)
+
+    def scaled(self, factor: float) -> BinValues:
+        """Means in another unit."""
+        return BinValues(self.mean * factor, self.sem * abs(factor), self.dof)
+
+    def minus(self, other: BinValues) -> BinValues:
+        """Differences bin by bin; errors of the two count as independent."""
+        var = self.sem**2, other.sem**2
+        total = var[0] + var[1]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            # Satterthwaite's degrees of freedom of a sum of variances
+            dof = total**2 / (var[0] ** 2 / self.dof + var[1] ** 2 / other.dof)
+        return BinValues(self.mean - other.mean, np.sqrt(total), dof)
+
+
+@dataclass(frozen=True, eq=False)
 class BinnedSums:
     """Sums of residuals in equal bins that cover the detector; sums of pieces of the data add.
 
@@ -65,9 +100,9 @@ class BinnedSums:
         Stars of positive weight.
     weight, weight_2 : ndarray, shape (ny, nx)
         Sums of the weights and of their squares.
-    first, first_2, second_2 : ndarray, shape (2, ny, nx)
-        Of u and of v: sums of the residual times its weight and times its squared weight, and of
-        the squared residual times the squared weight.
+    first, first_2, second_2 : ndarray, shape (q, ny, nx)
+        Of u, of v and of further quantities: sums of the residual times its weight and times its
+        squared weight, and of the squared residual times the squared weight.
     n_outside : int
         Stars of positive weight that lie on no pixel of the detector and went into no bin.
     """
@@ -92,8 +127,9 @@ class BinnedSums:
         """Stars in all bins."""
         return int(self.count.sum())
 
-    def residuals(self) -> BinnedResiduals:
-        """Means, and their standard errors from the scatter inside the bins."""
+    @property
+    def means(self) -> tuple[Float, Float]:
+        """Means (q, ny, nx), and their standard errors from the scatter inside the bins."""
         mean = _ratio(self.first, self.weight)
         about = np.nan_to_num(mean)
         spread = self.second_2 - 2 * about * self.first_2 + about**2 * self.weight_2
@@ -101,8 +137,11 @@ class BinnedSums:
         # sample variance over n
         variance = _ratio(np.maximum(spread, 0.0), self.weight**2)
         count = self.count.astype(np.float64)
-        variance = variance * _ratio(count, count - 1.0)
-        sem = np.sqrt(variance)
+        return mean, np.sqrt(variance * _ratio(count, count - 1.0))
+
+    def residuals(self) -> BinnedResiduals:
+        """Means of u and v, with their standard errors and the centres of the bins."""
+        mean, sem = self.means
         ny, nx = self.count.shape
         edges_x, edges_y = _edges(self.size[0], nx), _edges(self.size[1], ny)
         return BinnedResiduals(
@@ -115,6 +154,16 @@ class BinnedSums:
             sem_v=sem[1],
             n_outside=self.n_outside,
         )
+
+    def values(self, axis: str) -> BinValues:
+        """Means of the bins along one axis, of `band_bins`.
+
+        `axis` is one of `BAND_AXES`; else InputError.
+        """
+        require_known(axis, BAND_AXES, "axis")
+        k = BAND_AXES.index(axis)
+        mean, sem = self.means
+        return BinValues(mean[k], sem[k], np.maximum(self.count - 1.0, 0.0))
 
 
 def binned_residuals(
@@ -151,7 +200,7 @@ def binned_sums(
     y: ArrayLike,
     ru: ArrayLike,
     rv: ArrayLike,
-    *,
+    *more: ArrayLike,
     bins: int | tuple[int, int],
     size: tuple[float, float],
     weights: ArrayLike | None = None,
@@ -164,6 +213,8 @@ def binned_sums(
         FITS 1-based pixels.
     ru, rv : array_like, shape (N,)
         Residuals, data minus model.
+    *more : array_like, shape (N,)
+        Further quantities of each star.
     bins : int or tuple of int
         Number of bins on x and on y (WSDC D-T033 uses 31 on each).
     size : tuple of float
@@ -184,21 +235,21 @@ def binned_sums(
     nx, ny = (bins, bins) if isinstance(bins, int | np.integer) else bins
     if min(nx, ny) < 1 or int(nx) != nx or int(ny) != ny:
         raise InputError(f"the number of bins is {bins}", do="give whole numbers of at least 1")
-    x, y, ru, rv = (np.asarray(a, float) for a in (x, y, ru, rv))
+    columns = [np.asarray(a, float) for a in (x, y, ru, rv, *more)]
     w = None if weights is None else np.asarray(weights, float)
-    shapes = {a.shape for a in (x, y, ru, rv, *(() if w is None else (w,)))}
-    if x.ndim != 1 or len(shapes) != 1:
+    shapes = {a.shape for a in (*columns, *(() if w is None else (w,)))}
+    if columns[0].ndim != 1 or len(shapes) != 1:
         raise InputError("positions, residuals and weights differ in length")
     if w is not None and (not (w >= 0).all() or not np.isfinite(w).all()):
         raise InputError("weights must be finite and not negative", where="weights")
     out: BinnedSums | None = None
     # a block at a time: its scratch arrays stay in the cache, however many stars there are
-    for start in range(0, max(len(x), 1), _BLOCK):
+    for start in range(0, max(len(columns[0]), 1), _BLOCK):
         rows = slice(start, start + _BLOCK)
-        block = tuple(a[rows] for a in (x, y, ru, rv))
+        block = [a[rows] for a in columns]
         here = None if w is None else w[rows]
         if here is not None and not (here > 0).all():
-            block, here = tuple(a[here > 0] for a in block), here[here > 0]
+            block, here = [a[here > 0] for a in block], here[here > 0]
         if not all(np.isfinite(a).all() for a in block):
             raise InputError(
                 "a position or residual is not finite", do="give that star the weight 0"
@@ -210,14 +261,15 @@ def binned_sums(
 
 
 def _block_sums(
-    block: tuple[Float, ...], w: Float | None, nx: int, ny: int, size: tuple[float, float]
+    block: Sequence[Float], w: Float | None, nx: int, ny: int, size: tuple[float, float]
 ) -> BinnedSums:
-    x, y, ru, rv = block
+    """Sums over some stars of positive weights."""
+    x, y, *residuals = block
     edges_x, edges_y = _edges(size[0], nx), _edges(size[1], ny)
     inside = (x >= edges_x[0]) & (x <= edges_x[-1]) & (y >= edges_y[0]) & (y <= edges_y[-1])
     n_outside = int(inside.size - inside.sum())
     if n_outside:
-        x, y, ru, rv = (a[inside] for a in (x, y, ru, rv))
+        x, y, *residuals = (a[inside] for a in block)
         w = None if w is None else w[inside]
     index = _bin(y, edges_y) * nx + _bin(x, edges_x)
 
@@ -225,7 +277,6 @@ def _block_sums(
         return np.bincount(index, values, minlength=nx * ny).reshape(ny, nx)
 
     count = total().astype(np.int64)
-    residuals = (ru, rv)
     if w is None:
         weight = weight_2 = count.astype(float)
         first = first_2 = np.stack([total(r) for r in residuals])
@@ -238,7 +289,29 @@ def _block_sums(
     return BinnedSums(size, count, weight, weight_2, first, first_2, second_2, n_outside)
 
 
+def band_bins(
+    x: ArrayLike,
+    y: ArrayLike,
+    ru: ArrayLike,
+    rv: ArrayLike,
+    *,
+    bins: int | tuple[int, int] = 31,
+    size: tuple[float, float],
+    weights: ArrayLike | None = None,
+) -> BinnedSums:
+    """Sums of residuals and of their lengths in bins, as section 5 of WSDC D-T033.
+
+    The mean length of a bin is that of single stars, not the length of the mean residual.
+
+    Parameters are those of `binned_sums`, residuals in pixels of the band; `bins` are 31 in section
+    5 of WSDC D-T033 and 45 in its Appendix C.
+    """
+    length = np.hypot(np.asarray(ru, float), np.asarray(rv, float))
+    return binned_sums(x, y, ru, rv, length, bins=bins, size=size, weights=weights)
+
+
 def _edges(size: float, n: int) -> Float:
+    """Edges (n + 1,) of equal bins over pixels."""
     return np.linspace(0.5, size + 0.5, n + 1)
 
 
@@ -254,6 +327,7 @@ def _bin(values: Float, edges: Float) -> Int:
 
 
 def _ratio(a: Float, b: Float) -> Float:
+    """Ratios, NaN where the denominator is not positive."""
     b = np.broadcast_to(b, a.shape)
     return np.divide(a, b, out=np.full(a.shape, np.nan), where=b > 0)
 

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.sample import ScoredSample, scored_sample
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.solution import Solution
+from bayesdist.limits import EPOCH_SHIFT
 from bayesdist.model.basis import polynomial_terms
 
 __all__ = ["EpochShift", "epoch_shift"]
@@ -32,11 +33,10 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 SAMPLE = 20_000  # detections that are looked at
-FEWEST = 30  # stars with motions
+MIN_STARS = 30  # stars with motions
 FARTHEST = 60.0  # years that are scanned
 STEPS = 481  # of the scan, a quarter of a year each
-SIGNIFICANT = 5.0  # standard errors
-ROUNDS = 30
+MAX_ITERATIONS = 30
 # error of a motion over the scatter of motions, at most: larger ones are often quoted too small
 WELL_KNOWN = 0.2
 BIWEIGHT = 4.685  # robust standard deviations, beyond which a star has no weight (Tukey)
@@ -45,33 +45,20 @@ NORMAL = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
 
 @dataclass(frozen=True)
 class EpochShift:
-    """An error of the epochs that explains residuals.
+    """An error of the epochs that explains residuals."""
 
-    Parameters
-    ----------
-    years : float
-        From the epoch that the reference positions have to that of the exposures.
-    sigma : float
-        Its standard error.
-    before, after : float
-        Robust scatter of the residuals along an axis, as they are and with the shift, in `unit`; of
-        stars with well known motions.
-    unit : str
-        Of u and v.
-    significant : bool
-        More than five standard errors, and the scatter falls.
-    """
-
-    years: float
-    sigma: float
+    years: float  # from the epoch that the reference positions have to that of the exposures
+    sigma: float  # its standard error
+    # before, after: robust scatter of the residuals along an axis, as they are and with the shift,
+    # in `unit`; of stars with well known motions
     before: float
     after: float
-    unit: str
-    significant: bool
+    unit: str  # of u and v
+    significant: bool  # more than five standard errors, and the scatter falls
 
     @property
     def sentence(self) -> str:
-        """What it means, and what to do about it."""
+        """Meaning of the shift, and remedy."""
         when = "after" if self.years > 0 else "before"
         return (
             f"the residuals go with the proper motions of the stars: the exposures were taken "
@@ -84,16 +71,8 @@ class EpochShift:
 def epoch_shift(table: MatchTable, solution: Solution) -> EpochShift | None:
     """The error of the epochs that the residuals show.
 
-    Parameters
-    ----------
-    table : MatchTable
-        With proper motions; of more than `SAMPLE` rows, every k-th is taken.
-    solution : Posterior or LinearFit
-
-    Returns
-    -------
-    EpochShift or None
-        None without proper motions, or with too few.
+    Of a table of more than `SAMPLE` rows every k-th is taken. None without proper motions, or with
+    too few.
     """
     if table.pm_u is None or table.pm_v is None:
         return None
@@ -102,11 +81,11 @@ def epoch_shift(table: MatchTable, solution: Solution) -> EpochShift | None:
     if motion is None:
         return None
     moving = np.any(motion != 0, axis=0)  # 0 on both axes is that none was measured
-    if moving.sum() < FEWEST:
+    if moving.sum() < MIN_STARS:
         return None
     error = np.zeros_like(motion) if sample.motion_sigma is None else sample.motion_sigma
     known = moving & (error < WELL_KNOWN * _scatter(motion[:, moving])).all(axis=0)
-    if known.sum() < FEWEST:
+    if known.sum() < MIN_STARS:
         return None
     residual, P = _left_over(sample, known * sample.inlier, sample.residual, motion)
     grid = np.linspace(-FARTHEST, FARTHEST, STEPS)
@@ -114,7 +93,7 @@ def epoch_shift(table: MatchTable, solution: Solution) -> EpochShift | None:
     dt = float(grid[int(np.argmin(sizes))])
     before = _scatter(residual[:, known])
     weight = information = np.zeros(0)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ITERATIONS):
         scale = np.sqrt(_scatter((residual + dt * P)[:, known]) ** 2 + (dt * error) ** 2)
         if not (scale > 0).all():
             return None
@@ -135,7 +114,7 @@ def epoch_shift(table: MatchTable, solution: Solution) -> EpochShift | None:
     score = (weight * (left * P - dt * error**2)).sum(axis=0)
     sigma = float(np.sqrt(squares_over(star.ravel(), score)[0]) / information)
     after = _scatter(left[:, known])
-    found = abs(dt) > SIGNIFICANT * sigma and after < before
+    found = abs(dt) > EPOCH_SHIFT.value * sigma and after < before
     return EpochShift(dt, sigma, before, after, sample.model.unit, bool(found))
 
 
@@ -146,7 +125,7 @@ def _scatter(values: Float) -> float:
 
 
 def _left_over(sample: ScoredSample, weight: Float, *fields: Float) -> Iterator[Float]:
-    """What polynomials on each chip of each exposure leave of vectors (2, N)."""
+    """Vectors (2, N) less their polynomials on each chip of each exposure."""
     out = [field.copy() for field in fields]
     order = sample.model.order
     i, j = np.array(polynomial_terms(order)).T
@@ -164,8 +143,6 @@ def _left_over(sample: ScoredSample, weight: Float, *fields: Float) -> Iterator[
 
 def _together(sample: ScoredSample) -> list[Int]:
     """Rows of each chip of each exposure."""
-    rows: dict[tuple[int, int], list[Int]] = {}
-    for block in sample.blocks:
-        own = np.arange(block.rows.start, block.rows.stop)
-        rows.setdefault((block.chip, block.exposure), []).append(own)
-    return [np.concatenate(parts) for parts in rows.values()]
+    keys = np.column_stack([sample.codes("chip"), sample.codes("exposure")])
+    code = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
+    return np.split(np.argsort(code, kind="stable"), np.cumsum(np.bincount(code))[:-1])

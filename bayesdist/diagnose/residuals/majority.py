@@ -10,11 +10,9 @@ from __future__ import annotations
 
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.posterior import Posterior
+from bayesdist.limits import FALSE_MAJORITY, WIDENED_ERRORS
 
 __all__ = ["majority_sentence"]
-
-MAJORITY = 0.5
-WIDENED = 5.0  # times the quoted error: a mixture that widens the true matches to hold the false
 
 
 def majority_sentence(
@@ -24,38 +22,28 @@ def majority_sentence(
     quoted: float | None = None,
     things: str = "pairs",
 ) -> str:
-    """What it means that most pairs are false, as a clause; empty where they are not.
+    """Warning that most pairs are false, as a clause; empty where they are not.
 
-    Parameters
-    ----------
-    fit : LinearFit
-    posterior : Posterior, optional
-    quoted : float, optional
-        Usual quoted error of one axis, in the unit of u, v.
-    things : str
-        What is true or false.
-
-    Returns
-    -------
-    str
+    `quoted` is the usual quoted error of one axis, in the unit of u, v; `things` is the word for
+    the matches.
     """
     if posterior is not None and "f" in posterior.hyper:
         fraction = float(posterior.hyper["f"].mean())
-        if fraction > MAJORITY:
+        if not FALSE_MAJORITY.met_by(fraction):
             return (
                 f"the mixture takes {100 * fraction:.0f} % of the {things} for false ones: with "
                 "more false than true ones the solution may rest on chance alignments"
             )
     if posterior is not None and quoted and "j" in posterior.hyper:
         jitter = float(posterior.hyper["j"].mean())
-        if jitter > WIDENED * quoted:
+        if jitter > WIDENED_ERRORS.value * quoted:
             return (
                 f"the mixture adds {jitter:.3g} {posterior.unit} to the errors of all {things}, "
                 f"{jitter / quoted:.2g} times the quoted one: either that is far too small, or "
                 f"most {things} are false ones that were taken for true"
             )
     share = fit.n_rejected / fit.n_rows
-    if share > MAJORITY:
+    if not FALSE_MAJORITY.met_by(share):
         return (
             f"the fit left out {100 * share:.0f} % of the {things}: most of them are "
             "false, or the quoted errors are far too small, and the solution may rest on "

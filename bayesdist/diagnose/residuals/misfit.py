@@ -16,11 +16,12 @@ from scipy.stats import chi2
 
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, BinnedSums
 from bayesdist.diagnose.significance import p_words
+from bayesdist.limits import STRUCTURE, STRUCTURE_SEEN
 from bayesdist.model import Chip
 from bayesdist.model.basis import polynomial_terms
 
 __all__ = [
-    "MOST_BINS",
+    "MAX_BINS",
     "STARS_PER_BIN",
     "Misfit",
     "bin_means",
@@ -32,9 +33,7 @@ __all__ = [
 Float = NDArray[np.float64]
 
 STARS_PER_BIN = 25
-MOST_BINS = 32  # along each side
-SEEN = 0.5  # of all patterns, below which that none is found says little
-SIGNIFICANT = 1e-4  # probability of as much structure by chance, over all tests together
+MAX_BINS = 32  # along each side
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class Misfit:
     unit : str
     chip : Chip or None
         The chip, where the detector has several.
-    told : float
+    power : float
         Share of the patterns over the partitions that would have been seen: below 1 where fitted
         stars hide some.
     """
@@ -64,26 +63,26 @@ class Misfit:
     structure: float
     unit: str
     chip: Chip | None = None
-    told: float = 1.0
+    power: float = 1.0
 
     @property
     def significant(self) -> bool:
-        """Whether the structure is more than chance."""
-        return self.p_value < SIGNIFICANT
+        """True where the structure is more than chance."""
+        return not STRUCTURE.met_by(self.p_value)
 
     @property
-    def hidden(self) -> bool:
-        """Whether most structure would not have been seen."""
-        return self.told < SEEN
+    def underpowered(self) -> bool:
+        """True where most structure would not have been seen."""
+        return not STRUCTURE_SEEN.met_by(self.power)
 
     @property
     def sentence(self) -> str:
-        """What it means, as a clause."""
+        """Meaning and consequence of the structure, as a clause."""
         return f"{self.finding}, so that errors are larger than the posterior says"
 
     @property
     def finding(self) -> str:
-        """The same without the consequence."""
+        """Meaning of the structure, as a clause."""
         part = "the detector" if self.chip is None else f"chip {self.chip.name}"
         return (
             f"the residuals hold structure that the model does not describe ({self.structure:.2g} "
@@ -104,8 +103,8 @@ def partitions_for(n: int) -> dict[str, tuple[int, int]]:
     dict of str to tuple of int
         Bins on x and on y, by name.
     """
-    side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 3, MOST_BINS))
-    strips = int(np.clip(n / STARS_PER_BIN, 3, 2 * MOST_BINS))
+    side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 3, MAX_BINS))
+    strips = int(np.clip(n / STARS_PER_BIN, 3, 2 * MAX_BINS))
     return {"cells": (side, side), "columns": (strips, 1), "rows": (1, strips)}
 
 

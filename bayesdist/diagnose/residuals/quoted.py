@@ -1,4 +1,4 @@
-"""Quoted errors that are far too small: how many times, and what is said of it.
+"""Quoted errors that are far too small: the factor, and its sentence.
 
 Jitter takes up errors that are a few times too small.  Where they are far smaller, what they say of
 single stars would be lost beside it, so all of them are multiplied by what the residuals show.
@@ -12,11 +12,11 @@ from scipy.stats import chi2
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.stars.stars import prepare
+from bayesdist.limits import QUOTED_ERRORS
 
 __all__ = ["error_scale", "error_scale_sentence"]
 
-FEW = 0.1  # of the matches
-FAR = 20.0  # times the quoted errors, beyond which jitter would be nearly all there is
+LOW_QUANTILE = 0.1  # of the matches
 
 
 def error_scale(fit: LinearFit, table: MatchTable) -> float:
@@ -24,38 +24,20 @@ def error_scale(fit: LinearFit, table: MatchTable) -> float:
 
     A low quantile of chi-square is compared with its expectation: most matches may be false.
 
-    Parameters
-    ----------
-    fit : LinearFit
-    table : MatchTable
-        The matches, or some of them.
-
-    Returns
-    -------
-    float
+    `table` has the matches, or some of them.
     """
     stars, _ = prepare(fit.model, table)
     r = stars.residuals(np.asarray(fit.mean))
-    found = np.quantile(r[:, 0] ** 2 / stars.var_u + r[:, 1] ** 2 / stars.var_v, FEW)
-    factor = float(np.sqrt(found / chi2.ppf(FEW, 2)))
-    return factor if factor > FAR else 1.0
+    found = np.quantile(r[:, 0] ** 2 / stars.var_u + r[:, 1] ** 2 / stars.var_v, LOW_QUANTILE)
+    factor = float(np.sqrt(found / chi2.ppf(LOW_QUANTILE, 2)))
+    return 1.0 if QUOTED_ERRORS.met_by(factor) else factor
 
 
 def error_scale_sentence(factor: float, sigma: float, unit: str, *, by_magnitude: bool) -> str:
-    """What has been done to the errors, and what else may help, as a clause.
+    """Warning that errors were multiplied, and what else may help, as a clause.
 
-    Parameters
-    ----------
-    factor : float
-    sigma : float
-        Median error after it.
-    unit : str
-    by_magnitude : bool
-        There are magnitudes to estimate errors by.
-
-    Returns
-    -------
-    str
+    `sigma` is the median error after it; `by_magnitude` says that there are magnitudes to estimate
+    errors by.
     """
     do = "check their unit and the order of the model"
     if by_magnitude:

@@ -1,4 +1,4 @@
-"""Some of the stars with what the solutions say of them: for figures that draw single stars."""
+"""Some of the stars with residuals and probabilities: for figures that draw single stars."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class StarSample:
 
     @property
     def partial(self) -> bool:
-        """Whether there are more stars than these."""
+        """True where there are more stars than these."""
         return len(self.table) < self.n_total
 
     @property
@@ -67,7 +67,7 @@ class StarSample:
 def star_sample(
     table: MatchTable, n_total: int, fit: LinearFit, posterior: Posterior | None = None
 ) -> StarSample:
-    """What a fit and a posterior say of some stars.
+    """Residuals and probabilities of some stars, by a fit and a posterior.
 
     Parameters
     ----------

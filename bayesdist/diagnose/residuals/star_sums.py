@@ -1,4 +1,4 @@
-"""What is to be known of all stars at a solution, as sums that take one pass over the data.
+"""Sums over all stars at a solution, in one pass over the data.
 
 The functions that go over a shard are those of a module, so that they can be sent to other
 processes; what they return adds.
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from bayesdist.diagnose.residuals.binned import BinnedSums, binned_sums
 from bayesdist.infer.kernel import Constants
-from bayesdist.infer.linear import Clip
 from bayesdist.infer.posterior import Posterior
-from bayesdist.infer.posterior.memberships import averaged_draws, star_averages
+from bayesdist.infer.posterior.memberships import averaged_draws
+from bayesdist.infer.stars.likelihood import Clip, star_averages
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars
 
@@ -142,7 +142,7 @@ def _flagged(stars: Stars, theta: Float, constants: Constants) -> Int:
 
 
 def _of_groups(stars: Stars, codes: Int) -> Int:
-    """What belongs to each star's group."""
+    """Codes (N,) of the groups of all stars."""
     return np.repeat(codes, np.diff(stars.starts))
 
 

@@ -11,8 +11,7 @@ are those of a scaled chi-square (Satterthwaite 1946).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +19,13 @@ from scipy import stats
 from scipy.linalg import cho_solve
 
 from bayesdist.diagnose.clusters import add_over, sums_over
+from bayesdist.diagnose.score.directions import independent_directions, squares_of
+from bayesdist.diagnose.score.families import FAMILIES
 from bayesdist.diagnose.score.projection import Projection
-from bayesdist.diagnose.score.result import Outcome
+from bayesdist.diagnose.score.result import Outcome, outcome
 from bayesdist.diagnose.score.sample import Block
-from bayesdist.diagnose.score.score import independent_directions, smallest_pattern
-from bayesdist.diagnose.significance import LEAST_P
-from bayesdist.model.frames import frame_names
+from bayesdist.diagnose.significance import chi_square_of, hotelling_p
+from bayesdist.model.frames import LINEAR_MATRICES, frame_names
 
 __all__ = ["exposure_test"]
 
@@ -33,55 +33,31 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 STARS_PER_DIRECTION = 4  # of an exposure that is tested
-MOST_PRODUCTS = 1e10  # of scores: beyond, those of other exposures count by their mean
+MAX_PRODUCTS = 1e10  # of scores: beyond, those of other exposures count by their mean
 INDEPENDENT = 0.02  # as for time: what the frames' curvature leaves is no deviation
-
-_LINEAR = {
-    "scale": np.array([[1.0, 0.0], [0.0, 1.0]]),
-    "rotation": np.array([[0.0, -1.0], [1.0, 0.0]]),
-    "shear_plus": np.array([[1.0, 0.0], [0.0, -1.0]]),
-    "shear_cross": np.array([[0.0, 1.0], [1.0, 0.0]]),
-}
 
 
 @dataclass(frozen=True, eq=False)
 class _Deviations:
-    """One exposure's deviations, all parameters projected out.
+    """One exposure's deviations, all parameters projected out."""
 
-    Parameters
-    ----------
-    score : ndarray, shape (n,)
-    information : ndarray, shape (n, n)
-        Beside all parameters.
-    own : ndarray, shape (n, n)
-        Beside those of the exposure alone.
-    cross : ndarray, shape (n, G)
-        With the global parameters.
-    covariance : ndarray, shape (n, n)
-        Of the score, from those of single detections.
-    square : ndarray, shape (n, n)
-        Mean square of the deviations over the detector.
-    n_stars : float
-        Stars that the covariance is known from, those of other exposures by what they add to it.
-    """
-
-    score: Float
-    information: Float
-    own: Float
-    cross: Float
-    covariance: Float
-    square: Float
+    score: Float  # (n,)
+    information: Float  # (n, n) beside all parameters
+    own: Float  # (n, n) beside those of the exposure alone
+    cross: Float  # (n, G) with the global parameters
+    covariance: Float  # (n, n) of the score, from those of single detections
+    square: Float  # (n, n) mean square of the deviations over the detector
+    # stars that the covariance is known from, those of other exposures by what they add to it
     n_stars: float
 
     @property
     def statistic(self) -> float:
         """Chi-square of the same probability as Hotelling's statistic about zero."""
         n, t = len(self.score), float(self.score @ np.linalg.solve(self.covariance, self.score))
-        p = stats.beta.sf(min(t / self.n_stars, 1.0), n / 2, (self.n_stars - n) / 2)
-        return float(stats.chi2.isf(max(p, LEAST_P), n))
+        return chi_square_of(hotelling_p(t, n, self.n_stars), n)
 
     def along(self, N: Float) -> _Deviations:
-        """Some directions of them."""
+        """Deviations along some directions N (n, q)."""
         return _Deviations(
             N.T @ self.score,
             N.T @ self.information @ N,
@@ -95,22 +71,14 @@ class _Deviations:
 
 @dataclass(frozen=True, eq=False)
 class _Meat:
-    """Scores of the global parameters, by stars.
+    """Scores of the global parameters, by stars."""
 
-    Parameters
-    ----------
-    by_star : ndarray, shape (stars, G)
-        Sums over the detections of each.
-    total : ndarray, shape (G, G)
-        Sum of their squares, and what the priors add.
-    """
-
-    by_star: Float
-    total: Float
+    by_star: Float  # (stars, G) sums over the detections of each
+    total: Float  # (G, G) sum of their squares, and what the priors add
 
     @classmethod
     def of(cls, projection: Projection) -> _Meat:
-        """Those of all stars."""
+        """Scores of all stars."""
         sample, G = projection.sample, projection.n_global
         by_star = np.zeros((int(sample.star.max()) + 1, G))
         for block in sample.blocks:
@@ -126,14 +94,9 @@ class _Meat:
     def covariance(self, nuisance: Float, star: Int, own: Float) -> tuple[Float, Float]:
         """Covariance (n, n) of an exposure's scores: of its own stars, and of all others.
 
-        Parameters
-        ----------
-        nuisance : ndarray, shape (G, n)
-            Parameters that the deviations are taken for.
-        star : ndarray of int, shape (N,)
-            Stars of the exposure's detections.
-        own : ndarray, shape (N, n)
-            Scores of the detections before the parameters are projected out.
+        `nuisance` (G, n) are the parameters that the deviations are taken for, `star` (N,) the
+        stars of the exposure's detections, `own` (N, n) the scores of the detections before the
+        parameters are projected out.
         """
         which, of = np.unique(star, return_inverse=True)
         # a star is one, in this exposure and in all others
@@ -146,15 +109,8 @@ class _Meat:
 def exposure_test(projection: Projection) -> Outcome | None:
     """Test of the exposures' own deviations.
 
-    Parameters
-    ----------
-    projection : Projection
-
-    Returns
-    -------
-    Outcome or None
-        None where there is one exposure, where the frames fit all linear terms, and where no two
-        exposures have stars enough.
+    None where there is one exposure, where the frames fit all linear terms, and where no two
+    exposures have stars enough.
     """
     model = projection.sample.model
     names = [name for name in frame_names("affine") if name not in frame_names(model.frames)]
@@ -163,7 +119,8 @@ def exposure_test(projection: Projection) -> Outcome | None:
     found = list(_deviations(projection, names))
     if len(found) < 2:
         return None
-    T, n, size2, noise2 = 0.0, 0, 0.0, 0.0
+    T, n = 0.0, 0
+    squares = [squares_of(one.score, one.own, one.covariance, one.square) for one in found]
     shared, apart = np.zeros((projection.n_global, projection.n_global)), 0.0
     for one in found:
         T += one.statistic
@@ -173,44 +130,37 @@ def exposure_test(projection: Projection) -> Outcome | None:
             one.information, one.cross @ cho_solve(projection.root, one.cross.T)
         )
         apart += float(np.trace(alone @ alone))
-        back = np.linalg.inv(one.own)
-        step = back @ one.score
-        noise = float(np.trace(one.square @ back @ one.covariance @ back))
-        size2 += (float(step @ one.square @ step) - noise) / len(found)
-        noise2 += noise / len(found)
     together = cho_solve(projection.root, shared)
     # mean n, variance 2 n (1 + ...), as a multiple of a chi-square
     stretch = 1.0 + (float((together * together.T).sum()) - apart) / n
     dof = n / stretch
-    return Outcome(
-        name="exposures",
-        statistic=T / stretch,
-        dof=dof,
-        dof_residual=None,
-        p_value=float(stats.chi2.sf(T / stretch, dof)),
-        size=float(np.sqrt(max(size2, 0.0))),
-        smallest=partial(smallest_pattern, float(np.sqrt(noise2)), dof, None),
+    T = T / stretch
+    square, noise = (float(values) for values in np.mean(squares, axis=0))
+    family = replace(FAMILIES["exposures"], remedy=_remedy(model.frames))
+    return outcome(
+        family,
+        T,
+        dof,
+        None,
+        float(stats.chi2.sf(T, dof)),
+        square=square,
+        noise=noise,
         unit=model.unit,
-        remedy=_remedy(model.frames),
-        present="exposures deviate from each other in linear terms that their frames do not fit",
-        absent="no deviations of single exposures are left in the residuals",
     )
 
 
 def _remedy(frames: str) -> str:
-    hierarchy = "use a campaign, whose exposures have a hierarchy of deviations"
+    """Remedy of deviations, as a clause, by the kind of the frames."""
+    hierarchy = FAMILIES["exposures"].remedy
     return hierarchy if frames == "affine" else f"set model.frames to 'affine', or {hierarchy}"
 
 
 def _deviations(projection: Projection, names: list[str]) -> Iterator[_Deviations]:
     """Deviations of every exposure with stars enough, along the directions that it has left."""
     meat = None
-    if len(projection.sample) * projection.n_global**2 < MOST_PRODUCTS:
+    if len(projection.sample) * projection.n_global**2 < MAX_PRODUCTS:
         meat = _Meat.of(projection)
-    by_exposure: dict[int, list[Block]] = {}
-    for block in projection.sample.blocks:
-        by_exposure.setdefault(block.exposure, []).append(block)
-    for blocks in by_exposure.values():
+    for blocks in projection.sample.blocks_by("exposure"):
         n = sum(int(projection.sample.used[block.rows].sum()) for block in blocks)
         if n < STARS_PER_DIRECTION * len(names):
             continue
@@ -221,13 +171,13 @@ def _deviations(projection: Projection, names: list[str]) -> Iterator[_Deviation
 
 
 def _fields(block: Block, names: list[str], origin: tuple[float, float]) -> Float:
-    """What each deviation does to the polynomial of a block, (2, K, n)."""
+    """Changes (2, K, n) of the polynomial of a block by unit deviations."""
     out = np.zeros((*block.effective.shape, len(names)))
     about = block.effective.copy()
     about[:, 0] -= origin
     for k, name in enumerate(names):
-        if name in _LINEAR:
-            out[..., k] = _LINEAR[name] @ about
+        if name in LINEAR_MATRICES:
+            out[..., k] = LINEAR_MATRICES[name] @ about
         else:
             out["uv".index(name[-1]), 0, k] = 1.0
     return out

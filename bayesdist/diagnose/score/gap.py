@@ -17,7 +17,7 @@ are alike, is added to var(rate).  The largest of all F is tested, corrected for
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -25,55 +25,37 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bayesdist.diagnose.clusters import squares_over
+from bayesdist.diagnose.score.families import FAMILIES
 from bayesdist.diagnose.score.projection import Projection
-from bayesdist.diagnose.score.result import Outcome
+from bayesdist.diagnose.score.result import Outcome, outcome, smallest_pattern
 from bayesdist.diagnose.score.sample import Block
-from bayesdist.diagnose.score.score import smallest_pattern
-from bayesdist.model.frames import RIGID, frame_names
+from bayesdist.model.frames import DEVIATIONS, LINEAR_MATRICES, RIGID, frame_names
 
 __all__ = ["gap_test", "visit_codes"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-FEWEST_FREE = 3  # visits beyond those that the line takes
-FEWEST_STARS = 12  # of an exposure on a chip: six linear terms of both axes, and as many beside
+MIN_FREE = 3  # visits beyond those that the line takes
+MIN_STARS = 12  # of an exposure on a chip: six linear terms of both axes, and as many beside
 SHORTEST = 0.1  # years over which a drift is looked for
 VISIT = 1 / 365.25  # years between exposures that deviate together
 
-_QUARTER = np.array([[0.0, -1.0], [1.0, 0.0]])
-_STRETCHES = {
-    "scale": np.array([[1.0, 0.0], [0.0, 1.0]]),
-    "shear_plus": np.array([[1.0, 0.0], [0.0, -1.0]]),
-    "shear_cross": np.array([[0.0, 1.0], [1.0, 0.0]]),
-}
 _WAYS = ("along x", "along y", "in rotation")
 
 
 @dataclass(frozen=True, eq=False)
 class _Exposure:
-    """Where the chips of one exposure lie against the first one.
-
-    Parameters
-    ----------
-    epoch : float
-    chips : tuple of int
-        Codes of all but the first.
-    value : ndarray, shape (len(chips), 3)
-        Shifts along the axes of the polynomials, and rotation times half a side: unit of u, v.
-    variance : ndarray, shape (len(chips), 3)
-    star : ndarray of int, shape (n,)
-        Stars of the detections.
-    by_star : ndarray, shape (n, len(chips), 3)
-        What each detection has added to `value`.
-    """
+    """Positions of the chips of one exposure against the first one."""
 
     epoch: float
-    chips: tuple[int, ...]
+    chips: tuple[int, ...]  # codes of all but the first
+    # (len(chips), 3) shifts along the axes of the polynomials, and rotation times half a side: unit
+    # of u, v
     value: Float
-    variance: Float
-    star: Int
-    by_star: Float
+    variance: Float  # (len(chips), 3)
+    star: Int  # (n,) stars of the detections
+    by_star: Float  # (n, len(chips), 3) what each detection has added to `value`
 
 
 @dataclass(frozen=True)
@@ -93,21 +75,14 @@ class _Line:
 
     @property
     def p_value(self) -> float:
-        """Of this line by itself."""
+        """Probability of a larger statistic, of this line by itself."""
         return float(stats.f.sf(self.statistic, 1, self.free))
 
 
 def gap_test(projection: Projection) -> Outcome | None:
     """Test for chips that drift against each other.
 
-    Parameters
-    ----------
-    projection : Projection
-
-    Returns
-    -------
-    Outcome or None
-        None for one chip, without dates, and with too few visits for a line.
+    None for one chip, without dates, and with too few visits for a line.
     """
     sample = projection.sample
     model = sample.model
@@ -123,23 +98,23 @@ def gap_test(projection: Projection) -> Outcome | None:
     if not lines:
         return None
     best = min(lines, key=lambda one: one.p_value)
-    n = len(lines)
     name = model.chips[best.chip].name
-    return Outcome(
-        name="gap",
-        statistic=best.statistic,
-        dof=1,
-        dof_residual=float(best.free),
-        p_value=float(-np.expm1(n * np.log1p(-best.p_value))),
-        size=float(np.sqrt(max(best.rate**2 - best.variance, 0.0))),
-        smallest=partial(_smallest, lines),
+    terms = "['u', 0, 0] and ['v', 0, 0]" if best.way < 2 else "['u', 0, 1] and ['v', 1, 0]"
+    return outcome(
+        replace(
+            FAMILIES["gap"],
+            remedy=f"add {terms} to model.tdd.terms",
+            present=f"chip {name} drifts {_WAYS[best.way]} against chip {model.chips[0].name}, and "
+            "the gap between them is taken to be constant",
+        ),
+        best.statistic,
+        1,
+        float(best.free),
+        float(-np.expm1(len(lines) * np.log1p(-best.p_value))),
+        square=best.rate**2,
+        noise=best.variance,
         unit=f"{model.unit}/yr",
-        remedy="add ['u', 0, 0] and ['v', 0, 0] to model.tdd.terms"
-        if best.way < 2
-        else "add ['u', 0, 1] and ['v', 1, 0] to model.tdd.terms",
-        present=f"chip {name} drifts {_WAYS[best.way]} against chip {model.chips[0].name}, and the "
-        "gap between them is taken to be constant",
-        absent="no drift of the gap between the chips is left in the residuals",
+        smallest=partial(_smallest, lines),
     )
 
 
@@ -150,7 +125,7 @@ def _smallest(lines: list[_Line], level: float) -> float:
 
 
 def _drifts(projection: Projection, chip: int, way: int) -> bool:
-    """Whether the model has this drift: a rate that no prior holds."""
+    """True where the model has this drift: a rate that no prior holds."""
     model = projection.sample.model
     if model.time is None or way == 2:
         return False
@@ -191,7 +166,7 @@ def _line(projection: Projection, exposures: list[_Exposure], chip: int, way: in
     design = (segment[:, None] == np.unique(segment)).astype(float)
     design = np.column_stack([design, t - t.mean()])
     free = len(t) - np.linalg.matrix_rank(design)
-    if free < FEWEST_FREE or np.linalg.matrix_rank(design[:, :-1]) == np.linalg.matrix_rank(design):
+    if free < MIN_FREE or np.linalg.matrix_rank(design[:, :-1]) == np.linalg.matrix_rank(design):
         return None
     weight = _weights(design, d, 1 / total)
     root = np.sqrt(weight)[:, None]
@@ -226,11 +201,8 @@ def _of_stars(some: list[_Exposure], at: list[tuple[int, int]], pull: Float) -> 
 
 
 def _exposures(projection: Projection) -> Iterator[_Exposure]:
-    """All exposures with stars enough on the first chip and on another."""
-    by_exposure: dict[int, list[Block]] = {}
-    for block in projection.sample.blocks:
-        by_exposure.setdefault(block.exposure, []).append(block)
-    for blocks in by_exposure.values():
+    """Iterator over the exposures with stars enough on the first chip and on another."""
+    for blocks in projection.sample.blocks_by("exposure"):
         if one := _exposure(projection, blocks):
             yield one
 
@@ -241,7 +213,7 @@ def _exposure(projection: Projection, blocks: list[Block]) -> _Exposure | None:
     for block in blocks:
         n = int(sample.used[block.rows].sum())
         number[block.chip] = number.get(block.chip, 0) + n
-    enough = sorted(chip for chip, n in number.items() if n >= FEWEST_STARS)
+    enough = sorted(chip for chip, n in number.items() if n >= MIN_STARS)
     if len(enough) < 2 or enough[0] != 0:
         return None
     chips = enough[1:]
@@ -284,7 +256,7 @@ def _half(projection: Projection, chip: int) -> float:
 
 
 def _columns(projection: Projection, block: Block, chips: list[int]) -> Float:
-    """What each unknown of an exposure does to the positions of a block, (2, n, unknowns)."""
+    """Derivatives (2, n, unknowns) of the positions of a block by the unknowns of its exposure."""
     model = projection.sample.model
     polynomials = projection.functions.polynomials(block.rows)
     at_centre = block.effective @ model.basis(model.chips[block.chip].number).monomial_matrix[0]
@@ -293,13 +265,14 @@ def _columns(projection: Projection, block: Block, chips: list[int]) -> Float:
     shared = () if model.chip_deviations else frame_names(model.frames)
     origin = np.zeros(2) + model.origin
     columns = [np.tile(one, (n, 1)) for one in np.eye(2)]
-    columns.append((about + at_centre - origin) @ _QUARTER.T)
-    for name, L in _STRETCHES.items():
-        columns.append((about + at_centre - origin if name in shared else about) @ L.T)
+    columns.append((about + at_centre - origin) @ LINEAR_MATRICES["rotation"].T)
+    for name in DEVIATIONS:
+        at = about + at_centre - origin if name in shared else about
+        columns.append(at @ LINEAR_MATRICES[name].T)
     for chip in chips:
         here = float(chip == block.chip)
         columns += [np.tile(here * block.frame[:, axis], (n, 1)) for axis in (0, 1)]
-        columns.append(here / _half(projection, chip) * about @ _QUARTER.T)
+        columns.append(here / _half(projection, chip) * about @ LINEAR_MATRICES["rotation"].T)
     return np.moveaxis(np.stack(columns), (0, 1, 2), (2, 1, 0))
 
 

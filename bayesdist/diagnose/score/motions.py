@@ -1,4 +1,4 @@
-"""Test for stars that move in ways that nobody has told: do a star's residuals go with time?
+"""Test for stars that move in ways that are not known: do a star's residuals go with time?
 
 Of each star the square of the slope's score is compared with those of its single detections, after
 position and slope, so that nothing is assumed of the size of the errors.  With the slope b_s of
@@ -21,100 +21,61 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bayesdist.diagnose.clusters import sums_over
-from bayesdist.diagnose.score.projection import Projection
-from bayesdist.diagnose.score.result import Outcome, noncentrality
+from bayesdist.diagnose.score.families import FAMILIES, Family
+from bayesdist.diagnose.score.result import Outcome, noncentrality, outcome
+from bayesdist.diagnose.score.sample import ScoredSample
 
 __all__ = ["StarResiduals", "motion_outcome", "motion_test"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-FEWEST_DETECTIONS = 4  # of a star: of fewer nothing is left
-FEWEST_STARS = 100
+MIN_DETECTIONS = 4  # of a star: of fewer nothing is left
+MIN_STARS = 100
 SHORTEST = 0.1  # years in which motions are looked for
-MOST_TAKEN = 0.95  # of one detection, by position and slope
+MAX_TAKEN = 0.95  # of one detection, by position and slope
 MOVING = 1e-6  # of the determinant of the slope's information, that the position leaves
 
 
 @dataclass(frozen=True, eq=False)
 class StarResiduals:
-    """What detections say of the places of their stars.
+    """Gradients and curvatures of detections by the positions of their stars."""
 
-    Parameters
-    ----------
-    star : ndarray of int, shape (N,)
-    epoch : ndarray, shape (N,)
-    gradient : ndarray, shape (N, 2)
-        Of the log-likelihood by the star's place.
-    curvature : ndarray, shape (N, 2, 2)
-        Minus the second derivatives.
-    precision : ndarray, shape (2, 2), (stars, 2, 2) or ()
-        Of what is known of the places beforehand.
-    stated : ndarray, shape (stars, 2), or None
-        Errors of the motions that the catalogue has.
-    """
-
-    star: Int
-    epoch: Float
-    gradient: Float
-    curvature: Float
-    precision: Float
-    stated: Float | None = None
+    star: Int  # (N,)
+    epoch: Float  # (N,)
+    gradient: Float  # (N, 2) of the log-likelihood by the star's position
+    curvature: Float  # (N, 2, 2) minus the second derivatives
+    precision: Float  # (2, 2) or (stars, 2, 2) or () of what is known of the positions beforehand
+    stated: Float | None = None  # (stars, 2) errors of the motions that the catalogue has
 
 
-def motion_test(projection: Projection) -> Outcome | None:
+def motion_test(sample: ScoredSample) -> Outcome | None:
     """Test of matched stars for motions that the catalogue does not have.
 
-    Parameters
-    ----------
-    projection : Projection
-
-    Returns
-    -------
-    Outcome or None
-        None without dates, and where too few stars are seen at several of them.
+    None without dates, and where too few stars are seen at several of them.
     """
-    sample = projection.sample
     if sample.epoch is None or np.ptp(sample.epoch) < SHORTEST:
         return None
     uu, uv, vv = sample.curvature
-    g = projection.whole_score.T
     stated = None
     if sample.motion_sigma is not None:
         stated = np.zeros((int(sample.star.max()) + 1, 2))
         stated[sample.star] = sample.motion_sigma.T
-    return motion_outcome(
-        StarResiduals(
-            sample.star,
-            sample.epoch,
-            g,
-            np.moveaxis(np.array([[uu, uv], [uv, vv]]), 2, 0),
-            np.zeros(()),
-            stated,
-        ),
-        sample.model.unit,
-        remedy="give the catalogue proper motions, or larger errors of those that it has, or leave "
-        "out the stars that move",
-        present="stars move between the dates of the exposures in ways that the catalogue does not "
-        "have",
+    residuals = StarResiduals(
+        sample.star,
+        sample.epoch,
+        sample.whole_score.T,
+        np.moveaxis(np.array([[uu, uv], [uv, vv]]), 2, 0),
+        np.zeros(()),
+        stated,
     )
+    return motion_outcome(residuals, sample.model.unit, FAMILIES["motions"])
 
 
-def motion_outcome(data: StarResiduals, unit: str, *, remedy: str, present: str) -> Outcome | None:
+def motion_outcome(data: StarResiduals, unit: str, family: Family) -> Outcome | None:
     """Test of residuals of stars.
 
-    Parameters
-    ----------
-    data : StarResiduals
-    unit : str
-        Of u and v.
-    remedy, present : str
-        As of `Outcome`.
-
-    Returns
-    -------
-    Outcome or None
-        None for too few stars.
+    None for too few stars.
     """
     star, g, H = data.star, data.gradient, data.curvature
     S = int(star.max()) + 1
@@ -123,7 +84,7 @@ def motion_outcome(data: StarResiduals, unit: str, *, remedy: str, present: str)
     g, H = g * good[:, None], H * good[:, None, None]
     members = sums_over(star, good.astype(float), S)
     A = sums_over(star, H, S) + data.precision
-    many = np.flatnonzero(members >= FEWEST_DETECTIONS)
+    many = np.flatnonzero(members >= MIN_DETECTIONS)
     mean = sums_over(star, good * data.epoch, S) / np.maximum(members, 1)
     t = data.epoch - mean[star]
     cross, square = (sums_over(star, t[:, None, None] ** k * H, S)[many] for k in (1, 2))
@@ -132,7 +93,7 @@ def motion_outcome(data: StarResiduals, unit: str, *, remedy: str, present: str)
         left = square - np.swapaxes(cross, 1, 2) @ back
         moving = np.linalg.det(left) > MOVING * np.linalg.det(square)
         many, back, left = many[moving], back[moving], left[moving]
-    if len(many) < FEWEST_STARS:
+    if len(many) < MIN_STARS:
         return None
     of = np.full(S, -1)
     of[many] = np.arange(len(many))
@@ -149,7 +110,7 @@ def motion_outcome(data: StarResiduals, unit: str, *, remedy: str, present: str)
     taken = np.einsum("nab,nba->n", H, follows) / 2
     moved = np.einsum("nab,nb->na", T, step[of]) + place[of]
     psi = np.einsum("nba,nb->na", T, g - np.einsum("nab,nb->na", H, moved))
-    each = np.einsum("na,nab,nb->n", psi, inside[of], psi) / (1 - np.minimum(taken, MOST_TAKEN))
+    each = np.einsum("na,nab,nb->n", psi, inside[of], psi) / (1 - np.minimum(taken, MAX_TAKEN))
     difference = (np.einsum("na,na->n", slope, step) - np.bincount(of, each)) / 2
     if data.stated is not None:
         difference -= np.einsum("naa,na->n", left, data.stated[many] ** 2) / 2
@@ -157,19 +118,17 @@ def motion_outcome(data: StarResiduals, unit: str, *, remedy: str, present: str)
     unit_square = 4 / float(np.trace(left, axis1=1, axis2=2).sum())
     statistic, p = _above_zero(difference)
     noise = float(each.sum()) / (2 * len(many)), float(np.var(difference)), len(many)
-    return Outcome(
-        name="motions",
-        statistic=max(statistic, 0.0) ** 2,
-        dof=1,
-        dof_residual=None,
-        p_value=p,
+    return outcome(
+        family,
+        max(statistic, 0.0) ** 2,
+        1,
+        None,
+        p,
         # of a motion in a year, rms over the stars and both axes together
-        size=float(np.sqrt(max(unit_square * difference.sum(), 0.0))),
-        smallest=partial(_smallest, unit_square, *noise),
+        square=float(unit_square * difference.sum()),
+        noise=0.0,
         unit=f"{unit}/yr",
-        remedy=remedy,
-        present=present,
-        absent="no motions of the stars are left in the residuals",
+        smallest=partial(_smallest, unit_square, *noise),
     )
 
 

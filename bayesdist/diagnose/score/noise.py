@@ -8,21 +8,21 @@ squares themselves, whose distribution has longer tails than that of Gaussian no
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
 from bayesdist.diagnose.clusters import squares_over
-from bayesdist.diagnose.score.result import Outcome
+from bayesdist.diagnose.score.families import FAMILIES, Family
+from bayesdist.diagnose.score.result import Outcome, outcome, smallest_pattern
 from bayesdist.diagnose.score.sample import ScoredSample
-from bayesdist.diagnose.score.score import smallest_pattern
+from bayesdist.diagnose.significance import hotelling_p
 from bayesdist.model.grid import cell_index
 
-__all__ = ["Scored", "noise_tests"]
+__all__ = ["noise_tests"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -31,119 +31,76 @@ LARGEST_LEVERAGE = 0.5
 STARS_PER_PART = 40  # of a part of the data; smaller ones are joined
 STARS_PER_CELL = 60
 STARS_PER_BIN = 150  # of magnitudes
-MOST_CELLS = 8  # along each side of a chip
-MOST_MAGNITUDES = 10
-
-
-class Scored(Protocol):
-    """Detections with scores to which has been given back what the fit has taken of them."""
-
-    @property
-    def sample(self) -> ScoredSample: ...
-
-    @property
-    def whole_score(self) -> Float: ...
-
-    @property
-    def leverage(self) -> Float: ...
+MAX_CELLS = 8  # along each side of a chip
+MAX_MAGNITUDES = 10
 
 
 @dataclass(frozen=True, eq=False)
 class _Squares:
-    """Squared scores and curvatures of the detections that say anything, in units of their errors.
+    """Squared scores and curvatures of detections, in units of their errors."""
 
-    Parameters
-    ----------
-    rows : ndarray of int, shape (N,)
-        Where the detections stand in the sample.
-    square, expected : ndarray, shape (2, N)
-        Along u and v.
-    star : ndarray of int, shape (N,)
-    sigma : float
-        Typical standard deviation along an axis.
-    free : float
-        Degrees of freedom of the residuals, over their number: what the fit takes from all of them
-        together makes their squares scatter more than each by itself tells.
-    unit : str
-    """
-
-    rows: Int
+    # square, expected (2, N): along u and v
     square: Float
     expected: Float
-    star: Int
-    sigma: float
+    star: Int  # (N,)
+    sigma: float  # typical standard deviation along an axis
+    # degrees of freedom of the residuals, over their number: what the fit takes from all of them
+    # together makes their squares scatter more than each by itself shows
     free: float
     unit: str
 
     @property
     def ratio(self) -> float:
-        """Ratio of the sums."""
+        """Ratio of the sum of squares to the expected one."""
         return float(self.square.sum() / self.expected.sum())
 
 
-def noise_tests(projection: Scored) -> list[Outcome]:
-    """Outcomes of the tests by position, magnitude, exposure and axis, as far as the data go.
-
-    Parameters
-    ----------
-    projection : Projection, or what else has sample and scores
-
-    Returns
-    -------
-    list of Outcome
-    """
-    sample = projection.sample
+def noise_tests(sample: ScoredSample) -> list[Outcome]:
+    """Outcomes of the tests by position, magnitude, exposure and axis, as far as the data go."""
+    leverage = np.broadcast_to(sample.leverage, sample.score.shape)
     # what the fit has taken of a residual says nothing of its noise
-    rows = np.flatnonzero(sample.used & (projection.leverage.max(axis=0) < LARGEST_LEVERAGE))
+    rows = np.flatnonzero(sample.used & (leverage.max(axis=0) < LARGEST_LEVERAGE))
     if len(rows) < STARS_PER_PART:
         return []
     variance = sample.variance[:, rows]
-    square = projection.whole_score[:, rows] ** 2 * variance
+    square = sample.whole_score[:, rows] ** 2 * variance
     expected = sample.curvature[0::2, rows] * variance
     ratio = float(square.sum() / expected.sum())
     squares = _Squares(
-        rows,
         square,
         expected,
         np.unique(sample.star[rows], return_inverse=True)[1],
         float(np.sqrt(ratio * np.median(variance))),
-        1.0 - float(projection.leverage[:, rows].mean()),
+        1.0 - float(leverage[:, rows].mean()),
         sample.model.unit,
     )
-    parts = {"position": _cells(projection, rows)}
+    parts = {"position": _cells(sample, rows)}
     if sample.mag is not None:
         n_stars = int(squares.star.max(initial=0)) + 1
         parts["magnitude"] = _magnitudes(sample.mag[rows], n_stars)
-    exposure = np.concatenate(
-        [np.full(one.rows.stop - one.rows.start, one.exposure) for one in sample.blocks]
-    )
-    parts["exposure"] = exposure[rows]
-    out = [_by_part(squares, name, code) for name, code in parts.items()]
+    parts["exposure"] = sample.codes("exposure")[rows]
+    out = [_by_part(squares, FAMILIES[f"noise by {name}"], code) for name, code in parts.items()]
     return [one for one in (*out, _by_axis(squares)) if one is not None]
 
 
-def _cells(projection: Scored, rows: Int) -> Int:
-    """Coarse cells of each chip."""
-    sample = projection.sample
-    chip = np.empty(len(sample), np.int64)
-    for block in sample.blocks:
-        chip[block.rows] = block.chip
-    chip = chip[rows]
+def _cells(sample: ScoredSample, rows: Int) -> Int:
+    """Codes (n,) of coarse cells of each chip."""
+    chip = sample.codes("chip")[rows]
     code = np.zeros(len(rows), np.int64)
     for c in np.unique(chip):
         here = chip == c
         n = len(np.unique(sample.star[rows[here]]))
-        side = int(np.clip(np.sqrt(n / STARS_PER_CELL), 1, MOST_CELLS))
+        side = int(np.clip(np.sqrt(n / STARS_PER_CELL), 1, MAX_CELLS))
         at = rows[here]
         iy, ix = np.divmod(cell_index(sample.X[at], sample.Y[at], (side, side)), side)
         # boustrophedon: cells with few stars are joined to neighbours
-        code[here] = c * MOST_CELLS**2 + iy * side + np.where(iy % 2, side - 1 - ix, ix)
+        code[here] = c * MAX_CELLS**2 + iy * side + np.where(iy % 2, side - 1 - ix, ix)
     return code
 
 
 def _magnitudes(mag: Float, n_stars: int) -> Int:
     """Bins with equal numbers of detections."""
-    n = int(np.clip(n_stars // STARS_PER_BIN, 1, MOST_MAGNITUDES))
+    n = int(np.clip(n_stars // STARS_PER_BIN, 1, MAX_MAGNITUDES))
     edges = np.quantile(mag, np.linspace(0, 1, n + 1)[1:-1])
     return np.searchsorted(np.unique(edges), mag)
 
@@ -164,7 +121,7 @@ def _joined(code: Int, star: Int) -> Int:
     return out[index]
 
 
-def _by_part(squares: _Squares, name: str, code: Int) -> Outcome | None:
+def _by_part(squares: _Squares, family: Family, code: Int) -> Outcome | None:
     """Test by parts of the data; None where there is but one."""
     code = _joined(code, squares.star)
     m = int(code.max(initial=0)) + 1
@@ -189,32 +146,21 @@ def _by_part(squares: _Squares, name: str, code: Int) -> Outcome | None:
     # a cube root of the variance: half its logarithm's change is that of the standard deviation
     step = 1.5 * root * squares.sigma
     noise = float(np.average(0.25 / shape, weights=n)) * squares.sigma**2 * (m - 1) / m
-    size2 = float(np.average(step**2, weights=n)) - noise
-    low, high = np.sqrt(ratio.min() / squares.ratio), np.sqrt(ratio.max() / squares.ratio)
-    words = {"position": "cell to cell", "magnitude": "bright to faint stars"}
-    over = words.get(name, f"{name} to {name}")
-    return Outcome(
-        name=f"noise by {name}",
-        statistic=T,
-        dof=m - 1,
-        dof_residual=None,
-        p_value=float(stats.chi2.sf(T, m - 1)),
-        size=float(np.sqrt(max(size2, 0.0))),
-        smallest=partial(smallest_pattern, float(np.sqrt(noise)), m - 1, None),
-        unit=squares.unit,
-        remedy=_REMEDIES[name],
-        present=f"the noise differs from {over}, from {low * squares.sigma:.2g} to "
-        f"{high * squares.sigma:.2g} {squares.unit} along an axis where errors are typical",
-        absent=f"the noise is described equally well from {over}",
+    low, high = (squares.sigma * np.sqrt(one / squares.ratio) for one in (ratio.min(), ratio.max()))
+    present = (
+        f"{family.present}, from {low:.2g} to {high:.2g} {squares.unit} along an axis where errors "
+        "are typical"
     )
-
-
-_REMEDIES = {
-    "position": "give errors that go with position",
-    "magnitude": "give errors that go with magnitude, or finer ones if they do",
-    "exposure": "give each exposure errors of its own, or leave out exposures",
-    "axis": "give errors sigma_u and sigma_v of their own",
-}
+    return outcome(
+        replace(family, present=present),
+        T,
+        m - 1,
+        None,
+        float(stats.chi2.sf(T, m - 1)),
+        square=float(np.average(step**2, weights=n)),
+        noise=noise,
+        unit=squares.unit,
+    )
 
 
 def _by_axis(squares: _Squares) -> Outcome | None:
@@ -234,18 +180,16 @@ def _by_axis(squares: _Squares) -> Outcome | None:
         * float(np.sqrt((d**2).sum() / squares.free))
         / (2 * ratio * squares.expected.sum())
     )
-    size2 = (squares.sigma * float(scale[0] - scale[1]) / 2) ** 2 - noise**2
+    family = FAMILIES["noise by axis"]
     larger = "u" if scale[0] > scale[1] else "v"
-    return Outcome(
-        name="noise by axis",
-        statistic=T,
-        dof=1,
-        dof_residual=float(n - 1),
-        p_value=float(stats.beta.sf(min(T / n, 1.0), 0.5, (n - 1) / 2)),
-        size=float(np.sqrt(max(size2, 0.0))),
-        smallest=partial(smallest_pattern, noise, 1, None),
+    return outcome(
+        replace(family, present=f"the noise along {larger} is larger than {family.present}"),
+        T,
+        1,
+        float(n - 1),
+        hotelling_p(T, 1, n),
+        square=(squares.sigma * float(scale[0] - scale[1]) / 2) ** 2,
+        noise=noise**2,
         unit=squares.unit,
-        remedy=_REMEDIES["axis"],
-        present=f"the noise along {larger} is larger than along the other axis, beside its errors",
-        absent="the noise is described equally well along u and v",
+        smallest=partial(smallest_pattern, noise, 1, None),
     )

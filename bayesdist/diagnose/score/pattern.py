@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import i0e, i1e
 
-from bayesdist.diagnose.score.projection import Projection
-from bayesdist.diagnose.score.result import Outcome
+from bayesdist.diagnose.score.families import FAMILIES
+from bayesdist.diagnose.score.result import Outcome, outcome
+from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.model.grid import cell_index
 
 __all__ = ["pattern_test"]
@@ -15,42 +19,38 @@ Float = NDArray[np.float64]
 
 BINS = 256  # along each side of a chip: periods from a hundredth of it are seen
 PADDED = 2  # finer frequencies than the bins', so that none falls between
-INDEPENDENT = 2.0  # frequencies that the padding makes of one, as far as maxima go
 SLOWEST = 1.5  # periods beyond the polynomial's own, below which it takes waves for terms
-FEWEST_STARS = 100
+MIN_STARS = 100
 
 
-def pattern_test(projection: Projection) -> Outcome | None:
+def pattern_test(sample: ScoredSample) -> Outcome | None:
     """Test for a wave of any period and direction on a chip.
 
-    At each frequency k the power |sum g exp(i k x)|^2 of the scores g of one axis, over the sum of
-    their squares, is exponential where there is no wave, whatever the errors of single stars.
+    At each frequency k the length of sum g exp(i k x), over the scores g of one axis, is that of a
+    walk of steps |g| in directions of chance where there is no wave, whatever the errors of single
+    stars.  The longest of all frequencies counts as one of so many walks: at lengths that matter,
+    even neighbours of the finer frequencies hardly ever exceed it together.
 
-    Parameters
-    ----------
-    projection : Projection
-
-    Returns
-    -------
-    Outcome or None
-        None for less than `FEWEST_STARS` detections.
+    None for less than `MIN_STARS` detections.
     """
-    sample = projection.sample
-    if len(sample) < FEWEST_STARS:
+    if len(sample) < MIN_STARS:
         return None
     model = sample.model
-    power, trials, at = 0.0, 0.0, (0, 0, 0, 0)
-    for chip, (scores, squares) in _binned(projection).items():
-        allowed = _frequencies(model.order)
+    allowed = _frequencies(model.order)
+    log_tail, power, trials, at = 0.0, 0.0, 0, (0, 0, 0, 0)
+    for chip, (scores, binned) in _binned(sample).items():
         for axis in (0, 1):
-            found = np.abs(np.fft.rfft2(scores[axis], (PADDED * BINS,) * 2)) ** 2
-            found /= max(float(squares[axis]), 1e-300)
+            if not scores[axis].any():
+                continue
+            found = np.abs(np.fft.rfft2(binned[axis], (PADDED * BINS,) * 2))
             found[~allowed] = 0.0
             j, i = np.unravel_index(np.argmax(found), found.shape)
-            trials += allowed.sum() / PADDED**2 * INDEPENDENT
-            if found[j, i] > power:
-                power, at = float(found[j, i]), (int(i), int(j), chip, axis)
-    p_value = float(-np.expm1(trials * np.log1p(-np.exp(-power)))) if power > 0 else 1.0
+            trials += int(allowed.sum())
+            tail = _log_tail(np.abs(scores[axis]), float(found[j, i]))
+            if tail < log_tail:
+                log_tail, at = tail, (int(i), int(j), chip, axis)
+                power = float(found[j, i] ** 2 / (scores[axis] ** 2).sum())
+    p_value = float(-np.expm1(trials * np.log1p(-np.exp(log_tail)))) if power > 0 else 1.0
     column, row, chip, axis = at
     size = model.chips[chip].size
     signed = row if row <= PADDED * BINS // 2 else row - PADDED * BINS
@@ -64,39 +64,62 @@ def pattern_test(projection: Projection) -> Outcome | None:
         # a noncentral exponential exceeds it with probability 0.9
         return float(unit * (np.sqrt(needed) + 1.0))
 
-    return Outcome(
-        name="repeating pattern",
-        statistic=2 * power,
-        dof=2,
-        dof_residual=None,
-        p_value=p_value,
-        size=float(unit * np.sqrt(max(power - 1, 0.0))),
-        smallest=smallest,
+    present = (
+        f"the residuals along {'uv'[axis]} repeat over the detector with a period of {period:.0f} "
+        "pixels"
+    )
+    return outcome(
+        replace(FAMILIES["repeating pattern"], present=present),
+        2 * power,
+        2,
+        None,
+        p_value,
+        square=float(unit**2 * power),
+        noise=float(unit**2),
         unit=model.unit,
-        remedy="fit a look-up table with nodes closer than half the period",
-        present=f"the residuals along {'uv'[axis]} repeat over the detector with a period of "
-        f"{period:.0f} pixels",
-        absent="no pattern repeats over the detector",
+        smallest=smallest,
     )
 
 
 def _frequencies(order: int) -> NDArray[np.bool_]:
-    """Which frequencies of `rfft2` are tested: those that the polynomial does not take up."""
+    """Boolean mask of the frequencies of `rfft2` that the polynomial does not take up."""
     n = PADDED * BINS
     j, i = np.fft.fftfreq(n, 1 / n)[:, None], np.arange(n // 2 + 1)[None]
     waves = np.hypot(i, j) / PADDED  # over the chip
     return (waves > SLOWEST * (order + 1) / 2) & (waves < BINS / 2.5)
 
 
-def _binned(projection: Projection) -> dict[int, tuple[Float, Float]]:
-    """Scores (2, BINS, BINS) along the axes of the polynomials on each chip, and their squares."""
-    sample, out = projection.sample, dict[int, tuple[Float, Float]]()
+def _binned(sample: ScoredSample) -> dict[int, tuple[list[Float], Float]]:
+    """Scores (N,) along each axis of the polynomials on each chip, and binned (2, BINS, BINS)."""
+    found = dict[int, list[tuple[NDArray[np.int64], Float]]]()
     code = cell_index(sample.X, sample.Y, (BINS, BINS))
     for block in sample.blocks:
-        g = block.frame.T @ projection.whole_score[:, block.rows]
-        scores, squares = out.setdefault(block.chip, (np.zeros((2, BINS, BINS)), np.zeros(2)))
-        for axis in (0, 1):
-            binned = np.bincount(code[block.rows], g[axis], minlength=BINS * BINS)
-            scores[axis] += binned.reshape(BINS, BINS)
-            squares[axis] += float((g[axis] ** 2).sum())
+        scores = block.frame.T @ sample.whole_score[:, block.rows]
+        found.setdefault(block.chip, []).append((code[block.rows], scores))
+    out: dict[int, tuple[list[Float], Float]] = {}
+    for chip, parts in found.items():
+        cells = np.concatenate([one for one, _ in parts])
+        whole = np.concatenate([one for _, one in parts], axis=1)
+        binned = np.array([np.bincount(cells, one, minlength=BINS * BINS) for one in whole])
+        out[chip] = list(whole), binned.astype(float).reshape(2, BINS, BINS)
     return out
+
+
+def _log_tail(steps: Float, length: float) -> float:
+    """Log probability that a plane walk of steps (N,) in directions of chance gets beyond a length.
+
+    By the saddle point of its cumulants K(t) = sum log I_0(t steps): exact for many small steps,
+    where it is -length^2 / sum steps^2, and less where a few steps are much of the walk.
+    """
+    if length >= steps.sum():
+        return -np.inf
+    t = 2 * length / (steps**2).sum()
+    for _ in range(50):
+        ratio = i1e(t * steps) / i0e(t * steps)
+        slope = (steps**2 * (1 - ratio**2) - steps * ratio / t).sum()
+        step = (length - steps @ ratio) / slope
+        t = max(t + step, 0.5 * t)
+        if abs(step) < 1e-9 * t:
+            break
+    cumulants = (np.log(i0e(t * steps)) + t * steps).sum()
+    return float(cumulants - t * length + 0.5 * np.log(length / (t * slope)))

@@ -9,7 +9,6 @@ built.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -32,27 +31,13 @@ LARGEST_LEVERAGE = 0.95  # of one detection; it has next to no residual of its o
 
 @dataclass(frozen=True, eq=False)
 class Eliminated:
-    """Parameters of one exposure, as far as the sample knows them.
+    """Parameters of one exposure, as far as the sample knows them."""
 
-    Parameters
-    ----------
-    index : ndarray of int, shape (l,)
-        Which entries of theta.
-    inverse : ndarray, shape (l, l)
-        Inverse of their information, with the priors.
-    gain : ndarray, shape (l, G + q)
-        How they follow a global parameter, or a regressor.
-    score : ndarray, shape (l,)
-        With the pull of the priors.
-    precision : ndarray, shape (l,)
-        Of the priors.
-    """
-
-    index: Int
-    inverse: Float
-    gain: Float
-    score: Float
-    precision: Float
+    index: Int  # (l,) which entries of theta
+    inverse: Float  # (l, l) inverse of their information, with the priors
+    gain: Float  # (l, G + q) how they follow a global parameter, or a regressor
+    score: Float  # (l,) with the pull of the priors
+    precision: Float  # (l,) of the priors
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,45 +46,34 @@ class Projection:
 
     G global parameters, q regressors: each of the functions that the tests add, on both axes of
     every chip.
-
-    Parameters
-    ----------
-    functions : Functions
-    exposures : dict of int to Eliminated
-        By the code of the frame's exposure.
-    information : ndarray, shape (G + q, G + q)
-        Of global parameters and regressors, with the priors, the exposures' parameters eliminated.
-    score : ndarray, shape (G + q,)
-    precision : ndarray, shape (D,)
-        Of the priors.
-    theta : ndarray, shape (D,)
-        Where the scores were taken.
     """
 
     functions: Functions
-    exposures: dict[int, Eliminated]
+    exposures: dict[int, Eliminated]  # by the code of the frame's exposure
+    # (G + q, G + q) of global parameters and regressors, with the priors, the exposures' parameters
+    # eliminated
     information: Float
-    score: Float
-    precision: Float
-    theta: Float
+    score: Float  # (G + q,)
+    precision: Float  # (D,) of the priors
+    theta: Float  # (D,) where the scores were taken
 
     @property
     def sample(self) -> ScoredSample:
-        """The detections."""
+        """Detections."""
         return self.functions.sample
 
     @property
     def n_global(self) -> int:
-        """Global parameters."""
+        """Number of global parameters."""
         return self.sample.model.n_global
 
     @property
     def n_added(self) -> int:
-        """Functions that the tests add to those of the model."""
+        """Number of functions that the tests add to those of the model."""
         return len(self.functions.terms) - self.sample.model.n_terms
 
     def columns(self, function: Int, chip: int) -> Int:
-        """Where the regressors of some functions on both axes of a chip stand, from 0."""
+        """Indices of the regressors of some functions on both axes of a chip."""
         start = 2 * self.n_added * chip
         return np.ravel(start + 2 * (function[:, None] - self.sample.model.n_terms) + [0, 1])
 
@@ -157,7 +131,7 @@ class Projection:
 
     def star_scores(self, F: Float, block: Block, coefficients: Float) -> Float:
         """Scores (n, q) of detections, by coefficients (2, L, q) of functions F (L, n)."""
-        g = self.whole_score[:, block.rows]
+        g = self.scored.whole_score[:, block.rows]
         return np.asarray(sum((F * g[axis]).T @ coefficients[axis] for axis in (0, 1)))
 
     @cached_property
@@ -191,23 +165,14 @@ class Projection:
         return np.clip(out, 0.0, LARGEST_LEVERAGE)
 
     @cached_property
-    def whole_score(self) -> Float:
-        """Score (2, N), given back what the fit has taken (Bell and McCaffrey 2002)."""
-        return np.asarray(self.sample.score / np.sqrt(1.0 - self.leverage))
+    def scored(self) -> ScoredSample:
+        """Sample with its leverage."""
+        return replace(self.sample, leverage=self.leverage)
 
     def regressor_map(self, block: Block, which: Int) -> Float:
         """Coefficients (2, L, n) of projected regressors in a block.
 
-        Parameters
-        ----------
-        block : Block
-        which : ndarray of int, shape (n,)
-            From 0 to q - 1.
-
-        Returns
-        -------
-        ndarray, shape (2, L, n)
-            Of the functions.
+        `which` (n,) are from 0 to q - 1.
         """
         K, nuisance = self.sample.model.n_terms, self.nuisance[:, which]
         by_global, by_local = _parts(block, self.n_global)
@@ -238,23 +203,13 @@ class Projection:
     def score_ratio(self) -> float:
         """Mean square of the scores over what the curvature expects."""
         h = self.sample.curvature[[0, 2]]
-        return float((self.whole_score**2).sum() / h.sum())
+        return float((self.scored.whole_score**2).sum() / h.sum())
 
 
 def projection_of(functions: Functions, theta: Float, priors: GaussianPriors) -> Projection:
     """Sums over the detections of a sample.
 
-    Parameters
-    ----------
-    functions : Functions
-        With the sample.
-    theta : ndarray, shape (D,)
-        Where the scores were taken.
-    priors : GaussianPriors
-
-    Returns
-    -------
-    Projection
+    `theta` (D,) is where the scores were taken.
     """
     try:
         return _summed(functions, theta, priors)
@@ -273,7 +228,7 @@ def _summed(functions: Functions, theta: Float, priors: GaussianPriors) -> Proje
     information[np.arange(G), np.arange(G)] = priors.precision[:G]
     score[:G] = pull[:G]
     exposures: dict[int, Eliminated] = {}
-    for blocks in _by_frame(sample.blocks):
+    for blocks in sample.blocks_by("frame_exposure"):
         index = np.arange(0)
         for block in blocks:
             index = np.union1d(index, block.columns[block.columns >= G])
@@ -311,14 +266,6 @@ def _summed(functions: Functions, theta: Float, priors: GaussianPriors) -> Proje
     return out
 
 
-def _by_frame(blocks: tuple[Block, ...]) -> Iterator[list[Block]]:
-    """Blocks of one exposure's frame at a time."""
-    found: dict[int, list[Block]] = {}
-    for block in blocks:
-        found.setdefault(block.frame_exposure, []).append(block)
-    yield from found.values()
-
-
 def _parts(block: Block, n_global: int) -> tuple[Float, Float]:
     """Derivatives of a block's polynomial by global and by the exposure's parameters."""
     n = int((block.columns < n_global).sum())
@@ -326,7 +273,7 @@ def _parts(block: Block, n_global: int) -> tuple[Float, Float]:
 
 
 def _added(block: Block, n_added: int, n_terms: int, which: Int) -> Float:
-    """Some regressors (2, L, n) in a block, along the axes of the polynomials."""
+    """Coefficients (2, L, n) of some regressors in a block, along the axes of the polynomials."""
     out = np.zeros((2, n_terms + n_added, len(which)))
     chip, rest = np.divmod(which, 2 * n_added)
     here = np.flatnonzero(chip == block.chip)
@@ -361,10 +308,7 @@ def _ridged(matrix: Float) -> Float:
 def _inverse(matrix: Float) -> Float:
     """Inverse of an information matrix.
 
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        When it is not positive.
+    Raises `numpy.linalg.LinAlgError` when it is not positive.
     """
     root = np.linalg.cholesky(_ridged(matrix))
     return np.asarray(cho_solve((root, True), np.eye(len(matrix))))

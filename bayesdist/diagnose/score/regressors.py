@@ -3,7 +3,6 @@ magnitude, colour and time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -11,8 +10,9 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
+from bayesdist.diagnose.score.families import FAMILIES, Family, order_family
 from bayesdist.diagnose.score.sample import ScoredSample
-from bayesdist.model.basis import MAX_ORDER, polynomial_terms
+from bayesdist.model.basis import polynomial_terms
 from bayesdist.model.timedep import TimeDependence
 
 __all__ = ["EDGES", "EDGES_BESIDE_ORDERS", "Factor", "Functions", "Regressors", "functions_for"]
@@ -24,7 +24,7 @@ EDGES, EDGES_BESIDE_ORDERS = "edges", "edges beside orders"
 LINEAR = 1  # order of the terms that go with magnitude, colour and time
 HIGHER = 2  # orders above the model's that are tested
 OUTSIDE = 0.5  # per cent of the values at either end that are moved to the others
-FEWEST_AT_EDGES = 200  # detections: some in each margin
+MIN_AT_EDGES = 200  # detections: some in each margin
 NEAR_EDGE = 0.05  # of half a side, over which what is at an edge falls off
 SHORTEST = 0.1  # years over which a drift is looked for
 # information that a direction has kept beside the parameters, over what it had: below, it is theirs
@@ -35,17 +35,10 @@ OWN_OF_TIME = 0.02  # frames take up drifts but for what the curvature of the po
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """A number of each detection that multiplies polynomial terms.
+    """Number of each detection that multiplies polynomial terms."""
 
-    Parameters
-    ----------
-    values : ndarray, shape (N,)
-    order : int
-        Of the terms, 0 included.
-    """
-
-    values: Float
-    order: int
+    values: Float  # (N,)
+    order: int  # of the terms, 0 included
 
     @property
     def n_terms(self) -> int:
@@ -55,55 +48,32 @@ class Factor:
 
 @dataclass(frozen=True, eq=False)
 class Regressors:
-    """What one test adds to the model, on both axes of every chip.
+    """Functions that one test adds to the model, on both axes of every chip."""
 
-    Parameters
-    ----------
-    name : str
-    functions : ndarray of int
-        Which `Functions`.
-    least : float
-        Fraction of the information that a direction must have kept beside the model's parameters.
-    remedy, present, absent : str
-        As of `Outcome`.
-    beside : ndarray of int
-        Functions that the fit is given as well, so that they do not pass for these.
-    """
-
-    name: str
-    functions: Int
-    least: float
-    remedy: str
-    present: str
-    absent: str
+    family: Family
+    functions: Int  # which `Functions`
+    # fraction of the information that a direction must have kept beside the model's parameters
+    least: float = INDEPENDENT
+    # functions that the fit is given as well, so that they do not pass for these
     beside: Int = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def every(self) -> Int:
-        """All of these functions, the tested ones first."""
+        """Indices of all of these functions, the tested ones first."""
         return np.concatenate([self.functions, self.beside])
 
     @property
     def own(self) -> NDArray[np.bool_]:
-        """Which of them are tested."""
+        """Boolean mask of those that are tested."""
         return np.arange(len(self.functions) + len(self.beside)) < len(self.functions)
 
 
 @dataclass(frozen=True, eq=False)
 class Functions:
-    """Functions of the detections: those of the model, and those that the tests add.
-
-    Parameters
-    ----------
-    sample : ScoredSample
-    order : int
-        Highest total order of the polynomials.
-    factors : tuple of Factor
-    regressors : tuple of Regressors
-    """
+    """Functions of the detections: those of the model, and those that the tests add."""
 
     sample: ScoredSample
-    order: int
+    order: int  # highest total order of the polynomials
     factors: tuple[Factor, ...]
     regressors: tuple[Regressors, ...]
 
@@ -153,49 +123,45 @@ class Functions:
 
 
 def functions_for(sample: ScoredSample) -> Functions:
-    """The functions that the data can be asked for.
-
-    Parameters
-    ----------
-    sample : ScoredSample
-
-    Returns
-    -------
-    Functions
-    """
+    """Functions that the data can be asked for."""
     n = sample.model.order
-    regressors = [_higher(n, n + step) for step in range(1, HIGHER + 1)]
+    regressors = [
+        Regressors(order_family(total, n), len(polynomial_terms(total - 1)) + np.arange(total + 1))
+        for total in range(n + 1, n + HIGHER + 1)
+    ]
     factors: list[Factor] = []
     start = len(polynomial_terms(n + HIGHER))
 
-    def add(factor: Factor, make: Callable[[Int], Regressors]) -> None:
+    def add(name: str, factor: Factor, least: float = INDEPENDENT) -> None:
         nonlocal start
         if np.std(factor.values) < CONSTANT:
             return
         factors.append(factor)
-        regressors.append(make(start + np.arange(factor.n_terms)))
+        functions = start + np.arange(factor.n_terms)
+        regressors.append(Regressors(FAMILIES[name], functions, least))
         start += factor.n_terms
 
-    for values, make in ((sample.mag, _by_magnitude), (sample.colour, _by_colour)):
+    for name, values in (("magnitude", sample.mag), ("colour", sample.colour)):
         if values is not None:
-            add(Factor(_standing_out(values), LINEAR), make)
+            add(name, Factor(_standing_out(values), LINEAR))
     edges = [np.exp((s * Z - 1.0) / NEAR_EDGE) for Z in (sample.X, sample.Y) for s in (-1, 1)]
-    if len(sample) >= FEWEST_AT_EDGES:
+    if len(sample) >= MIN_AT_EDGES:
         factors += [Factor(one - one.mean(), 0) for one in edges]
         orders = np.concatenate([one.functions for one in regressors[:HIGHER]])
-        alone = _at_edges(start + np.arange(len(edges)))
-        regressors += [alone, replace(alone, name=EDGES_BESIDE_ORDERS, beside=orders)]
+        alone = Regressors(FAMILIES[EDGES], start + np.arange(len(edges)))
+        beside = replace(alone.family, name=EDGES_BESIDE_ORDERS)
+        regressors += [alone, replace(alone, family=beside, beside=orders)]
         start += len(edges)
     time, epoch = sample.model.time, sample.epoch
     if epoch is not None and np.ptp(epoch) > SHORTEST:
         # from -1 to 1
         half = (2 * epoch - epoch.min() - epoch.max()) / np.ptp(epoch)
         if sample.mag is not None:
-            add(Factor(_standing_out(sample.mag) * half, LINEAR), _magnitude_in_time)
-        add(Factor(half - half.mean(), LINEAR), _drift)
+            add("magnitude in time", Factor(_standing_out(sample.mag) * half, LINEAR))
+        add("drift", Factor(half - half.mean(), LINEAR), OWN_OF_TIME)
         if time is not None and len(np.unique(epoch)) > 2:
             order = max([LINEAR, *(i + j for _, i, j in time.terms)])
-            add(Factor(_beyond_lines(half, time, epoch), order), _curved)
+            add("curvature in time", Factor(_beyond_lines(half, time, epoch), order), OWN_OF_TIME)
     return Functions(sample, n + HIGHER, tuple(factors), tuple(regressors))
 
 
@@ -214,82 +180,3 @@ def _beyond_lines(half: Float, time: TimeDependence, epoch: Float) -> Float:
     weight = np.sqrt(np.bincount(of))
     found = np.linalg.lstsq(weight[:, None] * design[first], weight * dates**2)[0]
     return half**2 - design @ found
-
-
-def _higher(order: int, total: int) -> Regressors:
-    first = len(polynomial_terms(total - 1))
-    table = "fit a look-up table"
-    return Regressors(
-        f"order {total}",
-        first + np.arange(total + 1),
-        INDEPENDENT,
-        f"raise model.order to {total}" if total <= MAX_ORDER else table,
-        f"the residuals hold terms of order {total}, and the model ends at order {order}",
-        f"no terms of order {total} are left in the residuals",
-    )
-
-
-def _at_edges(functions: Int) -> Regressors:
-    return Regressors(
-        EDGES,
-        functions,
-        INDEPENDENT,
-        "leave out the margins of the detector, or fit a look-up table",
-        "the residuals rise towards the edges of the detector",
-        "the residuals do not rise towards the edges of the detector",
-    )
-
-
-def _by_magnitude(functions: Int) -> Regressors:
-    return Regressors(
-        "magnitude",
-        functions,
-        INDEPENDENT,
-        "add a magnitude term, cut the faint stars, or correct the charge-transfer efficiency",
-        "the residuals go with the magnitude of the stars",
-        "the residuals do not go with the magnitude of the stars",
-    )
-
-
-def _magnitude_in_time(functions: Int) -> Regressors:
-    return Regressors(
-        "magnitude in time",
-        functions,
-        INDEPENDENT,
-        "cut the faint stars, correct the charge-transfer efficiency, or leave out the late years",
-        "how the residuals go with the magnitude of the stars changes with time",
-        "how the residuals go with the magnitude of the stars does not change with time",
-    )
-
-
-def _by_colour(functions: Int) -> Regressors:
-    return Regressors(
-        "colour",
-        functions,
-        INDEPENDENT,
-        "add a colour term, or select a narrower range of colours",
-        "the residuals go with the colour of the stars",
-        "the residuals do not go with the colour of the stars",
-    )
-
-
-def _drift(functions: Int) -> Regressors:
-    return Regressors(
-        "drift",
-        functions,
-        OWN_OF_TIME,
-        "add time-dependent terms to model.tdd",
-        "linear terms drift with time, and the model's do not",
-        "no drift of the linear terms is left in the residuals",
-    )
-
-
-def _curved(functions: Int) -> Regressors:
-    return Regressors(
-        "curvature in time",
-        functions,
-        OWN_OF_TIME,
-        "give model.tdd a break, or shorter periods",
-        "the time dependence is not linear",
-        "no curvature of the time dependence is left in the residuals",
-    )

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
+import numpy as np
 from scipy import special, stats
 
+from bayesdist.diagnose.score.families import Family
 from bayesdist.diagnose.significance import holm, p_words
+from bayesdist.limits import SCORE_TESTS
 
-__all__ = ["FAMILY_LEVEL", "POWER", "Outcome", "ScoreTest", "corrected", "noncentrality"]
+__all__ = [
+    "POWER",
+    "Outcome",
+    "ScoreTest",
+    "corrected",
+    "noncentrality",
+    "outcome",
+    "smallest_pattern",
+]
 
-FAMILY_LEVEL = 1e-3  # probability that any of a run's tests finds something where nothing is
-POWER = 0.9  # with which the smallest effect that is told would have been found
+POWER = 0.9  # with which the smallest effect that is stated would have been found
 
 
 @dataclass(frozen=True)
@@ -43,7 +54,7 @@ class ScoreTest:
     finding : str
         What it means, as a sentence.
     significant : bool
-        More than chance, corrected for the number of tests (Holm 1979, at `FAMILY_LEVEL`).
+        More than chance, corrected for the number of tests (Holm 1979, at `limits.SCORE_TESTS`).
     """
 
     name: str
@@ -61,38 +72,37 @@ class ScoreTest:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """One test by itself, before it is known how many there are.
+    """One test by itself, before it is known how many there are."""
 
-    Parameters
-    ----------
-    name, statistic, dof, dof_residual, p_value, size, unit, remedy
-        As of `ScoreTest`.
-    smallest : callable
-        Size that is found with probability `POWER`, by the level of the test.
-    present, absent : str
-        Subject and verb of the finding, where there is something and where there is not.
-    """
-
-    name: str
+    family: Family
+    # statistic, dof, dof_residual, p_value, size, unit: as of `ScoreTest`
     statistic: float
     dof: float
     dof_residual: float | None
     p_value: float
     size: float
+    # size that is found with probability `POWER`, by the level of the test
     smallest: Callable[[float], float]
     unit: str
-    remedy: str
-    present: str
-    absent: str
+
+    @property
+    def name(self) -> str:
+        """Name of the test."""
+        return self.family.name
+
+    def unless(self, clause: str) -> Outcome:
+        """Outcome with another explanation of the finding, as a clause: 'it is not ...'."""
+        present = f"{self.family.present}, if {clause}"
+        return replace(self, family=replace(self.family, present=present))
 
     def judged(self, significant: bool, level: float) -> ScoreTest:
-        """The test among others, by whether it is significant and by the level of each."""
+        """Result of the test among others, by whether it is significant and by its level."""
         smallest = self.smallest(level)
-        p = p_words(self.p_value)
         if significant:
-            finding = f"{self.present} ({self.size:.2g} {self.unit} rms, {p})"
+            size = f"{self.size:.2g} {self.unit} rms, {p_words(self.p_value)}"
+            finding = f"{self.family.present} ({size})"
         else:
-            finding = f"{self.absent} ({smallest:.2g} {self.unit} rms would have been found)"
+            finding = f"{self.family.absent} ({smallest:.2g} {self.unit} rms would have been found)"
         return ScoreTest(
             name=self.name,
             statistic=self.statistic,
@@ -102,29 +112,43 @@ class Outcome:
             size=self.size,
             smallest=smallest,
             unit=self.unit,
-            remedy=self.remedy,
+            remedy=self.family.remedy,
             finding=finding,
             significant=significant,
         )
 
 
-def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
-    """Tests with their verdicts, corrected for how many there are (Holm 1979).
+def outcome(
+    family: Family,
+    statistic: float,
+    dof: float,
+    dof_residual: float | None,
+    p_value: float,
+    *,
+    square: float,
+    noise: float,
+    unit: str,
+    smallest: Callable[[float], float] | None = None,
+) -> Outcome:
+    """Outcome of a test that has found a pattern of some mean square.
 
-    Parameters
-    ----------
-    outcomes : sequence of Outcome
-
-    Returns
-    -------
-    tuple of ScoreTest
-        In the same order.
+    `square` and `noise` are the mean square of the pattern, noise included, and that of the noise;
+    `smallest` is by default that of a pattern that lies in any direction as noise does. Others as
+    of `ScoreTest`.
     """
+    if smallest is None:
+        smallest = partial(smallest_pattern, float(np.sqrt(max(noise, 0.0))), dof, dof_residual)
+    size = float(np.sqrt(max(square - noise, 0.0)))
+    return Outcome(family, statistic, dof, dof_residual, p_value, size, smallest, unit)
+
+
+def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
+    """Tests with their verdicts, corrected for how many there are (Holm 1979)."""
     n = len(outcomes)
-    significant = holm([one.p_value for one in outcomes]) <= FAMILY_LEVEL
+    significant = holm([one.p_value for one in outcomes]) <= SCORE_TESTS.value
     # what is alone has to pass the first step
     return tuple(
-        one.judged(bool(found), FAMILY_LEVEL / n)
+        one.judged(bool(found), SCORE_TESTS.value / n)
         for one, found in zip(outcomes, significant, strict=True)
     )
 
@@ -132,19 +156,18 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
 def noncentrality(level: float, dof: float, dof_residual: float | None = None) -> float:
     """Noncentrality at which a chi-square or F test has the power `POWER`.
 
-    Parameters
-    ----------
-    level : float
-        Of the test.
-    dof : float
-    dof_residual : float, optional
-        Of the F test.
-
-    Returns
-    -------
-    float
+    `dof_residual` is that of an F test.
     """
-    if dof_residual is None or dof_residual > 1e5:  # where F is no longer told from chi-square
+    if dof_residual is None or dof_residual > 1e5:  # where F and chi-square are alike
         return float(special.chndtrinc(stats.chi2.isf(level, dof), dof, 1 - POWER))
     limit = stats.f.isf(level, dof, dof_residual)
     return float(special.ncfdtrinc(dof, dof_residual, 1 - POWER, limit))
+
+
+def smallest_pattern(noise: float, dof: float, dof_residual: float | None, level: float) -> float:
+    """Rms of a pattern that is found with the power `POWER`.
+
+    `noise` is the rms of the pattern that noise makes; the pattern lies in any direction as noise
+    does.
+    """
+    return float(noise * np.sqrt(noncentrality(level, dof, dof_residual) / dof))

@@ -1,17 +1,16 @@
-"""Detections with their scores: what all tests of one solution look at."""
+"""Detections with their scores: the data of all tests of one solution."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.infer.posterior.likelihood import scores_of
-from bayesdist.infer.posterior.memberships import star_averages
+from bayesdist.infer.solution import Solution, likelihood_of
 from bayesdist.infer.stars.stars import Stars, prepare
-from bayesdist.infer.transforms import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["SAMPLE", "Block", "ScoredSample", "scored_sample"]
@@ -25,92 +24,74 @@ LARGEST_BLOCK = 4096  # detections, whose functions stay in the cache
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Detections of one chip, exposure and epoch, or some of them: one polynomial describes them.
-
-    Parameters
-    ----------
-    rows : slice
-    chip : int
-        Code into the model's chips.
-    exposure : int
-        Code into the exposures of the data.
-    frame_exposure : int
-        Code of the exposure whose frame they have.
-    frame : ndarray, shape (2, 2)
-        Linear part of that frame.
-    effective : ndarray, shape (2, K)
-    columns : ndarray of int, shape (m,)
-        Parameters that the polynomial depends on, the global ones first.
-    derivative : ndarray, shape (2, K, m)
-        Of the effective coefficients by them.
-    """
+    """Detections of one chip, exposure and epoch, or some of them, with one polynomial."""
 
     rows: slice
-    chip: int
-    exposure: int
-    frame_exposure: int
-    frame: Float
-    effective: Float
-    columns: Int
-    derivative: Float
+    chip: int  # code into the model's chips
+    exposure: int  # code into the exposures of the data
+    frame_exposure: int  # code of the exposure whose frame they have
+    frame: Float  # (2, 2) linear part of that frame
+    effective: Float  # (2, K)
+    columns: Int  # (m,) parameters that the polynomial depends on, the global ones first
+    derivative: Float  # (2, K, m) of the effective coefficients by them
 
 
 @dataclass(frozen=True, eq=False)
 class ScoredSample:
-    """Detections in the order of their blocks, with gradient and curvature of their likelihood.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    X, Y : ndarray, shape (N,)
-        Scaled detector position.
-    score : ndarray, shape (2, N)
-        Gradient of the log-likelihood by the model's u and v.
-    curvature : ndarray, shape (3, N)
-        Minus the second derivatives uu, uv, vv.
-    residual : ndarray, shape (2, N)
-        Data minus model.
-    variance : ndarray, shape (2, N)
-        Squared errors of true matches along u and v, jitter included.
-    inlier : ndarray, shape (N,)
-        Probability of being a true match; of a least-squares fit, whether it uses the detection.
-    mag, colour, epoch : ndarray, shape (N,), or None
-    star : ndarray of int, shape (N,)
-        Number of the star, from 0: detections of one star share the error of its reference
-        position.
-    blocks : tuple of Block
-    motion : ndarray, shape (2, N), or None
-        Proper motions along u and v, in the unit of u, v per year.
-    motion_sigma : ndarray, shape (2, N), or None
-        Their standard errors, where the table has them.
-    """
+    """Detections in the order of their blocks, with gradient and curvature of their likelihood."""
 
     model: DistortionModel
+    # X, Y (N,): scaled detector position
     X: Float
     Y: Float
-    score: Float
-    curvature: Float
-    residual: Float
-    variance: Float
+    score: Float  # (2, N) gradient of the log-likelihood by the model's u and v
+    curvature: Float  # (3, N) minus the second derivatives uu, uv, vv
+    residual: Float  # (2, N) data minus model
+    variance: Float  # (2, N) squared errors of true matches along u and v, jitter included
+    # (N,) probability of being a true match; of a least-squares fit, whether it uses the detection
     inlier: Float
-    mag: Float | None
+    mag: Float | None  # (N,)
     colour: Float | None
     epoch: Float | None
+    # (N,) number of the star, from 0: detections of one star share the error of its reference
+    # position
     star: Int
     blocks: tuple[Block, ...]
-    motion: Float | None = None
-    motion_sigma: Float | None = None
+    motion: Float | None = None  # (2, N) proper motions along u and v, in the unit of u, v per year
+    motion_sigma: Float | None = None  # (2, N) their standard errors, where the table has them
+    # (2, N) fraction of the noise of each detection that the fit follows, along u and v; 0 where it
+    # is not known
+    leverage: Float | float = 0.0
 
     def __len__(self) -> int:
         return len(self.X)
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """Detections that say anything: all but those that a fit rejects."""
+        """Boolean mask (N,) of the detections that count: all but those that a fit rejects."""
         return np.any(self.curvature != 0, axis=0)
 
+    @cached_property
+    def whole_score(self) -> Float:
+        """Score (2, N), given back what the fit has taken (Bell and McCaffrey 2002)."""
+        return np.asarray(self.score / np.sqrt(1.0 - self.leverage))
+
+    def codes(self, name: str) -> Int:
+        """Codes (N,) of what the detections of a block have in common: 'chip', 'exposure'."""
+        out = np.empty(len(self), np.int64)
+        for block in self.blocks:
+            out[block.rows] = getattr(block, name)
+        return out
+
+    def blocks_by(self, name: str) -> list[list[Block]]:
+        """Blocks that have a code in common: 'exposure', 'frame_exposure'."""
+        found: dict[int, list[Block]] = {}
+        for block in self.blocks:
+            found.setdefault(getattr(block, name), []).append(block)
+        return list(found.values())
+
     def with_positive_curvature(self) -> ScoredSample:
-        """The sample with what is concave in the likelihood alone.
+        """Sample with what is concave in the likelihood alone.
 
         Detections between true and false curve the wrong way; where there are many of them, their
         sum is no information matrix.
@@ -123,36 +104,17 @@ class ScoredSample:
 
 
 def scored_sample(table: MatchTable, solution: Solution) -> ScoredSample:
-    """Detections of a table with what a solution says of each.
+    """Sample of the detections of a table, with their scores at a solution.
 
-    Parameters
-    ----------
-    table : MatchTable
-        With errors; of more than `SAMPLE` rows, every k-th is taken.
-    solution : Posterior or LinearFit
-
-    Returns
-    -------
-    ScoredSample
-
-    Raises
-    ------
-    InputError
-        As `prepare` and `scores_of`.
+    The table has errors; of more than `SAMPLE` rows, every k-th is taken. Raises InputError where
+    the table does not go with the solution.
     """
     table = table.sample(SAMPLE)
     by_exposure = np.argsort(table.exposure, kind="stable")
-    scores = scores_of(solution)
+    likelihood = likelihood_of(solution)
     stars, order = prepare(solution.model, table.select(by_exposure))
     rows = by_exposure[order]
-    columns = scores.of(stars)
-    residual = stars.residuals(scores.theta).T
-    variance = np.stack([stars.var_u, stars.var_v])
-    if scores.constants is None:
-        inlier = (columns[2] > 0).astype(float)
-    else:
-        inlier = 1.0 - star_averages(stars, scores.theta[None], scores.constants)[0]
-        variance = variance + scores.constants.j2[0]
+    columns = likelihood.scores(stars)
     codes = np.arange(len(rows)) if table.star is None else table.star[rows]
     return ScoredSample(
         model=solution.model,
@@ -160,14 +122,14 @@ def scored_sample(table: MatchTable, solution: Solution) -> ScoredSample:
         Y=stars.Y,
         score=columns[:2],
         curvature=columns[2:],
-        residual=residual,
-        variance=variance,
-        inlier=inlier,
+        residual=stars.residuals(likelihood.theta).T,
+        variance=likelihood.variances(stars),
+        inlier=likelihood.inliers(stars),
         mag=None if table.mag is None else table.mag[rows],
         colour=None if table.colour is None else table.colour[rows],
         epoch=None if table.epoch is None else table.epoch[rows],
         star=np.unique(codes, return_inverse=True)[1],
-        blocks=_blocks(stars, table.exposure[rows], scores.theta),
+        blocks=_blocks(stars, table.exposure[rows], likelihood.theta),
         motion=_both(table.pm_u, table.pm_v, rows),
         motion_sigma=_both(table.sigma_pm_u, table.sigma_pm_v, rows),
     )

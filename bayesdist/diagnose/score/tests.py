@@ -1,4 +1,4 @@
-"""All tests of one solution, corrected for their number."""
+"""Tests of one solution, corrected for their number."""
 
 from __future__ import annotations
 
@@ -8,24 +8,26 @@ import numpy as np
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.score.exposures import exposure_test
+from bayesdist.diagnose.score.families import FAMILIES
 from bayesdist.diagnose.score.gap import gap_test
 from bayesdist.diagnose.score.motions import motion_test
 from bayesdist.diagnose.score.noise import noise_tests
 from bayesdist.diagnose.score.pattern import pattern_test
 from bayesdist.diagnose.score.projection import projection_of
+from bayesdist.diagnose.score.regressor_tests import regressor_tests
 from bayesdist.diagnose.score.regressors import EDGES, EDGES_BESIDE_ORDERS, functions_for
-from bayesdist.diagnose.score.result import FAMILY_LEVEL, Outcome, ScoreTest, corrected
+from bayesdist.diagnose.score.result import Outcome, ScoreTest, corrected
 from bayesdist.diagnose.score.sample import scored_sample
-from bayesdist.diagnose.score.score import regressor_tests
 from bayesdist.diagnose.score.truncation import truncation_test
 from bayesdist.infer.equations.priors import GaussianPriors
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.solution import Solution
+from bayesdist.limits import SCORE_TESTS
 
 __all__ = ["score_tests"]
 
 SAYS_NOTHING = 0.2  # probability by chance above which a second look has seen nothing
 OF_TIME = ("drift", "curvature in time", "motions")
-ORDERS, OF_PLACE = "order ", ("noise by position",)
+ORDERS, OF_PLACE = "order ", "noise by position"
 
 
 def score_tests(
@@ -68,15 +70,18 @@ def score_tests(
     )
     exposures = exposure_test(projection)
     found = _edges_or_orders(regressor_tests(projection))
-    found += [one for one in (gap_test(projection), motion_test(projection)) if one is not None]
-    if exposures is not None and exposures.p_value < FAMILY_LEVEL:
-        found = [_doubtful(one) if one.name in OF_TIME else one for one in found]
+    sample = projection.scored
+    found += [one for one in (gap_test(projection), motion_test(sample)) if one is not None]
+    if exposures is not None and exposures.p_value < SCORE_TESTS.value:
+        # so few dates may go with time too
+        clause = "it is not single exposures that deviate"
+        found = [one.unless(clause) if one.name in OF_TIME else one for one in found]
     orders = [one.p_value for one in found if one.name.startswith(ORDERS)]
-    truncation = truncation_test(projection, match_radius)
-    others = (exposures, pattern_test(projection), truncation)
-    found += noise_tests(projection)
-    if min(orders, default=1.0) < FAMILY_LEVEL:
-        found = [_after_orders(one) if one.name in OF_PLACE else one for one in found]
+    found += noise_tests(sample)
+    if min(orders, default=1.0) < SCORE_TESTS.value:  # which look the same
+        clause = "it is not the missing order"
+        found = [one.unless(clause) if one.name == OF_PLACE else one for one in found]
+    others = (exposures, pattern_test(sample), truncation_test(sample, match_radius))
     return corrected([*found, *(one for one in others if one is not None)])
 
 
@@ -89,17 +94,5 @@ def _edges_or_orders(outcomes: list[Outcome]) -> list[Outcome]:
     by_name = {one.name: one for one in outcomes}
     beside = by_name.pop(EDGES_BESIDE_ORDERS, None)
     if EDGES in by_name and beside is not None and beside.p_value > SAYS_NOTHING:
-        by_name[EDGES] = replace(beside, name=EDGES)
+        by_name[EDGES] = replace(beside, family=FAMILIES[EDGES])
     return list(by_name.values())
-
-
-def _after_orders(outcome: Outcome) -> Outcome:
-    """A test by place where orders are missing, which look the same."""
-    return replace(outcome, present=f"{outcome.present}, if it is not the missing order")
-
-
-def _doubtful(outcome: Outcome) -> Outcome:
-    """A test of time where exposures deviate by themselves: so few dates may go with time too."""
-    return replace(
-        outcome, present=f"{outcome.present}, if it is not single exposures that deviate"
-    )

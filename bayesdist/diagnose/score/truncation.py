@@ -9,28 +9,29 @@ lie beyond the last ones that there are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, special, stats
+from scipy import optimize, special
 
-from bayesdist.diagnose.score.projection import Projection
+from bayesdist.diagnose.score.families import FAMILIES
 from bayesdist.diagnose.score.result import Outcome
-from bayesdist.diagnose.significance import LEAST_P
+from bayesdist.diagnose.score.sample import ScoredSample
+from bayesdist.diagnose.significance import chi_square_of
 
 __all__ = ["truncation_test"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-FEWEST_STARS = 50
+MIN_STARS = 50
 LARGEST_LEVERAGE = 0.5
-ENDS = 0.25  # of the expected number: with more, nothing ends at the match radius
+MAX_FRACTION_BEYOND = 0.25  # of the expected number: with more, nothing ends at the match radius
 STARS_PER_PART = 150  # with errors alike, from which their scatter is measured
-MOST_PARTS = 12
-FEW = 0.5  # expected matches whose absence says nothing
+MAX_PARTS = 12
+MIN_EXPECTED = 0.5  # expected matches whose absence says nothing
 BEYOND = (0, 3)  # stars that may lie beyond a radius: the edge need not be sharp
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
 ANGLES = (np.arange(8) + 0.5) * np.pi / 16  # of a quarter of the circle
@@ -38,28 +39,19 @@ ANGLES = (np.arange(8) + 0.5) * np.pi / 16  # of a quarter of the circle
 
 @dataclass(frozen=True, eq=False)
 class _Deficit:
-    """True matches expected beyond a radius, and detections that are there.
-
-    Parameters
-    ----------
-    expected : float
-    beyond : int
-    radius : float
-    unit : str
-    spread : float
-        Standard deviation of the logarithm of `expected`, as the scale is not known exactly.
-    """
+    """True matches expected beyond a radius, and detections that are there."""
 
     expected: float
     beyond: int
     radius: float
     unit: str
+    # standard deviation of the logarithm of `expected`, as the scale is not known exactly
     spread: float
 
     @property
     def p_value(self) -> float:
         """Probability of so few, over what the scale may be."""
-        if self.expected < FEW or self.beyond > ENDS * self.expected:
+        if self.expected < MIN_EXPECTED or self.beyond > MAX_FRACTION_BEYOND * self.expected:
             return 1.0
         at = self.expected * np.exp(self.spread * NODES)
         chance = special.gammaincc(self.beyond + 1, at)
@@ -68,46 +60,33 @@ class _Deficit:
 
 @dataclass(frozen=True, eq=False)
 class _Radii:
-    """Residuals in units of their own scatter.
+    """Residuals in units of their own scatter."""
 
-    Parameters
-    ----------
-    inlier : ndarray, shape (N,)
-        Probability of being a true match.
-    square : ndarray, shape (2, N)
-        Squared residuals over their quoted variance, by which they scatter as a whole.
-    relative : float
-        Relative error of that factor.
-    radius2 : ndarray, shape (N,)
-        Squared residuals of both axes, in the unit of u and v.
-    part : ndarray of int, shape (N,)
-        Stars of about equal quoted errors.
-    variance : ndarray, shape (2, P)
-        Of the residuals along each axis, in each part.
-    relative_of : ndarray, shape (P,)
-        Its relative error.
-    """
-
-    inlier: Float
+    inlier: Float  # (N,) probability of being a true match
+    # (2, N) squared residuals over their quoted variance, by which they scatter as a whole
     square: Float
-    relative: float
-    radius2: Float
-    part: Int
+    relative: float  # relative error of that factor
+    radius2: Float  # (N,) squared residuals of both axes, in the unit of u and v
+    part: Int  # (N,) stars of about equal quoted errors
+    # (2, P) of the residuals along each axis, in each part, given back what the fit has taken
     variance: Float
-    relative_of: Float
+    left: Float  # (2, P) as the fit has left it
+    relative_of: Float  # (P,) its relative error
 
     @classmethod
-    def of(cls, projection: Projection) -> _Radii:
-        """Those of a sample."""
-        sample, inlier = projection.sample, _weights(projection)
+    def of(cls, sample: ScoredSample, inlier: Float) -> _Radii:
+        """Residuals of a sample, its true matches by their probabilities (N,)."""
         n = inlier.sum()
         # given back what the fit has taken of them
-        square = sample.residual**2 / (1.0 - projection.leverage)
+        square = sample.residual**2 / (1.0 - sample.leverage)
         part = _alike(sample.variance.sum(axis=0), inlier)
         count = np.bincount(part, inlier)
         # not by the quoted errors of single stars: where they are wrong, those with large ones
         # would be expected far out
-        variance = np.stack([np.bincount(part, inlier * one) / count for one in square])
+        variance, left = (
+            np.stack([np.bincount(part, inlier * one) / count for one in both])
+            for both in (square, sample.residual**2)
+        )
         excess = square.sum(axis=0) / variance.sum(axis=0)[part] - 1.0
         square = square / sample.variance
         t = square.mean(axis=0)
@@ -119,6 +98,7 @@ class _Radii:
             radius2=(sample.residual**2).sum(axis=0),
             part=part,
             variance=variance,
+            left=left,
             relative_of=np.sqrt(np.bincount(part, inlier * excess**2)) / count,
         )
 
@@ -131,15 +111,15 @@ class _Radii:
         return float(np.sqrt(np.average(self.variance.mean(axis=0) * excess, weights=count)))
 
 
-def _weights(projection: Projection) -> Float:
+def _weights(sample: ScoredSample) -> Float:
     """Probabilities (N,) of true matches, without those whose residuals the fit has taken."""
-    own = projection.leverage.max(axis=0) < LARGEST_LEVERAGE
-    return np.asarray(projection.sample.inlier * own)
+    leverage = np.broadcast_to(sample.leverage, sample.score.shape)
+    return np.asarray(sample.inlier * (leverage.max(axis=0) < LARGEST_LEVERAGE))
 
 
 def _alike(variance: Float, inlier: Float) -> Int:
     """Parts (N,) with stars of about equal errors."""
-    n = int(np.clip(inlier.sum() // STARS_PER_PART, 1, MOST_PARTS))
+    n = int(np.clip(inlier.sum() // STARS_PER_PART, 1, MAX_PARTS))
     edges = np.unique(np.quantile(variance, np.linspace(0, 1, n + 1)[1:-1]))
     part = np.searchsorted(edges, variance, side="right")
     count = np.bincount(part, inlier, minlength=len(edges) + 1)
@@ -150,25 +130,16 @@ def _alike(variance: Float, inlier: Float) -> Int:
     return np.clip(np.searchsorted(kept, np.arange(len(count))), 0, len(kept) - 1)[part]
 
 
-def truncation_test(projection: Projection, match_radius: float | None = None) -> Outcome | None:
+def truncation_test(sample: ScoredSample, match_radius: float | None = None) -> Outcome | None:
     """Test for true matches missing beyond some radius.
 
-    Parameters
-    ----------
-    projection : Projection
-    match_radius : float, optional
-        In the unit of u and v.
-
-    Returns
-    -------
-    Outcome or None
-        None for less than `FEWEST_STARS` true matches.
+    `match_radius` is in the unit of u and v. None for less than `MIN_STARS` true matches.
     """
-    sample, inlier = projection.sample, _weights(projection)
+    inlier = _weights(sample)
     n = float(inlier.sum())
-    if n < FEWEST_STARS:
+    if n < MIN_STARS:
         return None
-    radii = _Radii.of(projection)
+    radii = _Radii.of(sample, inlier)
     found = [
         *_in_sigmas(radii),
         *_along_an_axis(radii),
@@ -180,24 +151,23 @@ def truncation_test(projection: Projection, match_radius: float | None = None) -
     if worst.unit == sample.model.unit:
         end = worst.radius**2 / both
     sigma = float(np.sqrt(np.median(both[radii.part]) / 2))
-    chi2 = sample.residual**2 / (sample.variance * (1.0 - projection.leverage))
+    chi2 = sample.residual**2 / (sample.variance * (1.0 - sample.leverage))
     p_value = min(1.0, len(found) * worst.p_value)
+    present = (
+        f"the residuals end too abruptly: {worst.expected:.3g} true matches are expected beyond "
+        f"{worst.radius:.3g} {worst.unit}, and there are {worst.beyond}, so that the matching has "
+        f"cut the scatter, and chi-square ({float(inlier @ chi2.mean(axis=0)) / n:.2g} of each "
+        "degree of freedom) says nothing of the quoted errors"
+    )
     return Outcome(
-        name="truncation",
-        statistic=float(stats.chi2.isf(max(p_value, LEAST_P), 1)),  # of the same probability
-        dof=1,
-        dof_residual=None,
-        p_value=p_value,
-        size=radii.lost(end),
-        smallest=partial(_smallest, sigma, n, len(found)),
-        unit=sample.model.unit,
-        remedy="match again with a wider radius",
-        present=f"the residuals end too abruptly: {worst.expected:.3g} true matches are expected "
-        f"beyond {worst.radius:.3g} {worst.unit}, and there are {worst.beyond}, so that the "
-        "matching has cut the scatter, and chi-square "
-        f"({float(inlier @ chi2.mean(axis=0)) / n:.2g} of each degree of freedom) says "
-        "nothing of the quoted errors",
-        absent="the residuals do not end abruptly",
+        replace(FAMILIES["truncation"], present=present),
+        chi_square_of(p_value, 1),
+        1,
+        None,
+        p_value,
+        radii.lost(end),
+        partial(_smallest, sigma, n, len(found)),
+        sample.model.unit,
     )
 
 
@@ -229,9 +199,9 @@ def _in_units(radii: _Radii, unit: str, match_radius: float | None) -> list[_Def
         ends.append((outside, match_radius**2))
     out = []
     for k, end in ends:
-        expected = np.bincount(radii.part, radii.inlier) * _tail(radii.variance, end)
+        expected = np.bincount(radii.part, radii.inlier) * _tail(radii.left, end)
         # by how much the logarithm goes with that of the variance
-        slope = end / radii.variance.sum(axis=0)
+        slope = end / radii.left.sum(axis=0)
         spread = np.sqrt(((expected * slope * radii.relative_of) ** 2).sum())
         total = float(expected.sum())
         out.append(_Deficit(total, k, np.sqrt(end), unit, float(spread) / max(total, 1e-300)))
@@ -239,7 +209,7 @@ def _in_units(radii: _Radii, unit: str, match_radius: float | None) -> list[_Def
 
 
 def _ends(values: Float) -> list[tuple[int, float]]:
-    """Where so many values lie beyond, for each number of `BEYOND`."""
+    """Numbers of `BEYOND`, each with the limit beyond which so many values lie."""
     return [(k, float(np.partition(values, -k - 1)[-k - 1])) for k in BEYOND]
 
 
@@ -256,10 +226,7 @@ def _tail(variance: Float, radius2: float) -> Float:
 def _lost(end: float) -> float:
     """Scatter along an axis that was cut off, in units of what is left.
 
-    Parameters
-    ----------
-    end : float
-        Half the square of the radius in units of the scatter that is left.
+    `end` is half the square of the radius in units of the scatter that is left.
     """
     # mean of an exponential of scale s cut at `end`: s - end / (exp(end / s) - 1) = 1
     if end <= 2.0:  # as flat a distribution as there is

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.discrepancy.functions import legendre_products
-from bayesdist.infer.selfcal.eliminated import Columns
+from bayesdist.diagnose.correlated.functions import legendre_products
+from bayesdist.diagnose.selfcal.eliminated import Columns
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.basis import polynomial_terms
 
@@ -30,17 +30,10 @@ class AddedColumns(Columns):
 
     They are terms of higher order, linear terms times the magnitude, and quadratic terms of the
     position times the offset of the exposure.
-
-    Parameters
-    ----------
-    mag : ndarray, shape (N,), or None
-        Of each detection, about the mean.
-    pointed : ndarray, shape (N, 6), or None
-        As of `pointing_terms`.
     """
 
-    mag: Float | None = field(default=None)
-    pointed: Float | None = field(default=None)
+    mag: Float | None = field(default=None)  # (N,) of each detection, about the mean
+    pointed: Float | None = field(default=None)  # (N, 6) as of `pointing_terms`
 
     @cached_property
     def terms(self) -> tuple[tuple[int, int], ...]:
@@ -89,19 +82,11 @@ class AddedColumns(Columns):
 
 
 def pointing_terms(problem: Problem, theta: Float) -> Float | None:
-    """Quadratic terms of the position times the offset, along the axes of the detector.
+    """Quadratic terms (N, 6) of the position times the offset, along the axes of the detector.
 
     To their first order these are what a curved sky makes of the tangent planes of exposures.
 
-    Parameters
-    ----------
-    problem : Problem
-    theta : ndarray, shape (D,)
-
-    Returns
-    -------
-    ndarray, shape (N, 6), or None
-        Lengths in half sides of the detector; None where nothing was dithered.
+    Lengths are in half sides of the detector; None where nothing was dithered.
     """
     model = problem.model
     exposure = problem.groups.exposure[problem.groups.index]

@@ -22,8 +22,8 @@ from scipy.sparse import csr_array
 from scipy.stats import f as f_distribution
 
 from bayesdist.diagnose.residuals.misfit import Misfit, bin_means, partitions_for, worst_misfit
-from bayesdist.infer.selfcal import Solution
-from bayesdist.infer.selfcal.following import Following, following
+from bayesdist.diagnose.selfcal.leverage import StarBlock, star_blocks
+from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.model.grid import cell_index
@@ -33,41 +33,30 @@ __all__ = ["dithered_misfit"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-MOST_SIDE = 16  # cells along each side of a chip
-MOST_CELLS = 512  # of all chips: the matrix of all shifts is decomposed
-TOLD = 0.05  # of what detections would say of a cell if stars were known: less is not told
+MAX_SIDE = 16  # cells along each side of a chip
+MAX_CELLS = 512  # of all chips: the matrix of all shifts is decomposed
+MIN_INFORMATION = 0.05  # of a direction, relative to that with known stars
 
 
-def dithered_misfit(solution: Solution) -> Misfit:
-    """Test the detections of a self-calibration for structure over the detector.
-
-    Parameters
-    ----------
-    solution : Solution
-
-    Returns
-    -------
-    Misfit
-        Of all chips together, since they share stars; `told` is the share of the patterns over
-        all partitions, polynomials apart, that the detections can tell from places of stars.
-    """
+def dithered_misfit(solution: SelfCalibrationMode) -> Misfit:
+    """Misfit of a self-calibration: structure over the detector, of all chips together."""
     model, unit = solution.problem.model, solution.problem.model.pixel_size(solution.theta)
     partitions = _partitions(len(solution.problem), len(model.chips))
-    found, told, patterns = [], 0, 0
+    found, seen, patterns = [], 0, 0
     for (name, bins), shifts in zip(
         partitions.items(), _shifts(solution, list(partitions.values())), strict=True
     ):
         one = _test(shifts, _polynomials(model.order, len(model.chips), bins))
         found.append(Misfit(one.p_value, name, one.pixels * unit, model.unit))
-        told, patterns = told + one.told, patterns + one.patterns
-    return replace(worst_misfit(found), told=told / patterns if patterns else 1.0)
+        seen, patterns = seen + one.seen, patterns + one.patterns
+    return replace(worst_misfit(found), power=seen / patterns if patterns else 1.0)
 
 
 def _partitions(n: int, n_chips: int) -> dict[str, tuple[int, int]]:
     """Bins on x and on y of each chip, by name."""
-    out, most = {}, MOST_CELLS // n_chips
+    out, most = {}, MAX_CELLS // n_chips
     for name, bins in partitions_for(n // n_chips).items():
-        side = min(MOST_SIDE, int(np.sqrt(most))) if name == "cells" else most
+        side = min(MAX_SIDE, int(np.sqrt(most))) if name == "cells" else most
         nx, ny = (min(b, max(side, 2)) for b in bins)
         out[name] = nx, ny
     return out
@@ -75,37 +64,26 @@ def _partitions(n: int, n_chips: int) -> dict[str, tuple[int, int]]:
 
 @dataclass(frozen=True, eq=False)
 class _Shifts:
-    """What detections say of shifts of K cells in x and in y, pixels.
+    """Gradient and curvature of the log density by shifts of K cells in x and in y, pixels."""
 
-    Parameters
-    ----------
-    gradient : ndarray, shape (2 K,)
-        Of the log density at no shift; x of all cells, then y.
-    curvature : ndarray, shape (2 K, 2 K)
-        With the stars eliminated.
-    weight : ndarray, shape (2 K,)
-        Its diagonal if the stars were known.
-    chi2, dof : float
-        Of the residuals; the rest of it is the unit: errors that are too large or too small as a
-        whole are no structure.
-    """
-
-    gradient: Float
-    curvature: Float
-    weight: Float
+    gradient: Float  # (2 K,) of the log density at no shift; x of all cells, then y
+    curvature: Float  # (2 K, 2 K) with the stars eliminated
+    weight: Float  # (2 K,) its diagonal if the stars were known
+    # chi2, dof: of the residuals; the rest of it is the unit: errors that are too large or too
+    # small as a whole are no structure
     chi2: float = 0.0
     dof: float = 1.0
 
 
-def _shifts(solution: Solution, partitions: Sequence[tuple[int, int]]) -> list[_Shifts]:
-    """What detections say of shifts of the cells of each partition, in one pass over them."""
+def _shifts(solution: SelfCalibrationMode, partitions: Sequence[tuple[int, int]]) -> list[_Shifts]:
+    """Gradients and curvatures by shifts of the cells of each partition, in one pass."""
     p, expansion = solution.problem, solution.expansion
     out = []
     for nx, ny in partitions:
         n = 2 * len(p.model.chips) * nx * ny
         out.append(_Shifts(np.zeros(n), np.zeros((n, n)), np.zeros(n)))
     taken = float(len(solution.free))  # of the detections' numbers by distortion and stars
-    for some in following(solution):
+    for some in star_blocks(solution):
         taken += np.minimum(p.n_star, 2 * np.bincount(some.star, some.member)).sum()
         for sums, bins in zip(out, partitions, strict=True):
             _add(sums, some, _cells(p, some.rows, bins))
@@ -115,7 +93,7 @@ def _shifts(solution: Solution, partitions: Sequence[tuple[int, int]]) -> list[_
     return [replace(sums, chi2=expansion.chi2, dof=dof) for sums in out]
 
 
-def _add(sums: _Shifts, some: Following, cell: Int) -> None:
+def _add(sums: _Shifts, some: StarBlock, cell: Int) -> None:
     """Add some stars; of the curvature what they take of it."""
     w, ties, n = some.weight, some.ties, len(sums.weight)
     index = np.stack([cell, cell + n // 2], axis=1)
@@ -148,11 +126,11 @@ def _polynomials(order: int, n_chips: int, bins: tuple[int, int]) -> Float:
 
 @dataclass(frozen=True)
 class _Test:
-    """Outcome for one partition: structure is rms in pixels, `told` of how many `patterns`."""
+    """Outcome for one partition: structure is rms in pixels, `seen` of how many `patterns`."""
 
     p_value: float
     pixels: float
-    told: int
+    seen: int
     patterns: int
 
 
@@ -167,10 +145,10 @@ def _test(shifts: _Shifts, fields: Float) -> _Test:
     lost = lost[:, singular > 1e-9 * max(singular[0], 1.0)]
     free = np.linalg.svd(lost, full_matrices=True)[0][:, lost.shape[1] :]
     values, vectors = np.linalg.eigh(free.T @ C @ free)
-    told = values > TOLD
-    if not told.any():
+    known = values > MIN_INFORMATION
+    if not known.any():
         return _Test(1.0, 0.0, 0, free.shape[1])
-    values, vectors = values[told], free @ vectors[:, told]
+    values, vectors = values[known], free @ vectors[:, known]
     along = vectors.T @ g
     k, explained = len(values), float(np.sum(along**2 / values))
     left = max(shifts.dof - k, 1.0)

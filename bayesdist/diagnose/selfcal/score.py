@@ -1,82 +1,72 @@
 """Score tests of self-calibrations: what a model lacks, with the stars eliminated.
 
-As for matched stars (`bayesdist.diagnose.score.score`), with the positions of stars among the
+As for matched stars (`diagnose.score.regressor_tests`), with the positions of stars among the
 parameters that are projected out, and with the scores of a star's detections added up.  What stars
 take up cannot be tested: directions in which known stars would say much more are left out.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
+from bayesdist.diagnose.correlated.deviations import deviation_columns
+from bayesdist.diagnose.score.directions import independent_directions, squares_of
+from bayesdist.diagnose.score.families import FAMILIES, Family, order_family
 from bayesdist.diagnose.score.motions import SHORTEST, StarResiduals, motion_outcome
 from bayesdist.diagnose.score.noise import noise_tests
-from bayesdist.diagnose.score.result import Outcome, ScoreTest, corrected, noncentrality
+from bayesdist.diagnose.score.result import Outcome, ScoreTest, corrected, outcome
 from bayesdist.diagnose.score.sample import Block, ScoredSample
-from bayesdist.diagnose.score.score import independent_directions
 from bayesdist.diagnose.selfcal.columns import AddedColumns, pointing_terms
-from bayesdist.infer.discrepancy.linear import deviation_columns
-from bayesdist.infer.selfcal.discrepancy import MOST_EXPOSURES
-from bayesdist.infer.selfcal.eliminated import (
+from bayesdist.diagnose.selfcal.correlated import MAX_EXPOSURES
+from bayesdist.diagnose.selfcal.eliminated import (
     add_products,
     even_stars,
     pieces,
     star_sums,
     without_parameters,
 )
-from bayesdist.infer.selfcal.following import taken_by_stars
-from bayesdist.infer.selfcal.normal import memberships
-from bayesdist.infer.selfcal.sandwich import star_scores
-from bayesdist.infer.selfcal.scores import scores_of_detections
-from bayesdist.infer.selfcal.solve import Solution
-from bayesdist.model.basis import MAX_ORDER
+from bayesdist.diagnose.selfcal.leverage import taken_by_stars
+from bayesdist.diagnose.selfcal.sandwich import star_scores
+from bayesdist.diagnose.selfcal.scores import scores_of_detections
+from bayesdist.diagnose.significance import hotelling_p
+from bayesdist.infer.selfcal.elimination import memberships
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 
 __all__ = ["selfcal_score_tests"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-MOST_DETECTIONS = 60_000  # that are looked at
+MAX_DETECTIONS = 60_000  # that are looked at
 STARS_PER_DIRECTION = 2  # below, a covariance of the scores says nothing
-TOLD = 0.02  # of what known stars would say of a direction: less is not told from their places
+MIN_INFORMATION = 0.02  # of a direction, relative to that with known stars
+REMEDIES = {
+    "magnitude": "cut the faint stars, or correct the charge-transfer efficiency",
+    "exposures": "give selfcal.frames a scale where it has none, or leave out exposures",
+}
 OUTSIDE = 0.5  # per cent of the magnitudes at either end that are moved to the others
 
 
 @dataclass(frozen=True, eq=False)
 class _Sums:
-    """What the detections say of the further columns of a problem.
+    """Information and score of the further columns of a problem."""
 
-    Parameters
-    ----------
-    known : ndarray, shape (n, n)
-        Information if stars and parameters were known.
-    information, score : ndarray, shape (n, n), (n,)
-        With both eliminated.
-    covariance : ndarray, shape (n, n)
-        Of the score, by the scores of single stars.
-    square : ndarray, shape (n, n)
-        Mean products of displacements over the detections.
-    n_stars : int
-    unit : str
-    """
-
-    known: Float
+    known: Float  # (n, n) information if stars and parameters were known
+    # information, score (n, n) or (n,): with both eliminated
     information: Float
     score: Float
-    covariance: Float
-    square: Float
+    covariance: Float  # (n, n) of the score, by the scores of single stars
+    square: Float  # (n, n) mean products of displacements over the detections
     n_stars: int
     unit: str
 
 
 def selfcal_score_tests(
-    solution: Solution, *, mag: Float | None = None, epoch: Float | None = None
+    solution: SelfCalibrationMode, *, mag: Float | None = None, epoch: Float | None = None
 ) -> tuple[ScoreTest, ...]:
     """Targeted tests of a self-calibration for what its model lacks, and for its noise.
 
@@ -84,7 +74,7 @@ def selfcal_score_tests(
 
     Parameters
     ----------
-    solution : Solution
+    solution : SelfCalibrationMode
     mag, epoch : ndarray, shape (N,), optional
         Of each detection of its problem; decimal years.
 
@@ -93,7 +83,7 @@ def selfcal_score_tests(
     tuple of ScoreTest
     """
     whole = solution.problem
-    some = even_stars(whole, MOST_DETECTIONS)
+    some = even_stars(whole, MAX_DETECTIONS)
     rows = np.isin(whole.star, some)
     problem, model = whole.of_stars(some), whole.model
     varied = None
@@ -103,7 +93,7 @@ def selfcal_score_tests(
         varied = inside - inside.mean()
     counts = np.bincount(problem.groups.index, minlength=len(problem.groups)).astype(float)
     deviations = deviation_columns(
-        model, solution.theta, problem.groups, counts, most=MOST_EXPOSURES
+        model, solution.theta, problem.groups, counts, most=MAX_EXPOSURES
     )
     pointed = pointing_terms(problem, solution.theta)
     columns = AddedColumns(problem, solution.theta, {}, deviations, varied, pointed)
@@ -116,7 +106,7 @@ def selfcal_score_tests(
 
 
 def _summed(
-    solution: Solution, columns: AddedColumns, rows: NDArray[np.bool_], stars: Float
+    solution: SelfCalibrationMode, columns: AddedColumns, rows: NDArray[np.bool_], stars: Float
 ) -> _Sums:
     """Sums over some of the detections of a solution."""
     p, scores = columns.problem, scores_of_detections(solution).at(rows)
@@ -141,7 +131,7 @@ def _summed(
     # given back what the parameters have taken: a little, and much the same everywhere
     numbers = 2 * float((scores.curvature[:, 0, 0] > 0).sum()) - p.n_star * p.n_stars
     free = max(1 - len(solution.free) / max(numbers, 1.0), 0.1)
-    covariance = own.T @ own / free + left.gain.T @ solution.information.precision @ left.gain
+    covariance = own.T @ own / free + left.gain.T @ solution.prior.precision @ left.gain
     further = np.ix_(columns.order[D:], columns.order[D:])
     return _Sums(
         known[further],
@@ -157,87 +147,48 @@ def _summed(
 def _tested(sums: _Sums, name: str, which: Int, order: int) -> Outcome | None:
     """Outcome of one test; None where the data cannot be asked."""
     at = np.ix_(which, which)
-    N = independent_directions(sums.known[at], sums.information[at], TOLD)
+    N = independent_directions(sums.known[at], sums.information[at], MIN_INFORMATION)
     q, n = N.shape[1], sums.n_stars
     if q == 0 or n < STARS_PER_DIRECTION * q + 2:
         return None
     U, S, V = N.T @ sums.score[which], N.T @ sums.information[at] @ N, N.T @ sums.covariance[at] @ N
     T = float(U @ np.linalg.solve(V, U))
-    inverse, Q = np.linalg.inv(S), N.T @ sums.square[at] @ N
-    step, noise = inverse @ U, float(np.trace(Q @ inverse @ V @ inverse))
-    remedy, present, absent = _words(name, order)
-    return Outcome(
-        name=name,
-        statistic=T,
-        dof=q,
-        dof_residual=float(n - q),
-        p_value=float(stats.beta.sf(min(T / n, 1.0), q / 2, (n - q) / 2)),
-        size=float(np.sqrt(max(float(step @ Q @ step) - noise, 0.0))),
-        smallest=partial(_smallest, float(np.sqrt(max(noise, 0.0))), q, float(n - q)),
+    square, noise = squares_of(U, S, V, N.T @ sums.square[at] @ N)
+    return outcome(
+        _family(name, order),
+        T,
+        q,
+        float(n - q),
+        hotelling_p(T, q, n),
+        square=square,
+        noise=noise,
         unit=sums.unit,
-        remedy=remedy,
-        present=present,
-        absent=absent,
     )
 
 
-def _smallest(noise: float, dof: float, dof_residual: float, level: float) -> float:
-    return float(noise * np.sqrt(noncentrality(level, dof, dof_residual) / dof))
-
-
-def _words(name: str, order: int) -> tuple[str, str, str]:
-    """Remedy, and the finding where there is something and where there is not."""
+def _family(name: str, order: int) -> Family:
+    """Words of a test, with what can be done in a self-calibration."""
     if name.startswith("order "):
-        total = int(name.removeprefix("order "))
-        raised = f"raise model.order to {total}" if total <= MAX_ORDER else "fit a look-up table"
-        return (
-            raised,
-            f"the residuals hold terms of {name}, and the model ends at order {order}",
-            f"no terms of {name} are left in the residuals",
-        )
-    if name == "magnitude":
-        return (
-            "cut the faint stars, or correct the charge-transfer efficiency",
-            "the residuals go with the magnitude of the stars",
-            "the residuals do not go with the magnitude of the stars",
-        )
-    if name == "pointing":
-        return (
-            "give the true detector.scale_mas, by which tangent planes are taken to one",
-            "the distortion goes with where exposures point, as if a curved sky were taken as flat",
-            "the distortion does not go with where exposures point",
-        )
-    return (
-        "give selfcal.frames a scale where it has none, or leave out exposures",
-        "exposures deviate from each other in linear terms that their frames do not fit",
-        "no deviations of single exposures are left in the residuals",
-    )
+        return order_family(int(name.removeprefix("order ")), order)
+    return replace(FAMILIES[name], remedy=REMEDIES.get(name, FAMILIES[name].remedy))
 
 
-def _motions(solution: Solution, epoch: Float) -> Outcome | None:
+def _motions(solution: SelfCalibrationMode, epoch: Float) -> Outcome | None:
     """Test for stars that move."""
     p, scores = solution.problem, scores_of_detections(solution)
-    return motion_outcome(
-        StarResiduals(p.star, epoch, scores.gradient, scores.curvature, p.priors.precision),
-        p.model.unit,
+    family = replace(
+        FAMILIES["motions"],
         remedy="set selfcal.motion to 'proper_motion'",
         present="stars move between the dates of the exposures, and are taken to stand still",
     )
-
-
-@dataclass(frozen=True, eq=False)
-class _Scored:
-    """As of `Scored`."""
-
-    sample: ScoredSample
-    whole_score: Float
-    leverage: Float
+    residuals = StarResiduals(p.star, epoch, scores.gradient, scores.curvature, p.priors.precision)
+    return motion_outcome(residuals, p.model.unit, family)
 
 
 def _noise_sample(
-    solution: Solution, some: Int, rows: NDArray[np.bool_], mag: Float | None
-) -> _Scored:
-    """Some detections along the axes of the detector, in the unit of u and v.
+    solution: SelfCalibrationMode, some: Int, rows: NDArray[np.bool_], mag: Float | None
+) -> ScoredSample:
+    """Sample of detections along the axes of the detector, in the unit of u and v.
 
     Rolls turn the axes of the sky from exposure to exposure, and errors are those of pixels.
     """
@@ -268,7 +219,8 @@ def _noise_sample(
         for k, (a, b) in enumerate(pairwise(starts))
         if b > a
     )
-    sample = ScoredSample(
+    taken = taken_by_stars(solution)[rows][order]
+    return ScoredSample(
         model=model,
         X=p.X[order],
         Y=p.Y[order],
@@ -282,6 +234,5 @@ def _noise_sample(
         epoch=None,
         star=p.star[order],
         blocks=blocks,
+        leverage=np.stack([taken, taken]),
     )
-    taken = taken_by_stars(solution)[rows][order]
-    return _Scored(sample, sample.score / np.sqrt(1.0 - taken), np.stack([taken, taken]))

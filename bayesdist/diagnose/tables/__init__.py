@@ -1,1 +1,1 @@
-"""What look-up tables leave between their nodes."""
+"""Errors that look-up tables leave between their nodes."""

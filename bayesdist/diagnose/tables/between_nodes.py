@@ -1,4 +1,4 @@
-"""What a look-up table leaves between its nodes: measured, not derived from how smooth it looks.
+"""Error that a look-up table leaves between its nodes: measured, not derived from smoothness.
 
 A table is bilinear between nodes, and the distortion is not.  Two stars at the same place, of two
 exposures, see the same of it and nothing else in common: the mean product of their residuals is the
@@ -33,34 +33,26 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 FINE, COARSE = 8, 4  # cells along a side of the squares between nodes
-SHARE = (FINE / COARSE) ** 2  # areas of the cells
-FEWEST = 30  # pairs of stars
-ROUNDS = 3  # of weights that depend on the result
-SOME = 1500  # cells in which the variance of the fit is looked at
+AREA_RATIO = (FINE / COARSE) ** 2  # areas of the cells
+MIN_PAIRS = 30  # pairs of stars
+MAX_ITERATIONS = 3  # of weights that depend on the result
+CELLS_SAMPLED = 1500  # cells in which the variance of the fit is looked at
 
 
 @dataclass(frozen=True, eq=False)
 class BetweenNodes:
-    """Mean square of what a table leaves on one chip.
+    """Mean square of what a table leaves on one chip."""
 
-    Parameters
-    ----------
-    chip : int
-        Chip number.
-    square, error : ndarray, shape (2,)
-        Along x and y, square pixels, and standard deviations; a square may come out below zero.
-    n_pairs : int
-        Of stars.
-    """
-
-    chip: int
+    chip: int  # chip number
+    # square, error (2,): along x and y, square pixels, and standard deviations; a square may come
+    # out below zero
     square: Float
     error: Float
-    n_pairs: int
+    n_pairs: int  # of stars
 
     @property
     def left(self) -> MeanSquare:
-        """What the mean squares may be, given that they are not negative."""
+        """Mean squares, given that they are not negative."""
         return MeanSquare(self.square, self.error)
 
 
@@ -78,40 +70,21 @@ def between_nodes(
 ) -> BetweenNodes:
     """Mean square of what a table leaves of the distortion of one chip.
 
-    Parameters
-    ----------
-    x, y : ndarray, shape (N,)
-        Raw pixels.
-    residual : ndarray, shape (N, 2)
-        After table and polynomial, pixels.
-    precision : ndarray, shape (N, 2)
-        Inverse variances that these were fitted with; zero for a star that did not count.
-    star, exposure : ndarray of int, shape (N,)
-        Codes.
-    chip : Chip
-    step : tuple of float
-        Pixels between nodes.
-    taken : callable
-        Variance (n, 2) of table and polynomial at pixels (n,), square pixels: what the fit has
-        taken of the residuals.  Below zero for a table that was not fitted to them and errs by
-        itself: its error is in the products as it is.
-
-    Returns
-    -------
-    BetweenNodes
-
-    Raises
-    ------
-    DegenerateError
-        When too few stars lie that near to each other, or in too few places.
+    `x` and `y` (N,) are raw pixels, `residual` (N, 2) is what table and polynomial leave, pixels,
+    `precision` (N, 2) the inverse variances that they were fitted with, 0 for a star that did not
+    count; `star` and `exposure` (N,) are codes, `step` the pixels between nodes. `taken` is the
+    variance (n, 2) of table and polynomial at pixels (n,): what the fit has taken of the residuals,
+    square pixels. It is negative for a table that was not fitted to them: its own error is in the
+    products. Raises `DegenerateError` when too few stars lie that near to each other, or in too few
+    places.
     """
     used = (precision > 0).all(axis=1)
     stars = x[used], y[used], residual[used], precision[used], star[used], exposure[used]
     fine, coarse = (_pairs(NodeCells.of(chip, step, parts), *stars) for parts in (FINE, COARSE))
     n_pairs = round(float(fine.number.sum()) / 2)
     part = fine.cells.areas(chip)
-    told = ((fine.weight > 0) & (coarse.weight > 0)).all(axis=1) & (part > 0)
-    if n_pairs < FEWEST or not told.any():
+    seen = ((fine.weight > 0) & (coarse.weight > 0)).all(axis=1) & (part > 0)
+    if n_pairs < MIN_PAIRS or not seen.any():
         raise DegenerateError(
             f"{n_pairs} pairs of stars at the same place do not tell what lies between nodes",
             where=f"look-up table of chip {chip.number}",
@@ -120,20 +93,20 @@ def between_nodes(
     common = _of_stars(*stars[2:5])
     square, error = np.empty(2), np.empty(2)
     for a in (0, 1):
-        of_fine, of_coarse = (s.axis(a, told) for s in (fine, coarse))
-        each = (SHARE * of_fine.mean - of_coarse.mean) / (SHARE - 1)
+        of_fine, of_coarse = (s.axis(a, seen) for s in (fine, coarse))
+        each = (AREA_RATIO * of_fine.mean - of_coarse.mean) / (AREA_RATIO - 1)
         # pairs in a fine cell are among those of the coarse one around it
-        noise = SHARE**2 * of_fine.noise - 2 * SHARE * of_fine.noise_among(of_coarse)
-        noise = (noise + of_coarse.noise) / (SHARE - 1) ** 2
+        noise = AREA_RATIO**2 * of_fine.noise - 2 * AREA_RATIO * of_fine.noise_among(of_coarse)
+        noise = (noise + of_coarse.noise) / (AREA_RATIO - 1) ** 2
         size = max(float(np.average(each, weights=1 / noise)), 0.0)
-        for _ in range(ROUNDS):
+        for _ in range(MAX_ITERATIONS):
             # squares differ by about what they hold: where that is well known, area counts
-            weight = 1 / (noise + size**2 / part[told])
+            weight = 1 / (noise + size**2 / part[seen])
             weight /= weight.sum()
-            square[a] = weight @ each + fine.average(taken, a, told, weight)
+            square[a] = weight @ each + fine.average(taken, a, seen, weight)
             size = max(square[a], 0.0)
         off = -part / part.sum()
-        off[told] += weight
+        off[seen] += weight
         uneven = size**2 * np.sum(off[part > 0] ** 2 / part[part > 0])
         error[a] = np.sqrt(weight**2 @ noise + uneven + 4 * size * common[a])
     return BetweenNodes(chip.number, square, error, n_pairs)
@@ -169,43 +142,35 @@ class _Axis:
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Sums over ordered pairs of different stars in different exposures of the same cell.
-
-    Parameters
-    ----------
-    cells : NodeCells
-    by_cell : ndarray, shape (cells, 2)
-        Weights.
-    product, weight, spread : ndarray, shape (squares, 2)
-        Products and weights by square; variance of the former as far as stars err by themselves.
-    number : ndarray, shape (squares,)
-    """
+    """Sums over ordered pairs of different stars in different exposures of the same cell."""
 
     cells: NodeCells
-    by_cell: Float
+    by_cell: Float  # (cells, 2) weights
+    # product, weight, spread (squares, 2): products and weights by square; variance of the former
+    # as far as stars err by themselves
     product: Float
     weight: Float
     spread: Float
-    number: Float
+    number: Float  # (squares,)
 
-    def axis(self, a: int, told: NDArray[np.bool_]) -> _Axis:
-        """Of one axis, in some of the squares; noise goes with one over the weight."""
+    def axis(self, a: int, seen: NDArray[np.bool_]) -> _Axis:
+        """Sums along one axis, in some of the squares; noise goes with one over the weight."""
         scatter = self.spread[:, a].sum() / self.weight[:, a].sum()
-        return _Axis(self.product[told, a], self.weight[told, a], float(scatter))
+        return _Axis(self.product[seen, a], self.weight[seen, a], float(scatter))
 
     def average(
         self,
         function: Callable[[Float, Float], Float],
         a: int,
-        told: NDArray[np.bool_],
+        seen: NDArray[np.bool_],
         weight: Float,
     ) -> float:
         """Mean of a function of the place (n, 2) along one axis, squares having weights."""
-        each = np.zeros(len(told))
-        each[told] = weight / self.weight[told, a]
+        each = np.zeros(len(seen))
+        each[seen] = weight / self.weight[seen, a]
         of_cell = self.by_cell[:, a] * each[self.cells.squares()]
         there = np.flatnonzero(of_cell > 0)
-        some = there[:: max(1, len(there) // SOME)]
+        some = there[:: max(1, len(there) // CELLS_SAMPLED)]
         values = function(*self.cells.centres(some))[:, a]
         return float(np.average(values, weights=of_cell[some]))
 

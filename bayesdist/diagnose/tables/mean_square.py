@@ -15,18 +15,10 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class MeanSquare:
-    """What mean squares of two axes may be, given what was measured and that none is negative.
+    """Mean squares of two axes, given their measurements and that none is negative."""
 
-    Parameters
-    ----------
-    measured : ndarray, shape (2,)
-        Of u and v; noise may have carried one below zero.
-    error : ndarray, shape (2,)
-        Standard deviations of these numbers, independent of each other.
-    """
-
-    measured: Float
-    error: Float
+    measured: Float  # (2,) of u and v; noise may have carried one below zero
+    error: Float  # (2,) standard deviations of these numbers, independent of each other
 
     @property
     def mean(self) -> Float:
@@ -38,7 +30,7 @@ class MeanSquare:
 
     @property
     def relative_error(self) -> float:
-        """How well the radial rms is known, relative to its size."""
+        """Relative error of the radial rms."""
         mean, variance = self._moments
         whole = mean.sum()
         return float(np.sqrt(variance.sum()) / (2 * whole)) if whole > 0 else 0.0

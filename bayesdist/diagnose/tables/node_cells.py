@@ -17,23 +17,13 @@ Int = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class NodeCells:
-    """Cells that divide the squares between nodes.
+    """Cells that divide the squares between nodes."""
 
-    Parameters
-    ----------
-    origin : tuple of float
-        Pixel of the corner of the first cell: on the node before the first one of the table.
-    side : tuple of float
-    shape : tuple of int
-        Cells along x and y.
-    parts : int
-        Along a side of a square.
-    """
-
+    # pixel of the corner of the first cell: on the node before the first one of the table
     origin: tuple[float, float]
     side: tuple[float, float]
-    shape: tuple[int, int]
-    parts: int
+    shape: tuple[int, int]  # cells along x and y
+    parts: int  # along a side of a square
 
     @classmethod
     def of(cls, chip: Chip, step: tuple[float, float], parts: int) -> NodeCells:
@@ -62,7 +52,7 @@ class NodeCells:
         return x, y
 
     def areas(self, chip: Chip) -> Float:
-        """Share of each square that lies on the chip."""
+        """Fraction of each square that lies on the chip."""
         shares = []
         for o, s, n, size in zip(self.origin, self.side, self.shape, chip.size, strict=True):
             edges = o + s * self.parts * np.arange(n // self.parts + 1)
@@ -70,6 +60,6 @@ class NodeCells:
         return np.outer(shares[1], shares[0]).ravel()
 
     def squares(self) -> Int:
-        """Of each cell the square that it lies in."""
+        """Square (cells,) that each cell lies in."""
         j, i = np.divmod(np.arange(self.number), self.shape[0])
         return j // self.parts * (self.shape[0] // self.parts) + i // self.parts

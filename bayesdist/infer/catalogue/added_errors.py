@@ -112,7 +112,7 @@ class GroupedErrors:
 
 
 @dataclass(eq=False)
-class _Climb:
+class _State:
     """State of the maximisation: fit, mixture and added variances of one grouping."""
 
     fit: LinearFit
@@ -159,24 +159,24 @@ def grouped_errors(
     if by:
         codes |= {by: np.stack([label, label]), f"{by} and {AXIS}": 2 * label + axis}
     quoted = _quoted(table)
-    state = _begun(table, fit, quoted, outliers)
-    climbs = {}
+    state = _starting_state(table, fit, quoted, outliers)
+    states = {}
     for name, code in codes.items():
-        climbs[name] = state = _climbed(table, model, quoted, code, state, outliers, priors)
+        states[name] = state = _maximised(table, model, quoted, code, state, outliers, priors)
     last = list(codes)[-1]
-    dispersion = _dispersion(table, climbs[last], quoted, codes[last])
-    counts = {name: _counts(climbs[name].good, code) for name, code in codes.items()}
+    dispersion = _dispersion(table, states[last], quoted, codes[last])
+    counts = {name: _counts(states[name].good, code) for name, code in codes.items()}
     value = {
         name: one.log_likelihood / dispersion - 0.5 * np.log(np.maximum(counts[name], 1.0)).sum()
-        for name, one in climbs.items()
+        for name, one in states.items()
     }
     evidence = {name: float(value[name] - value[ONE]) for name in codes if name != ONE}
     best = max(evidence, key=lambda name: evidence[name])
-    typical = np.median(quoted + climbs[best].variance.min())
-    spread = np.ptp(climbs[best].variance) / typical
+    typical = np.median(quoted + states[best].variance.min())
+    spread = np.ptp(states[best].variance) / typical
     if evidence[best] < DECISIVE or np.sqrt(1.0 + spread) < 1.0 + MATERIAL:
         best = ONE
-    return _result(best, by, labels, climbs[best], quoted, codes[best], evidence, dispersion)
+    return _result(best, by, labels, states[best], quoted, codes[best], evidence, dispersion)
 
 
 def _quoted(table: MatchTable) -> Float:
@@ -185,25 +185,25 @@ def _quoted(table: MatchTable) -> Float:
     return np.stack([table.sigma_u, table.sigma_v]) ** 2
 
 
-def _begun(table: MatchTable, fit: LinearFit, quoted: Float, outliers: bool) -> _Climb:
+def _starting_state(table: MatchTable, fit: LinearFit, quoted: Float, outliers: bool) -> _State:
     """Starting state with one added variance for all, from the median residual."""
     square = residuals_of(fit, table) ** 2
     core = float(np.median(square)) / 0.4549  # of a squared normal variable
     variance = max(0.0, core - float(np.median(quoted)))
     wide = max(WIDER**2 * max(core, float(np.median(quoted))), float(square.sum(axis=0).max()) / 8)
     f = FALSE[0] if outliers else 0.0
-    return _Climb(fit, square, f, wide, np.full(1, variance), np.ones(len(table)))
+    return _State(fit, square, f, wide, np.full(1, variance), np.ones(len(table)))
 
 
-def _climbed(
+def _maximised(
     table: MatchTable,
     model: DistortionModel,
     quoted: Float,
     code: Int,
-    start: _Climb,
+    start: _State,
     outliers: bool,
     priors: GaussianPriors | None,
-) -> _Climb:
+) -> _State:
     """State at the maximum of the restricted likelihood, for groups with codes (2, N)."""
     n_groups = int(code.max()) + 1
     variance = np.full(n_groups, float(np.average(start.variance)))
@@ -233,7 +233,7 @@ def _climbed(
         each = -0.5 * (residual / var + np.log(var)).sum(axis=0)
     # the determinant of the fit's normal matrix makes the likelihood the restricted one
     value = float(each.sum() + 0.5 * np.linalg.slogdet(fit.cov)[1])
-    return _Climb(fit, square, f, wide, variance, good, value)
+    return _State(fit, square, f, wide, variance, good, value)
 
 
 def _maxima(quoted: Float, square: Float, good: Float, code: Int, n_groups: int) -> Float:
@@ -269,22 +269,22 @@ def _counts(good: Float, code: Int) -> Float:
     return np.asarray(np.bincount(code.ravel(), np.concatenate([good, good])), float)
 
 
-def _dispersion(table: MatchTable, climb: _Climb, quoted: Float, code: Int) -> float:
+def _dispersion(table: MatchTable, state: _State, quoted: Float, code: Int) -> float:
     """Factor by which sums of squares scatter more than those of independent normal errors."""
-    var = quoted + climb.variance[code]
-    score = climb.good * (climb.square / var - 1.0)
+    var = quoted + state.variance[code]
+    score = state.good * (state.square / var - 1.0)
     star = np.arange(len(table)) if table.star is None else table.star
     n_groups = int(code.max()) + 1
     _, of = np.unique((star * n_groups + code).ravel(), return_inverse=True)
     sums = np.bincount(of, score.ravel())
-    return max(1.0, float((sums**2).sum() / (4.0 * climb.good.sum())))
+    return max(1.0, float((sums**2).sum() / (4.0 * state.good.sum())))
 
 
 def _result(
     grouping: str,
     by: str,
     labels: tuple[str, ...],
-    climb: _Climb,
+    state: _State,
     quoted: Float,
     code: Int,
     evidence: dict[str, float],
@@ -292,19 +292,19 @@ def _result(
 ) -> GroupedErrors:
     """Table of labels and axes for the chosen groups."""
     columns = 2 if grouping.endswith(AXIS) else 1
-    flat, weight = code.ravel(), np.concatenate([climb.good, climb.good])
-    weight = weight / (quoted + climb.variance[code]).ravel() ** 2
+    flat, weight = code.ravel(), np.concatenate([state.good, state.good])
+    weight = weight / (quoted + state.variance[code]).ravel() ** 2
     total = np.maximum(np.bincount(flat, weight), 1e-300)
     error = np.sqrt(2.0 * dispersion / total)
-    n = _counts(climb.good, code) / (3 - columns)  # stars, not axes of stars
-    variance = climb.variance
+    n = _counts(state.good, code) / (3 - columns)  # stars, not axes of stars
+    variance = state.variance
     if len(variance) >= SHRUNK * columns:
-        whole = np.bincount(flat, weight * climb.square.ravel()) / total
+        whole = np.bincount(flat, weight * state.square.ravel()) / total
         own = np.bincount(flat, weight * quoted.ravel()) / total
         variance = variance.copy()
         for k in range(columns):
             rows = slice(k, None, columns)
-            drawn = _drawn_together(whole[rows], (error[rows] / whole[rows]) ** 2)
+            drawn = _shrunk(whole[rows], (error[rows] / whole[rows]) ** 2)
             variance[rows] = np.maximum(drawn - own[rows], 0.0)
     several = grouping.startswith(by) if by else False
     n, variance, error = (
@@ -323,7 +323,7 @@ def _result(
     )
 
 
-def _drawn_together(variance: Float, noise: Float) -> Float:
+def _shrunk(variance: Float, noise: Float) -> Float:
     """Variances (G,) whose logarithms are shrunk to their mean by how much chance explains.
 
     After DerSimonian and Laird 1986; `noise` (G,) is the variance of each logarithm by chance, half

@@ -22,13 +22,61 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
 from bayesdist.infer.equations.scaled import one_thread
+from bayesdist.infer.solution import Solution
 from bayesdist.infer.stars.stars import prepare
-from bayesdist.infer.transforms import Solution
 
-__all__ = ["StarCovariance", "star_covariance"]
+__all__ = ["StarCovariance", "StarErrors", "star_covariance"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class StarErrors:
+    """Errors of a catalogue by code of the star.
+
+    Parameters
+    ----------
+    position : ndarray, shape (S, 2)
+        Standard errors of the positions along u and v, in the unit of u, v.
+    motion : ndarray, shape (S, 2), optional
+        Standard errors of the proper motions, in that unit per year.
+    epoch : ndarray, shape (S,), optional
+        Dates at which errors of positions and motions are uncorrelated; needed with motions.
+    """
+
+    position: Float
+    motion: Float | None = None
+    epoch: Float | None = None
+
+    def levers(self, star: Int, epoch: Float | None) -> Float:
+        """Derivatives (levers, n) of matched positions by the errors of position and motion."""
+        one = np.ones(len(star))
+        if self.motion is None or self.epoch is None or epoch is None:
+            return one[None]
+        return np.stack([one, epoch - self.epoch[star]])
+
+    @property
+    def variances(self) -> Float:
+        """Variances (levers, S, 2) of positions, and then of motions where there are any."""
+        parts = [self.position] if self.motion is None else [self.position, self.motion]
+        return np.asarray(np.stack(parts) ** 2)
+
+    def at(self, star: Int, epoch: Float | None) -> Float:
+        """Variances (n, 2) of the catalogue's positions for some matches."""
+        levers = self.levers(star, epoch)
+        variances = self.variances[: len(levers), star]
+        return np.asarray(np.einsum("ln,lna->na", levers**2, variances))
+
+    def checked(self, n_stars: int) -> StarErrors:
+        """These errors of the first stars; InputError for fewer, and for numbers that are none."""
+        position = _checked(self.position, n_stars, "position")
+        if self.motion is None or not self.motion.any():
+            return StarErrors(position)
+        if self.epoch is None:
+            raise InputError("errors of proper motions need the catalogue's epoch", do="give it")
+        motion = _checked(self.motion, n_stars, "motion")
+        return StarErrors(position, motion, _checked(self.epoch, n_stars, "epoch", signed=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +108,8 @@ class StarCovariance:
 def star_covariance(
     solution: Solution,
     matches: MatchTable,
-    sigma_u: ArrayLike,
-    sigma_v: ArrayLike,
+    errors: StarErrors,
     *,
-    motion_u: ArrayLike = 0.0,
-    motion_v: ArrayLike = 0.0,
-    epoch0: ArrayLike | None = None,
     star: ArrayLike | None = None,
     weight: ArrayLike | None = None,
     included: bool = True,
@@ -80,12 +124,8 @@ def star_covariance(
         matrix, so that it must not come from a fit with extra weight in the corners.
     matches : MatchTable
         All stars at once.
-    sigma_u, sigma_v : array_like, shape () or (n_stars,)
-        Errors of the catalogue's positions at `epoch0`, in the unit of u, v; by star code.
-    motion_u, motion_v : array_like, shape () or (n_stars,)
-        Errors of the proper motions, in that unit per year.
-    epoch0 : array_like, shape () or (n_stars,), optional
-        Date at which errors of positions and motions are uncorrelated; needed with motions.
+    errors : StarErrors
+        Of the catalogue, by star code; where there are errors of proper motions, with dates.
     star : array_like of int, shape (N,), optional
         Code of the star of each match; the table's by default.
     weight : array_like, shape (N,), optional
@@ -105,42 +145,28 @@ def star_covariance(
     Raises
     ------
     InputError
-        When the stars have no codes, for errors that are negative or not finite, arrays of other
-        lengths, and errors of the catalogue that quoted errors do not contain.
+        When the stars have no codes, for errors that are negative or not finite, or of too few
+        stars, and errors of the catalogue that quoted errors do not contain.
     """
     code = _codes(matches, star)
-    n_stars = int(code.max()) + 1
-    by_axis = [
-        _by_star(s, n_stars, name) for s, name in ((sigma_u, "sigma_u"), (sigma_v, "sigma_v"))
-    ]
-    variances = [np.stack(by_axis, axis=1) ** 2]
-    levers = [np.ones(len(matches))]
-    moving = [
-        _by_star(s, n_stars, name) for s, name in ((motion_u, "motion_u"), (motion_v, "motion_v"))
-    ]
-    if any(m.any() for m in moving):
-        if epoch0 is None or matches.epoch is None:
-            raise InputError(
-                "errors of proper motions need the catalogue's epoch and those of the matches",
-                do="give epoch0, and a table with epochs",
-            )
-        variances.append(np.stack(moving, axis=1) ** 2)
-        levers.append(matches.epoch - _by_star(epoch0, n_stars, "epoch0", signed=True)[code])
+    errors = errors.checked(int(code.max()) + 1)
+    if errors.motion is not None and matches.epoch is None:
+        raise InputError("errors of proper motions need the epochs of the matches")
+    levers, variances = errors.levers(code, matches.epoch), errors.variances
     if weight is None:
-        uses = getattr(solution, "uses", None)
-        weight = np.ones(len(matches)) if uses is None else uses(matches)
+        weight = solution.uses(matches)
     weight = np.broadcast_to(np.asarray(weight, float), (len(matches),))
 
     if included:
         _require_contained(matches, code, variances, levers)
     stars, order = prepare(solution.model, matches)
     inverse = np.stack([weight[order] / stars.var_u, weight[order] / stars.var_v])
-    sums = StarSums.of(stars, code[order], inverse, [lever[order] for lever in levers])
+    sums = StarSums.of(stars, code[order], inverse, list(levers[:, order]))
     cov, mean = np.asarray(solution.cov, float), np.asarray(solution.mean)
     D = solution.model.n_params if frames else solution.model.n_distortion
     influence = influence_by_group(solution.model, mean, stars.groups, cov, D)
-    parts = sums.shared(influence, variances)
-    counted = sums.independent(influence, variances) if included else np.zeros((D, D))
+    parts = sums.shared(influence, list(variances))
+    counted = sums.independent(influence, list(variances)) if included else np.zeros((D, D))
     if not frames:
         follow = np.linalg.solve(cov[:D, :D], cov[:D]).T
         parts, counted = (follow @ c @ follow.T for c in (parts, counted))
@@ -148,9 +174,7 @@ def star_covariance(
     return StarCovariance(sum(motions, positions), (counted + counted.T) / 2, *motions)
 
 
-def _require_contained(
-    matches: MatchTable, code: Int, variances: list[Float], levers: list[Float]
-) -> None:
+def _require_contained(matches: MatchTable, code: Int, variances: Float, levers: Float) -> None:
     """Raise InputError for quoted errors that are smaller than the catalogue's part of them."""
     for axis, quoted in enumerate((matches.sigma_u, matches.sigma_v)):
         if quoted is None:
@@ -184,20 +208,20 @@ def _codes(matches: MatchTable, star: ArrayLike | None) -> Int:
     return code.astype(np.int64)
 
 
-def _by_star(values: ArrayLike, n_stars: int, name: str, *, signed: bool = False) -> Float:
-    """Values of every star, from one for all or an array of n_stars or more."""
-    values = np.asarray(values, float)
-    if values.ndim and (values.ndim > 1 or len(values) < n_stars):
+def _checked(values: Float, n_stars: int, name: str, *, signed: bool = False) -> Float:
+    """Values of the first stars, which must be finite and, but for signed ones, not negative."""
+    if len(values) < n_stars:
         raise InputError(
-            f"{name} has shape {values.shape}, and star codes go up to {n_stars - 1}",
+            f"{name} is given for {len(values)} stars, and codes go up to {n_stars - 1}",
             where=name,
-            do="give one value, or one for each star",
+            do="give that of all stars",
         )
-    good = np.isfinite(values) if signed else np.isfinite(values) & (values >= 0)
+    values = values[:n_stars]
+    good = np.isfinite(values) & (signed | (values >= 0))
     if not good.all():
         raise InputError(
-            f"{name} is {values.ravel()[int(np.argmin(good))]:g}",
+            f"{name} is {values[~good][0]:g}",
             where=name,
             do="give finite numbers" + ("" if signed else " that are not negative"),
         )
-    return np.broadcast_to(values, (n_stars,)) if values.ndim == 0 else values[:n_stars]
+    return values

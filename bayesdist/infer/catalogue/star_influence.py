@@ -13,44 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.stars.stars import prepare
 
-__all__ = ["StarErrors", "StarInfluence", "star_influence"]
+__all__ = ["StarInfluence", "star_influence"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
-
-
-@dataclass(frozen=True, eq=False)
-class StarErrors:
-    """Errors of a catalogue by code of the star."""
-
-    position: Float  # standard errors (S, 2), in the unit of u, v
-    motion: Float | None = None  # errors (S, 2) of proper motions, in that unit per year
-    # dates (S,) at which errors of positions and motions are uncorrelated
-    epoch: Float | None = None
-
-    def levers(self, star: Int, epoch: Float | None) -> Float:
-        """Derivatives (levers, n) of matched positions by the errors of position and motion."""
-        one = np.ones(len(star))
-        if self.motion is None or self.epoch is None or epoch is None:
-            return one[None]
-        return np.stack([one, epoch - self.epoch[star]])
-
-    @property
-    def variances(self) -> Float:
-        """Variances (levers, S, 2) of positions, and then of motions where there are any."""
-        parts = [self.position] if self.motion is None else [self.position, self.motion]
-        return np.asarray(np.stack(parts) ** 2)
-
-    def at(self, star: Int, epoch: Float | None) -> Float:
-        """Variances (n, 2) of the catalogue's positions for some matches."""
-        levers = self.levers(star, epoch)
-        variances = self.variances[: len(levers), star]
-        return np.asarray(np.einsum("ln,lna->na", levers**2, variances))
 
 
 @dataclass(frozen=True, eq=False)

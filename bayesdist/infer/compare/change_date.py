@@ -102,8 +102,8 @@ def _edges(matches: Matches, most: int) -> Float:
     dates, counts = np.unique(epoch, return_counts=True)
     if len(dates) <= most:
         return dates[1:]
-    share = (np.cumsum(counts) - counts) * most // counts.sum()
-    return dates[np.flatnonzero(np.diff(share)) + 1]
+    period = (np.cumsum(counts) - counts) * most // counts.sum()
+    return dates[np.flatnonzero(np.diff(period)) + 1]
 
 
 def _sums(new: NewFit, table: MatchTable, constants) -> tuple[NormalEquations, float, float, int]:  # type: ignore[no-untyped-def]
@@ -170,7 +170,7 @@ def scan_dates(scores: tuple[PeriodScore, ...], change: Change) -> ChangeDate:
     `change` gives the covariance of the release and the fields that frames absorb.
     """
     # what frames absorb is no change; a drift between the periods leaves a trace of it in N_b
-    free = null_space((change.taken / np.linalg.norm(change.taken, axis=0)).T)
+    free = null_space((change.absorbed / np.linalg.norm(change.absorbed, axis=0)).T)
     cov, normals = change.released_cov, np.array([s.normal for s in scores])
     rights = np.array([s.score for s in scores])
     after_n = np.cumsum(normals[::-1], axis=0)[::-1]
@@ -178,11 +178,11 @@ def scan_dates(scores: tuple[PeriodScore, ...], change: Change) -> ChangeDate:
     all_n, all_r = after_n[0], after_r[0]
     # (C^-1 + N)^-1 without the inverse of C, which may be singular
     inner = np.linalg.solve(np.eye(len(cov)) + cov @ all_n, cov)
-    told = [
+    ahead = [
         (normal - normal @ inner @ normal, right - normal @ inner @ all_r)
         for normal, right in zip(after_n, after_r, strict=True)
     ]
-    gain, dofs = np.array([_gain(*one, free) for one in told]).T
+    gain, dofs = np.array([_gain(*one, free) for one in ahead]).T
     best = int(gain.argmax())
     starts = np.array([-np.inf, *(s.last for s in scores[:-1])])
     ends = np.array([s.first for s in scores])
@@ -203,7 +203,7 @@ def scan_dates(scores: tuple[PeriodScore, ...], change: Change) -> ChangeDate:
         gain=gain,
         dof=int(dofs[best]),
         p_value=min(1.0, len(gain) * float(chi_square.sf(gain[best], dofs[best]))),
-        change=_from_then_on(change, *told[best], free),
+        change=_from_then_on(change, *ahead[best], free),
         scatter=chi2 / dof if dof > 0 else 1.0,
         scatter_dof=dof,
         p_scatter=float(chi_square.sf(chi2, dof)) if dof > 0 else 1.0,
@@ -224,7 +224,7 @@ def _root(normal: Float, free: Float) -> Float:
 
 def _from_then_on(change: Change, normal: Float, right: Float, free: Float) -> Change:
     """Change for a normal matrix and its score, without what frames absorb."""
-    root = without(change.taken, mean_squares(change.model)) @ _root(normal, free)
+    root = without(change.absorbed, mean_squares(change.model)) @ _root(normal, free)
     white = right @ _root(normal, free)
     return replace(
         change,

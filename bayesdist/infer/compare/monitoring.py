@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.infer.catalogue.star_errors import star_covariance
-from bayesdist.infer.catalogue.star_influence import StarErrors, star_influence
+from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
+from bayesdist.infer.catalogue.star_influence import star_influence
 from bayesdist.infer.compare.frame_fields import frame_between, frame_fields, mean_squares, without
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target
@@ -27,9 +27,10 @@ from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.infer.exposures.hierarchy import held_in_reference
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
+from bayesdist.infer.solution import Solution, TransformedSolution
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Matches, load
-from bayesdist.infer.transforms import Solution, View, without_frames
+from bayesdist.infer.transforms import without_frames
 from bayesdist.model import DistortionModel
 
 __all__ = ["Change", "NewFit", "change_of", "fit_new", "new_model", "with_star_errors_of"]
@@ -46,7 +47,7 @@ class NewFit:
 
     Parameters
     ----------
-    released : View
+    released : TransformedSolution
         The released polynomials and their drift, without frames.
     fit : LinearFit
         Least squares of the new matches, which starts the mixture.
@@ -69,7 +70,7 @@ class NewFit:
         Covariance of the release with these polynomials, by stars in both.
     """
 
-    released: View
+    released: TransformedSolution
     fit: LinearFit
     theta: Float
     cov: Float
@@ -118,7 +119,7 @@ class Change:
         Of the difference, n = 2 K chips.
     released_cov : ndarray, shape (n, n)
         Of the released polynomials at that date, and of all other errors common to the new matches.
-    taken : ndarray, shape (n, q)
+    absorbed : ndarray, shape (n, q)
         Fields that frames absorb.
     test : FieldTest
         Of the whole difference.
@@ -132,7 +133,7 @@ class Change:
     difference: Float
     cov: Float
     released_cov: Float
-    taken: Float
+    absorbed: Float
     test: FieldTest
     frame: tuple[Float, Float]
 
@@ -183,7 +184,7 @@ def fit_new(
         names = model.free_frame_names(1)
         scattering = np.array([scatter[k] ** -2.0 if k in scatter else 0.0 for k in names])
     shards = load(model, matches, compute)
-    mixture = mixture or getattr(released, "mixture", None) or OutlierMixture()
+    mixture = mixture or released.mixture or OutlierMixture()
     priors = _with_scatter(_held_drift(bare, model), model, scatter or {})
     fit = fit_linear(shards, model, rejection=rejection, priors=priors)
     target = Target(shards, mixture, priors)
@@ -273,15 +274,15 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
         common = at @ new.common @ turn.T
         released_cov = released_cov - common - common.T
     cov = turn @ own @ turn.T + released_cov
-    taken = frame_fields(model, new.open.frames, old, origin)
+    absorbed = frame_fields(model, new.open.frames, old, origin)
     norm = mean_squares(model)
     difference = (moved - old).ravel()
-    projector = without(taken, norm)
+    projector = without(absorbed, norm)
     rest = projector @ difference
     variance = np.einsum("ij,jk,ik->i", projector, cov, projector)
     of_release = np.einsum("ij,jk,ik->i", projector, released_cov, projector)
     known = variance > 1e-16 * np.diag(cov)
-    share = float(np.mean(of_release[known] / variance[known]))
+    fraction = max(float(np.mean(of_release[known] / variance[known])), 1e-3)
     return Change(
         model=model,
         epoch=new.epoch,
@@ -289,13 +290,13 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
         difference=rest.reshape(C, 2, K),
         cov=projector @ cov @ projector.T,
         released_cov=released_cov,
-        taken=taken,
-        test=chi_square(rest, cov, without=taken, norm=norm, draws=draws / max(share, 1e-3) ** 2),
+        absorbed=absorbed,
+        test=chi_square(rest, cov, without=absorbed, norm=norm, draws=draws / fraction**2),
         frame=(M, d),
     )
 
 
-def _held_drift(released: View, model: DistortionModel) -> GaussianPriors:
+def _held_drift(released: TransformedSolution, model: DistortionModel) -> GaussianPriors:
     """Priors that fix the drift at its released values."""
     priors = GaussianPriors.none(model)
     rows = slice(released.model.n_polynomial, released.model.n_distortion)
@@ -342,7 +343,7 @@ def with_star_errors_of(
     matches: MatchTable,
     released: tuple[LinearFit, MatchTable] | None = None,
 ) -> NewFit:
-    """New fit whose covariance includes the catalogue errors that the matches of a star share.
+    """New fit whose covariance includes the catalogue errors that all matches of a star have.
 
     A star has one error in all of its new exposures.  Where the release was made with the same
     catalogue, that error has moved both sides, and what it moved alike is no change.
@@ -362,16 +363,7 @@ def with_star_errors_of(
     NewFit
     """
     n = new.model.n_polynomial
-    motion_u, motion_v = (0.0, 0.0) if errors.motion is None else errors.motion.T
-    shared = star_covariance(
-        new.fit,
-        matches,
-        *errors.position.T,
-        motion_u=motion_u,
-        motion_v=motion_v,
-        epoch0=errors.epoch,
-        frames=False,
-    )
+    shared = star_covariance(new.fit, matches, errors, frames=False)
     out = replace(new, extra=shared.extra[:n, :n])
     if released is None or released[1].star is None or matches.star is None:
         return out

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.compare.order_result import HeldOutOrders, OrderSelection, OrderSurfaces
 from bayesdist.infer.compare.order_sums import (
-    LotSums,
+    FoldStatistics,
     bin_sums,
     departures,
+    fold_sums,
     held_out_gain,
-    share_sums,
     truncated,
 )
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
@@ -43,7 +43,7 @@ def select_order(
     orders: Sequence[int] = DEFAULT_ORDERS,
     bins: int = 31,
     regions: int = 10,
-    shares: int = 100,
+    folds: int = 100,
     rejection: Rejection = DEFAULT_REJECTION,
     compute: Compute | None = None,
 ) -> OrderSelection:
@@ -51,7 +51,7 @@ def select_order(
 
     Stars are clipped once, by the two-pass fit of the highest order, and alike for all orders; the
     model's own order does not matter.  `bins` (surfaces) and `regions` (held out, each made of
-    whole bins) are numbers along each axis; `shares` is the number of random subsets of the stars
+    whole bins) are numbers along each axis; `folds` is the number of random subsets of the stars
     that are held out, one at a time.
 
     Raises InputError for fewer than two orders, unusable ones, a model of several chips, or numbers
@@ -59,12 +59,12 @@ def select_order(
     highest order, and when too few bins have stars, or a group holds all that determines a
     coefficient.
     """
-    chosen = _checked(orders, model, bins, regions, shares)
+    chosen = _checked(orders, model, bins, regions, folds)
     top = replace(model, order=chosen[-1])
     with opened(top, matches, compute) as shards:
         fit = fit_linear(shards, top, rejection=rejection)
         binned = shards.sum(bin_sums, fit.mean, fit.clip, bins)
-        shared = shards.sum(share_sums, fit.mean, fit.clip, shares)
+        by_fold = shards.sum(fold_sums, fit.mean, fit.clip, folds)
     n_terms = [(n + 1) * (n + 2) // 2 for n in chosen]
     about = fit.mean.reshape(2, -1)
     scale2 = fit.chi2 / fit.dof
@@ -72,7 +72,7 @@ def select_order(
     region = binned.joined(iy * regions // bins * regions + ix * regions // bins, regions**2)
     try:
         by_stars, by_regions = (
-            held_out_gain(lots.filled(), about, n_terms) / scale2 for lots in (shared, region)
+            held_out_gain(one.filled(), about, n_terms) / scale2 for one in (by_fold, region)
         )
     except np.linalg.LinAlgError:
         raise DegenerateError(
@@ -85,7 +85,7 @@ def select_order(
         surfaces=_surfaces(binned.filled(), about, chosen, n_terms, scale2),
         stars=HeldOutOrders(chosen, "stars", by_stars),
         regions=HeldOutOrders(chosen, "regions", by_regions),
-        lost=_lost(shared, about, n_terms, scale2, fit),
+        lost=_lost(by_fold, about, n_terms, scale2, fit),
         pair_rms=float(np.hypot(fit.rms_u, fit.rms_v)),
         error_scale=float(np.sqrt(scale2)),
         n_used=fit.n_used,
@@ -94,7 +94,7 @@ def select_order(
 
 
 def _checked(
-    orders: Sequence[int], model: DistortionModel, bins: int, regions: int, shares: int
+    orders: Sequence[int], model: DistortionModel, bins: int, regions: int, folds: int
 ) -> tuple[int, ...]:
     """Orders in ascending sequence; InputError if a setting cannot be used."""
     chosen = tuple(sorted({int(n) for n in orders}))
@@ -110,17 +110,17 @@ def _checked(
             where="model",
             do="select one chip, and bring the exposures to one frame before",
         )
-    if not 2 <= regions <= bins or shares < 2:
+    if not 2 <= regions <= bins or folds < 2:
         raise InputError(
-            f"{bins} bins, {regions} regions and {shares} shares do not go together",
+            f"{bins} bins, {regions} regions and {folds} folds do not go together",
             where="orders",
-            do="give at least 2 regions and shares, and no more regions than bins",
+            do="give at least 2 regions and folds, and no more regions than bins",
         )
     return chosen
 
 
 def _surfaces(
-    sums: LotSums, about: Float, orders: tuple[int, ...], n_terms: list[int], scale2: float
+    sums: FoldStatistics, about: Float, orders: tuple[int, ...], n_terms: list[int], scale2: float
 ) -> OrderSurfaces:
     n = len(sums.count)
     if n <= n_terms[-1]:
@@ -144,7 +144,9 @@ def _surfaces(
     return OrderSurfaces(orders, n, chi2, n - np.array(n_terms), rms, noise)
 
 
-def _lost(sums: LotSums, about: Float, n_terms: list[int], scale2: float, fit: LinearFit) -> Float:
+def _lost(
+    sums: FoldStatistics, about: Float, n_terms: list[int], scale2: float, fit: LinearFit
+) -> Float:
     """Rms over the detector of the difference of each order's fit from the highest."""
     i, j = np.array(fit.model.basis().terms).T
     area = 1.0 / ((2 * i + 1) * (2 * j + 1))  # mean square of a product of Legendre polynomials

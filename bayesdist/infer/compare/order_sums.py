@@ -1,61 +1,56 @@
 """Normal equations of the highest order by group of stars, which contain those of all lower orders.
 
 The terms of a polynomial are sorted by total order, so that the normal matrix of a lower order is
-the first part of that of a higher one.  A lot is a bin of the detector, or a random subset of the
-stars.  With the sums of each lot, every order is fitted to all lots, to all but one, or to the
-means of the lots, without the data.
+the first part of that of a higher one.  A fold is a bin of the detector, or a random subset of the
+stars.  With the sums of each fold, every order is fitted to all folds, to all but one, or to the
+means of the folds, without the data.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer import kernel
-from bayesdist.infer.linear import Clip
+from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.stars import Stars, cell_of
+from bayesdist.infer.stars.sums import Sums
 
-__all__ = ["LotSums", "bin_sums", "departures", "held_out_gain", "share_sums", "truncated"]
+__all__ = ["FoldStatistics", "bin_sums", "departures", "fold_sums", "held_out_gain", "truncated"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class LotSums:
-    """Sums over the stars of each lot, about one polynomial; sums of chunks of the data add up."""
+class FoldStatistics(Sums):
+    """Sums over the stars of each fold, about one polynomial."""
 
-    count: Int  # number (L,) of stars, including clipped ones
-    weight: Float  # sum (L, 2, K, K) of w phi phi^T of u and of v
-    right: Float  # sum (L, 2, K) of w r phi, r the residual
+    count: Int  # number (F,) of stars, including clipped ones
+    weight: Float  # sum (F, 2, K, K) of w phi phi^T of u and of v
+    right: Float  # sum (F, 2, K) of w r phi, r the residual
 
-    def __add__(self, other: LotSums) -> LotSums:
-        return LotSums(
-            self.count + other.count, self.weight + other.weight, self.right + other.right
-        )
+    def joined(self, code: Int, n: int) -> FoldStatistics:
+        """Sums of `n` larger folds; `code` (F,) is the larger fold of each."""
 
-    def joined(self, code: Int, n: int) -> LotSums:
-        """Sums of `n` larger lots; `code` (L,) is the larger lot of each."""
-        out = LotSums(
-            np.zeros(n, np.int64),
-            np.zeros((n, *self.weight.shape[1:])),
-            np.zeros((n, *self.right.shape[1:])),
-        )
-        np.add.at(out.count, code, self.count)
-        np.add.at(out.weight, code, self.weight)
-        np.add.at(out.right, code, self.right)
-        return out
+        def joined(column: NDArray[Any]) -> NDArray[Any]:
+            out = np.zeros((n, *column.shape[1:]), column.dtype)
+            np.add.at(out, code, column)
+            return out
 
-    def filled(self) -> LotSums:
-        """Sums of the lots that have weight."""
+        return FoldStatistics(joined(self.count), joined(self.weight), joined(self.right))
+
+    def filled(self) -> FoldStatistics:
+        """Sums of the folds that have weight."""
         has = self.weight[:, 0, 0, 0] > 0
-        return LotSums(self.count[has], self.weight[has], self.right[has])
+        return FoldStatistics(self.count[has], self.weight[has], self.right[has])
 
 
-def bin_sums(stars: Stars, theta: Float, clip: Clip, bins: int) -> LotSums:
-    """Sums of equal bins that cover the detector, `bins` on each axis: lot `iy * bins + ix`.
+def bin_sums(stars: Stars, theta: Float, clip: Clip, bins: int) -> FoldStatistics:
+    """Sums of equal bins that cover the detector, `bins` on each axis: fold `iy * bins + ix`.
 
     The stars are of one chip, without frames; residuals are taken about `theta`, and `clip` leaves
     stars out.
@@ -63,8 +58,8 @@ def bin_sums(stars: Stars, theta: Float, clip: Clip, bins: int) -> LotSums:
     return _sums(stars, cell_of(stars.X, stars.Y, bins), bins * bins, theta, clip)
 
 
-def share_sums(stars: Stars, theta: Float, clip: Clip, shares: int) -> LotSums:
-    """Sums of `shares` random subsets of the stars; other arguments as of `bin_sums`.
+def fold_sums(stars: Stars, theta: Float, clip: Clip, folds: int) -> FoldStatistics:
+    """Sums of `folds` random subsets of the stars; other arguments as of `bin_sums`.
 
     The subset of a star follows from the digits of its own numbers, so that it depends neither on
     the order of the rows nor on the chunks into which the data are cut.
@@ -72,7 +67,7 @@ def share_sums(stars: Stars, theta: Float, clip: Clip, shares: int) -> LotSums:
     mixed = np.zeros(len(stars), np.uint64)
     for column in (stars.X, stars.Y, stars.u, stars.v):
         mixed = _scrambled(mixed ^ np.ascontiguousarray(column).view(np.uint64))
-    return _sums(stars, (mixed % np.uint64(shares)).astype(np.int64), shares, theta, clip)
+    return _sums(stars, (mixed % np.uint64(folds)).astype(np.int64), folds, theta, clip)
 
 
 def _scrambled(z: NDArray[np.uint64]) -> NDArray[np.uint64]:
@@ -83,7 +78,7 @@ def _scrambled(z: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return z ^ (z >> np.uint64(31))
 
 
-def _sums(stars: Stars, code: Int, n: int, theta: Float, clip: Clip) -> LotSums:
+def _sums(stars: Stars, code: Int, n: int, theta: Float, clip: Clip) -> FoldStatistics:
     count = np.bincount(code, minlength=n)
     order = np.argsort(code, kind="stable")
     present = np.flatnonzero(count)
@@ -105,7 +100,7 @@ def _sums(stars: Stars, code: Int, n: int, theta: Float, clip: Clip) -> LotSums:
     weight, right = np.zeros((n, 2, K, K)), np.zeros((n, 2, K))
     weight[present] = moments.weight[:, 0::2]
     right[present] = moments.right
-    return LotSums(count, weight, right)
+    return FoldStatistics(count, weight, right)
 
 
 def truncated(weight: Float, right: Float, about: Float, n_terms: int) -> Float:
@@ -124,16 +119,16 @@ def truncated(weight: Float, right: Float, about: Float, n_terms: int) -> Float:
     return out
 
 
-def departures(sums: LotSums, about: Float, n_terms: list[int]) -> Float:
-    """Coefficients (orders, 2, K) of each order's fit to all lots, minus `about`."""
+def departures(sums: FoldStatistics, about: Float, n_terms: list[int]) -> Float:
+    """Coefficients (orders, 2, K) of each order's fit to all folds, minus `about`."""
     weight, right = sums.weight.sum(axis=0), sums.right.sum(axis=0)
     return np.stack([truncated(weight, right, about, k) for k in n_terms])
 
 
-def held_out_gain(sums: LotSums, about: Float, n_terms: list[int]) -> Float:
-    """Log predictive density (L, orders, 2) of every lot by each order's fit to all others.
+def held_out_gain(sums: FoldStatistics, about: Float, n_terms: list[int]) -> Float:
+    """Log predictive density (F, orders, 2) of every fold by each order's fit to all others.
 
-    It is minus half the difference of the lot's chi-square, of u and of v, from that about the
+    It is minus half the difference of the fold's chi-square, of u and of v, from that about the
     coefficients `about` (2, K), and so up to a constant that all orders share.  The coefficients'
     own uncertainty is not added to the errors: where a star's leverage h is small, that would
     change the expectation by terms of the second order in h only.

@@ -6,10 +6,9 @@ from collections.abc import Mapping
 
 from bayesdist.infer.compare.periods import PeriodComparison
 from bayesdist.infer.compare.positions import PositionChange
+from bayesdist.limits import DIFFERENCE
 
-__all__ = ["SIGNIFICANT", "all_below", "period_verdict"]
-
-SIGNIFICANT = 0.01  # probability below which a difference is significant
+__all__ = ["all_below", "period_verdict"]
 
 
 def all_below(changes: Mapping[str, PositionChange], tolerance: float) -> bool:
@@ -32,7 +31,7 @@ def period_verdict(
     # the most significant, not the largest: the shortest period has the largest noise
     name, most = max(changes.items(), key=lambda one: one[1].chi2)
     unit = comparison.model.unit
-    head = "The distortion changes" if p < SIGNIFICANT else "No change is seen"
+    head = "The distortion changes" if p < DIFFERENCE.value else "No change is seen"
     out = (
         f"{head} (chi-square {chi2:.4g} for {dof} degrees of freedom, {_probability(p)}): "
         f"{name} differs most from the combined model, by up to {most.largest:.2g} +- "
@@ -47,7 +46,7 @@ def period_verdict(
     beyond = [
         name
         for name, one in changes.items()
-        if one.p_value < SIGNIFICANT and one.largest - 2 * one.sigma > tolerance
+        if one.p_value < DIFFERENCE.value and one.largest - 2 * one.sigma > tolerance
     ]
     if beyond:
         return f"{out}; beyond {limit}: {', '.join(beyond)}."

@@ -33,6 +33,7 @@ from bayesdist.infer.equations.rank import require_full_rank
 from bayesdist.infer.equations.scaled import FieldTest, chi_square, scaled_inverse
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.stars.stars import Stars
+from bayesdist.infer.stars.sums import Sums
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = [
@@ -47,8 +48,8 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class PeriodSums:
-    """Sums over the matches of one period, which add over chunks of the data.
+class PeriodSums(Sums):
+    """Sums over the matches of one period.
 
     Parameters
     ----------
@@ -63,12 +64,6 @@ class PeriodSums:
     equations: NormalEquations
     squares: NormalEquations | None
     n: int
-
-    def __add__(self, other: PeriodSums) -> PeriodSums:
-        squares = None
-        if self.squares is not None and other.squares is not None:
-            squares = self.squares + other.squares
-        return PeriodSums(self.equations + other.equations, squares, self.n + other.n)
 
 
 def sums_of_stars(stars: Stars, fit: LinearFit, radial_weight: float = 1.0) -> PeriodSums:
@@ -86,9 +81,10 @@ def sums_of_stars(stars: Stars, fit: LinearFit, radial_weight: float = 1.0) -> P
     -------
     PeriodSums
     """
-    rule = (fit.clip.theta, fit.clip.chi2_limit, fit.clip.abs_limit, radial_weight)
-    equations = least_squares(stars, fit.mean, *rule)
-    squares = least_squares(stars, fit.mean, *rule, 2) if radial_weight != 1.0 else None
+    equations = least_squares(stars, fit.mean, fit.clip, radial_weight)
+    squares = None
+    if radial_weight != 1.0:
+        squares = least_squares(stars, fit.mean, fit.clip, radial_weight, 2)
     return PeriodSums(equations, squares, int(equations.scalars[0]))
 
 
@@ -162,14 +158,14 @@ def compare_periods(
             covs.append(inverse)
         normals.append(normal)
     all_inverse = scaled_inverse(np.sum(normals, axis=0))
-    shares = np.array([all_inverse @ normal for normal in normals])
+    fractions = np.array([all_inverse @ normal for normal in normals])
     scale = _error_scale(sums.values(), rights, steps) if rescale else 1.0
     return PeriodComparison(
         model=model,
         names=tuple(sums),
         means=fit.mean + np.array(steps),
         covs=np.array(covs) * scale**2,
-        shares=shares,
+        fractions=fractions,
         counts=tuple(one.n for one in sums.values()),
         error_scale=scale,
     )
@@ -228,7 +224,7 @@ class PeriodComparison:
     means : ndarray, shape (P, D)
     covs : ndarray, shape (P, D, D)
         Covariance of each, independent of the others.
-    shares : ndarray, shape (P, D, D)
+    fractions : ndarray, shape (P, D, D)
         A_p = N^-1 N_p; their sum is the identity.
     counts : tuple of int
         Number of matches in each.
@@ -240,14 +236,14 @@ class PeriodComparison:
     names: tuple[str, ...]
     means: Float
     covs: Float
-    shares: Float
+    fractions: Float
     counts: tuple[int, ...]
     error_scale: float
 
     @cached_property
     def combined(self) -> Float:
         """Parameters (D,) of the model of all periods."""
-        return np.einsum("pij,pj->i", self.shares, self.means)
+        return np.einsum("pij,pj->i", self.fractions, self.means)
 
     def _code(self, period: str) -> int:
         if period not in self.names:
@@ -267,9 +263,9 @@ class PeriodComparison:
                 raise InputError(f"period {period} is compared with itself", do="name another")
             out[p], out[q] = np.eye(D), -np.eye(D)
             return out
-        out[:] = -self.shares
+        out[:] = -self.fractions
         # 1 - A_p without the cancellation that occurs for a period with most of the data
-        out[p] = np.delete(self.shares, p, axis=0).sum(axis=0)
+        out[p] = np.delete(self.fractions, p, axis=0).sum(axis=0)
         return out
 
     def difference(self, period: str, against: str | None = None) -> tuple[Float, Float]:
@@ -319,11 +315,6 @@ class PeriodComparison:
             to_monomials = block_diag(*(m for m in both for _ in (0, 1)))
             difference, cov = to_monomials @ difference, to_monomials @ cov @ to_monomials.T
         return CoefficientChange(self.model.names, difference, np.sqrt(np.diag(cov)))
-
-    def joint(self, period: str, against: str | None = None) -> FieldTest:
-        """Chi-square of all coefficients together."""
-        difference, cov = self.difference(period, against)
-        return chi_square(difference, cov)
 
     def positions(
         self,

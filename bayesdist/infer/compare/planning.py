@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import scaled_cholesky, scaled_inverse
-from bayesdist.infer.posterior.recoloured import Recoloured
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.posterior.covariance import with_covariance
+from bayesdist.infer.solution import Solution, TransformedSolution
 from bayesdist.model import DistortionModel
 
 __all__ = ["ExposureContent", "exposure_content", "exposure_information", "with_information"]
@@ -96,7 +96,7 @@ def exposure_information(
     return H[:n, :n] - cross @ np.linalg.solve(local * np.outer(scale, scale), cross.T)
 
 
-def with_information(solution: Solution, information: Float) -> Recoloured:
+def with_information(solution: Solution, information: Float) -> TransformedSolution:
     """Solution with the additional information (d, d) about polynomials and drift.
 
     Frames of the existing exposures change as far as they are correlated with these.  InputError
@@ -115,4 +115,4 @@ def with_information(solution: Solution, information: Float) -> Recoloured:
     after = root @ np.linalg.solve(inner, root.T)
     follow = cov[:, :n] @ scaled_inverse(cov[:n, :n])
     changed = cov + follow @ (after - cov[:n, :n]) @ follow.T
-    return Recoloured(solution, (changed + changed.T) / 2)
+    return with_covariance(solution, (changed + changed.T) / 2)

@@ -197,12 +197,12 @@ def _expand(target: Target, split: Split, y: Float, at: Float, *, em: bool = Fal
 
     g = matrix.n_global
     fixed = [g + k for k in held]
-    kept = [*range(g), *(g + k for k in rest)]
+    free = [*range(g), *(g + k for k in rest)]
     scale = np.concatenate([np.ones(g), h1])
-    border = matrix.border[np.ix_(kept, kept)] * np.outer(scale, scale)
-    tail = np.arange(g, len(kept))
+    border = matrix.border[np.ix_(free, free)] * np.outer(scale, scale)
+    tail = np.arange(g, len(free))
     border[tail, tail] += np.maximum(bend, 0.0) if em else bend
-    inner = Arrow(border, matrix.edge[:, kept] * scale[:, None], matrix.blocks, n_tail=len(rest))
+    inner = Arrow(border, matrix.edge[:, free] * scale[:, None], matrix.blocks, n_tail=len(rest))
     return _Expansion(
         y=y,
         value=value + float(split.log_jacobian(y)),
@@ -211,7 +211,7 @@ def _expand(target: Target, split: Split, y: Float, at: Float, *, em: bool = Fal
         slope=gradient[n:][held],
         curvature=matrix.border[np.ix_(fixed, fixed)],
         coupling=inner.join(
-            matrix.border[np.ix_(fixed, kept)] * scale,
+            matrix.border[np.ix_(fixed, free)] * scale,
             np.swapaxes(matrix.edge[:, fixed], 0, 1),
         ),
     )

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from bayesdist.infer import kernel
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.kernel import Constants
+from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.stars import Stars
-from bayesdist.model import DistortionModel, Groups, merge_groups
+from bayesdist.infer.stars.sums import Sums
+from bayesdist.model import DistortionModel, Groups
 
 __all__ = ["NormalEquations", "least_squares", "mixture"]
 
@@ -25,8 +27,11 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class NormalEquations:
-    """Moments of weighted residuals about given effective coefficients."""
+class NormalEquations(Sums):
+    """Moments of weighted residuals about given effective coefficients.
+
+    Two of them add where residuals of a group were taken at the same coefficients.
+    """
 
     weight: Float  # sum (G, 3, K, K) of w phi phi^T for the axis pairs uu, uv, vv
     right: Float  # sum (G, 2, K) of phi (W r), r the residual at `about`
@@ -36,38 +41,8 @@ class NormalEquations:
     scalars: Float  # further sums over the stars, named by the pass that made the equations
     groups: Groups
 
-    def __add__(self, other: NormalEquations) -> NormalEquations:
-        """Sum over two chunks of data, which may have different groups.
-
-        ValueError when residuals of one group were taken at different coefficients.
-        """
-        if self.groups.same(other.groups):
-            here = np.arange(len(self.groups))
-            groups, of_self, of_other = self.groups, here, here
-        else:
-            groups, of_self, of_other = merge_groups(self.groups, other.groups)
-        pair = ((self, of_self), (other, of_other))
-
-        def total(name: str) -> Float:
-            out = np.zeros((len(groups), *getattr(self, name).shape[1:]))
-            for part, index in pair:
-                out[index] += getattr(part, name)
-            return out
-
-        about = np.empty((len(groups), *self.about.shape[1:]))
-        for part, index in pair:
-            about[index] = part.about
-        if not all(np.array_equal(about[index], part.about) for part, index in pair):
-            raise ValueError("normal equations about different coefficients do not add")
-        return NormalEquations(
-            total("weight"),
-            total("right"),
-            about,
-            self.chi2 + other.chi2,
-            total("cross"),
-            self.scalars + other.scalars,
-            groups,
-        )
+    BY_GROUP = ("weight", "right", "cross")
+    OF_GROUP = ("about",)
 
     def moved(self, about: Float) -> NormalEquations:
         """Equations about other effective coefficients: exact, without the data."""
@@ -123,26 +98,23 @@ class NormalEquations:
 def least_squares(
     stars: Stars,
     about: Float | None,
-    test: Float | None = None,
-    chi2_limit: float = np.inf,
-    abs_limit: float = np.inf,
+    clip: Clip | None = None,
     corner: float = 1.0,
     power: int = 1,
 ) -> NormalEquations:
     """Normal equations of weighted least squares with rejection: one pass over the stars.
 
-    Residuals are taken at `about` (n_params,), or None for the data themselves; those at `test`
-    decide on rejection.  The limits, `corner`, `power` and the `scalars` are those of
-    `kernel.least_squares_moments`.
+    Residuals are taken at `about` (n_params,), or None for the data themselves; `clip` decides on
+    rejection.  `corner`, `power` and the `scalars` are those of `kernel.least_squares_moments`.
     """
     moments = kernel.least_squares_moments(
         stars.pieces,
         stars.columns,
         stars.powers(about),
-        stars.powers(test),
+        stars.powers(None if clip is None else clip.theta),
         stars.model.order,
-        chi2_limit=chi2_limit,
-        abs_limit=abs_limit,
+        chi2_limit=np.inf if clip is None else clip.chi2_limit,
+        abs_limit=np.inf if clip is None else clip.abs_limit,
         corner=corner,
         power=power,
     )

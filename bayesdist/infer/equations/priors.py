@@ -1,4 +1,4 @@
-"""Gaussian priors on named parameters; everything without one has a flat prior."""
+"""Gaussian priors of the parameters: independent ones by name, and correlated ones."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.model import DistortionModel
 
-__all__ = ["GaussianPriors"]
+__all__ = ["GaussianPriors", "Prior"]
 
 Float = NDArray[np.float64]
 
@@ -74,6 +74,10 @@ class GaussianPriors:
         """Log prior of parameter vectors (..., D), up to a constant."""
         return -0.5 * ((theta - self.centre) ** 2 * self.precision).sum(axis=-1)
 
+    def about(self, theta: Float) -> Prior:
+        """Priors as one of all parameters, about theta (D,)."""
+        return Prior(theta, np.diag(self.precision), self.pull(theta))
+
     def matrix(self, model: DistortionModel, n_tail: int = 0) -> Arrow:
         """The priors' precision as a diagonal arrow."""
         n, q, g = len(model.local_blocks), model.n_frame, model.n_global
@@ -81,3 +85,48 @@ class GaussianPriors:
         blocks = np.einsum("nq,qr->nqr", local, np.eye(q))
         border = np.diag(np.concatenate([self.precision[:g], np.zeros(n_tail)]))
         return Arrow(border, np.zeros((n, g + n_tail, q)), blocks, n_tail)
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Correlated Gaussian prior of the parameters, linearised at some.
+
+    log p = -d^T P d / 2 + r^T d with d = theta - reference.
+
+    Parameters
+    ----------
+    reference : ndarray, shape (D,)
+        Near the solution, so that no digits are lost.
+    precision : ndarray, shape (D, D)
+        P.
+    right : ndarray, shape (D,)
+        r.
+    """
+
+    reference: Float
+    precision: Float
+    right: Float
+
+    @classmethod
+    def none(cls, reference: Float) -> Prior:
+        """Flat prior."""
+        D = len(reference)
+        return cls(reference, np.zeros((D, D)), np.zeros(D))
+
+    def __add__(self, other: Prior) -> Prior:
+        """Sum of two independent pieces."""
+        shift = self.reference - other.reference
+        return Prior(
+            self.reference,
+            self.precision + other.precision,
+            self.right + other.right - other.precision @ shift,
+        )
+
+    def pull(self, theta: Float) -> Float:
+        """Gradient (D,)."""
+        return np.asarray(self.right - self.precision @ (theta - self.reference))
+
+    def log_density(self, theta: Float) -> Float:
+        """Log density of parameter vectors (..., D), up to a constant."""
+        d = theta - self.reference
+        return np.asarray(d @ self.right - 0.5 * np.einsum("...d,...d->...", d @ self.precision, d))

@@ -85,12 +85,12 @@ def _simpler_frames(matrix: Arrow, model: DistortionModel) -> str:
     dense = matrix.dense()
     for kind in reversed(FRAME_KINDS[: FRAME_KINDS.index(model.frames)]):
         names = frame_names(kind)
-        kept = [
+        left = [
             k
             for k, p in enumerate(model.parameters)
             if p.kind != "frame" or p.name.rpartition(".")[2] in names
         ]
-        part = dense[np.ix_(kept, kept)]
+        part = dense[np.ix_(left, left)]
         scale = np.sqrt(part.diagonal())
         if (scale == 0).any():
             continue

@@ -18,11 +18,10 @@ from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
+from bayesdist.infer.solution import ReferenceGauge, Solution, TransformedSolution
 from bayesdist.infer.transforms import (
     LinearTerms,
-    ReferenceGauge,
-    Solution,
-    View,
+    bare_model,
     linear_terms,
     reference_gauge,
     without_frames,
@@ -52,7 +51,7 @@ class ExposureSolutions:
         In the reference gauge; A_1, B_1 and A_3 of the reference chip are zero and have no error.
     cov : ndarray, shape (E, k, k)
         Formal covariance.
-    views : tuple of View
+    views : tuple of TransformedSolution
         The whole solution of each exposure, in the reference gauge.
     fits : tuple of LinearFit
         As fitted, in the system of the catalogue.
@@ -65,7 +64,7 @@ class ExposureSolutions:
     labels: tuple[str, ...]
     values: Float
     cov: Float
-    views: tuple[View, ...]
+    views: tuple[TransformedSolution, ...]
     fits: tuple[LinearFit, ...]
     skipped: Mapping[str, str]
 
@@ -161,15 +160,7 @@ def fit_exposures(
             where="data.columns",
             do="map column 'epoch'",
         )
-    alone = replace(
-        model,
-        frames="none",
-        time=None,
-        exposures=("1",),
-        origin=(0.0, 0.0),
-        gauge="first",
-        held=(0.0, 0.0, 0.0),
-    )
+    alone = replace(bare_model(model), time=None)
     base = priors or GaussianPriors.none(alone)
     joint = None if high_order is None else reference_gauge(without_frames(high_order), chip)
     if joint is not None and (joint.model.order, joint.model.chips) != (alone.order, alone.chips):
@@ -242,7 +233,7 @@ def _require_stars(table: MatchTable, model: DistortionModel, least: int) -> Non
 def _fit_held(
     table: MatchTable,
     model: DistortionModel,
-    joint: View,
+    joint: TransformedSolution,
     epoch: float,
     chip: int,
     base: GaussianPriors,

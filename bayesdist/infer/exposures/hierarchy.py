@@ -33,9 +33,11 @@ from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.exposures.scatter import Scatter
-from bayesdist.infer.linear import DEFAULT_REJECTION, Clip, LinearFit, Rejection, fit_linear
+from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
+from bayesdist.infer.solution import Solution
+from bayesdist.infer.stars.likelihood import ClippedGaussian
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
-from bayesdist.infer.transforms import reference_gauge
+from bayesdist.infer.transforms import bare_model, reference_gauge
 from bayesdist.model import DistortionModel
 
 __all__ = ["HierarchicalFit", "fit_hierarchical", "held_in_reference"]
@@ -53,7 +55,7 @@ LEAST_DETERMINED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class HierarchicalFit:
+class HierarchicalFit(Solution):
     """A joint solution of all exposures in which scale and shear of each may deviate.
 
     Draws and mean are over the posterior of tau.  So is the covariance, but for one simplification:
@@ -90,20 +92,15 @@ class HierarchicalFit:
         """Indices in theta of the deviations."""
         return self.scatter.index
 
-    @property
+    @cached_property
     def model(self) -> DistortionModel:
         """The distortion model."""
         return self.fit.model
 
     @property
-    def unit(self) -> str:
-        """Unit of u and v."""
-        return self.model.unit
-
-    @property
-    def clip(self) -> Clip:
-        """Rule by which stars were left out of the second pass."""
-        return self.fit.clip
+    def likelihood(self) -> ClippedGaussian:
+        """Normal errors of the stars in the second pass, at the mean."""
+        return ClippedGaussian(self.mean, self.fit.clip)
 
     def uses(self, matches: MatchTable) -> NDArray[np.bool_]:
         """Boolean mask (N,) of a table's stars that were used."""
@@ -145,11 +142,6 @@ class HierarchicalFit:
         """Posterior covariance of theta, shape (D, D)."""
         spread = self._means - self.mean
         return np.asarray(self.fit.cov + spread.T @ spread / len(spread))
-
-    @property
-    def sigma(self) -> Float:
-        """Posterior standard deviation of theta, shape (D,)."""
-        return np.asarray(np.sqrt(np.diag(self.cov)))
 
     @one_thread
     def draws(self, n: int, rng: np.random.Generator) -> Float:
@@ -231,15 +223,7 @@ def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -
             where=f"chip {model.chips[model.chip_code(chip)].name}",
             do="put another exposure first",
         )
-    alone = replace(
-        model,
-        chips=(model.chips[model.chip_code(chip)],),
-        time=None,
-        frames="none",
-        exposures=("1",),
-        gauge="first",
-        held=(0.0, 0.0, 0.0),
-    )
+    alone = replace(bare_model(model), chips=(model.chips[model.chip_code(chip)],), time=None)
     table = MatchTable.concatenate(parts)
     gauge = reference_gauge(fit_linear(table, alone), chip).gauge
     assert gauge is not None
@@ -313,8 +297,7 @@ def fit_hierarchical(
     with opened(model, matches, compute) as shards:
         wide = _with_deviations(others, index, scales[kind] ** -2)
         first = fit_linear(shards, model, rejection=rejection, priors=wide)
-        limits = (first.clip.theta, first.clip.chi2_limit, first.clip.abs_limit)
-        equations = shards.sum(least_squares, first.mean, *limits)
+        equations = shards.sum(least_squares, first.mean, first.clip)
         matrix, right = equations.assemble(model, first.mean)
         scatter = Scatter(
             kinds,

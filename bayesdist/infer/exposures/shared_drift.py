@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.scaled import scaled_inverse, unit_diagonal
-from bayesdist.infer.transforms import Derived, Solution, reference_gauge, without_frames
+from bayesdist.infer.solution import DerivedSolution, Solution
+from bayesdist.infer.transforms import reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.similarity import turned, turned_model
 
@@ -24,7 +25,7 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class SharedDrift(Derived):
+class SharedDrift(DerivedSolution):
     """A solution, without frames, whose drift is that of another one."""
 
     model: DistortionModel

@@ -13,6 +13,7 @@ costs an integral.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -48,9 +49,30 @@ INTEGRAL = 30  # cost of a star, in likelihood evaluations without a circle
 N_TERMS = 21  # columns and scalars of one star
 
 
+# In the loops `stars` are the columns X, Y, u, v, var_u, var_v, off_u, off_v; `circle` is True for
+# Gaussian outliers, then the radius, then the `NODES` of the integral.
+
+
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
-def _parts(ru, rv, du, dv, au, av, row, gaussian, radius, nodes, q, work):
+def _placed(stars, coef, order, a, e, pu, pv, inner):
+    """Write the model's positions of some stars of a group to pu and pv."""
+    X, Y = stars[0][a:e], stars[1][a:e]
+    horner(coef[0], order, X, Y, e - a, pu, inner)
+    horner(coef[1], order, X, Y, e - a, pv, inner)
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def _residual(stars, i, pu, pv, j2):
+    """Residual of a star, its distance from the nominal position, and its variances."""
+    ru, rv = stars[2][i] - pu, stars[3][i] - pv
+    return ru, rv, ru + stars[6][i], rv + stars[7][i], stars[4][i] + j2, stars[5][i] + j2
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def _parts(star, row, circle, q, work):
     """Densities of both parts, in the unit of `mixture`, and half the chi-square taken out."""
+    ru, rv, du, dv, au, av = star
+    gaussian, radius, nodes = circle[0], circle[1], circle[2:]
     q_in = 0.5 * (ru * ru / au + rv * rv / av)
     q_in += log_circle(du, dv, au, av, radius, nodes, q, work)
     q_out = (ru * ru + rv * rv) * row[3] + row[4]
@@ -68,118 +90,41 @@ def _parts(ru, rv, du, dv, au, av, row, gaussian, radius, nodes, q, work):
 
 
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def _sums(
-    blocks,
-    X,
-    Y,
-    u,
-    v,
-    var_u,
-    var_v,
-    off_u,
-    off_v,
-    coef,
-    order,
-    rows,
-    unit2,
-    gaussian,
-    radius,
-    nodes,
-):
-    n_blocks, n_draws = len(blocks), len(rows)
+def _evaluated(blocks, stars, coef, order, rows, unit2, circle, out):
+    """Log-likelihood (n, D) of each block; star by star, averages to out (3, N) if not empty."""
+    n_blocks, n_draws, wanted = len(blocks), len(rows), out.shape[1] > 0
     sums = np.empty((n_blocks, n_draws))
-    constant = math.log(2 * math.pi * unit2)
+    share, constant = 1.0 / n_draws, math.log(2 * math.pi * unit2)
     for b in nb.prange(n_blocks):
         g, a, e = blocks[b]
-        n = e - a
         pu, pv, inner = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
         q, work = np.empty(MOST), np.empty(MOST)
+        if wanted:
+            out[:, a:e] = 0.0
         for d in range(n_draws):
-            horner(coef[d, g, 0], order, X[a:e], Y[a:e], n, pu, inner)
-            horner(coef[d, g, 1], order, X[a:e], Y[a:e], n, pv, inner)
+            _placed(stars, coef[d, g], order, a, e, pu, pv, inner)
             total = 0.0
-            for s in range(n):
-                ru, rv = u[a + s] - pu[s], v[a + s] - pv[s]
-                d_in, d_out, least = _parts(
-                    ru,
-                    rv,
-                    ru + off_u[a + s],
-                    rv + off_v[a + s],
-                    var_u[a + s] + rows[d, 0],
-                    var_v[a + s] + rows[d, 0],
-                    rows[d],
-                    gaussian,
-                    radius,
-                    nodes,
-                    q,
-                    work,
-                )
-                total += math.log(d_in + d_out) - least
-            sums[b, d] = total - n * constant
+            for i in range(a, e):
+                star = _residual(stars, i, pu[i - a], pv[i - a], rows[d, 0])
+                d_in, d_out, least = _parts(star, rows[d], circle, q, work)
+                value = math.log(d_in + d_out) - least
+                total += value
+                if wanted:
+                    out[0, i] += share * d_out / (d_in + d_out)
+                    out[1, i] += share * (value - constant)
+                    out[2, i] += share * (value - constant) * (value - constant)
+            sums[b, d] = total - (e - a) * constant
     return sums
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def _memberships(
-    blocks,
-    X,
-    Y,
-    u,
-    v,
-    var_u,
-    var_v,
-    off_u,
-    off_v,
-    coef,
-    order,
-    rows,
-    unit2,
-    gaussian,
-    radius,
-    nodes,
-    out,
-):
-    share = 1.0 / len(rows)
-    constant = math.log(2 * math.pi * unit2)
-    for b in nb.prange(len(blocks)):
-        g, a, e = blocks[b]
-        n = e - a
-        pu, pv, inner = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
-        q, work = np.empty(MOST), np.empty(MOST)
-        for s in range(a, e):
-            out[0, s] = out[1, s] = out[2, s] = 0.0
-        for d in range(len(rows)):
-            horner(coef[d, g, 0], order, X[a:e], Y[a:e], n, pu, inner)
-            horner(coef[d, g, 1], order, X[a:e], Y[a:e], n, pv, inner)
-            for s in range(n):
-                ru, rv = u[a + s] - pu[s], v[a + s] - pv[s]
-                d_in, d_out, least = _parts(
-                    ru,
-                    rv,
-                    ru + off_u[a + s],
-                    rv + off_v[a + s],
-                    var_u[a + s] + rows[d, 0],
-                    var_v[a + s] + rows[d, 0],
-                    rows[d],
-                    gaussian,
-                    radius,
-                    nodes,
-                    q,
-                    work,
-                )
-                loglik = math.log(d_in + d_out) - least - constant
-                out[0, a + s] += share * d_out / (d_in + d_out)
-                out[1, a + s] += share * loglik
-                out[2, a + s] += share * loglik * loglik
-
-
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
-def _star(ru, rv, du, dv, au, av, row, gaussian, wavering, radius, nodes, q, work, zc, zo, out):
+def _terms(star, row, circle, wavering, q, work, zc, zo, out):
     """Write the terms of one star to out (21,): 11 columns and 10 scalars of `mixture_moments`.
 
     `wavering` is 1, or 0 at fixed memberships.
     """
-    nodes = nodes
+    ru, rv, du, dv, au, av = star
+    gaussian, radius, nodes = circle[0], circle[1], circle[2:]
     j2, f, w = row[0], row[5], row[6]
     slopes(du, dv, au, av, radius, nodes, q, work, zc)
     iu, iv = 1.0 / au, 1.0 / av
@@ -235,25 +180,7 @@ def _star(ru, rv, du, dv, au, av, row, gaussian, wavering, radius, nodes, q, wor
 
 
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def _moments(
-    pieces,
-    X,
-    Y,
-    u,
-    v,
-    var_u,
-    var_v,
-    off_u,
-    off_v,
-    coef,
-    order,
-    row,
-    unit2,
-    em,
-    gaussian,
-    radius,
-    nodes,
-):
+def _moments(pieces, stars, coef, order, row, unit2, circle, em):
     n_pieces, top = len(pieces), 2 * order
     sums = np.zeros((n_pieces, 11, (top + 1) * (top + 2) // 2))
     scalars = np.zeros((n_pieces, N_MIXTURE))
@@ -267,31 +194,13 @@ def _moments(
         for a in range(first, end, BLOCK):
             e = min(a + BLOCK, end)
             n = e - a
-            horner(coef[g, 0], order, X[a:e], Y[a:e], n, pu, inner)
-            horner(coef[g, 1], order, X[a:e], Y[a:e], n, pv, inner)
-            legendre(X[a:e], n, top, P)
-            legendre(Y[a:e], n, top, Q)
+            _placed(stars, coef[g], order, a, e, pu, pv, inner)
+            legendre(stars[0][a:e], n, top, P)
+            legendre(stars[1][a:e], n, top, Q)
             columns[:] = 0.0
             for s in range(n):
-                ru, rv = u[a + s] - pu[s], v[a + s] - pv[s]
-                _star(
-                    ru,
-                    rv,
-                    ru + off_u[a + s],
-                    rv + off_v[a + s],
-                    var_u[a + s] + row[0],
-                    var_v[a + s] + row[0],
-                    row,
-                    gaussian,
-                    wavering,
-                    radius,
-                    nodes,
-                    q,
-                    work,
-                    zc,
-                    zo,
-                    one,
-                )
+                star = _residual(stars, a + s, pu[s], pv[s], row[0])
+                _terms(star, row, circle, wavering, q, work, zc, zo, one)
                 columns[:, s] = one
             for k in range(N_MIXTURE):
                 scalars[b, k] += _dot(columns[11 + k], P[0])
@@ -304,55 +213,23 @@ def _moments(
 
 
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def _scores(
-    blocks,
-    X,
-    Y,
-    u,
-    v,
-    var_u,
-    var_v,
-    off_u,
-    off_v,
-    coef,
-    order,
-    row,
-    gaussian,
-    radius,
-    nodes,
-    out,
-):
+def _scores(blocks, stars, coef, order, row, circle, out):
     for b in nb.prange(len(blocks)):
         g, a, e = blocks[b]
-        n = e - a
         pu, pv, inner = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
         q, work, zc, zo = np.empty(MOST), np.empty(MOST), np.empty(10), np.empty(10)
         one = np.empty(N_TERMS)
-        horner(coef[g, 0], order, X[a:e], Y[a:e], n, pu, inner)
-        horner(coef[g, 1], order, X[a:e], Y[a:e], n, pv, inner)
-        for s in range(n):
-            ru, rv = u[a + s] - pu[s], v[a + s] - pv[s]
-            _star(
-                ru,
-                rv,
-                ru + off_u[a + s],
-                rv + off_v[a + s],
-                var_u[a + s] + row[0],
-                var_v[a + s] + row[0],
-                row,
-                gaussian,
-                1.0,
-                radius,
-                nodes,
-                q,
-                work,
-                zc,
-                zo,
-                one,
-            )
-            out[0, a + s], out[1, a + s] = one[3], one[4]
+        _placed(stars, coef[g], order, a, e, pu, pv, inner)
+        for i in range(a, e):
+            star = _residual(stars, i, pu[i - a], pv[i - a], row[0])
+            _terms(star, row, circle, 1.0, q, work, zc, zo, one)
+            out[0, i], out[1, i] = one[3], one[4]
             for k in range(3):
-                out[2 + k, a + s] = one[k]
+                out[2 + k, i] = one[k]
+
+
+def _circle(constants: Constants) -> tuple[Any, ...]:
+    return constants.kind == GAUSSIAN, constants.radius, *NODES
 
 
 def truncated_log_likelihood(
@@ -369,22 +246,14 @@ def truncated_log_likelihood(
     of the circle; other arguments as in `log_likelihood`.
     """
     rows, coef = packed(constants), np.ascontiguousarray(coef)
+    stars, circle, nothing = (*columns, *offsets), _circle(constants), np.empty((3, 0))
     out = np.empty(len(coef))
     step = max(1, SCRATCH // (8 * max(len(blocks), 1)))
     with threads_for(INTEGRAL * len(columns[0]) * len(coef)):
         for a in range(0, len(coef), step):
             some = slice(a, a + step)
-            sums = _sums(
-                blocks,
-                *columns,
-                *offsets,
-                coef[some],
-                order,
-                rows[some],
-                constants.unit2,
-                constants.kind == GAUSSIAN,
-                constants.radius,
-                NODES,
+            sums = _evaluated(
+                blocks, stars, coef[some], order, rows[some], constants.unit2, circle, nothing
             )
             # as in `log_likelihood`
             out[some] = np.ascontiguousarray(sums.T).sum(axis=1)
@@ -405,17 +274,14 @@ def truncated_memberships(
     """
     out = np.empty((3, len(columns[0])))
     with threads_for(INTEGRAL * out.shape[1] * len(coef)):
-        _memberships(
+        _evaluated(
             blocks,
-            *columns,
-            *offsets,
+            (*columns, *offsets),
             np.ascontiguousarray(coef),
             order,
             packed(constants),
             constants.unit2,
-            constants.kind == GAUSSIAN,
-            constants.radius,
-            NODES,
+            _circle(constants),
             out,
         )
     return out
@@ -442,16 +308,13 @@ def truncated_moments(
     with threads_for(INTEGRAL * len(columns[0])):
         sums, scalars = _moments(
             pieces,
-            *columns,
-            *offsets,
+            (*columns, *offsets),
             np.ascontiguousarray(coef),
             order,
             packed(constants)[0],
             constants.unit2,
+            _circle(constants),
             em,
-            constants.kind == GAUSSIAN,
-            constants.radius,
-            NODES,
         )
     total = _by_group(sums, pieces)
     weight = np.einsum("gcm,klm->gckl", total[:, :3], product_table(order), optimize=True)
@@ -480,14 +343,11 @@ def truncated_scores(
     with threads_for(INTEGRAL * out.shape[1]):
         _scores(
             blocks,
-            *columns,
-            *offsets,
+            (*columns, *offsets),
             np.ascontiguousarray(coef),
             order,
             packed(constants)[0],
-            constants.kind == GAUSSIAN,
-            constants.radius,
-            NODES,
+            _circle(constants),
             out,
         )
     return out

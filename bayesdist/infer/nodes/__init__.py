@@ -4,29 +4,34 @@
 2015-06; `fit_with_tables` runs either in turn with the polynomial fit.
 """
 
-from bayesdist.infer.nodes.alternation import Alternated, Round
-from bayesdist.infer.nodes.binning import binned_table
+from bayesdist.infer.nodes.binned import binned_table, quadratic_smoother
+from bayesdist.infer.nodes.corrected import corrected_matches, inside_chips, on_the_chips
 from bayesdist.infer.nodes.field import field_table
+from bayesdist.infer.nodes.fit import fit_with_tables
 from bayesdist.infer.nodes.grid import NodeGrid
-from bayesdist.infer.nodes.matern import Matern
-from bayesdist.infer.nodes.pixels import PixelShifts, pixel_jacobian, pixel_shifts
+from bayesdist.infer.nodes.hyperparameters import Matern
+from bayesdist.infer.nodes.mixture import ResidualMixture, fit_mixture
+from bayesdist.infer.nodes.pixels import PixelShifts, pixel_shifts
 from bayesdist.infer.nodes.posterior import AxisField, TablePosterior
-from bayesdist.infer.nodes.smoothing import quadratic_smoother
-from bayesdist.infer.nodes.tables import TableFit, fit_with_tables
+from bayesdist.infer.nodes.table_fit import Iteration, TableFit, held_sigma
 
 __all__ = [
-    "Alternated",
     "AxisField",
+    "Iteration",
     "Matern",
     "NodeGrid",
     "PixelShifts",
-    "Round",
+    "ResidualMixture",
     "TableFit",
     "TablePosterior",
     "binned_table",
+    "corrected_matches",
     "field_table",
+    "fit_mixture",
     "fit_with_tables",
-    "pixel_jacobian",
+    "held_sigma",
+    "inside_chips",
+    "on_the_chips",
     "pixel_shifts",
     "quadratic_smoother",
 ]

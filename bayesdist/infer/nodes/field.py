@@ -6,15 +6,19 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.errors import InputError
-from bayesdist.infer.nodes.evidence import Evidence, fitted_field, refined_field
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.nodes.grid import STEP, NodeGrid
-from bayesdist.infer.nodes.jitter import jitter_variance
-from bayesdist.infer.nodes.matern import SMOOTHNESS
+from bayesdist.infer.nodes.hyperparameters import (
+    SMOOTHNESS,
+    Evidence,
+    fitted_field,
+    refined_field,
+)
+from bayesdist.infer.nodes.mixture import jitter_variance
 from bayesdist.infer.nodes.posterior import TablePosterior, axis_posterior
-from bayesdist.infer.nodes.sums import BLOCK, NodeSums, interpolation, node_sums
+from bayesdist.infer.nodes.sums import BLOCK, NodeSums, node_sums
 from bayesdist.model import Chip
 
 __all__ = ["checked_stars", "field_table"]
@@ -22,11 +26,11 @@ __all__ = ["checked_stars", "field_table"]
 Float = NDArray[np.float64]
 
 STEADY = 1e-5  # change of the stars' typical variance that is small against any error of the jitter
-ROUNDS = 6
+MAX_ITERATIONS = 6
 
 
 # a factorisation of this size is no faster on two threads, and far slower where they are shared
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def field_table(
     x: ArrayLike,
     y: ArrayLike,
@@ -72,7 +76,7 @@ def field_table(
     smoothness : sequence of float
         Matern smoothness to choose from.
     earlier : TablePosterior, optional
-        Table of nearly the same stars from an earlier round, at which the search starts.
+        Table of nearly the same stars from an earlier iteration, at which the search starts.
     hold : bool
         True to take the hyperparameters of the earlier table unchanged.
 
@@ -122,7 +126,7 @@ def field_table(
             fields = [
                 refined_field(Evidence(grid, s), f) for s, f in zip(sums, fields, strict=True)
             ]
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ITERATIONS):
         axes = (axis_posterior(grid, sums[0], fields[0]), axis_posterior(grid, sums[1], fields[1]))
         n = sum(axis.n_effective for axis in axes)
         new, error = jitter_at(sums, [axis.mean for axis in axes], n)
@@ -200,7 +204,7 @@ def _residual(
     out = np.empty_like(shift)
     for start in range(0, len(x), BLOCK):
         rows = slice(start, start + BLOCK)
-        fitted = interpolation(grid, x[rows], y[rows]) @ values
+        fitted = grid.interpolation(x[rows], y[rows]) @ values
         fitted += grid.basis.evaluate(x[rows], y[rows]) @ polynomial
         out[rows] = shift[rows] - fitted
     return out

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
@@ -80,6 +81,13 @@ class NodeGrid:
     def blank(self) -> LookupTable:
         """Table of zeros, which has the weights of the nodes at any pixel."""
         return self.table(np.zeros((2, self.n_nodes)))
+
+    def interpolation(self, x: Float, y: Float) -> scipy.sparse.csr_array:
+        """Bilinear weights (N, n_nodes) of all nodes at pixels (N,), four in a row."""
+        index, weight = self.blank.weights(x, y)
+        starts = np.arange(0, index.size + 1, 4)
+        shape = (len(x), self.n_nodes)
+        return scipy.sparse.csr_array((weight.ravel(), index.ravel(), starts), shape)
 
     @cached_property
     def positions(self) -> tuple[Float, Float]:

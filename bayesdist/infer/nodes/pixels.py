@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.stars.stars import errors_of, groups_of
-from bayesdist.model import DistortionModel, Groups
+from bayesdist.model import DistortionModel
 
-__all__ = ["PixelShifts", "Solved", "pixel_jacobian", "pixel_shifts"]
+__all__ = ["PixelShifts", "Solved", "pixel_shifts"]
 
 Float = NDArray[np.float64]
 
@@ -47,52 +47,6 @@ class PixelShifts:
     variance: Float
 
 
-def pixel_jacobian(
-    model: DistortionModel,
-    theta: ArrayLike,
-    x: ArrayLike,
-    y: ArrayLike,
-    *,
-    epoch: ArrayLike | None = None,
-    exposure: ArrayLike | None = None,
-    chip: ArrayLike | None = None,
-) -> Float:
-    """Derivatives of (u, v) with respect to the pixel.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    theta : array_like, shape (D,)
-    x, y : array_like, shape (N,)
-        FITS 1-based pixels, corrected by the look-up tables.
-    epoch, exposure, chip
-        As in `DistortionModel.predict`.
-
-    Returns
-    -------
-    ndarray, shape (N, 2, 2)
-        [[du/dx, du/dy], [dv/dx, dv/dy]], in the unit of u, v per pixel.
-    """
-    px, py = np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(y))
-    groups = model.groups(px.size, epoch=epoch, exposure=exposure, chip=chip)
-    return _evaluated(model, theta, groups, px, py)[1]
-
-
-def _evaluated(
-    model: DistortionModel, theta: ArrayLike, groups: Groups, x: Float, y: Float
-) -> tuple[Float, Float]:
-    """Positions (N, 2) and their derivatives (N, 2, 2)."""
-    effective = model.effective(theta, groups)
-    position, slope = np.empty((x.size, 2)), np.empty((x.size, 2, 2))
-    for g, rows in enumerate(groups.members()):
-        basis = model.basis(model.chips[groups.chip[g]].number)
-        phi = basis.evaluate(x[rows], y[rows])
-        position[rows] = phi @ effective[g].T
-        for axis, D in enumerate(basis.derivatives):
-            slope[rows, :, axis] = phi @ (D @ effective[g].T)
-    return position, slope
-
-
 def pixel_shifts(solution: Solved, matches: MatchTable) -> PixelShifts:
     """Residuals of matches, mapped to the detector by the inverse of the local Jacobian.
 
@@ -117,8 +71,8 @@ def pixel_shifts(solution: Solved, matches: MatchTable) -> PixelShifts:
         Where the polynomial folds over: its Jacobian is singular at a star.
     """
     sigma_u, sigma_v = errors_of(matches)
-    groups = groups_of(solution.model, matches)
-    fitted, J = _evaluated(solution.model, solution.mean, groups, matches.x, matches.y)
+    model, groups = solution.model, groups_of(solution.model, matches)
+    fitted, J = model.linearised(solution.mean, groups, matches.x, matches.y)
     det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
     folded = np.abs(det) <= FOLDED * (J**2).sum(axis=(1, 2))
     if folded.any():

@@ -8,10 +8,9 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.infer.nodes.evidence import FittedField
 from bayesdist.infer.nodes.grid import NodeGrid
-from bayesdist.infer.nodes.matern import Matern
-from bayesdist.infer.nodes.sums import NodeSums, interpolation
+from bayesdist.infer.nodes.hyperparameters import FittedField, Matern
+from bayesdist.infer.nodes.sums import NodeSums
 from bayesdist.model.lookup import LookupTable
 
 __all__ = ["AxisField", "TablePosterior", "axis_posterior"]
@@ -150,7 +149,7 @@ class TablePosterior:
         refitted : bool
             As in `position_sigma`.
         """
-        out: Float = interpolation(self.grid, x, y).toarray()
+        out: Float = self.grid.interpolation(x, y).toarray()
         if refitted:
             out -= self.grid.basis.evaluate(x, y) @ self.axes[axis].sums.absorbed
         return out

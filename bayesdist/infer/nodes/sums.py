@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.nodes.grid import NodeGrid
 
-__all__ = ["NodeSums", "interpolation", "node_sums"]
+__all__ = ["NodeSums", "node_sums"]
 
 Float = NDArray[np.float64]
 
@@ -80,13 +80,6 @@ class NodeSums:
         return self.nodes.toarray() - self.cross.T @ self.absorbed
 
 
-def interpolation(grid: NodeGrid, x: Float, y: Float) -> scipy.sparse.csr_array:
-    """Bilinear weights W (N, n_nodes) of all nodes at pixels (N,)."""
-    index, weight = grid.blank.weights(x, y)
-    starts = np.arange(0, index.size + 1, 4)
-    return scipy.sparse.csr_array((weight.ravel(), index.ravel(), starts), (len(x), grid.n_nodes))
-
-
 def node_sums(
     grid: NodeGrid, x: Float, y: Float, shift: Float, precision: Float
 ) -> tuple[NodeSums, NodeSums]:
@@ -120,7 +113,7 @@ def node_sums(
 def _block(
     grid: NodeGrid, x: Float, y: Float, shift: Float, precision: Float
 ) -> tuple[NodeSums, NodeSums]:
-    W, phi = interpolation(grid, x, y), grid.basis.evaluate(x, y)
+    W, phi = grid.interpolation(x, y), grid.basis.evaluate(x, y)
     transposed = W.T.tocsr()
 
     def one(axis: int) -> NodeSums:

@@ -1,4 +1,4 @@
-"""Fitted tables of a calibration: corrected pixels, positions, and their errors."""
+"""Polynomial and look-up tables of one filter: corrected pixels, positions, and their errors."""
 
 from __future__ import annotations
 
@@ -11,71 +11,90 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.infer.nodes.alternation import Alternated, Round, on_the_chips, with_columns
-from bayesdist.infer.nodes.pixels import pixel_jacobian
+from bayesdist.infer.linear import LinearFit
+from bayesdist.infer.nodes.corrected import corrected_matches, on_the_chips
+from bayesdist.infer.nodes.mixture import ResidualMixture
 from bayesdist.infer.nodes.posterior import TablePosterior
 from bayesdist.model.lookup import LookupTable, corrected
 
-__all__ = ["TableFit", "held_sigma"]
+__all__ = ["Iteration", "TableFit", "held_sigma", "table_of"]
 
 Float = NDArray[np.float64]
 
 BLOCK = 1024  # positions whose derivatives are in memory at once
 
 
-@dataclass(frozen=True, eq=False)
-class TableFit:
-    """Polynomials and look-up tables of all filters.
+@dataclass(frozen=True)
+class Iteration:
+    """Statistics of one iteration.
 
     Parameters
     ----------
-    base : str
-        Filter that the detector's tables come from.  They contain the base filter's own pattern:
-        one filter alone cannot separate it from the detector's.
-    parts : dict of str to Alternated
-        By filter, the base filter first.  The tables of the base filter are the detector's, unless
-        these were given.
-    held : tuple of LookupTable
-        Detector's tables that were given; the base filter then has tables of its own.
+    number : int
+        From 1.
+    moved, moved_rms : float
+        Largest and rms change of a node, pixels.
+    rms : float
+        Rms residual of an axis before the new tables, stars weighted by their probability of being
+        true matches, pixels.
+    false_fraction : float
+        Of the matches.
     """
 
-    base: str
-    parts: dict[str, Alternated]
-    held: tuple[LookupTable, ...] = ()
+    number: int
+    moved: float
+    moved_rms: float
+    rms: float
+    false_fraction: float
+
+
+def table_of(table: LookupTable | TablePosterior) -> LookupTable:
+    """The table, of a posterior its means."""
+    return table.table if isinstance(table, TablePosterior) else table
+
+
+@dataclass(frozen=True, eq=False)
+class TableFit:
+    """Polynomial and look-up tables of the matches of one filter.
+
+    Parameters
+    ----------
+    filter : str
+        Filter of the fitted tables.  '' for the detector's: these contain the own pattern of the
+        filter that they come from, which one filter alone cannot separate from the detector's.
+    solution : LinearFit
+        The polynomial, fitted last, with these tables fixed.
+    beneath : tuple of LookupTable or TablePosterior
+        The detector's tables that were given.
+    fitted : tuple of LookupTable or TablePosterior
+        One for each chip; binned ones have no posterior.
+    mixture : ResidualMixture
+        Memberships of the matches, in their order.
+    progress : tuple of Iteration
+    converged : bool
+        True if the tables moved less than the tolerance in the last iteration.
+    """
+
+    filter: str
+    solution: LinearFit
+    beneath: tuple[LookupTable | TablePosterior, ...]
+    fitted: tuple[LookupTable | TablePosterior, ...]
+    mixture: ResidualMixture
+    progress: tuple[Iteration, ...]
+    converged: bool
 
     @property
     def tables(self) -> tuple[LookupTable, ...]:
         """All tables, the detector's first."""
-        return (*self.held, *(table for part in self.parts.values() for table in part.tables))
+        return tuple(table_of(one) for one in (*self.beneath, *self.fitted))
 
     @property
-    def progress(self) -> tuple[Round, ...]:
-        """Rounds of all filters."""
-        return tuple(one for part in self.parts.values() for one in part.progress)
-
-    @property
-    def converged(self) -> bool:
-        """True if all tables converged."""
-        return all(part.converged for part in self.parts.values())
-
-    def part(self, filter: str | None = None) -> Alternated:
-        """Polynomial and tables of a filter (the base filter by default).
-
-        Raises
-        ------
-        InputError
-            For a filter that was not fitted.
-        """
-        name = self.base if filter is None else filter
-        if name not in self.parts:
-            raise InputError(
-                f"there are no tables for filter {name!r}",
-                do=f"known filters are {', '.join(map(repr, self.parts))}",
-            )
-        return self.parts[name]
+    def posteriors(self) -> tuple[TablePosterior, ...]:
+        """Posteriors of the fitted tables; empty for binned ones."""
+        return tuple(one for one in self.fitted if isinstance(one, TablePosterior))
 
     def corrected(self, matches: MatchTable) -> MatchTable:
-        """Matches at the pixels that the tables have corrected.
+        """Matches of the filter at the pixels that the tables have corrected.
 
         Parameters
         ----------
@@ -87,9 +106,7 @@ class TableFit:
         MatchTable
             The few that are moved off their chip are left out, and counted in `rejected`.
         """
-        names = np.asarray(matches.filter_names)[matches.filter]
-        x, y = corrected(self.tables, matches.x, matches.y, chip=matches.chip_number, filter=names)
-        return on_the_chips(with_columns(matches, x=x, y=y), self.part().fit.model)
+        return on_the_chips(corrected_matches(self.tables, matches), self.solution.model)
 
     def predict(
         self,
@@ -97,7 +114,6 @@ class TableFit:
         y: ArrayLike,
         *,
         chip: int,
-        filter: str | None = None,
         epoch: ArrayLike | None = None,
         exposure: ArrayLike | None = None,
     ) -> Float:
@@ -108,8 +124,6 @@ class TableFit:
         x, y : array_like, shape (N,)
             FITS 1-based pixels.
         chip : int
-        filter : str, optional
-            The base filter by default.
         epoch, exposure : array_like, optional
             As in `DistortionModel.predict`.
 
@@ -117,10 +131,9 @@ class TableFit:
         -------
         ndarray, shape (N, 2)
         """
-        part = self.part(filter)
-        px, py = self._pixels(x, y, chip, part)
-        return part.fit.model.predict(
-            part.fit.mean, px, py, epoch=epoch, exposure=exposure, chip=chip
+        px, py = self._pixels(x, y, chip)
+        return self.solution.model.predict(
+            self.solution.mean, px, py, epoch=epoch, exposure=exposure, chip=chip
         )
 
     def position_sigma(
@@ -129,7 +142,6 @@ class TableFit:
         y: ArrayLike,
         *,
         chip: int,
-        filter: str | None = None,
         epoch: ArrayLike | None = None,
         exposure: ArrayLike | None = None,
     ) -> Float:
@@ -137,7 +149,7 @@ class TableFit:
 
         Parameters
         ----------
-        x, y, chip, filter, epoch, exposure
+        x, y, chip, epoch, exposure
             As in `predict`.
 
         Returns
@@ -157,13 +169,12 @@ class TableFit:
         that the sum is the variance of the joint solution.  The error of the detector's table
         counts in another filter only as far as that filter's own table does not absorb it.
         """
-        part, model = self.part(filter), self.part(filter).fit.model
+        model, mean, cov = self.solution.model, self.solution.mean, self.solution.cov
         x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.asarray(y, float))
-        out = self.table_sigma(x, y, chip=chip, filter=filter, epoch=epoch, exposure=exposure) ** 2
+        out = self.table_sigma(x, y, chip=chip, epoch=epoch, exposure=exposure) ** 2
         for rows, of in _blocks(len(x), chip, epoch, exposure):
-            px, py = self._pixels(x[rows], y[rows], chip, part)
-            D = model.jacobian(part.fit.mean, px, py, **of)
-            out[rows] += np.einsum("nap,pq,naq->na", D, part.fit.cov, D, optimize=True)
+            D = model.jacobian(mean, *self._pixels(x[rows], y[rows], chip), **of)
+            out[rows] += np.einsum("nap,pq,naq->na", D, cov, D, optimize=True)
         return np.sqrt(out)
 
     def table_sigma(
@@ -172,7 +183,6 @@ class TableFit:
         y: ArrayLike,
         *,
         chip: int,
-        filter: str | None = None,
         epoch: ArrayLike | None = None,
         exposure: ArrayLike | None = None,
     ) -> Float:
@@ -180,59 +190,64 @@ class TableFit:
 
         Parameters
         ----------
-        x, y, chip, filter, epoch, exposure
+        x, y, chip, epoch, exposure
             As in `predict`.
 
         Returns
         -------
         ndarray, shape (N, 2)
             In the unit of u, v: the part left after the polynomial has followed the tables.  It
-            is not assumed to follow held tables (`held_sigma`).
+            is not assumed to follow plain tables beneath (`held_sigma`).
 
         Raises
         ------
         InputError
             For binned tables, whose nodes have no covariance.
         """
-        part = self.part(filter)
-        if not part.posteriors:
-            raise InputError(
-                "binned tables know no covariance of their nodes", do="choose method 'field'"
-            )
         x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.asarray(y, float))
+        own = self._posterior(chip)
         out = np.empty((len(x), 2))
         for rows, of in _blocks(len(x), chip, epoch, exposure):
-            px, py = self._pixels(x[rows], y[rows], chip, part)
-            J = pixel_jacobian(part.fit.model, part.fit.mean, px, py, **of)
-            table = self._table_variance(x[rows], y[rows], chip, part)
+            pixels = self._pixels(x[rows], y[rows], chip)
+            J = self.solution.model.slopes(self.solution.mean, *pixels, **of)
+            table = self._table_variance(own, x[rows], y[rows], chip)
             out[rows] = np.sqrt(np.einsum("nab,nb->na", J**2, table))
         return out
 
-    def _pixels(
-        self, x: ArrayLike, y: ArrayLike, chip: int, part: Alternated
-    ) -> tuple[Float, Float]:
-        # tables of no filter are the detector's
-        return corrected(self.tables, x, y, chip=chip, filter=part.filter)
+    def _pixels(self, x: ArrayLike, y: ArrayLike, chip: int) -> tuple[Float, Float]:
+        """Raw pixels (N,) as all tables have corrected them."""
+        return corrected(self.tables, x, y, chip=chip, filter=self.filter)
 
-    def _table_variance(self, x: Float, y: Float, chip: int, part: Alternated) -> Float:
+    def _posterior(self, chip: int) -> TablePosterior:
+        """Posterior of the fitted table of a chip."""
+        if not self.posteriors:
+            raise InputError(
+                "binned tables know no covariance of their nodes", do="choose method 'field'"
+            )
+        for posterior in self.posteriors:
+            if posterior.table.chip == chip:
+                return posterior
+        raise InputError(
+            f"there is no table for chip {chip}",
+            do=f"there are those for {', '.join(str(p.table.chip) for p in self.posteriors)}",
+        )
+
+    def _table_variance(self, own: TablePosterior, x: Float, y: Float, chip: int) -> Float:
         """Variance (N, 2) of the tables' shift where the polynomial follows, square pixels."""
-        own = _of_chip(part, chip)
-        if not part.filter:
+        lower = next((one for one in self.beneath if table_of(one).chip == chip), None)
+        if lower is None:
             return own.position_sigma(x, y, refitted=True) ** 2
-        if self.held:
-            px, py = corrected(self.held, x, y, chip=chip)
+        px, py = corrected([table_of(lower)], x, y, chip=chip)
+        if not isinstance(lower, TablePosterior):
             own_variance = own.position_sigma(px, py, refitted=True) ** 2
-            return own_variance + held_sigma(self.held, x, y, chip=chip) ** 2
-        detector = _of_chip(self.parts[self.base], chip)
-        px, py = corrected([detector.table], x, y, chip=chip)
+            return own_variance + held_sigma([lower], x, y, chip=chip) ** 2
         out = np.empty((len(x), 2))
-        for a in (0, 1):
-            axis = own.axes[a]
+        for a, axis in enumerate(own.axes):
             rows = own.rows(px, py, a, refitted=True)
             # the filter's polynomial and its table both follow an error of the detector's table
             left = rows - axis.gain(rows)
             out[:, a] = ((rows @ axis.root) ** 2).sum(axis=1)
-            out[:, a] += ((left @ detector.axes[a].root) ** 2).sum(axis=1)
+            out[:, a] += ((left @ lower.axes[a].root) ** 2).sum(axis=1)
         return out
 
 
@@ -265,13 +280,3 @@ def _blocks(
                 "chip": chip,
             },
         )
-
-
-def _of_chip(part: Alternated, chip: int) -> TablePosterior:
-    for posterior in part.posteriors:
-        if posterior.table.chip == chip:
-            return posterior
-    raise InputError(
-        f"there is no table for chip {chip}",
-        do=f"there are those for {', '.join(str(t.chip) for t in part.tables)}",
-    )

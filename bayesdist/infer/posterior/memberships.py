@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.infer import kernel
 from bayesdist.infer.kernel import Constants
 from bayesdist.infer.posterior.posterior import Posterior
+from bayesdist.infer.stars.likelihood import star_averages
 from bayesdist.infer.stars.mixture import Hyper
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
@@ -21,9 +21,7 @@ __all__ = [
     "count_outliers",
     "memberships",
     "memberships_of",
-    "sampled_points",
     "some_draws",
-    "star_averages",
     "star_log_likelihood",
 ]
 
@@ -64,13 +62,6 @@ class Memberships:
         )
 
 
-def sampled_points(posterior: Posterior) -> tuple[Float, Float]:
-    """All draws as theta (n, D) and hyperparameters (n, h) in sampled coordinates."""
-    hyper = posterior.mixture.bind(posterior.reference_sigma)
-    h = hyper.point({k: posterior.hyper[k].ravel() for k in posterior.mixture.hyper})
-    return posterior.flat, h.reshape(len(posterior.flat), len(posterior.mixture.hyper))
-
-
 def some_draws(theta: Float, h: Float, n_stars: int) -> tuple[Float, Float]:
     """Draws spread evenly over all: fewer for more stars, whose posterior is narrower."""
     n = int(np.clip(EVALUATIONS // n_stars, LEAST_DRAWS, MOST_DRAWS))
@@ -109,17 +100,17 @@ def averaged_draws(posterior: Posterior) -> tuple[Float, Constants]:
     Only the mean where the stars' positions are unknowns: at other draws they would be different.
     """
     if posterior.own_places:
-        theta, h = (one.mean(axis=0, keepdims=True) for one in sampled_points(posterior))
+        theta, h = (one.mean(axis=0, keepdims=True) for one in posterior.sampled_points)
     else:
-        theta, h = some_draws(*sampled_points(posterior), posterior.n_stars)
-    return theta, posterior.mixture.bind(posterior.reference_sigma).constants(h)
+        theta, h = some_draws(*posterior.sampled_points, posterior.n_stars)
+    return theta, posterior.bound_mixture.constants(h)
 
 
 def star_log_likelihood(posterior: Posterior, matches: MatchTable) -> Float:
     """Log-likelihood (chains, draws, N) of each star at every draw."""
     stars, order = prepare(posterior.model, matches)
-    theta, h = sampled_points(posterior)
-    constants = posterior.mixture.bind(posterior.reference_sigma).constants(h)
+    theta, h = posterior.sampled_points
+    constants = posterior.bound_mixture.constants(h)
     out = np.empty((len(theta), len(matches)))
     for k in range(len(theta)):
         rows = slice(k, k + 1)
@@ -136,19 +127,6 @@ def count_outliers(shards: Shards, hyper: Hyper, theta: Float, h: Float) -> tupl
     theta, h = some_draws(theta, h, len(shards))
     flagged, expected = shards.sum(_count, theta, hyper.constants(h))
     return int(flagged), float(expected)
-
-
-def star_averages(stars: Stars, theta: Float, constants: Constants) -> Float:
-    """Outlier probability, log-likelihood and its square (3, N), averaged over draws.
-
-    With a sum over the stars it makes a task for `Shards.sum`.
-    """
-    powers, order = stars.powers(theta), stars.model.order
-    if circle := stars.circle(constants):
-        return kernel.truncated_memberships(
-            stars.blocks, stars.columns, circle, powers, order, constants
-        )
-    return kernel.memberships(stars.blocks, stars.columns, powers, order, constants)
 
 
 def _count(stars: Stars, theta: Float, constants: Constants) -> Float:

@@ -1,19 +1,20 @@
-"""The posterior as a result: draws, their moments and convergence."""
+"""The posterior as a result: draws, their moments, convergence, and how they were made."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.convergence import Convergence
-from bayesdist.infer.posterior.certificate import Certificate
-from bayesdist.infer.stars.mixture import OutlierMixture
+from bayesdist.infer.solution import Solution
+from bayesdist.infer.stars.likelihood import MixtureAt
+from bayesdist.infer.stars.mixture import Hyper, OutlierMixture
 from bayesdist.model import DistortionModel
 
-__all__ = ["Posterior", "SamplerInfo"]
+__all__ = ["Certificate", "Posterior", "SamplerInfo"]
 
 Float = NDArray[np.float64]
 
@@ -53,8 +54,53 @@ class SamplerInfo:
     exact: bool = True
 
 
+@dataclass(frozen=True)
+class Certificate:
+    """Distance of a surrogate s from the posterior p, by pilots that were not used to make it.
+
+    Each pilot is one pass over the data.
+    """
+
+    n_train: int
+    n_held_out: int
+    n_outside: int  # pilots where the posterior density is zero
+    raw_sd: float  # standard deviation of log p - log q: without a surrogate
+    remainder_sd: float  # standard deviation of log p - log s, over the pilots held out
+    remainder_max: float  # the largest of these, with p and s normalised
+    raw_efficiency: float  # effective fraction of draws of q, weighted by p / q; over all pilots
+    # effective fraction of draws of s, weighted by p / s; over the pilots held out: 1 / (1 + chi2)
+    efficiency: float
+    pareto_k: float  # tail of p / q: where it is heavy, q misses a part of p that no pilot shows
+    chi2: float  # estimate of chi2(p || s) (module docstring)
+    chi2_upper: float  # upper limit of it
+    # no posterior mean is off by more than this many standard deviations; from `chi2_upper`
+    mean_shift_bound: float
+    # bound of the total variation: no probability is off by more; from `chi2_upper`
+    tv_bound: float
+    unseen: float  # largest probability under q of a region that all held-out pilots missed (95 %)
+    reasons: tuple[str, ...]  # of a refusal; empty when it is granted
+
+    @property
+    def granted(self) -> bool:
+        """True if draws of the surrogate may represent the posterior."""
+        return not self.reasons
+
+    @property
+    def statement(self) -> str:
+        """Scope and limits of the certificate, in words."""
+        if not self.granted:
+            return f"certificate refused: {'; '.join(self.reasons)}"
+        return (
+            f"approximate, with certificate: by {self.n_held_out} exact evaluations that took no "
+            f"part in the approximation, no posterior mean is off by more than "
+            f"{self.mean_shift_bound:.2g} of its standard deviation; regions that hold less than "
+            f"{self.unseen:.2g} of the proposal's probability, such as a separate mode, "
+            f"may have been missed"
+        )
+
+
 @dataclass(frozen=True, eq=False)
-class Posterior:
+class Posterior(Solution):
     """Posterior draws of the distortion and of the outlier mixture.
 
     Parameters
@@ -84,7 +130,7 @@ class Posterior:
     """
 
     model: DistortionModel
-    mixture: OutlierMixture
+    mixture: OutlierMixture = field()
     theta: Float
     hyper: dict[str, Float]
     log_prob: Float
@@ -92,7 +138,7 @@ class Posterior:
     n_flagged: int
     n_false: float
     reference_sigma: float
-    convergence: Convergence
+    convergence: Convergence = field()
     sampler: SamplerInfo
     certificate: Certificate | None = None
     own_places: bool = False
@@ -133,11 +179,6 @@ class Posterior:
         """Posterior standard deviation of theta, shape (D,)."""
         return self.flat.std(axis=0, ddof=1)
 
-    @property
-    def unit(self) -> str:
-        """Unit of u and v."""
-        return self.model.unit
-
     def interval(self, probability: float) -> Float:
         """Central interval of every entry of theta, shape (D, 2)."""
         tail = (1 - probability) / 2
@@ -157,3 +198,27 @@ class Posterior:
         """
         total = len(self.flat)
         return self.flat[rng.choice(total, size=n, replace=n > total)]
+
+    @property
+    def sampled_points(self) -> tuple[Float, Float]:
+        """All draws as theta (n, D) and hyperparameters (n, h) in sampled coordinates."""
+        h = self.bound_mixture.point({k: self.hyper[k].ravel() for k in self.mixture.hyper})
+        return self.flat, h.reshape(len(self.flat), len(self.mixture.hyper))
+
+    @property
+    def bound_mixture(self) -> Hyper:
+        """Mixture with its priors in the unit of the data."""
+        return self.mixture.bind(self.reference_sigma)
+
+    @property
+    def likelihood(self) -> MixtureAt:
+        """Mixture at the mean of theta and of the sampled coordinates of the hyperparameters.
+
+        Location and scale of a symmetric density are nearly independent.
+        """
+        _, h = self.sampled_points
+        return MixtureAt(self.mean, self.bound_mixture.constants(h.mean(axis=0)[None]))
+
+    def mapped(self, matrix: Float) -> Posterior:
+        """Posterior whose deviations from the mean are mapped by a matrix (D, D)."""
+        return replace(self, theta=self.mean + (self.theta - self.mean) @ matrix.T)

@@ -18,11 +18,11 @@ from bayesdist.infer.convergence import diagnose
 from bayesdist.infer.density.laplace import Node
 from bayesdist.infer.density.proposal import GridProposal, Random
 from bayesdist.infer.density.target import Target
-from bayesdist.infer.posterior.certificate import Certificate
+from bayesdist.infer.posterior import Certificate
 from bayesdist.infer.sampler.chains import Chains, Settings, run_chains
 from bayesdist.infer.sampler.ensembles import Whitening
-from bayesdist.infer.sampler.lookahead import Page, pilot_page
 from bayesdist.infer.sampler.move_schedule import Plan, expected_passes
+from bayesdist.infer.sampler.proposal_batch import ProposalBatch, pilot_batch
 from bayesdist.infer.sampler.surrogate import Surrogate, certify, draw_surrogate
 
 __all__ = ["PILOTS", "SECOND_STAGES", "SurrogateProposal", "has_second_stage", "run_certified"]
@@ -88,10 +88,10 @@ def run_certified(
             do=f"choose {', '.join(SECOND_STAGES)}",
         )
     s, E = settings, len(settings.seeds)
-    page = pilot_page(
+    batch = pilot_batch(
         target, proposal, s.seeds, -(-PILOTS // E), s.folder, s.fingerprint, "certificate", KEY
     )
-    psi, log_weights = page.psi.reshape(-1, page.psi.shape[-1]), page.log_weights.ravel()
+    psi, log_weights = batch.psi.reshape(-1, batch.psi.shape[-1]), batch.log_weights.ravel()
     inside = np.isfinite(psi).all(axis=1)
     psi, log_weights = psi[inside], log_weights[inside]
     whitening = Whitening.of(target, proposal, psi)
@@ -107,18 +107,18 @@ def run_certified(
         method = f"delayed acceptance ({chains.plan.method} second stage)"
         plan = replace(chains.plan, method=method)
         return (
-            replace(chains, plan=plan, passes=chains.passes + page.n_evaluated),
+            replace(chains, plan=plan, passes=chains.passes + batch.n_evaluated),
             certificate,
             True,
         )
-    return _approximate(target, better, certificate, page, s), certificate, False
+    return _approximate(target, better, certificate, batch, s), certificate, False
 
 
 def _approximate(
     target: Target,
     proposal: SurrogateProposal,
     certificate: Certificate,
-    page: Page,
+    batch: ProposalBatch,
     s: Settings,
 ) -> Chains:
     """Independent draws of the surrogate, as chains of one walker each."""
@@ -129,12 +129,12 @@ def _approximate(
         draws, share = proposal.accepted(n, rng)
         psi.append(draws[:, None])
         shares.append(share)
-    kept = np.array(psi)
+    all_psi = np.array(psi)
     log_prob = np.array([proposal.log_density(p[:, 0])[:, None] for p in psi])
-    flat = page.psi.reshape(-1, page.psi.shape[-1])
-    inside = np.isfinite(page.log_prob.ravel())
-    weights = page.log_prob.ravel()[inside] - proposal.log_density(flat[inside])
-    verdict = diagnose(kept, target.names, weights, s.limits, coupled=False)
+    flat = batch.psi.reshape(-1, batch.psi.shape[-1])
+    inside = np.isfinite(batch.log_prob.ravel())
+    weights = batch.log_prob.ravel()[inside] - proposal.log_density(flat[inside])
+    verdict = diagnose(all_psi, target.names, weights, s.limits, coupled=False)
     verdict = replace(
         verdict,
         pareto_k=certificate.pareto_k,
@@ -144,12 +144,12 @@ def _approximate(
         reasons = (*verdict.reasons, certificate.statement)
         verdict = replace(verdict, converged=False, reasons=reasons)
     return Chains(
-        psi=kept,
+        psi=all_psi,
         log_prob=log_prob,
         verdict=verdict,
         plan=Plan("certified surrogate (approximate)", (1.0, 0.0, 0.0), 1, 0.0),
         steps=n,
         warmup=0,
-        passes=page.n_evaluated,
+        passes=batch.n_evaluated,
         acceptance=float(np.mean(shares)),
     )

@@ -7,7 +7,7 @@ on it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.convergence import (
-    LEAST_PER_WALKER,
     Convergence,
     Limits,
     diagnose,
@@ -29,22 +28,22 @@ from bayesdist.infer.density.importance import (
 )
 from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Target
-from bayesdist.infer.sampler.checkpoints import Block
+from bayesdist.infer.sampler.checkpoints import Block, Walkers
 from bayesdist.infer.sampler.ensembles import Ensembles, Whitening
-from bayesdist.infer.sampler.lookahead import pilot_page
 from bayesdist.infer.sampler.move_schedule import (
     EFFICIENT,
-    LONGEST_TAIL,
     Plan,
-    Stretch,
-    boundaries,
+    StepRange,
+    block_schedule,
+    doubling_schedule,
     first_check,
-    ladder,
     next_check,
     pilot_steps,
     plan_moves,
     walkers_for,
 )
+from bayesdist.infer.sampler.proposal_batch import ProposalBatch, pilot_batch
+from bayesdist.limits import DRAWS_PER_WALKER, PARETO_K
 
 __all__ = ["Chains", "Settings", "run_chains"]
 
@@ -95,20 +94,33 @@ class _History:
     rows: int = 0
     end: int = 0
 
-    def add(self, blocks: list[Block], end: int) -> None:
-        self.psi.append(np.array([self.runs.psi(b) for b in blocks]))
-        self.log_prob.append(np.array([b.log_prob for b in blocks]))
-        self.accepted += float(sum(b.accepted.sum() for b in blocks))
-        self.rows += self.psi[-1].shape[1]
-        self.end = end
+    def walk(
+        self,
+        states: list[Walkers],
+        schedule: Iterable[StepRange],
+        rest: ProposalBatch,
+        s: Settings,
+    ) -> Iterator[tuple[StepRange, list[Block]]]:
+        """Steps and blocks of all ensembles one after another, as they are made and added."""
+        for span in schedule:
+            blocks = self.runs.advance(states, span, rest)
+            states = [block.end for block in blocks]
+            self.psi.append(np.array([self.runs.psi(b) for b in blocks]))
+            self.log_prob.append(np.array([b.log_prob for b in blocks]))
+            self.accepted += float(sum(b.accepted.sum() for b in blocks))
+            self.rows += self.psi[-1].shape[1]
+            self.end = span.end
+            if s.progress is not None:
+                s.progress(span.end, s.max_steps)
+            yield span, blocks
 
-    def kept(self, warmup: int) -> tuple[Float, Float]:
+    def after(self, warmup: int) -> tuple[Float, Float]:
         """Draws and log densities after some rows."""
         psi = np.concatenate(self.psi, axis=1)[:, warmup:]
         return psi, np.concatenate(self.log_prob, axis=1)[:, warmup:]
 
     def chains(self, warmup: int, verdict: Convergence, passes: int) -> Chains:
-        plan, (psi, log_prob) = self.runs.plan, self.kept(warmup)
+        plan, (psi, log_prob) = self.runs.plan, self.after(warmup)
         made = len(self.runs.seeds) * plan.walkers * self.rows
         return Chains(
             psi=psi,
@@ -131,7 +143,7 @@ def run_chains(target: Target, proposal: Proposal, settings: Settings) -> Chains
     s, E = settings, len(settings.seeds)
     W = s.walkers or walkers_for(s.n_stars)
     n = W * (pilot_steps(E, W) + 1)
-    pilot = pilot_page(target, proposal, s.seeds, n, s.folder, s.fingerprint)
+    pilot = pilot_batch(target, proposal, s.seeds, n, s.folder, s.fingerprint)
     inside = np.isfinite(pilot.log_prob)
     if inside.sum() < 2:
         raise DegenerateError(
@@ -183,23 +195,19 @@ def _drawn_ahead(
     cost = draws_per_effective(pilot.log_weights)
     wanted = first_check(s.limits, cost, len(target.names), len(s.seeds), W)
     wanted = max(wanted, total * LEAST_ROWS)
-    for stretch in ladder(first, s.checkpoint_every, s.max_steps, s.n_stars):
-        blocks = runs.advance(states, stretch, rest)
-        states = [block.end for block in blocks]
-        history.add(blocks, stretch.end)
-        if stretch.begin >= first:
+    schedule = block_schedule(first, s.checkpoint_every, s.max_steps, s.n_stars)
+    for span, blocks in history.walk(states, schedule, rest, s):
+        if span.begin >= first:
             weights.append(np.array([block.log_weights for block in blocks]))
             passes += int((~np.isnan(weights[-1])).sum())
-        if s.progress is not None:
-            s.progress(stretch.end, s.max_steps)
         # judged at each block for any targets: a resumed run may have others
         quality = quality_of(np.concatenate(weights, axis=1))
-        last = stretch.end == s.max_steps
+        last = span.end == s.max_steps
         if not _plan(target, quality, s).independent and not last:
-            return None, quality, passes, stretch.end
+            return None, quality, passes, span.end
         dropped = min(warmup, history.rows // 2)
         made = total * (history.rows - dropped)
-        trusted = quality.efficiency > EFFICIENT and quality.k < LONGEST_TAIL
+        trusted = quality.efficiency > EFFICIENT and quality.k < PARETO_K.value
         if (made < wanted or not trusted) and not last:
             continue
         verdict = _verdict(target, history, dropped, quality, s.limits)
@@ -232,41 +240,30 @@ def _state_dependent(
     states, _, further = runs.starts()
     passes += further
     history, wanted, nothing = _History(runs, begin), 0.0, runs.pilot[slice(0, 0)]
-    for stretch in _from(begin, boundaries(s.checkpoint_every, s.max_steps - begin, plan.thin)):
-        blocks = runs.advance(states, stretch, nothing)
-        states = [block.end for block in blocks]
-        history.add(blocks, stretch.end)
-        passes += total * (stretch.end - stretch.begin)
-        if s.progress is not None:
-            s.progress(stretch.end, s.max_steps)
-        warmup, last = history.rows // 2, stretch.end + plan.thin > s.max_steps
+    schedule = doubling_schedule(begin, s.checkpoint_every, s.max_steps, plan.thin)
+    for span, _ in history.walk(states, schedule, nothing, s):
+        passes += total * (span.end - span.begin)
+        warmup, last = history.rows // 2, span.end + plan.thin > s.max_steps
         made = total * (history.rows - warmup)
         # at the same step for any targets, as a resumed run may have others
-        trial = not plan.coupled and stretch.begin < begin + MIX_STEPS <= stretch.end
+        trial = not plan.coupled and span.begin < begin + MIX_STEPS <= span.end
         if made < max(wanted, total * LEAST_ROWS) and not last and not trial:
             continue
         verdict = _verdict(target, history, warmup, quality, s.limits)
         if verdict.converged or last:
             break
         ess = min(verdict.ess_bulk_min, verdict.ess_tail_min)
-        if trial and ess < LEAST_PER_WALKER * total:
-            return None, passes, stretch.end
+        if trial and ess < DRAWS_PER_WALKER.value * total:
+            return None, passes, span.end
         wanted = next_check(made, verdict, s.n_stars, total)
     return history.chains(warmup, verdict, passes), passes, history.end
-
-
-def _from(begin: int, ends: Iterator[int]) -> Iterator[Stretch]:
-    here = begin
-    for end in ends:
-        yield Stretch(here, begin + end, begin + end)
-        here = begin + end
 
 
 def _verdict(
     target: Target, history: _History, warmup: int, quality: Quality, limits: Limits
 ) -> Convergence:
     return diagnose(
-        history.kept(warmup)[0],
+        history.after(warmup)[0],
         target.names,
         quality.log_weights,
         limits,

@@ -105,11 +105,11 @@ class Block:
     def read(cls, path: Path, mark: str) -> Block:
         """Block from a file; InputError when it cannot be read, or has another mark."""
         do = "delete it and resume: its steps are run again"
-        kept = read_arrays(path, mark, (*BLOCK_ARRAYS, *END_ARRAYS), do=do)
-        log_q, keys, (position, has_gauss, gauss) = (kept.pop(name) for name in END_ARRAYS)
+        stored = read_arrays(path, mark, (*BLOCK_ARRAYS, *END_ARRAYS), do=do)
+        log_q, keys, (position, has_gauss, gauss) = (stored.pop(name) for name in END_ARRAYS)
         random = ("MT19937", keys, int(position), int(has_gauss), float(gauss))
-        end = Walkers(kept["coords"][-1], kept["log_prob"][-1], log_q, random)
-        return cls(**kept, end=end)
+        end = Walkers(stored["coords"][-1], stored["log_prob"][-1], log_q, random)
+        return cls(**stored, end=end)
 
 
 def block_path(folder: Path, ensemble: int, end: int) -> Path:

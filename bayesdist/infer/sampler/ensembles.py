@@ -30,15 +30,15 @@ from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.equations.arrow import ArrowFactor
 from bayesdist.infer.sampler.checkpoints import Block, Walkers, block_path
-from bayesdist.infer.sampler.lookahead import Page, draw_page
-from bayesdist.infer.sampler.move_schedule import Plan, Stretch
+from bayesdist.infer.sampler.move_schedule import Plan, StepRange
+from bayesdist.infer.sampler.proposal_batch import ProposalBatch, draw_batch
 
 __all__ = ["Ensembles", "Whitening", "replay"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-START_PAGES = 20  # further pages of proposals that are searched for starts of walkers
+START_BATCHES = 20  # further batches of proposals that are searched for starts of walkers
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +78,10 @@ class Whitening:
 class _Replay:
     """Proposals by number: first the positions of the walkers, then those of each step in turn."""
 
-    def __init__(self, start: Walkers, page: Page, ensemble: int) -> None:
-        log_prob, log_q = page.log_prob[ensemble], page.log_q[ensemble]
+    def __init__(self, start: Walkers, batch: ProposalBatch, ensemble: int) -> None:
+        log_prob, log_q = batch.log_prob[ensemble], batch.log_q[ensemble]
         outside = np.isnan(log_prob)
-        self.psi = np.concatenate([start.coords, page.psi[ensemble]])
+        self.psi = np.concatenate([start.coords, batch.psi[ensemble]])
         self.log_prob = np.concatenate([start.log_prob, np.where(outside, -np.inf, log_prob)])
         self.log_q = np.concatenate([start.log_q, np.where(outside, 0.0, log_q)])
         self.used = len(start.coords)
@@ -102,25 +102,25 @@ class _Replay:
         return numbers[:, 0].astype(np.int64)
 
 
-def replay(start: Walkers, page: Page, ensemble: int) -> Block:
+def replay(start: Walkers, batch: ProposalBatch, ensemble: int) -> Block:
     """Block of Metropolis-Hastings steps over proposals that have been evaluated.
 
-    The page has proposals (ensembles, steps * walkers, D), step after step.
+    The batch has proposals (ensembles, steps * walkers, D), step after step.
     """
-    known, W = _Replay(start, page, ensemble), len(start.coords)
+    known, W = _Replay(start, batch, ensemble), len(start.coords)
     sampler = emcee.EnsembleSampler(
         W, 1, known.log_density, moves=MHMove(known.propose), vectorize=True
     )
     state = emcee.State(np.arange(W, dtype=float)[:, None], log_prob=start.log_prob.copy())
     state.random_state = start.random
-    steps = page.psi.shape[1] // W
+    steps = batch.psi.shape[1] // W
     sampler.run_mcmc(state, steps, skip_initial_state_check=True)
     index = sampler.get_chain()[..., 0].astype(np.int64)
     log_q = known.log_q[index[-1]]
     log_prob = known.log_prob[index]
     end = Walkers(known.psi[index[-1]], log_prob[-1], log_q, sampler.random_state)
     accepted = sampler.backend.accepted.astype(float)
-    return Block(known.psi[index], log_prob, accepted, page.log_weights[ensemble].copy(), end)
+    return Block(known.psi[index], log_prob, accepted, batch.log_weights[ensemble].copy(), end)
 
 
 def _independence(proposal: Proposal, whitening: Whitening) -> MHMove:
@@ -154,7 +154,7 @@ class Ensembles:
 
     target: Target
     proposal: Proposal
-    pilot: Page  # first proposals of each ensemble
+    pilot: ProposalBatch  # first proposals of each ensemble
     whitening: Whitening  # coordinates of moves that depend on the state
     plan: Plan
     seeds: tuple[int, ...]  # one for each ensemble
@@ -168,47 +168,51 @@ class Ensembles:
 
         Where the pilot is too short for so many walkers, further proposals are evaluated.
         """
-        pages, W = [self.pilot], self.plan.walkers
-        while (fewest := min(len(_usable(pages, e)) for e in range(len(self.seeds)))) < W:
-            if len(pages) > START_PAGES:
+        batches, W = [self.pilot], self.plan.walkers
+        while (fewest := min(len(_usable(batches, e)) for e in range(len(self.seeds)))) < W:
+            if len(batches) > START_BATCHES:
                 raise InputError("the proposal has no mass inside the support", where="sampler")
-            key = (0, len(pages))
-            pages.append(draw_page(self.target, self.proposal, self.seeds, key, W - fewest))
+            key = (0, len(batches))
+            batches.append(draw_batch(self.target, self.proposal, self.seeds, key, W - fewest))
         n = self.pilot.psi.shape[1]
         states, taken = [], np.zeros((len(self.seeds), n), bool)
         for e, seed in enumerate(self.seeds):
-            rows = _usable(pages, e)[:W]
+            rows = _usable(batches, e)[:W]
             psi, log_prob, log_q = (
-                np.concatenate([getattr(p, name)[e] for p in pages])[rows]
+                np.concatenate([getattr(p, name)[e] for p in batches])[rows]
                 for name in ("psi", "log_prob", "log_q")
             )
             random = tuple(np.random.RandomState(seed).get_state(legacy=True))
             coords = psi if self.plan.independent else self.whitening.to_white(psi)
             taken[e, rows[rows < n]] = True
             states.append(Walkers(coords, log_prob, log_q, random))
-        return states, taken, sum(page.n_evaluated for page in pages[1:])
+        return states, taken, sum(batch.n_evaluated for batch in batches[1:])
 
     # -- steps ------------------------------------------------------------------------------------
 
-    def advance(self, states: Sequence[Walkers], stretch: Stretch, rest: Page) -> list[Block]:
-        """One block of every ensemble from its state at `stretch.begin`, read from a file or run.
+    def advance(
+        self, states: Sequence[Walkers], span: StepRange, rest: ProposalBatch
+    ) -> list[Block]:
+        """One block of every ensemble from its state at `span.begin`, read from a file or run.
 
         `rest` are pilot proposals that were not taken as starts, for the first steps.
         """
         paths: list[Path | None] = [None] * len(self.seeds)
         if self.folder is not None:
-            paths = [block_path(self.folder, e, stretch.end) for e in range(len(self.seeds))]
-        mark = f"{self.fingerprint} {self.plan.method} {stretch.begin}"
+            paths = [block_path(self.folder, e, span.end) for e in range(len(self.seeds))]
+        mark = f"{self.fingerprint} {self.plan.method} {span.begin}"
         known = [Block.read(p, mark) if p is not None and p.exists() else None for p in paths]
         # always for all ensembles, so that the numbers do not depend on how many are known already
-        page = None
+        batch = None
         if self.plan.independent and any(block is None for block in known):
-            page = self._page(stretch, rest)
+            batch = self._batch(span, rest)
         out = []
         for e, (block, path) in enumerate(zip(known, paths, strict=True)):
             if block is None:
-                steps = stretch.end - stretch.begin
-                block = self._walk(states[e], steps) if page is None else replay(states[e], page, e)
+                steps = span.end - span.begin
+                block = (
+                    self._walk(states[e], steps) if batch is None else replay(states[e], batch, e)
+                )
                 if path is not None:
                     block.write(path, mark)
             out.append(block)
@@ -221,12 +225,12 @@ class Ensembles:
         flat = block.coords.reshape(-1, block.coords.shape[-1])
         return self.whitening.to_psi(flat).reshape(block.coords.shape)
 
-    def _page(self, stretch: Stretch, rest: Page) -> Page:
+    def _batch(self, span: StepRange, rest: ProposalBatch) -> ProposalBatch:
         W = self.plan.walkers
-        if stretch.begin * W < rest.psi.shape[1]:
-            return rest[slice(stretch.begin * W, stretch.end * W)]
-        drawn, used = (stretch.full - stretch.begin) * W, (stretch.end - stretch.begin) * W
-        return draw_page(self.target, self.proposal, self.seeds, (stretch.begin,), drawn, used)
+        if span.begin * W < rest.psi.shape[1]:
+            return rest[slice(span.begin * W, span.end * W)]
+        drawn, used = (span.full - span.begin) * W, (span.end - span.begin) * W
+        return draw_batch(self.target, self.proposal, self.seeds, (span.begin,), drawn, used)
 
     @cached_property
     def _sampler(self) -> emcee.EnsembleSampler:
@@ -258,6 +262,6 @@ class Ensembles:
         return Block(coords, log_prob, accepted, np.empty(0), end)
 
 
-def _usable(pages: Sequence[Page], ensemble: int) -> Int:
-    """Numbers, through the pages, of an ensemble's proposals with a density above zero."""
-    return np.flatnonzero(np.isfinite(np.concatenate([p.log_prob[ensemble] for p in pages])))
+def _usable(batches: Sequence[ProposalBatch], ensemble: int) -> Int:
+    """Numbers, through the batches, of an ensemble's proposals with a density above zero."""
+    return np.flatnonzero(np.isfinite(np.concatenate([p.log_prob[ensemble] for p in batches])))

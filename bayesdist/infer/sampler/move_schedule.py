@@ -12,18 +12,18 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from bayesdist.infer.convergence import LEAST_PER_WALKER, Convergence, Limits
+from bayesdist.infer.convergence import Convergence, Limits
+from bayesdist.limits import DRAWS_PER_WALKER, PARETO_K
 
 __all__ = [
     "EFFICIENT",
     "FIRST_CHECK",
-    "LONGEST_TAIL",
     "Plan",
-    "Stretch",
-    "boundaries",
+    "StepRange",
+    "block_schedule",
+    "doubling_schedule",
     "expected_passes",
     "first_check",
-    "ladder",
     "next_check",
     "pilot_steps",
     "plan_moves",
@@ -38,7 +38,6 @@ DEAR = 200_000  # stars above which passes are counted one by one
 FEWEST_WALKERS, MOST_WALKERS = 8, 64
 
 EFFICIENT, USABLE = 0.5, 0.05  # importance efficiency
-LONGEST_TAIL = 0.7  # Pareto k
 NO_MEAN = 1.0  # Pareto k beyond which weights have no mean: the proposal misses the posterior
 PROBATION = 2048  # proposals below which k scatters too much (by about 0.2 at 512) to reject one
 
@@ -81,7 +80,7 @@ def plan_moves(
     """
     step = min(0.5, 2.0 / np.sqrt(n_params))
     dear = n_stars > DEAR  # every step counts, and there are few of them
-    if efficiency > EFFICIENT and (k < LONGEST_TAIL or n_proposals < PROBATION):
+    if efficiency > EFFICIENT and (k < PARETO_K.value or n_proposals < PROBATION):
         return Plan("independence", (1.0, 0.0, 0.0), walkers or walkers_for(n_stars), step)
     # local moves compensate for a tail that the proposal reaches too seldom
     if efficiency > USABLE and (k < NO_MEAN or n_proposals < PROBATION):
@@ -115,7 +114,7 @@ def pilot_steps(ensembles: int, walkers: int) -> int:
 
 
 @dataclass(frozen=True)
-class Stretch:
+class StepRange:
     """Steps from `begin` to `end`; without the limit `max_steps` they would end at `full`."""
 
     begin: int
@@ -123,7 +122,7 @@ class Stretch:
     full: int
 
 
-def ladder(pilot: int, every: int, max_steps: int, n_stars: int) -> Iterator[Stretch]:
+def block_schedule(pilot: int, every: int, max_steps: int, n_stars: int) -> Iterator[StepRange]:
     """Blocks of the independence plan, independent of the targets.
 
     The pilot is cut into pieces of `every` steps at most; then blocks grow with the steps made, by
@@ -134,7 +133,7 @@ def ladder(pilot: int, every: int, max_steps: int, n_stars: int) -> Iterator[Str
     while begin < max_steps:
         step = pilot - begin if begin < pilot else int(np.ceil(growth * begin))
         full = begin + min(step, every)
-        yield Stretch(begin, min(full, max_steps), full)
+        yield StepRange(begin, min(full, max_steps), full)
         begin = full
 
 
@@ -156,7 +155,7 @@ def first_check(limits: Limits, cost: float, n_params: int, ensembles: int, walk
     slack = 1.05 + 3 / np.sqrt(max(limits.ess, 1.0))  # the estimate of the ESS scatters
     return max(
         slack * cost * limits.ess,
-        1.1 * cost * LEAST_PER_WALKER * ensembles * walkers,
+        1.1 * cost * DRAWS_PER_WALKER.value * ensembles * walkers,
         0.7 * cost * _chance_rhat(limits, n_params, ensembles),
     )
 
@@ -169,7 +168,7 @@ def next_check(made: int, verdict: Convergence, n_stars: int, walkers: int) -> f
     ess = max(min(verdict.ess_bulk_min, verdict.ess_tail_min), 1e-3)
     lacking = max(
         verdict.limits.ess / ess,
-        LEAST_PER_WALKER * walkers / ess,
+        DRAWS_PER_WALKER.value * walkers / ess,
         (verdict.rhat_max - 1) / max(verdict.limits.rhat - 1, 1e-6),
     )
     # a little early: another check costs less than passes that were not needed
@@ -188,13 +187,14 @@ def expected_passes(n_params: int, n_stars: int, limits: Limits, ensembles: int 
 # -- state-dependent moves ------------------------------------------------------------------------
 
 
-def boundaries(every: int, max_steps: int, thin: int = 1) -> Iterator[int]:
-    """Steps at which blocks end: 50, 100, 200, ... then every `every` steps up to `max_steps`.
+def doubling_schedule(begin: int, every: int, max_steps: int, thin: int = 1) -> Iterator[StepRange]:
+    """Blocks that end 50, 100, 200, ... then every `every` steps after `begin`, up to `max_steps`.
 
-    All are multiples of `thin`, so that every stored row represents as many steps.
+    All have a multiple of `thin` steps, so that every stored row represents as many.
     """
-    last, end = max_steps - max_steps % thin, 0
-    while end < last:
-        step = min(max(end, FIRST_CHECK), every)
-        end = min(end + step + -step % thin, last)
-        yield end
+    last, made = (max_steps - begin) // thin * thin, 0
+    while made < last:
+        step = min(max(made, FIRST_CHECK), every)
+        end = min(made + step + -step % thin, last)
+        yield StepRange(begin + made, begin + end, begin + end)
+        made = end

@@ -19,8 +19,7 @@ from bayesdist.infer.density.target import Target
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import LinearFit
-from bayesdist.infer.posterior import Posterior, SamplerInfo
-from bayesdist.infer.posterior.certificate import Certificate
+from bayesdist.infer.posterior import Certificate, Posterior, SamplerInfo
 from bayesdist.infer.posterior.memberships import count_outliers
 from bayesdist.infer.sampler.certified import run_certified
 from bayesdist.infer.sampler.chains import Chains, Settings, run_chains

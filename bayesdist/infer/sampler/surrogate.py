@@ -41,8 +41,9 @@ from bayesdist.errors import InputError, NotConvergedError
 from bayesdist.infer.convergence import importance_efficiency
 from bayesdist.infer.convergence import pareto_k as tail_shape
 from bayesdist.infer.density.proposal import Random
-from bayesdist.infer.posterior.certificate import Certificate
-from bayesdist.infer.sampler.move_schedule import EFFICIENT, LONGEST_TAIL
+from bayesdist.infer.posterior import Certificate
+from bayesdist.infer.sampler.move_schedule import EFFICIENT
+from bayesdist.limits import PARETO_K
 
 __all__ = ["Surrogate", "certify", "draw_surrogate"]
 
@@ -162,7 +163,7 @@ def draw_surrogate(
     `whiten` maps draws to the coordinates of the pilots.  NotConvergedError when next to no
     proposal is accepted.
     """
-    kept: list[Float] = []
+    accepted: list[Float] = []
     n_kept = tried = 0
     while n_kept < n:
         psi = propose(BATCH, rng)
@@ -170,7 +171,7 @@ def draw_surrogate(
         inside = np.isfinite(psi).all(axis=1)
         psi, chance = psi[inside], chance[inside]
         take = psi[chance < surrogate.log_weight(whiten(psi)) - surrogate.upper]
-        kept.append(take)
+        accepted.append(take)
         n_kept, tried = n_kept + len(take), tried + BATCH
         if tried >= 10 / LEAST_ACCEPTED and n_kept < LEAST_ACCEPTED * tried:
             raise NotConvergedError(
@@ -178,7 +179,7 @@ def draw_surrogate(
                 where="certificate",
                 do="sample the exact posterior",
             )
-    draws = np.concatenate(kept)[:n] if kept else propose(0, rng)
+    draws = np.concatenate(accepted)[:n] if accepted else propose(0, rng)
     return draws, n_kept / tried if tried else 1.0
 
 
@@ -279,8 +280,8 @@ def _judge(
         reasons.append(f"{n} pilots held out are fewer than {LEAST_HELD_OUT}")
     if n_outside:
         reasons.append(f"{n_outside} pilots lie where the posterior is zero")
-    if not pareto_k < LONGEST_TAIL:
-        reasons.append(f"Pareto k {pareto_k:.3f} of the proposal is not below {LONGEST_TAIL}")
+    if not pareto_k < PARETO_K.value:
+        reasons.append(f"Pareto k {pareto_k:.3f} of the proposal is not below {PARETO_K.value}")
     if not efficiency > EFFICIENT:
         reasons.append(f"efficiency {efficiency:.3f} of the proposal is not above {EFFICIENT}")
     if not sd <= MOST_REMAINDER:

@@ -11,54 +11,56 @@ from numpy.typing import NDArray
 from bayesdist.data.detections import Detections
 from bayesdist.data.matching.friends import Friends, friends_of_friends
 from bayesdist.errors import NotSettledError
-from bayesdist.infer.selfcal.errors import scatter_by_magnitude
+from bayesdist.infer.equations.priors import Prior
+from bayesdist.infer.selfcal.elimination import Mixture, memberships
 from bayesdist.infer.selfcal.gauge import Gauge
-from bayesdist.infer.selfcal.information import Information
-from bayesdist.infer.selfcal.normal import Mixture
-from bayesdist.infer.selfcal.problem import Problem, StarPriors, prepared
-from bayesdist.infer.selfcal.settled import Knowledge, gauge_of, solved_in_gauge
-from bayesdist.infer.selfcal.solve import Solution
+from bayesdist.infer.selfcal.mode import PriorAt, SelfCalibrationMode, gauge_of, solve_in_gauge
+from bayesdist.infer.selfcal.problem import Problem, StarPriors, prepare
 from bayesdist.infer.selfcal.tangent import TangentPlane, places_of
 from bayesdist.model import DistortionModel
 
-__all__ = ["SelfCalibration", "self_calibrate"]
+__all__ = ["SelfCalibration", "scatter_by_magnitude", "self_calibrate"]
 
 Float = NDArray[np.float64]
 
-MOST_ROUNDS = 12
-SHRINK = 0.5  # smallest factor on the linking length from round to round
+MAX_ITERATIONS = 12
+SHRINK = 0.5  # smallest factor on the linking length from one iteration to the next
 REACH = 12.0  # errors below which the linking length does not shrink
-SETTLED = 1e-3  # fraction of the detections that may change their star,
-FEWEST = 4  # or this number: two at the edge of the linking length, each with its successor
+MAX_CHANGED = 1e-3  # fraction of the detections that may change their star,
+MIN_CHANGED = 4  # or this number: two at the edge of the linking length, each with its successor
 ALIKE = 0.02  # change of the number of detections by which the errors hardly change
 GUESS = 0.02  # pixels: error where none is quoted, until it is measured
+MIN_IN_BIN = 200  # detections of one magnitude
+MAX_BINS = 20
+# of a residual's variance: a star with as many parameters as detections absorbs it all
+MOST_TAKEN = 0.99
 
 References = Callable[[Problem, Float], StarPriors]
 
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibration:
-    """A solution with its gauge and the last grouping of detections.
+    """A mode with its gauge and the last grouping of detections.
 
     Parameters
     ----------
-    solution : Solution
+    mode : SelfCalibrationMode
     gauge : Gauge
     friends : Friends
-        Of the last round; its `star` is of the detections given.
+        Of the last iteration; its `star` is of the detections given.
     detections : Detections
         With star codes and errors, on one tangent plane where that is requested.
     magnitude_errors : tuple of ndarray, or None
         Magnitudes and errors in pixels, where these were measured.
-    rounds : int
+    iterations : int
     """
 
-    solution: Solution
+    mode: SelfCalibrationMode
     gauge: Gauge
     friends: Friends
     detections: Detections
     magnitude_errors: tuple[Float, Float] | None
-    rounds: int
+    iterations: int
 
 
 def self_calibrate(
@@ -66,17 +68,17 @@ def self_calibrate(
     detections: Detections,
     theta: Float,
     *,
-    knowledge: Knowledge | None = None,
+    prior_at: PriorAt | None = None,
     match_radius: float,
     start_radius: float | None = None,
-    least: int = 2,
+    min_detections: int = 2,
     motion: str = "none",
     parallax_factors: Float | None = None,
     dilation: Float | None = None,
     jitter: float | None = None,
     references: References | None = None,
     plane: TangentPlane | None = None,
-    rounds: int = MOST_ROUNDS,
+    max_iterations: int = MAX_ITERATIONS,
     log: Callable[[str], None] = lambda text: None,
 ) -> SelfCalibration:
     """Calibrate a detector from detections alone.
@@ -88,16 +90,16 @@ def self_calibrate(
         Without errors these are measured, by magnitude where magnitudes are given.
     theta : ndarray, shape (D,)
         A start by which detections of a star lie closer than `start_radius`.
-    knowledge : callable, optional
-        Information from other sources than the detections, linearised at parameters (D,).
+    prior_at : callable, optional
+        Prior from other sources than the detections, linearised at parameters (D,).
     match_radius : float
-        Linking length of the last round, pixels: the largest distance of false detections.
+        Linking length of the last iteration, pixels: the largest distance of false detections.
     start_radius : float, optional
-        Linking length of the first round.
-    least : int
-        Fewest detections of a star.
+        Linking length of the first iteration.
+    min_detections : int
+        Of a star.
     motion, parallax_factors
-        As `prepared`.
+        As `prepare`.
     dilation : ndarray, shape (E,), optional
         VAFACTOR of each exposure.
     jitter : float, optional
@@ -106,10 +108,9 @@ def self_calibrate(
         Priors of the stars of a problem at parameters (D,).
     plane : TangentPlane, optional
         To which the tangent planes of all exposures are mapped; the sky counts as flat by default.
-    rounds : int
-        Largest number of rounds.
+    max_iterations : int
     log : callable, optional
-        Called with a sentence for each round.
+        Called with a sentence for each iteration.
 
     Returns
     -------
@@ -118,12 +119,12 @@ def self_calibrate(
     Raises
     ------
     InputError, DegenerateError
-        As `prepared` and `solve`.
+        As `prepare` and `solve`.
     NotSettledError
         When the groups do not converge.
     """
     theta = np.array(theta, float)
-    knowledge = knowledge or Information.none
+    prior_at = prior_at or Prior.none
     measured = detections.sigma is None
     if measured:
         detections = replace(detections, sigma=np.full(len(detections), GUESS))
@@ -131,78 +132,87 @@ def self_calibrate(
     pixel = model.pixel_size(theta)
     errors: tuple[Float, Float] | None = None
     before: Friends | None = None
-    solution: Solution | None = None
-    for turn in range(rounds):
+    mode: SelfCalibrationMode | None = None
+    for turn in range(max_iterations):
         flat = detections if plane is None else plane.onto_it(model, detections, theta)
         friends = friends_of_friends(
             places_of(model, flat, theta, dilation), flat.exposure, radius * pixel
         )
         found = replace(flat, star=friends.star)
-        problem = prepared(
-            model, found, theta, match_radius=radius, least=least, motion=motion,
-            parallax_factors=parallax_factors, dilation=dilation,
-        )  # fmt: skip
+        problem = prepare(
+            model,
+            found,
+            theta,
+            match_radius=radius,
+            min_detections=min_detections,
+            motion=motion,
+            parallax_factors=parallax_factors,
+            dilation=dilation,
+        )
         if references is not None:
             problem = replace(problem, priors=references(problem, theta))
-        known = None if solution is None else _still(problem, solution)
-        solution = solved_in_gauge(problem, theta, knowledge, jitter=jitter, mixture=known)
-        theta = solution.theta
+        known = None if mode is None else _still(problem, mode)
+        mode = solve_in_gauge(problem, theta, prior_at, jitter=jitter, mixture=known)
+        theta = mode.theta
         log(
-            f"round {turn + 1}: linking length {radius:.3g} pix, {friends.n_stars} stars, "
-            f"{len(problem)} detections, error "
-            f"{np.sqrt(np.median(solution.problem.var) + solution.mixture.jitter**2):.3g} pix"
+            f"iteration {turn + 1}: linking length {radius:.3g} pix, {friends.n_stars} stars, "
+            f"{len(problem)} detections, error {mode.error:.3g} pix"
         )
         last = radius <= match_radius
         if measured:
-            detections, errors = _with_errors(detections, solution)
-        few = max(SETTLED * len(detections), FEWEST)
+            detections, errors = _with_errors(detections, mode)
+        few = max(MAX_CHANGED * len(detections), MIN_CHANGED)
         if last and before is not None and _changed(before, friends) <= few:
-            if measured:  # with the errors of this round
+            if measured:  # with the errors of this iteration
                 sigma = detections.sigma
                 assert sigma is not None
-                problem = solution.problem.with_sigma(sigma[solution.problem.rows])
-                solution = solved_in_gauge(
-                    problem, theta, knowledge, stars=solution.stars, jitter=jitter,
-                    mixture=solution.mixture,
-                )  # fmt: skip
-            gauge = gauge_of(solution.problem, solution.theta, knowledge(solution.theta), solution)
+                problem = mode.problem.with_sigma(sigma[mode.problem.rows])
+                mode = solve_in_gauge(
+                    problem,
+                    theta,
+                    prior_at,
+                    stars=mode.stars,
+                    jitter=jitter,
+                    mixture=mode.mixture,
+                )
+            gauge = gauge_of(mode.problem, mode.theta, prior_at(mode.theta), mode)
             found = replace(found, sigma=detections.sigma)
-            return SelfCalibration(solution, gauge, friends, found, errors, turn + 1)
+            return SelfCalibration(mode, gauge, friends, found, errors, turn + 1)
         before = friends
-        scatter = float(np.sqrt(np.median(solution.problem.var) + solution.mixture.jitter**2))
+        scatter = mode.error
         radius = max(match_radius, min(radius, max(SHRINK * radius, REACH * scatter)))
     if last:
         raise NotSettledError(
-            f"stars and solution still change after {rounds} rounds",
+            f"stars and solution still change after {max_iterations} iterations",
             where="self-calibration",
             do="give a better start, another match radius, or a lower order",
         )
     raise NotSettledError(
-        f"after {rounds} rounds the detections still ask for a linking length of {radius:.3g} pix, "
-        f"since they scatter by {scatter:.3g} pix",
+        f"after {max_iterations} iterations the detections still ask for a linking length of "
+        f"{radius:.3g} pix, since they scatter by {scatter:.3g} pix",
         where="self-calibration",
         do="give a higher order, a better start, or a larger match radius",
     )
 
 
-def _still(problem: Problem, solution: Solution) -> Mixture | None:
-    """Mixture of the last round, if this round starts with nearly the same detections.
+def _still(problem: Problem, mode: SelfCalibrationMode) -> Mixture | None:
+    """Mixture of the last iteration, if this one starts with nearly the same detections.
 
     New ones may lie far from their positions by the solution, and so do stars with motions, which
     start at rest: then the first errors have to be large.
     """
-    same = abs(len(problem) / len(solution.problem) - 1.0) < ALIKE
-    return solution.mixture if same and problem.n_star == 2 else None
+    same = abs(len(problem) / len(mode.problem) - 1.0) < ALIKE
+    return mode.mixture if same and problem.n_star == 2 else None
 
 
 def _with_errors(
-    detections: Detections, solution: Solution
+    detections: Detections, mode: SelfCalibrationMode
 ) -> tuple[Detections, tuple[Float, Float]]:
     """Detections with errors by magnitude, or one for all."""
-    problem = solution.problem
+    problem = mode.problem
     mag = np.zeros(len(detections)) if detections.mag is None else detections.mag
     middles, sigma = scatter_by_magnitude(
-        problem, solution.theta, solution.mixture, solution.stars, mag[problem.rows]
+        problem, mode.theta, mode.mixture, mode.stars, mag[problem.rows]
     )
     of_each = np.exp(np.interp(mag, middles, np.log(sigma)))
     return replace(detections, sigma=of_each), (middles, sigma)
@@ -223,3 +233,28 @@ def _previous(star: NDArray[np.int64]) -> NDArray[np.int64]:
     out = np.full(len(star), -1)
     out[order[1:]] = np.where(same, order[:-1], -1)
     return out
+
+
+def scatter_by_magnitude(
+    problem: Problem, theta: Float, mixture: Mixture, stars: Float, mag: Float
+) -> tuple[Float, Float]:
+    """Median magnitude of each bin (bins,), and error on one axis there in pixels (bins,).
+
+    A star's position is that of its own detections; the scatter is corrected for this.  `mag` (N,)
+    is in the order of the problem.
+    """
+    w = memberships(problem, theta, mixture, stars)
+    precision = w / (problem.var + mixture.jitter**2)
+    total = np.bincount(problem.star, precision, minlength=problem.n_stars)[problem.star]
+    # on each axis a star takes q / 2 degrees of freedom, shared by weight
+    left = 1.0 - np.minimum(precision / np.maximum(total, 1e-300) * problem.n_star / 2, MOST_TAKEN)
+    square = problem.squares(theta, stars)
+    n_bins = int(np.clip(len(mag) // MIN_IN_BIN, 1, MAX_BINS))
+    # equal magnitudes, as in lists without any, leave fewer bins
+    edges = np.unique(np.quantile(mag, np.linspace(0, 1, n_bins + 1)))
+    n_bins = max(len(edges) - 1, 1)
+    bin_of = np.clip(np.searchsorted(edges, mag, side="right") - 1, 0, n_bins - 1)
+    number = np.bincount(bin_of, w * left, n_bins)
+    variance = np.bincount(bin_of, w * square, n_bins) / (2 * np.maximum(number, 1e-9))
+    middles = np.array([np.median(mag[bin_of == k]) for k in range(n_bins)])
+    return middles, np.sqrt(variance)

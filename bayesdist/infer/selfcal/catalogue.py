@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.selfcal.normal import eliminated_rows, memberships
-from bayesdist.infer.selfcal.solve import Solution
+from bayesdist.infer.selfcal.elimination import eliminated_rows, memberships
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 
 __all__ = ["StarCatalogue", "star_catalogue"]
 
@@ -48,7 +48,7 @@ class StarCatalogue:
         return len(self.values)
 
 
-def star_catalogue(solution: Solution, cov: Float | None = None) -> StarCatalogue:
+def star_catalogue(solution: SelfCalibrationMode, cov: Float | None = None) -> StarCatalogue:
     """Stars at their modes, with Laplace covariances.
 
     The covariance of a star is that by its own detections for a known distortion, plus that by
@@ -56,7 +56,7 @@ def star_catalogue(solution: Solution, cov: Float | None = None) -> StarCatalogu
 
     Parameters
     ----------
-    solution : Solution
+    solution : SelfCalibrationMode
     cov : ndarray, shape (D, D), optional
         Sigma; that of the solution by default.
     """

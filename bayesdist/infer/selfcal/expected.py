@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.detections import Detections
+from bayesdist.infer.equations.priors import Prior
+from bayesdist.infer.selfcal.elimination import Mixture, expand
 from bayesdist.infer.selfcal.gauge import Gauge, find_gauge
-from bayesdist.infer.selfcal.information import Information
-from bayesdist.infer.selfcal.normal import Mixture, expand
-from bayesdist.infer.selfcal.problem import Problem, prepared
+from bayesdist.infer.selfcal.problem import Problem, prepare
 from bayesdist.infer.selfcal.relative import gauge_free_matrix
+from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["ExpectedSolution", "expected_solution"]
@@ -28,7 +29,7 @@ NONE_FALSE = Mixture(jitter=0.0, fraction=1e-300)
 
 
 @dataclass(frozen=True, eq=False)
-class ExpectedSolution:
+class ExpectedSolution(Solution):
     """Expected solution without noise: its mean is the truth."""
 
     model: DistortionModel
@@ -64,24 +65,24 @@ def expected_solution(
     model: DistortionModel,
     truth: Float,
     detections: Detections,
-    information: Information,
+    prior: Prior,
     *,
-    least: int = 2,
+    min_detections: int = 2,
 ) -> ExpectedSolution:
     """Covariance that a self-calibration would have, its stars marginalised.
 
-    `detections` have the positions of stars, their codes and errors, and no noise; `information` is
-    that from other sources; `least` is the fewest detections of a star.  InputError when no star is
+    `detections` have the positions of stars, their codes and errors, and no noise; `prior` is from
+    other sources; `min_detections` are those of a star.  InputError when no star is
     seen often enough.
     """
     # false detections are not drawn, so that their largest distance does not matter
-    problem = prepared(model, detections, truth, match_radius=1.0, least=least)
+    problem = prepare(model, detections, truth, match_radius=1.0, min_detections=min_detections)
     stars = problem.mean_places(truth)
     problem = problem.at(truth, stars)
     curvature = expand(problem, truth, NONE_FALSE, stars).curvature
-    gauge = find_gauge(problem, truth, curvature, information)
+    gauge = find_gauge(problem, truth, curvature, prior)
     free = np.setdiff1d(np.arange(model.n_params), gauge.held)
-    precision = (curvature + information.precision)[np.ix_(free, free)]
+    precision = (curvature + prior.precision)[np.ix_(free, free)]
     scale = 1.0 / np.sqrt(np.diag(precision))
     cov = np.zeros_like(curvature)
     cov[np.ix_(free, free)] = np.linalg.inv(precision * np.outer(scale, scale)) * np.outer(

@@ -14,18 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from bayesdist.infer.selfcal.information import Information
-from bayesdist.infer.selfcal.moves import (
+from bayesdist.infer.equations.priors import Prior
+from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.infer.selfcal.sky_moves import (
     GENERATORS,
     PARALLAX,
     POINTS,
     functionals,
+    largest_roll_difference,
     moves,
     parameter_scale,
     rates,
-    roll_spread,
 )
-from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import DistortionModel
 
 __all__ = ["FAR", "SAME_ROLL", "Decision", "Gauge", "NamedDirection", "find_gauge"]
@@ -40,7 +40,7 @@ WEAK_PIX = 0.1  # error at the detector's edge above which a direction counts as
 FAR = 3.0  # times the final error: information no better than this does not fix a direction
 EXPLAINED = 1e-2  # fraction of a free direction that its names may leave out
 SAME_ROLL = np.radians(0.1)
-LEAST_PIVOT = 0.02
+MIN_PIVOT = 0.02
 HIDDEN = 1e-5  # of a property that lies along undetermined directions: it is free
 
 
@@ -151,20 +151,20 @@ class Gauge:
         out, free = list[str](), set(self.free_names)
         # the degeneracy with a skew of the sky is reported at once
         skew = {"skew_plus", "skew_cross"}
-        told = set(POINTS) | (skew if skew & set(self.whole) else set())
-        if skew <= told and skew <= free and self.spread < SAME_ROLL:
+        named = set(POINTS) | (skew if skew & set(self.whole) else set())
+        if skew <= named and skew <= free and self.spread < SAME_ROLL:
             out.append(
                 f"one roll angle (they differ by {np.degrees(self.spread):.2g} deg at most, half "
                 "turns apart): a linear skew of the distortion cannot be told from one of the sky"
             )
-        elif skew <= told:
+        elif skew <= named:
             out.append("a linear skew of the distortion cannot be told from one of the sky")
         for one in self.directions:
             if one.free and one.name == "scale":
                 out.append(f"scale: the detections say nothing of it; {_fixed(one)}")
             elif one.free and one.name == "rotation":
                 out.append(f"rotation on the sky: free; {_fixed(one)}")
-            elif one.free and one.name not in told:
+            elif one.free and one.name not in named:
                 out.append(f"{one.name}: the detections say nothing of it; {_fixed(one)}")
             elif one.weak and not one.free:
                 out.append(
@@ -204,7 +204,7 @@ def find_gauge(
     problem: Problem,
     theta: Float,
     curvature: Float,
-    information: Information,
+    prior: Prior,
     *,
     known: Float | None = None,
     decision: Decision | None = None,
@@ -218,7 +218,7 @@ def find_gauge(
     model = problem.model
     years = float(np.ptp(problem.groups.epoch)) or 1.0
     scale = parameter_scale(model, theta, years)
-    both = (curvature if known is None else known) + information.precision
+    both = (curvature if known is None else known) + prior.precision
     alone, fixed = (
         _Spectrum.of(H * np.outer(scale, scale), n)
         for H, n in (
@@ -247,7 +247,7 @@ def find_gauge(
         directions=directions,
         unnamed=_unnamed(model, null, known_moves),
         weakest=weakest,
-        spread=roll_spread(model, theta),
+        spread=largest_roll_difference(model, theta),
         whole=tuple(name for name in GENERATORS if _within(named[name] / scale, null)),
         rates=tuple(name for name, row in moving.items() if _within(row / scale, loose)),
     )
@@ -337,7 +337,7 @@ def _pivots(model: DistortionModel, null: Float) -> Int:
             break
         _, R, order = qr(left[rows].T, pivoting=True, mode="economic")
         size = np.abs(np.diag(R))
-        take = rows[order[: int((size > LEAST_PIVOT).sum())]]
+        take = rows[order[: int((size > MIN_PIVOT).sum())]]
         held += list(take)
         # still free once these are fixed
         _, s, Vt = np.linalg.svd(null[held])

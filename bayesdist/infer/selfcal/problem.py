@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
@@ -14,12 +15,12 @@ from bayesdist.infer import kernel
 from bayesdist.model import DistortionModel
 from bayesdist.model.grouping import Groups
 
-__all__ = ["LEAST_DETECTIONS", "MOTIONS", "Problem", "StarPriors", "prepared"]
+__all__ = ["MIN_DETECTIONS", "MOTIONS", "Problem", "StarPriors", "prepare"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-LEAST_DETECTIONS = 2  # of a star that gives information about the distortion
+MIN_DETECTIONS = 2  # of a star that gives information about the distortion
 MOTIONS = {"none": 2, "proper_motion": 4, "parallax": 5}
 # precision, in the unit of u, v, that makes a star's matrix positive and is no information
 VAGUE = 1e-12
@@ -214,9 +215,7 @@ class Problem:
 
     def medians(self, values: Float) -> Float:
         """Medians (S,) of numbers (N,) over the detections of each star."""
-        ordered, first = values[np.lexsort((values, self.star))], self.starts[:-1]
-        low, high = first + (self.counts - 1) // 2, first + self.counts // 2
-        return np.asarray((ordered[low] + ordered[high]) / 2)
+        return np.asarray(ndimage.median(values, self.star, np.arange(self.n_stars)))
 
     def found_again(self, theta: Float, stars: Float) -> Float:
         """Stars (S, q), those far from all their detections moved back to the mean of these."""
@@ -280,7 +279,7 @@ def _square(W: Float) -> Float:
     return np.asarray(W[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
 
 
-def prepared(
+def prepare(
     model: DistortionModel,
     detections: Detections,
     theta: Float,
@@ -290,11 +289,11 @@ def prepared(
     epoch0: float | None = None,
     parallax_factors: Float | None = None,
     dilation: Float | None = None,
-    least: int = LEAST_DETECTIONS,
+    min_detections: int = MIN_DETECTIONS,
 ) -> Problem:
     """Problem from detections, sorted for the passes.
 
-    Detections without star codes, and stars with fewer than `least` detections, are left out; the
+    Detections without star codes, and stars with fewer than `min_detections`, are left out; the
     model's exposures are those of the detections.  `theta` is good enough for the size and shape of
     pixels on the sky; `match_radius` is in pixels; `motion`, one of `MOTIONS`, gives the parameters
     of a star; `epoch0` is the date of the stars' positions, the mean of the exposures' by default;
@@ -304,10 +303,10 @@ def prepared(
     """
     q = MOTIONS[motion]
     counts = np.bincount(detections.star[detections.star >= 0], minlength=1)
-    kept = (detections.star >= 0) & (counts[detections.star] >= max(least, LEAST_DETECTIONS))
-    if not kept.any():
+    used = (detections.star >= 0) & (counts[detections.star] >= max(min_detections, MIN_DETECTIONS))
+    if not used.any():
         raise InputError(
-            f"no star is seen {max(least, LEAST_DETECTIONS)} times",
+            f"no star is seen {max(min_detections, MIN_DETECTIONS)} times",
             where=detections.source,
             do="give exposures that overlap, a better start, or a larger match radius",
         )
@@ -315,7 +314,7 @@ def prepared(
         raise InputError(
             "the detections carry no errors", where=detections.source, do="give sigma in pixels"
         )
-    rows = np.flatnonzero(kept)
+    rows = np.flatnonzero(used)
     rows = rows[np.argsort(detections.star[rows], kind="stable")]
     star = np.unique(detections.star[rows], return_inverse=True)[1]
     starts = np.concatenate([[0], np.cumsum(np.bincount(star))]).astype(np.int64)

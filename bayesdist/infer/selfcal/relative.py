@@ -7,14 +7,10 @@ removed (an S-transformation: Baarda 1973; Teunissen 1985); the rest is common t
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
-from bayesdist.infer.linear import LinearFit
-from bayesdist.infer.posterior import Posterior
+from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["gauge_free", "gauge_free_matrix"]
@@ -32,39 +28,21 @@ def gauge_free_matrix(model: DistortionModel, theta: Float, null: Float) -> Floa
     D = model.n_params
     if not null.shape[1]:
         return np.eye(D)
-    nodes, weights = leggauss(model.order + 1)  # exact for squares of the polynomials
     rows = []
     for chip in model.chips:
-        nx, ny = chip.size
-        x, y = (
-            a.ravel() for a in np.meshgrid((nx + 1 + nx * nodes) / 2, (ny + 1 + ny * nodes) / 2)
-        )
+        x, y, area = chip.quadrature(model.order + 1)  # exact for squares of the polynomials
         where = {"exposure": np.zeros(len(x), np.int64), "chip": np.full(len(x), chip.number)}
         if model.time is not None:
             where["epoch"] = np.full(len(x), model.time.epoch0[0])
         J = model.jacobian(theta, x, y, **where)
-        area = nx * ny * np.outer(weights, weights).ravel()
         rows.append((np.sqrt(area)[:, None, None] * J).reshape(-1, D))
     J = np.concatenate(rows)
     return np.asarray(np.eye(D) - null @ np.linalg.pinv(J @ null) @ J)
 
 
-def gauge_free(solution: LinearFit | Posterior, null: Float) -> LinearFit | Posterior:
-    """Solution whose errors are those of relative positions on the detector.
+def gauge_free(solution: Solution, null: Float) -> Solution:
+    """Solution whose errors are those of relative positions on the detector; its mean stays.
 
-    Parameters
-    ----------
-    solution : LinearFit or Posterior
-    null : ndarray, shape (D, d)
-        Free directions at it.
-
-    Returns
-    -------
-    LinearFit or Posterior
-        With the same mean.
+    `null` (D, d) are the free directions at it.
     """
-    S = gauge_free_matrix(solution.model, solution.mean, null)
-    if isinstance(solution, LinearFit):
-        return replace(solution, cov=S @ solution.cov @ S.T)
-    mean = solution.mean
-    return replace(solution, theta=mean + (solution.theta - mean) @ S.T)
+    return solution.mapped(gauge_free_matrix(solution.model, solution.mean, null))

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
 from bayesdist.data.matching.frames import MutualFrames
@@ -78,14 +77,10 @@ def fitted_polynomials(
 
     `start` maps x, y and the number of a chip to positions (N, 2), `onto` is applied to these.
     """
-    nodes, weights = leggauss(4 * (order + 1))
     out = []
     for chip in chips:
-        nx, ny = chip.size
-        x, y = (
-            a.ravel() for a in np.meshgrid((nx + 1 + nx * nodes) / 2, (ny + 1 + ny * nodes) / 2)
-        )
-        root = np.sqrt(np.outer(weights, weights).ravel())[:, None]
+        x, y, weight = chip.quadrature(4 * (order + 1))
+        root = np.sqrt(weight)[:, None]
         basis = PolynomialBasis(order, chip.size, chip.reference_pixel).evaluate(x, y)
         plane = start(x, y, chip.number)
         plane = plane if onto is None else onto(plane)

@@ -9,6 +9,7 @@ are moved by it to the pixels at which they would be on one plane.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,7 @@ __all__ = ["TangentPlane", "places_of"]
 
 Float = NDArray[np.float64]
 
-STEP = 0.5  # pixels, over which positions are differenced
-TURNS = 3  # of Newton's method, each of which leaves a hundredth or less
+STEPS = 3  # of Newton's method, each of which leaves a hundredth or less
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +91,9 @@ class TangentPlane:
             here = detections.exposure == e
             moved[here] = self.displacements(model, theta, flat[here], e)
         aim, out = flat + moved, detections
-        right = places_of(model, replace(detections, x=detections.x + STEP), theta)
-        up = places_of(model, replace(detections, y=detections.y + STEP), theta)
-        back = np.linalg.inv(np.stack([right - flat, up - flat], axis=2) / STEP)
-        for _ in range(TURNS):
+        slopes = model.slopes(theta, detections.x, detections.y, **_where(model, detections))
+        back = np.linalg.inv(slopes)
+        for _ in range(STEPS):
             step = np.einsum("nab,nb->na", back, aim - places_of(model, out, theta))
             out = replace(out, x=out.x + step[:, 0], y=out.y + step[:, 1])
         return out
@@ -104,18 +103,16 @@ def places_of(
     model: DistortionModel, detections: Detections, theta: Float, dilation: Float | None = None
 ) -> Float:
     """Sky position (N, 2) of each detection by the model."""
-    when = None
-    if model.time is not None and detections.epoch is not None:
-        when = detections.epoch[detections.exposure]
-    out = model.predict(
-        theta,
-        detections.x,
-        detections.y,
-        exposure=detections.exposure,
-        chip=detections.chip,
-        epoch=when,
-    )
+    out = model.predict(theta, detections.x, detections.y, **_where(model, detections))
     if dilation is None:
         return out
     o = np.asarray(model.origin)
     return np.asarray(o + (out - o) * dilation[detections.exposure, None])
+
+
+def _where(model: DistortionModel, detections: Detections) -> dict[str, Any]:
+    """Exposure, chip and epoch of each detection, as `DistortionModel.predict` takes them."""
+    when = None
+    if model.time is not None and detections.epoch is not None:
+        when = detections.epoch[detections.exposure]
+    return {"exposure": detections.exposure, "chip": detections.chip, "epoch": when}

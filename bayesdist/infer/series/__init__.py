@@ -1,27 +1,26 @@
 """Coefficients of many exposures against time: lines, breaks, scatter, predictions."""
 
 from bayesdist.infer.series.compare import Comparison, compare, serial_correlation
-from bayesdist.infer.series.course import KINDS, Course
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.filters import FilterDependence, filter_dependence
 from bayesdist.infer.series.fit import fit_series
 from bayesdist.infer.series.heldout import HeldOut, block_folds, exposure_folds, held_out
-from bayesdist.infer.series.posterior import SeriesPosterior
-from bayesdist.infer.series.results import Change, Prediction
+from bayesdist.infer.series.posterior import Change, Prediction, SeriesPosterior
 from bayesdist.infer.series.series import Series
+from bayesdist.infer.series.trend import KINDS, TrendModel
 from bayesdist.infer.series.verdict import Verdict, default_candidates, describe
 
 __all__ = [
     "KINDS",
     "Change",
     "Comparison",
-    "Course",
     "Design",
     "FilterDependence",
     "HeldOut",
     "Prediction",
     "Series",
     "SeriesPosterior",
+    "TrendModel",
     "Verdict",
     "block_folds",
     "compare",

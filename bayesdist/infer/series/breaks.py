@@ -1,4 +1,4 @@
-"""Draws of unknown dates of breaks, given everything but the course's parameters.
+"""Draws of unknown dates of breaks, given everything but the trend's parameters.
 
 The prior of a date is uniform over the span of the series, each segment keeping some exposures.
 Between two neighbouring exposures the date is free, so that a candidate is a gap and a date in it.
@@ -14,8 +14,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.series.course import LEAST_FOUND
 from bayesdist.infer.series.design import Design
+from bayesdist.infer.series.trend import MIN_EXPOSURES_FOUND
 
 __all__ = ["BreakMoves", "Likelihood"]
 
@@ -31,7 +31,7 @@ class BreakMoves:
     """Moves of the dates of breaks."""
 
     def __init__(self, design: Design) -> None:
-        self.count = design.course.find
+        self.count = design.trend.find
         self.dates = np.unique(design.series.epoch)
         self.epoch = np.sort(design.series.epoch)
         self.width = np.diff(self.dates)
@@ -44,7 +44,7 @@ class BreakMoves:
         place = np.searchsorted(self.epoch, breaks)
         shape = (*breaks.shape[:-1], 1)
         edges = np.concatenate([np.zeros(shape, int), place, np.full(shape, len(self.epoch))], -1)
-        return np.all(np.diff(edges, axis=-1) >= LEAST_FOUND, axis=-1)
+        return np.all(np.diff(edges, axis=-1) >= MIN_EXPOSURES_FOUND, axis=-1)
 
     def _at(self, gap: NDArray[np.int64], rng: np.random.Generator) -> Float:
         return self.dates[gap] + self.width[gap] * rng.random(gap.shape)
@@ -74,8 +74,8 @@ class BreakMoves:
             weight = np.where(self.possible(trial), likelihood(trial), -np.inf)
             weight = weight + np.log(self.prior)
             weight -= weight.max(axis=1, keepdims=True)
-            share = np.exp(weight) / np.exp(weight).sum(axis=1, keepdims=True)
-            self._seen[b] += share.mean(axis=0)
+            probability = np.exp(weight) / np.exp(weight).sum(axis=1, keepdims=True)
+            self._seen[b] += probability.mean(axis=0)
             breaks = _pick(trial, weight, rng)
         return breaks
 

@@ -11,19 +11,19 @@ from bayesdist.infer.convergence import Convergence, Limits, diagnose
 from bayesdist.infer.series.breaks import BreakMoves
 from bayesdist.infer.series.gibbs import sweep
 from bayesdist.infer.series.problem import Problem, State, break_likelihood
+from bayesdist.infer.series.scatter import FRACTION_PRIOR, KAPPA_RATE, MAX_FRACTION, RandomWalk
 from bayesdist.infer.series.series import MAD_TO_SIGMA
 from bayesdist.infer.series.small import cholesky, precision_of
-from bayesdist.infer.series.walk import FRACTION_MOST, FRACTION_PRIOR, KAPPA_RATE, RandomWalk
 
 __all__ = ["Draws", "Engine", "run"]
 
 Float = NDArray[np.float64]
 
 ENSEMBLES = 4  # the chains are judged in as many groups
-SCANS = 10  # sweeps of the warm-up in which breaks are drawn among all gaps
+N_SCANS = 10  # sweeps of the warm-up in which breaks are drawn among all gaps
 # the scatter needs further moves above this fraction of the formal errors in the variance, and with
 # this many exposures that may or may not lie off
-FORMAL_SHARE, UNCLEAR = 0.25, 1.0
+MAX_FORMAL_FRACTION, MAX_UNCLEAR = 0.25, 1.0
 EQUAL_WEIGHTS = np.zeros(25)  # no proposal, no importance weights
 
 
@@ -35,9 +35,9 @@ class Engine:
     walk: RandomWalk | None
     moves: BreakMoves | None
 
-    def step(self, state: State, rng: np.random.Generator, kept: Float | None = None) -> State:
+    def step(self, state: State, rng: np.random.Generator, included: Float | None = None) -> State:
         """Next state of all chains."""
-        return sweep(self.problem, state, rng, kept=kept, walk=self.walk, moves=self.moves)
+        return sweep(self.problem, state, rng, included=included, walk=self.walk, moves=self.moves)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +95,9 @@ class Draws:
         if problem.outliers:
             parts += [self.fraction[..., None], np.log(self.kappa2)[..., None]]
             labels += ["fraction of outliers", "inflation of outliers"]
-        if design.course.find:
+        if design.trend.find:
             parts.append(self.breaks)
-            labels += [f"break {i + 1}" for i in range(design.course.find)]
+            labels += [f"break {i + 1}" for i in range(design.trend.find)]
         if design.drift:
             parts.append(np.log(self.drift))
             labels += [f"drift of {c}" for c in names]
@@ -131,7 +131,7 @@ def starting_state(
         breaks = moves.start(n_chains, break_likelihood(problem, precision), rng)
     fraction = np.zeros(n_chains)
     if problem.outliers:
-        fraction = np.clip(rng.beta(*FRACTION_PRIOR, size=n_chains), 1e-6, FRACTION_MOST)
+        fraction = np.clip(rng.beta(*FRACTION_PRIOR, size=n_chains), 1e-6, MAX_FRACTION)
     return State(
         b=np.zeros((n_chains, k, problem.design.n_columns)),
         sigma=sigma,
@@ -148,13 +148,13 @@ def warm_up(
     problem: Problem, n_chains: int, sweeps: int, rng: np.random.Generator
 ) -> tuple[Engine, State]:
     """Chains that have forgotten their start, and moves that are fixed from now on."""
-    moves = BreakMoves(problem.design) if problem.design.course.find else None
+    moves = BreakMoves(problem.design) if problem.design.trend.find else None
     state = starting_state(problem, moves, n_chains, rng)
     seen: list[State] = []
     for t in range(sweeps):
-        scan = moves is not None and t < SCANS
+        scan = moves is not None and t < N_SCANS
         state = sweep(problem, state, rng, moves=moves, scan=scan)
-        if moves is not None and t + 1 == SCANS:
+        if moves is not None and t + 1 == N_SCANS:
             moves.learn()
         if t >= sweeps // 2:
             seen.append(state)
@@ -168,7 +168,7 @@ def _further_moves(problem: Problem, seen: list[State]) -> RandomWalk | None:
     formal = np.median(np.diagonal(problem.formal), axis=0)
     intrinsic = np.median(np.diagonal(sigma), axis=0)
     unclear = np.mean([(s.probability * (1 - s.probability)).sum(axis=1).mean() for s in seen])
-    if unclear < UNCLEAR and (formal < FORMAL_SHARE * (formal + intrinsic)).all():
+    if unclear < MAX_UNCLEAR and (formal < MAX_FORMAL_FRACTION * (formal + intrinsic)).all():
         return None
     fraction = np.concatenate([s.fraction for s in seen])
     kappa2 = np.concatenate([s.kappa2 for s in seen])

@@ -1,8 +1,8 @@
 """Correlated deviations of successive exposures, for predictions beyond the series.
 
-In addition to a course of few columns each coefficient deviates by a first-order
+In addition to a trend of few columns each coefficient deviates by a first-order
 (Ornstein-Uhlenbeck) process of variance a^2 and memory tau, and each exposure by an independent
-scatter.  The course's parameters are integrated out; memory, total variance and the process's
+scatter.  The trend's parameters are integrated out; memory, total variance and the process's
 fraction of it are summed over a grid with the weight of their marginal likelihood.  A memory far
 longer than the series makes a random walk, a fraction of zero the scatter alone.  Closed forms
 throughout: nothing to converge.
@@ -19,12 +19,12 @@ __all__ = ["Correlated", "Shared"]
 
 Float = NDArray[np.float64]
 
-VAGUE = 100.0  # prior standard deviation of the course's parameters, in units of the spread
+VAGUE = 100.0  # prior standard deviation of the trend's parameters, in units of the spread
 MEMORIES, TOTALS = 9, 9
 FRACTIONS = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 0.95])
 LONGEST = 10.0  # memory, in spans of the series
-RANGE = 0.2, 20.0  # total variance, in units of that about the course
-MOST = 300  # exposures, or means of successive ones
+RANGE = 0.2, 20.0  # total variance, in units of that about the trend
+MAX_POINTS = 300  # exposures, or means of successive ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +32,8 @@ class Shared:
     """Prediction of a coefficient at M epochs: a mixture of P normal distributions."""
 
     weight: Float  # of each process (P,)
-    means: Float  # of course and correlated deviation (P, M)
-    variances: Float  # of course and correlated deviation (P, M)
+    means: Float  # of trend and correlated deviation (P, M)
+    variances: Float  # of trend and correlated deviation (P, M)
     own: Float  # independent variance (P,) of each exposure, in addition to its formal one
 
     @property
@@ -58,22 +58,22 @@ class Correlated:
     epoch: Float
     y: Float  # (E,) in units of the spread
     noise: Float  # formal variances (E,)
-    columns: Float  # of the course (E, p)
+    columns: Float  # of the trend (E, p)
     count: Float  # number (E,) of exposures of which each of these is the mean
 
     @classmethod
     def of(cls, epoch: Float, y: Float, noise: Float, columns: Float) -> Correlated:
         """Deviations of single exposures, or of means of successive ones if they are very many."""
         order = np.argsort(epoch, kind="stable")
-        lots = np.array_split(order, min(len(order), MOST))
-        mean = [np.stack([values[lot].mean(axis=0) for lot in lots]) for values in (epoch, y)]
-        count = np.array([float(len(lot)) for lot in lots])
-        of_mean = np.array([noise[lot].mean() for lot in lots]) / count
-        rows = np.stack([columns[lot].mean(axis=0) for lot in lots])
+        groups = np.array_split(order, min(len(order), MAX_POINTS))
+        mean = [np.stack([values[group].mean(axis=0) for group in groups]) for values in (epoch, y)]
+        count = np.array([float(len(group)) for group in groups])
+        of_mean = np.array([noise[group].mean() for group in groups]) / count
+        rows = np.stack([columns[group].mean(axis=0) for group in groups])
         return cls(mean[0], mean[1], of_mean, rows, count)
 
     def predict(self, epoch: Float, columns: Float) -> Shared:
-        """Course and correlated deviation at other epochs (M,), with the course's columns there."""
+        """Trend and correlated deviation at other epochs (M,), with the trend's columns there."""
         points = self._grid()
         solved = [self._at(*point, epoch, columns) for point in points]
         log_weight = np.array([one[0] for one in solved])

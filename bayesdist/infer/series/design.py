@@ -1,4 +1,11 @@
-"""Columns of a course for one series, and the meaning of their parameters."""
+"""Columns of a trend for one series, and the meaning of their parameters.
+
+An irregular or a smooth drift is a Wiener process, plain or integrated once, seen at knots.  With a
+free level (and, integrated, a free slope) in addition, the date at which such a process starts does
+not matter; here it is the middle of the series.  Given its values at the knots the process is known
+exactly there, and its conditional mean runs between them: linear or cubic.  The integrated process
+is the smoothing spline of Wahba (1978).
+"""
 
 from __future__ import annotations
 
@@ -10,40 +17,92 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import DegenerateError
-from bayesdist.infer.series.course import LEAST, LEAST_FOUND, Course
-from bayesdist.infer.series.drift import Drift
 from bayesdist.infer.series.series import Series
+from bayesdist.infer.series.trend import MIN_EXPOSURES, MIN_EXPOSURES_FOUND, TrendModel
 
-__all__ = ["Design"]
+__all__ = ["Design", "Drift"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-KNOTS = {"spline": 8, "wander": 16}
+KNOTS = {"spline": 8, "random_walk": 16}
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """A process of unit amplitude: about one at the ends of the series."""
+
+    origin: float  # middle of the series
+    years: float  # half its span
+    knots: Float  # (Q,) in units of half the span from the middle, none of them zero
+    smooth: bool  # integrated once
+
+    @classmethod
+    def over(cls, epoch: Float, n_knots: int, *, smooth: bool) -> Drift:
+        """Process over a series.
+
+        A smooth one has its knots at even distances, an irregular one where the exposures are.
+        """
+        first, last = epoch.min(), epoch.max()
+        origin, years = (first + last) / 2, (last - first) / 2
+        if smooth:
+            places = np.linspace(-1, 1, n_knots)
+        else:
+            places = np.quantile((np.unique(epoch) - origin) / years, np.linspace(0, 1, n_knots))
+        places = np.unique(np.round(places, 9))
+        return cls(float(origin), float(years), places[np.abs(places) > 1e-6], smooth)
+
+    @property
+    def n_columns(self) -> int:
+        """Number of knots."""
+        return len(self.knots)
+
+    def kernel(self, a: Float, b: Float) -> Float:
+        """Covariance (..., n, m) of the process at dates (n,) and (m,), in half spans."""
+        same = np.sign(a)[:, None] == np.sign(b)
+        x, y = np.abs(a)[:, None], np.abs(b)
+        low, high = np.minimum(x, y), np.maximum(x, y)
+        values = 3 * low**2 * (high - low / 3) / 2 if self.smooth else low
+        return np.where(same, values, 0.0)
+
+    def columns(self, epoch: ArrayLike) -> Float:
+        """Columns (E, Q) whose parameters are independent and of one variance.
+
+        Their sum with such parameters is the conditional mean given the process at the knots.
+        """
+        places = (np.asarray(epoch, float) - self.origin) / self.years
+        factor = np.linalg.cholesky(self.kernel(self.knots, self.knots))
+        return np.linalg.solve(factor, self.kernel(self.knots, places)).T
+
+    def unseen(self, epoch: ArrayLike) -> Float:
+        """Variance (E,) of the process about that mean, of unit amplitude."""
+        places = (np.asarray(epoch, float) - self.origin) / self.years
+        total = np.abs(places) ** 3 if self.smooth else np.abs(places)
+        return np.maximum(total - (self.columns(epoch) ** 2).sum(axis=1), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """Columns of a course for one series.
+    """Columns of a trend for one series.
 
     Parameters
     ----------
-    course : Course
+    trend : TrendModel
     series : Series
 
     Raises
     ------
     DegenerateError
         Where a segment or a group has too few exposures, or exposures of one date only, for the
-        parameters of the course.
+        parameters of the trend.
     """
 
-    course: Course
+    trend: TrendModel
     series: Series
 
     def __post_init__(self) -> None:
         self._check_segments()
-        if self.course.groups == "slopes":
+        if self.trend.groups == "slopes":
             for name in self.series.group_names:
                 epoch = self.series.epoch[np.array(self.series.group) == name]
                 if len(epoch) < 3 or np.ptp(epoch) == 0:
@@ -53,41 +112,41 @@ class Design:
                         do="leave the group out, or let the groups share their slopes",
                     )
 
-        if not self.course.find and self.n_groups > 1:
+        if not self.trend.find and self.n_groups > 1:
             columns = self.matrix(self.series.epoch, self.series.group_code)[0, :, : self.n_fixed]
             if np.linalg.matrix_rank(columns) < self.n_fixed:
                 raise DegenerateError(
                     f"the groups ({', '.join(self.series.group_names)}) cannot be told from the "
-                    f"course {self.course.name!r}: some of them have exposures in one segment only",
+                    f"trend {self.trend.name!r}: some of them have exposures in one segment only",
                     where=self.series.source,
                     do="leave groups out, or take a break away",
                 )
 
     def _check_segments(self) -> None:
-        course, series = self.course, self.series
-        if np.ptp(series.epoch) == 0 and course.kind != "constant":
+        trend, series = self.trend, self.series
+        if np.ptp(series.epoch) == 0 and trend.kind != "constant":
             raise DegenerateError(
                 "all exposures have one date", where=series.source, do="ask for a constant"
             )
-        if course.find:
-            need = LEAST_FOUND * course.n_segments
+        if trend.find:
+            need = MIN_EXPOSURES_FOUND * trend.n_segments
             if len(np.unique(series.epoch)) < need:
                 raise DegenerateError(
-                    f"finding {course.find} breaks needs exposures of at least {need} dates, and "
+                    f"finding {trend.find} breaks needs exposures of at least {need} dates, and "
                     f"there are {len(np.unique(series.epoch))}",
                     where=series.source,
                     do="give the dates of the breaks",
                 )
             return
         segment = self.segment(series.epoch)[0]
-        limits = (-np.inf, *course.breaks, np.inf)
+        limits = (-np.inf, *trend.breaks, np.inf)
         for s, (first, last) in enumerate(pairwise(limits)):
             epoch = series.epoch[segment == s]
-            need = LEAST.get(course.kind, 1)
+            need = MIN_EXPOSURES.get(trend.kind, 1)
             if len(epoch) < need or (need > 1 and np.ptp(epoch) == 0):
                 raise DegenerateError(
                     f"the segment from {first:g} to {last:g} has {len(epoch)} exposures of "
-                    f"{len(np.unique(epoch))} dates, and course {course.kind!r} needs {need}",
+                    f"{len(np.unique(epoch))} dates, and trend {trend.kind!r} needs {need}",
                     where=series.source,
                     do="take this break away",
                 )
@@ -97,13 +156,13 @@ class Design:
     @cached_property
     def reference(self) -> Float:
         """Reference date (S,) of each segment."""
-        course, epoch = self.course, self.series.epoch
-        if course.reference:
-            return np.broadcast_to(np.array(course.reference, float), (course.n_segments,)).copy()
-        if course.find:
-            return np.full(course.n_segments, epoch.mean())
+        trend, epoch = self.trend, self.series.epoch
+        if trend.reference:
+            return np.broadcast_to(np.array(trend.reference, float), (trend.n_segments,)).copy()
+        if trend.find:
+            return np.full(trend.n_segments, epoch.mean())
         segment = self.segment(epoch)[0]
-        return np.array([epoch[segment == s].mean() for s in range(course.n_segments)])
+        return np.array([epoch[segment == s].mean() for s in range(trend.n_segments)])
 
     @cached_property
     def years(self) -> float:
@@ -112,11 +171,11 @@ class Design:
 
     @cached_property
     def drift(self) -> Drift | None:
-        """Random part of the course, or None."""
-        if self.course.kind not in KNOTS:
+        """Random part of the trend, or None."""
+        if self.trend.kind not in KNOTS:
             return None
-        knots = KNOTS[self.course.kind]
-        return Drift.over(self.series.epoch, knots, smooth=self.course.kind == "spline")
+        knots = KNOTS[self.trend.kind]
+        return Drift.over(self.series.epoch, knots, smooth=self.trend.kind == "spline")
 
     @property
     def n_groups(self) -> int:
@@ -124,17 +183,10 @@ class Design:
         return max(len(self.series.group_names), 1)
 
     @property
-    def n_course(self) -> int:
-        """Number of columns of the course itself."""
-        s = self.course.n_segments
-        sizes = {"constant": 1, "line": 2, "spline": 2, "wander": 1, "step": s}
-        return {**sizes, "line+step": s + 1, "piecewise": s + 1, "lines": 2 * s}[self.course.kind]
-
-    @property
     def n_fixed(self) -> int:
-        """Number of columns whose parameters have a vague prior: the course, then the groups."""
-        each = 2 if self.course.groups == "slopes" else 1
-        return self.n_course + each * (self.n_groups - 1)
+        """Number of columns whose parameters have a vague prior: the trend, then the groups."""
+        each = 2 if self.trend.groups == "slopes" else 1
+        return self.trend.n_columns + each * (self.n_groups - 1)
 
     @property
     def n_columns(self) -> int:
@@ -145,7 +197,7 @@ class Design:
 
     def given_breaks(self) -> Float:
         """Given breaks as one row (1, B)."""
-        return np.array(self.course.breaks, float)[None]
+        return np.array(self.trend.breaks, float)[None]
 
     def segment(self, epoch: Float, breaks: Float | None = None) -> Int:
         """Segment (..., E) of each epoch (E,) for breaks (..., B)."""
@@ -161,7 +213,7 @@ class Design:
         group : ndarray, shape (E,)
             Codes of the groups.
         breaks : ndarray, shape (..., B), optional
-            Dates of the breaks, possibly fewer than the course has; the given ones by default.
+            Dates of the breaks, possibly fewer than the trend has; the given ones by default.
 
         Returns
         -------
@@ -174,8 +226,8 @@ class Design:
         inside = (segment[..., None] == np.arange(n)).astype(float)
         one = np.ones((*segment.shape, 1))
         since = ((t - self.reference[segment]) / self.years)[..., None]
-        kind = self.course.kind
-        if kind in ("constant", "wander"):
+        kind = self.trend.kind
+        if kind in ("constant", "random_walk"):
             parts = [one]
         elif kind in ("line", "spline"):
             parts = [one, since]
@@ -192,7 +244,7 @@ class Design:
         if self.n_groups > 1:
             member = (group[:, None] == np.arange(1, self.n_groups)).astype(float)
             parts.append(member * one)
-            if self.course.groups == "slopes":
+            if self.trend.groups == "slopes":
                 middle = self.series.epoch.mean()
                 parts.append(member * one * ((t - middle) / self.years)[:, None])
         if self.drift:
@@ -211,13 +263,13 @@ class Design:
         Returns
         -------
         level, slope : ndarray, shape (n, S, k)
-            Of the first group; of a course with a random part, without it.
+            Of the first group; of a trend with a random part, without it.
         """
-        s = self.course.n_segments
-        kind = self.course.kind
+        s = self.trend.n_segments
+        kind = self.trend.kind
         rows = np.swapaxes(b, 1, 2)  # (n, p, k)
         flat = np.zeros((len(b), s, b.shape[1]))
-        if kind in ("constant", "wander", "step"):
+        if kind in ("constant", "random_walk", "step"):
             return rows[:, :s].copy(), flat
         if kind in ("line", "spline"):
             return rows[:, :1].copy(), rows[:, 1:2] / self.years

@@ -12,10 +12,9 @@ import numpy as np
 
 from bayesdist.errors import InputError
 from bayesdist.infer.series.compare import Comparison, compare
-from bayesdist.infer.series.course import Course
-from bayesdist.infer.series.posterior import SeriesPosterior
-from bayesdist.infer.series.results import Change
+from bayesdist.infer.series.posterior import Change, SeriesPosterior
 from bayesdist.infer.series.series import Series
+from bayesdist.infer.series.trend import TrendModel
 
 __all__ = ["FilterDependence", "filter_dependence"]
 
@@ -63,14 +62,14 @@ class FilterDependence:
         return posteriors.index(self.separate), posteriors.index(self.common)
 
 
-def filter_dependence(series: Series, course: Course, *, seed: int = 1) -> FilterDependence:
+def filter_dependence(series: Series, trend: TrendModel, *, seed: int = 1) -> FilterDependence:
     """Compare common slopes with a slope for each filter.
 
     Parameters
     ----------
     series : Series
         With filters as its groups.
-    course : Course
+    trend : TrendModel
         With slopes.
     seed : int
 
@@ -81,7 +80,7 @@ def filter_dependence(series: Series, course: Course, *, seed: int = 1) -> Filte
     Raises
     ------
     InputError
-        For a series of one filter, and a course without slopes.
+        For a series of one filter, and a trend without slopes.
     DegenerateError
         For a filter with fewer than three exposures, or of one date only.
     """
@@ -92,13 +91,13 @@ def filter_dependence(series: Series, course: Course, *, seed: int = 1) -> Filte
             where=series.source,
             do="give the filter of each exposure as its group",
         )
-    if not course.has_slope:
+    if not trend.has_slope:
         raise InputError(
-            f"course {course.name!r} has no slopes", where=series.source, do="ask for lines"
+            f"trend {trend.name!r} has no slopes", where=series.source, do="ask for lines"
         )
-    both = (replace(course, groups="offsets"), replace(course, groups="slopes"))
+    both = (replace(trend, groups="offsets"), replace(trend, groups="slopes"))
     comparison = compare(series, both, seed=seed)
-    places = [comparison.courses.index(c) for c in both]
+    places = [comparison.trends.index(c) for c in both]
     common, separate = (comparison.posteriors[i] for i in places)
     slopes = separate.group_slope
     return FilterDependence(

@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
-from threadpoolctl import threadpool_limits
 
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.convergence import Limits
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.series.chains import run
-from bayesdist.infer.series.course import Course
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.posterior import SeriesPosterior
 from bayesdist.infer.series.problem import Problem
 from bayesdist.infer.series.series import Series
+from bayesdist.infer.series.trend import TrendModel
 
 __all__ = ["fit_series"]
 
 CHAINS, WARMUP, SWEEPS = 32, 100, 100
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def fit_series(
     series: Series,
-    course: Course,
+    trend: TrendModel,
     *,
     seed: int = 1,
     scatter: ArrayLike | None = None,
@@ -32,17 +32,17 @@ def fit_series(
     target_rhat: float = 1.01,
     max_sweeps: int = 1600,
 ) -> SeriesPosterior:
-    """Posterior of a course with time, of the scatter of the exposures, and of outliers.
+    """Posterior of a trend with time, of the scatter of the exposures, and of outliers.
 
     Parameters
     ----------
     series : Series
-    course : Course
+    trend : TrendModel
     seed : int
     scatter : array_like, shape (k, k), optional
         Intrinsic covariance where it is known; it is a parameter by default.
     outliers : bool
-        True if exposures may lie off the course.
+        True if exposures may lie off the trend.
     target_ess, target_rhat : float
         Limits of convergence, for every parameter.
     max_sweeps : int
@@ -56,7 +56,7 @@ def fit_series(
     Raises
     ------
     DegenerateError
-        Where the exposures do not determine the course (see `Design`), or have no error at all.
+        Where the exposures do not determine the trend (see `Design`), or have no error at all.
     InputError
         For a scatter of another shape.
     """
@@ -78,7 +78,7 @@ def fit_series(
                 where=series.source,
                 do="give formal errors or a scatter above zero",
             )
-    design = Design(course, series)
+    design = Design(trend, series)
     problem = Problem.of(series, design, known, outliers=outliers)
     engine, last, draws, convergence = run(
         problem,
@@ -89,4 +89,4 @@ def fit_series(
         most=max(max_sweeps, SWEEPS),
         limits=Limits(target_ess, target_rhat),
     )
-    return SeriesPosterior(series, course, design, draws, convergence, engine, last)
+    return SeriesPosterior(series, trend, design, draws, convergence, engine, last)

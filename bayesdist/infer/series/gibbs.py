@@ -1,4 +1,4 @@
-"""Draws of a course, of the scatter about it, and of the exposures that lie off it.
+"""Draws of a trend, of the scatter about it, and of the exposures that lie off it.
 
     y_e = H(t_e) b + deviation,    deviation ~ N(0, w_e (S_e + Sigma)),    w_e = 1 or kappa^2
 
@@ -26,24 +26,24 @@ from numpy.typing import NDArray
 from scipy.special import betainc, betaincinv, gammainc, gammaincinv
 
 from bayesdist.infer.series.breaks import BreakMoves
-from bayesdist.infer.series.problem import Problem, State, break_likelihood, course_equations
-from bayesdist.infer.series.scatter import draw_scatter
-from bayesdist.infer.series.small import cholesky, precision_of
-from bayesdist.infer.series.walk import (
-    FRACTION_MOST,
+from bayesdist.infer.series.problem import Problem, State, break_likelihood, trend_equations
+from bayesdist.infer.series.scatter import (
     FRACTION_PRIOR,
-    KAPPA_LEAST,
     KAPPA_RATE,
     KAPPA_SHAPE,
+    MAX_FRACTION,
+    MIN_KAPPA,
     RandomWalk,
+    draw_scatter,
 )
+from bayesdist.infer.series.small import cholesky, precision_of
 
 __all__ = ["sweep"]
 
 Float = NDArray[np.float64]
 
 DRIFT_NU, DRIFT_SCALE = 2.0, 1.0
-LEAPS = 2  # amplitudes that a sweep moves with all else of the course integrated out
+N_DRIFT_MOVES = 2  # amplitudes that a sweep moves with all else of the trend integrated out
 
 
 def sweep(
@@ -51,31 +51,31 @@ def sweep(
     state: State,
     rng: np.random.Generator,
     *,
-    kept: Float | None = None,
+    included: Float | None = None,
     walk: RandomWalk | None = None,
     moves: BreakMoves | None = None,
     scan: bool = False,
 ) -> State:
     """State after one draw of everything.
 
-    `kept` (C, E) is 0 for exposures that a chain must not see, else 1; `walk` makes further moves
-    of the scatter and of the mixture, `moves` those of breaks that are to be found.  With `scan`
-    the breaks are drawn among all gaps, for warming up only.
+    `included` (C, E) is 0 for exposures that a chain must not see, else 1; `walk` makes further
+    moves of the scatter and of the mixture, `moves` those of breaks that are to be found.  With
+    `scan` the breaks are drawn among all gaps, for warming up only.
     """
     k, n_exposures = problem.y.shape
     n_chains = len(state.fraction)
-    if kept is None:
-        kept = np.ones((n_chains, n_exposures))
+    if included is None:
+        included = np.ones((n_chains, n_exposures))
     factor = cholesky(problem.formal[:, :, None] + state.sigma[..., None])
     precision = precision_of(factor)
-    seen = precision * (kept / np.where(state.off, state.kappa2[:, None], 1.0))
+    seen = precision * (included / np.where(state.off, state.kappa2[:, None], 1.0))
 
     breaks = state.breaks
     if moves is not None:
         likelihood = break_likelihood(problem, seen)
         breaks = (moves.scan if scan else moves.move)(breaks, likelihood, rng)
     columns = problem.columns(breaks)
-    matrix, right = course_equations(problem, seen, columns, state.drift)
+    matrix, right = trend_equations(problem, seen, columns, state.drift)
     if problem.design.drift is not None:
         matrix, drift = _move_drift_alone(problem, matrix, right, state.drift, rng)
         state = replace(state, drift=drift)
@@ -91,40 +91,40 @@ def sweep(
     residual = problem.y[:, None] - fitted
     if walk is not None:
         sigma, fraction, kappa2 = walk.move(
-            state.sigma, state.fraction, state.kappa2, residual, problem.formal, kept, rng
+            state.sigma, state.fraction, state.kappa2, residual, problem.formal, included, rng
         )
         state = replace(state, sigma=sigma, fraction=fraction, kappa2=kappa2)
         precision = precision_of(cholesky(problem.formal[:, :, None] + sigma[..., None]))
     if problem.outliers:
         pull = np.einsum("ijce,jce->ice", precision, residual)
-        state = _draw_memberships(state, (residual * pull).sum(axis=0), kept, k, rng)
+        state = _draw_memberships(state, (residual * pull).sum(axis=0), included, k, rng)
     if problem.sigma is None:
         scaled = residual / np.where(state.off, np.sqrt(state.kappa2)[:, None], 1.0)
-        sigma = _draw_sigma(problem, state.sigma, precision, scaled, kept, rng)
+        sigma = _draw_sigma(problem, state.sigma, precision, scaled, included, rng)
         state = replace(state, sigma=sigma)
     return state
 
 
 def _draw_memberships(
-    state: State, distance: Float, kept: Float, k: int, rng: np.random.Generator
+    state: State, distance: Float, included: Float, k: int, rng: np.random.Generator
 ) -> State:
     """Memberships given squared distances (C, E), then fraction and inflation given them."""
     f, kappa2 = state.fraction[:, None], state.kappa2[:, None]
     log_odds = np.log(f / (1 - f)) - 0.5 * k * np.log(kappa2) + 0.5 * distance * (1 - 1 / kappa2)
     probability = 1 / (1 + np.exp(-np.clip(log_odds, -700, 700)))
     off = rng.random(probability.shape) < probability
-    count = (off * kept).sum(axis=1)
+    count = (off * included).sum(axis=1)
     a, b = FRACTION_PRIOR
-    of_good = b + kept.sum(axis=1) - count
-    share = np.maximum(betainc(a + count, of_good, FRACTION_MOST), 1e-290)
-    fraction = betaincinv(a + count, of_good, share * rng.uniform(1e-12, 1.0, len(share)))
-    fraction = np.clip(fraction, 1e-12, FRACTION_MOST)
+    of_good = b + included.sum(axis=1) - count
+    below = np.maximum(betainc(a + count, of_good, MAX_FRACTION), 1e-290)
+    fraction = betaincinv(a + count, of_good, below * rng.uniform(1e-12, 1.0, len(below)))
+    fraction = np.clip(fraction, 1e-12, MAX_FRACTION)
     shape = KAPPA_SHAPE + k * count / 2
-    rate = KAPPA_RATE + (off * kept * distance).sum(axis=1) / 2
+    rate = KAPPA_RATE + (off * included * distance).sum(axis=1) / 2
     # 1 / kappa^2 is gamma, cut off where kappa would be less than its smallest value
-    share = np.maximum(gammainc(shape, rate / KAPPA_LEAST**2), 1e-290)
-    inverse = gammaincinv(shape, share * rng.uniform(1e-12, 1.0, len(share))) / rate
-    kappa2_new = np.maximum(1 / np.maximum(inverse, 1e-300), KAPPA_LEAST**2)
+    below = np.maximum(gammainc(shape, rate / MIN_KAPPA**2), 1e-290)
+    inverse = gammaincinv(shape, below * rng.uniform(1e-12, 1.0, len(below))) / rate
+    kappa2_new = np.maximum(1 / np.maximum(inverse, 1e-300), MIN_KAPPA**2)
     return replace(state, off=off, probability=probability, fraction=fraction, kappa2=kappa2_new)
 
 
@@ -133,7 +133,7 @@ def _draw_sigma(
     sigma: Float,
     precision: Float,
     residual: Float,
-    kept: Float,
+    included: Float,
     rng: np.random.Generator,
 ) -> Float:
     """Intrinsic covariance given deviations, which are drawn from the residuals (k, C, E)."""
@@ -141,10 +141,10 @@ def _draw_sigma(
     free = np.einsum("ijc,jce->ice", cholesky(sigma), rng.standard_normal(residual.shape))
     formal = np.einsum("ije,jce->ice", problem.root, rng.standard_normal(residual.shape))
     missed = np.einsum("ijce,jce->ice", precision, residual - free - formal)
-    deviation = (free + np.einsum("ijc,jce->ice", sigma, missed)) * kept
+    deviation = (free + np.einsum("ijc,jce->ice", sigma, missed)) * included
     by_chain = np.moveaxis(deviation, 0, 1)
     scatter = by_chain @ np.swapaxes(by_chain, 1, 2)
-    return draw_scatter(sigma, scatter, kept.sum(axis=1), rng)
+    return draw_scatter(sigma, scatter, included.sum(axis=1), rng)
 
 
 def _move_drift_alone(
@@ -166,7 +166,7 @@ def _move_drift_alone(
         return 0.5 * (white**2).sum(axis=1) - log_det + (prior - n_random * np.log(d)).sum(axis=1)
 
     here = value(matrix, drift)
-    for _ in range(min(k, LEAPS)):
+    for _ in range(min(k, N_DRIFT_MOVES)):
         j = rng.integers(k, size=n_chains)
         new = drift.copy()
         new[chain, j] *= np.exp(rng.standard_normal(n_chains))

@@ -12,15 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
-from threadpoolctl import threadpool_limits
 
 from bayesdist.infer.convergence import smoothed_weights
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.series.posterior import SeriesPosterior
 from bayesdist.infer.series.problem import State
+from bayesdist.infer.series.scatter import log_mixture
 from bayesdist.infer.series.small import cholesky, solve_factor
-from bayesdist.infer.series.walk import log_mixture
+from bayesdist.limits import PARETO_K
 
-__all__ = ["LOTS", "HeldOut", "block_folds", "exposure_folds", "held_out"]
+__all__ = ["N_FOLDS", "HeldOut", "block_folds", "exposure_folds", "held_out"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -28,8 +29,7 @@ Int = NDArray[np.int64]
 CHAINS, WARMUP, SWEEPS = 6, 30, 60
 CHAINS_AT_ONCE = 192
 DRAWS_AT_ONCE = 1024
-WORST_PARETO_K = 0.7
-LOTS = 30
+N_FOLDS = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class HeldOut:
     log_density : ndarray, shape (E,)
         Log predictive density of all k coefficients together, in units of the spread.
     rank : ndarray, shape (E, k)
-        Predictive probability below the measured value; uniform if the course is right.
+        Predictive probability below the measured value; uniform if the trend is right.
     fold : ndarray, shape (E,)
         Code of the exposures that were held out together.
     mc_error : float
@@ -64,10 +64,10 @@ class HeldOut:
         return ((self.rank > tail) & (self.rank < 1 - tail)).mean(axis=0)
 
 
-def exposure_folds(epoch: Float, lots: int = LOTS) -> Int:
+def exposure_folds(epoch: Float, groups: int = N_FOLDS) -> Int:
     """Folds (E,) of exposures dealt out by date to so many groups, or one to each."""
     out = np.empty(len(epoch), np.int64)
-    out[np.argsort(epoch, kind="stable")] = np.arange(len(epoch)) % min(len(epoch), lots)
+    out[np.argsort(epoch, kind="stable")] = np.arange(len(epoch)) % min(len(epoch), groups)
     return out
 
 
@@ -103,7 +103,7 @@ def block_folds(epoch: Float, breaks: tuple[float, ...], length: int) -> Int:
     return out
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def held_out(posterior: SeriesPosterior, fold: Int, *, seed: int = 1) -> HeldOut:
     """Predict each fold from the rest.
 
@@ -132,7 +132,7 @@ def held_out(posterior: SeriesPosterior, fold: Int, *, seed: int = 1) -> HeldOut
     for code in np.unique(fold):
         rows = fold == code
         weight, pareto_k = smoothed_weights(-density[:, rows].sum(axis=1), independent)
-        if pareto_k > WORST_PARETO_K:
+        if pareto_k > PARETO_K.value:
             refitted.append(code)
             continue
         top = density[:, rows].max(axis=0)
@@ -175,14 +175,14 @@ def _without(
     """
     engine, last = posterior.engine, posterior.last
     own = np.repeat(codes, CHAINS)
-    kept = (own[:, None] != fold).astype(float)
+    included = (own[:, None] != fold).astype(float)
     state = last.take(rng.integers(0, len(last.fraction), len(own)))
     for _ in range(WARMUP):
-        state = engine.step(state, rng, kept)
-    density = np.full(kept.shape, -np.inf)
-    below = np.zeros((*kept.shape, posterior.series.n_coefficients))
+        state = engine.step(state, rng, included)
+    density = np.full(included.shape, -np.inf)
+    below = np.zeros((*included.shape, posterior.series.n_coefficients))
     for _ in range(SWEEPS):
-        state = engine.step(state, rng, kept)
+        state = engine.step(state, rng, included)
         log_density, less = predictive(posterior, state)
         density = np.logaddexp(density, log_density)
         below += less

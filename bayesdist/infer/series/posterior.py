@@ -1,4 +1,4 @@
-"""Posterior of a series: draws of its course and scatter, predictions, changes at breaks."""
+"""Posterior of a series: draws of its trend and scatter, predictions, changes at breaks."""
 
 from __future__ import annotations
 
@@ -7,30 +7,111 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2 as chi_squared
 
 from bayesdist.errors import InputError
 from bayesdist.infer.convergence import Convergence
 from bayesdist.infer.series.chains import Draws, Engine
 from bayesdist.infer.series.correlated import Correlated, Shared
-from bayesdist.infer.series.course import Course
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.problem import State
-from bayesdist.infer.series.results import Change, Prediction
 from bayesdist.infer.series.series import Series
+from bayesdist.infer.series.trend import TrendModel
 
-__all__ = ["SeriesPosterior"]
+__all__ = ["Change", "Prediction", "SeriesPosterior"]
 
 Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
+class Change:
+    """Difference of a set of coefficients, with covariance.
+
+    Parameters
+    ----------
+    value : ndarray, shape (k,)
+    cov : ndarray, shape (k, k)
+    """
+
+    value: Float
+    cov: Float
+
+    @classmethod
+    def of(cls, draws: Float) -> Change:
+        """Change from draws (n, k) of a difference."""
+        return cls(draws.mean(axis=0), np.atleast_2d(np.cov(draws, rowvar=False)))
+
+    @property
+    def sigma(self) -> Float:
+        """Standard deviations (k,)."""
+        return np.sqrt(np.diag(self.cov))
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Boolean mask (k,) of those that can differ: the slope of a step cannot."""
+        return self.sigma > 0
+
+    @property
+    def significance(self) -> Float:
+        """Value over sigma (k,) of each; 0 for those that cannot differ."""
+        return np.where(self.free, self.value / np.where(self.free, self.sigma, 1.0), 0.0)
+
+    @property
+    def chi2(self) -> float:
+        """Chi-square of all that can differ together, against no difference."""
+        some = np.flatnonzero(self.free)
+        unit = self.sigma[some]
+        scaled = self.cov[np.ix_(some, some)] / np.outer(unit, unit)
+        return float(self.significance[some] @ np.linalg.solve(scaled, self.significance[some]))
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a larger chi-square where nothing differs.
+
+        Of a Gaussian: with few exposures the posterior has heavier tails, and this is too small.
+        """
+        n = int(self.free.sum())
+        return float(chi_squared.sf(self.chi2, n)) if n else 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """The coefficients at M epochs.
+
+    Parameters
+    ----------
+    epoch : ndarray, shape (M,)
+    mean : ndarray, shape (M, k)
+    cov : ndarray, shape (M, k, k)
+        Of the trend.
+    cov_new : ndarray, shape (M, k, k)
+        Of an exposure that is no outlier and has no formal error: the trend's and the intrinsic.
+    """
+
+    epoch: Float
+    mean: Float
+    cov: Float
+    cov_new: Float
+
+    @property
+    def sigma(self) -> Float:
+        """Standard deviations (M, k) of the trend."""
+        return np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
+
+    @property
+    def sigma_new(self) -> Float:
+        """Standard deviations (M, k) of a new exposure."""
+        return np.sqrt(np.diagonal(self.cov_new, axis1=1, axis2=2))
+
+
+@dataclass(frozen=True, eq=False)
 class SeriesPosterior:
-    """Posterior of a course and of the scatter about it.
+    """Posterior of a trend and of the scatter about it.
 
     Parameters
     ----------
     series : Series
-    course : Course
+    trend : TrendModel
     design : Design
     raw : Draws
         In units of the spread.
@@ -41,7 +122,7 @@ class SeriesPosterior:
     """
 
     series: Series
-    course: Course
+    trend: TrendModel
     design: Design
     raw: Draws
     convergence: Convergence
@@ -58,9 +139,9 @@ class SeriesPosterior:
     @cached_property
     def _breaks(self) -> Float:
         """Breaks (n, B); one row where they are given."""
-        if not self.course.find:
+        if not self.trend.find:
             return self.design.given_breaks()
-        return self.raw.breaks.reshape(self.raw.fraction.size, self.course.find)
+        return self.raw.breaks.reshape(self.raw.fraction.size, self.trend.find)
 
     @property
     def reference(self) -> Float:
@@ -74,7 +155,7 @@ class SeriesPosterior:
 
     @property
     def beta(self) -> Float:
-        """Draws (n, S, k) of the slopes per year; zero where the course has none."""
+        """Draws (n, S, k) of the slopes per year; zero where the trend has none."""
         return self._lines[1]
 
     @cached_property
@@ -92,7 +173,7 @@ class SeriesPosterior:
     @property
     def breaks(self) -> Float:
         """Draws (n, B) of the breaks that were found."""
-        return self.raw.breaks.reshape(-1, self.course.find)
+        return self.raw.breaks.reshape(-1, self.trend.find)
 
     @property
     def outlier_probability(self) -> Float:
@@ -107,7 +188,7 @@ class SeriesPosterior:
     @cached_property
     def group_offset(self) -> Float:
         """Draws (n, G - 1, k) of each further group's offset."""
-        return self._group_columns(self.design.n_course) * self.series.spread
+        return self._group_columns(self.trend.n_columns) * self.series.spread
 
     @cached_property
     def group_slope(self) -> Float:
@@ -118,13 +199,13 @@ class SeriesPosterior:
         InputError
             Where the groups share their slopes.
         """
-        if self.course.groups != "slopes":
+        if self.trend.groups != "slopes":
             raise InputError(
                 "the groups share their slopes",
                 where=self.series.source,
-                do="ask for a course with groups='slopes'",
+                do="ask for a trend with groups='slopes'",
             )
-        first = self.design.n_course + self.design.n_groups - 1
+        first = self.trend.n_columns + self.design.n_groups - 1
         return self._group_columns(first) * self.series.spread / self.design.years
 
     def _group_columns(self, first: int) -> Float:
@@ -144,9 +225,9 @@ class SeriesPosterior:
         level, slope : Change
             After minus before.  Where slopes cannot change, theirs is zero with no sigma.
         """
-        if not 0 <= number < self.course.n_breaks:
+        if not 0 <= number < self.trend.n_breaks:
             raise InputError(
-                f"there is no break {number + 1}", where=self.series.source, do="see course.breaks"
+                f"there is no break {number + 1}", where=self.series.source, do="see trend.breaks"
             )
         date = self._breaks[:, number, None, None]
         at = self.alpha + self.beta * (date - self.reference[:, None])
@@ -181,9 +262,9 @@ class SeriesPosterior:
             For an epoch outside every segment, and an unknown group.
         """
         t = np.atleast_1d(np.asarray(epoch, float))
-        course = self._course_draws(t, group, extrapolate)
-        mean = course.mean(axis=0)
-        off = course - mean
+        trend = self._trend_draws(t, group, extrapolate)
+        mean = trend.mean(axis=0)
+        off = trend - mean
         cov = np.einsum("nmi,nmj->mij", off, off) / (len(off) - 1)
         drift = self.design.drift
         if drift:
@@ -204,7 +285,7 @@ class SeriesPosterior:
         return Prediction(t, mean, cov, cov_new)
 
     def _beyond(self, t: Float) -> NDArray[np.bool_]:
-        """Boolean mask (M,) of epochs outside the series, for a course without a random part."""
+        """Boolean mask (M,) of epochs outside the series, for a trend without a random part."""
         first, last = self.series.span
         return ((t < first) | (t > last)) & (self.design.drift is None)
 
@@ -257,15 +338,15 @@ class SeriesPosterior:
             As for `predict`.
         """
         t = np.atleast_1d(np.asarray(epoch, float))
-        course = self._course_draws(t, group, extrapolate)
-        n, m, k = course.shape
+        trend = self._trend_draws(t, group, extrapolate)
+        n, m, k = trend.shape
         drift = self.design.drift
         if drift:
             first, last = self.series.span
             unseen = np.where((t < first) | (t > last), drift.unseen(t), 0.0)
             amplitude = self.raw.drift.reshape(-1, k) * self.series.spread
-            course = course + np.sqrt(unseen)[:, None] * amplitude[:, None] * rng.standard_normal(
-                course.shape
+            trend = trend + np.sqrt(unseen)[:, None] * amplitude[:, None] * rng.standard_normal(
+                trend.shape
             )
         total = np.broadcast_to(self.scatter[:, None], (n, m, k, k)).copy()
         beyond = self._beyond(t)
@@ -276,7 +357,7 @@ class SeriesPosterior:
             for j, one in enumerate(self._shared(t[beyond], group)):
                 which = one.drawn(n, rng)
                 value = one.means[which] + np.sqrt(one.variances[which]) * white[..., j]
-                course[:, beyond, j] = self.series.centre[j] + value * self.series.spread[j]
+                trend[:, beyond, j] = self.series.centre[j] + value * self.series.spread[j]
                 own[:, j] = np.sqrt(one.own[which]) * self.series.spread[j]
             total[:, beyond] = (own[:, :, None] * self._common * own[:, None])[:, None]
         total = total + (0.0 if cov is None else np.asarray(cov, float))
@@ -285,10 +366,10 @@ class SeriesPosterior:
         noise = unit * (factor @ rng.standard_normal((n, m, k, 1)))[..., 0]
         off = rng.random((n, m)) < self.outlier_fraction[:, None]
         stretch = np.where(off, np.sqrt(self.raw.kappa2.ravel())[:, None], 1.0)
-        return course + stretch[..., None] * noise
+        return trend + stretch[..., None] * noise
 
-    def _course_draws(self, t: Float, group: str | None, extrapolate: bool) -> Float:
-        """Draws (n, M, k) of the course."""
+    def _trend_draws(self, t: Float, group: str | None, extrapolate: bool) -> Float:
+        """Draws (n, M, k) of the trend."""
         first, last = self.series.span
         outside = ~((t >= first) & (t <= last)) if not extrapolate else ~np.isfinite(t)
         if outside.any():

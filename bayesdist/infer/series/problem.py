@@ -11,18 +11,18 @@ from bayesdist.infer.series.breaks import Likelihood
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.series import Series
 
-__all__ = ["WIDE", "Problem", "State", "break_likelihood", "course_equations"]
+__all__ = ["WIDE", "Problem", "State", "break_likelihood", "trend_equations"]
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-WIDE = 100.0  # prior standard deviation of the course's parameters
+WIDE = 100.0  # prior standard deviation of the trend's parameters
 CANDIDATES_AT_ONCE = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A series in units of its spread, with its course and noise model."""
+    """A series in units of its spread, with its trend and noise model."""
 
     series: Series
     design: Design
@@ -30,7 +30,7 @@ class Problem:
     formal: Float  # formal covariance (k, k, E)
     root: Float  # a square root of it (k, k, E)
     sigma: Float | None = None  # intrinsic covariance (k, k) where it is known
-    outliers: bool = True  # True if exposures may lie off the course
+    outliers: bool = True  # True if exposures may lie off the trend
 
     @classmethod
     def of(
@@ -53,8 +53,8 @@ class Problem:
         )
 
     def columns(self, breaks: Float) -> Float:
-        """Columns (C or 1, E, p) of the course at the exposures, for breaks (..., B)."""
-        given = None if self.design.course.find == 0 else breaks
+        """Columns (C or 1, E, p) of the trend at the exposures, for breaks (..., B)."""
+        given = None if self.design.trend.find == 0 else breaks
         series = self.series
         return self.design.matrix(series.epoch, series.group_code, given)
 
@@ -119,7 +119,7 @@ def normal_equations(precision: Float, y: Float, columns: Float) -> tuple[Float,
     return matrix.reshape(*matrix.shape[:-4], k * p, k * p), right
 
 
-def course_equations(
+def trend_equations(
     problem: Problem, precision: Float, columns: Float, drift: Float
 ) -> tuple[Float, Float]:
     """Precision (C, k p, k p) of the parameters b given everything else, and that times their mean.

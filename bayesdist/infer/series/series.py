@@ -87,7 +87,7 @@ class Series:
         self._check_numbers()
         if n < 3:
             raise DegenerateError(
-                f"{n} exposures determine neither a course nor a scatter",
+                f"{n} exposures determine neither a trend nor a scatter",
                 where=self.source,
                 do="give at least three",
             )

@@ -8,20 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.series.compare import Comparison, compare
-from bayesdist.infer.series.course import Course
 from bayesdist.infer.series.posterior import SeriesPosterior
 from bayesdist.infer.series.series import Series
+from bayesdist.infer.series.trend import TrendModel
 
 __all__ = ["Verdict", "default_candidates", "describe"]
 
 Float = NDArray[np.float64]
 
-SIGNIFICANT = 3.0  # sigma from which a coefficient's own slope or step is named
+MIN_SIGNIFICANCE = 3.0  # sigma from which a coefficient's own slope or step is named
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """Verdict on the course of a series.
+    """Verdict on the trend of a series.
 
     Parameters
     ----------
@@ -31,9 +31,9 @@ class Verdict:
         The claim in full sentences, with its evidence.
     comparison : Comparison
     posterior : SeriesPosterior
-        Of the selected course.
+        Of the selected trend.
     breaks : ndarray, shape (B, 3)
-        Median and central 68 % interval of each break of that course.
+        Median and central 68 % interval of each break of that trend.
     rivals : tuple of str
         Names of drifts that predict as well: a spline or a random walk can follow a line, so that
         one of these in addition to a claimed slope means that the slope need not go on.
@@ -49,35 +49,35 @@ class Verdict:
     @property
     def is_line(self) -> bool:
         """True if a drift is claimed that goes on."""
-        return self.posterior.course.has_slope and self.posterior.course.kind != "spline"
+        return self.posterior.trend.has_slope and self.posterior.trend.kind != "spline"
 
 
-def default_candidates(breaks: tuple[float, ...] = ()) -> tuple[Course, ...]:
-    """Courses to compare: with the given breaks, or with one break that is to be found."""
+def default_candidates(breaks: tuple[float, ...] = ()) -> tuple[TrendModel, ...]:
+    """Trends to compare: with the given breaks, or with one break that is to be found."""
     search = 0 if breaks else 1
     broken = ("step", "line+step", "lines")
     return (
-        Course("constant"),
-        Course("line"),
-        *(Course(kind, breaks, search) for kind in broken),
-        Course("spline"),
-        Course("wander"),
+        TrendModel("constant"),
+        TrendModel("line"),
+        *(TrendModel(kind, breaks, search) for kind in broken),
+        TrendModel("spline"),
+        TrendModel("random_walk"),
     )
 
 
 def describe(
     series: Series,
-    candidates: tuple[Course, ...] | None = None,
+    candidates: tuple[TrendModel, ...] | None = None,
     *,
     breaks: tuple[float, ...] = (),
     seed: int = 1,
 ) -> Verdict:
-    """Describe the course of a series in words.
+    """Describe the trend of a series in words.
 
     Parameters
     ----------
     series : Series
-    candidates : tuple of Course, optional
+    candidates : tuple of TrendModel, optional
         By default a constant, a line, steps and lines with a break, a smooth and an irregular
         drift.
     breaks : tuple of float
@@ -90,38 +90,38 @@ def describe(
     """
     chosen = default_candidates(breaks) if candidates is None else candidates
     comparison = compare(series, chosen, seed=seed)
-    posterior = comparison.posteriors[comparison.carried]
+    posterior = comparison.posteriors[comparison.selected]
     dates = _break_dates(posterior)
-    claim = _claim(posterior.course, dates)
+    claim = _claim(posterior.trend, dates)
     rivals = _rivals(comparison)
     text = _text(claim, comparison, posterior, dates, rivals)
     return Verdict(claim, text, comparison, posterior, dates, rivals)
 
 
 def _rivals(comparison: Comparison) -> tuple[str, ...]:
-    here = comparison.carried
+    here = comparison.selected
     return tuple(
         c.name
-        for i, c in enumerate(comparison.courses)
-        if i != here and c.kind in ("spline", "wander") and not comparison.beats(here, i)
+        for i, c in enumerate(comparison.trends)
+        if i != here and c.drifts and not comparison.beats(here, i)
     )
 
 
 def _break_dates(posterior: SeriesPosterior) -> Float:
-    course = posterior.course
-    if course.find:
+    trend = posterior.trend
+    if trend.find:
         return np.quantile(posterior.breaks, [0.5, 0.16, 0.84], axis=0).T
-    return np.repeat(np.array(course.breaks)[:, None], 3, axis=1)
+    return np.repeat(np.array(trend.breaks)[:, None], 3, axis=1)
 
 
-def _claim(course: Course, dates: Float) -> str:
-    if course.kind == "constant":
+def _claim(trend: TrendModel, dates: Float) -> str:
+    if trend.kind == "constant":
         return "no line"
-    if course.kind == "line":
+    if trend.kind == "line":
         return "line"
-    if course.kind == "spline":
+    if trend.kind == "spline":
         return "no line: a smooth drift"
-    if course.kind == "wander":
+    if trend.kind == "random_walk":
         return "no line: an irregular drift"
     at = "break at " + ", ".join(f"{d[0]:.2f}" for d in dates)
     segments = {
@@ -130,7 +130,7 @@ def _claim(course: Course, dates: Float) -> str:
         "piecewise": "its slope changes there",
         "lines": "a line in each segment",
     }
-    return f"{at}: {segments[course.kind]}"
+    return f"{at}: {segments[trend.kind]}"
 
 
 def _text(
@@ -140,18 +140,18 @@ def _text(
     dates: Float,
     rivals: tuple[str, ...],
 ) -> str:
-    courses = comparison.courses
-    constant = next(i for i, c in enumerate(courses) if c.kind == "constant")
-    here = comparison.carried
+    trends = comparison.trends
+    constant = next(i for i, c in enumerate(trends) if c.kind == "constant")
+    here = comparison.selected
     n_folds = len(np.unique(comparison.scores[here].fold))
     held = "blocks of successive exposures" if comparison.scheme == "blocks" else "exposures"
     parts = [f"{claim[0].upper()}{claim[1:]}."]
     if here == constant:
-        others = [i for i in range(len(courses)) if i != constant]
+        others = [i for i in range(len(trends)) if i != constant]
         best = max(others, key=lambda i: comparison.scores[i].total)
         value, error = comparison.difference(best, constant)
         parts.append(
-            f"The best other course ({courses[best].name}) predicts held-out {held} ({n_folds} "
+            f"The best other trend ({trends[best].name}) predicts held-out {held} ({n_folds} "
             f"folds) by {value:.1f} +- {error:.1f} better than a constant, which is not enough."
         )
     else:
@@ -164,7 +164,7 @@ def _text(
         if high > low:
             parts.append(f"Break at {middle:.2f} ({low:.2f} to {high:.2f} with 68 %).")
     parts += _named_slopes(posterior)
-    if rivals and posterior.course.has_slope:
+    if rivals and posterior.trend.has_slope:
         parts.append(f"As well predicts: {', '.join(rivals)}; the slope need not go on.")
     if comparison.scheme == "blocks":
         parts.append(
@@ -177,20 +177,20 @@ def _text(
 
 
 def _named_slopes(posterior: SeriesPosterior) -> list[str]:
-    """Names of the coefficients that drift, for a course that claims a drift."""
-    course = posterior.course
-    if not course.has_slope or course.kind == "spline":
+    """Names of the coefficients that drift, for a trend that claims a drift."""
+    trend = posterior.trend
+    if not trend.has_slope or trend.kind == "spline":
         return []
     slope = posterior.beta
     mean, sigma = slope.mean(axis=0), slope.std(axis=0, ddof=1)
     names = posterior.series.coefficients
     out = []
-    for s in range(1 if course.kind in ("line", "line+step") else course.n_segments):
+    for s in range(1 if trend.kind in ("line", "line+step") else trend.n_segments):
         named = [
             f"{names[j]} {mean[s, j]:.3g} +- {sigma[s, j]:.1g}"
             for j in range(len(names))
-            if abs(mean[s, j]) > SIGNIFICANT * sigma[s, j]
+            if abs(mean[s, j]) > MIN_SIGNIFICANCE * sigma[s, j]
         ]
-        label = f" in segment {s + 1}" if course.kind in ("piecewise", "lines") else ""
+        label = f" in segment {s + 1}" if trend.kind in ("piecewise", "lines") else ""
         out.append(f"Slopes per year{label}: {', '.join(named) if named else 'none significant'}.")
     return out

@@ -30,32 +30,10 @@ def write_area_maps(
 ) -> str:
     """Write the pixel area maps of a calibration.
 
-    Parameters
-    ----------
-    path : path
-        As of `calibration_at`.
-    output : path
-        A FITS file.
-    chip : int, optional
-        All by default.
-    filter, scale
-        As of `calibration_at`.
-    epoch : float, optional
-        Decimal years, for what depends on time.
-    image : path, optional
-        A calibrated image: maps are of its chips, in its order, and of its subarrays.
-    force : bool
-        Replace a file that is there.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For what cannot be read or written.
+    `path`: as of `calibration_at`. `output`: a FITS file. `chip`: all by default. `filter`,
+    `scale`: as of `calibration_at`. `epoch`: decimal years, for what depends on time. `image`: a
+    calibrated image: maps are of its chips, in its order, and of its subarrays. `force`: replace a
+    file that is there. Returns the text to print. InputError for what cannot be read or written.
     """
     output = Path(output)
     if output.suffix.lower() != ".fits":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from bayesdist.app.screen import progress_bar, table_text
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
+from bayesdist.infer.solution import Solution
 from bayesdist.missions.acs.simulate import AcsCampaign, acs_solution, simulate_acs, write_acs
 from bayesdist.model import DistortionModel
 from bayesdist.products import IdcTab, idctab_from_solution, write_idctab
@@ -31,7 +33,8 @@ CONFIG = """\
 catalog = "catalog.parquet"
 exposures = "exposures.ecsv"
 lists = "lists"
-start = "{start}"            # a known distortion, for the matching
+simulated = true
+initial_distortion = "{start}"  # a known distortion, for the matching
 filter = "{filter}"
 mag = [-14.0, -10.0]         # instrumental; brighter ones are saturated
 q_max = 0.1
@@ -105,34 +108,11 @@ def simulate_campaign(
 ) -> str:
     """Simulate, and write into a folder.
 
-    Parameters
-    ----------
-    output : path
-        Folder.
-    seed : int
-    force : bool
-        Replace a campaign that is there.
-    exposures, stars : int
-        In the first filter, and of the catalogue.
-    filters : sequence of str
-    secondary_exposures : int
-        Of each further filter.
-    false, outlying : float
-        Fractions of detections that are none, and of outlying exposures.
-    cte : bool
-        Trailed charge moves the stars.
-    no_tables : bool
-        A distortion without look-up tables.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For options that cannot be used, and a folder in use.
+    `output`: folder. `force`: replace a campaign that is there. `exposures`, `stars`: in the first
+    filter, and of the catalogue. `secondary_exposures`: of each further filter. `false`,
+    `outlying`: fractions of detections that are none, and of outlying exposures. `cte`: trailed
+    charge moves the stars. `no_tables`: a distortion without look-up tables. Returns the text to
+    print. InputError for options that cannot be used, and a folder in use.
     """
     folder = Path(output)
     if (folder / "lists").exists() and not force:
@@ -196,7 +176,7 @@ def _config(filter: str, reference: str) -> str:
 
 
 def _stale() -> IdcTab:
-    """What an observer has before the calibration: the distortion of 2004.5, without drift."""
+    """IDCTAB that an observer has before: the distortion of 2004.5, without drift."""
     model, theta = acs_solution()
     known = replace(model, time=None)
     return idctab_from_solution(
@@ -211,13 +191,13 @@ def _stale() -> IdcTab:
 
 
 @dataclass(frozen=True, eq=False)
-class _Exact:
+class _Exact(Solution):
     """Given parameters as a solution without errors."""
 
     model: DistortionModel
     mean: Float
 
-    @property
+    @cached_property
     def cov(self) -> Float:
         return np.zeros((len(self.mean), len(self.mean)))
 

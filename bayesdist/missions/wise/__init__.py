@@ -5,6 +5,7 @@ from bayesdist.mission import Mission
 __all__ = ["MISSION"]
 
 _COMMANDS = "bayesdist.missions.wise.commands"
+_PAIRS = "bayesdist.missions.wise.pairs"
 
 MISSION = Mission(
     title="WISE: its bands beside each other, its pairs and its files.",
@@ -15,5 +16,7 @@ MISSION = Mission(
         "rvb": f"{_COMMANDS}:rvb",
     },
     simulate={"wise": f"{_COMMANDS}:simulate"},
+    data_sections={"rvb": f"{_PAIRS}.section:RvbData"},
+    match_sources={"rvb": f"{_PAIRS}.source:SOURCE"},
     beside_core={"demo": f"{_COMMANDS}:demo"},
 )

@@ -7,14 +7,15 @@ from pathlib import Path
 import numpy as np
 from astropy.table import QTable
 
+from bayesdist.app.results import results_of
 from bayesdist.app.run import run
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number, table_text
-from bayesdist.app.session import Session
 from bayesdist.app.summary_text import results_text
 from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path, made_folder
+from bayesdist.infer import LinearFit, Posterior
 from bayesdist.missions.wise.simulate import simulate_wise
 from bayesdist.simulate import Truth
 
@@ -29,6 +30,7 @@ _CONFIG = """\
 
 [data]
 matches = "stars.ecsv"
+simulated = true
 columns = {{x="x", y="y", u="u", v="v", sigma_u="sigma_u", sigma_v="sigma_v", mag="mag"}}
 
 [detector]
@@ -80,10 +82,7 @@ def simulation_config(band: str) -> str:
 def write_simulation(folder: Path, matches: MatchTable, truth: Truth, config: str) -> None:
     """Write stars.ecsv, truth.ecsv and config.toml of a simulation.
 
-    Raises
-    ------
-    InputError
-        When the folder cannot be made or written.
+    InputError when the folder cannot be made or written.
     """
     made_folder(folder)
     stars = QTable()
@@ -113,19 +112,8 @@ def write_simulation(folder: Path, matches: MatchTable, truth: Truth, config: st
 def demo(folder: str | Path, *, force: bool = False, command: str = "") -> str:
     """Simulate, calibrate, and compare with the truth.
 
-    Parameters
-    ----------
-    folder : path
-        Holds ``input/`` and ``run/`` afterwards.
-    force : bool
-        Replace an earlier demo.
-    command : str
-        For the record.
-
-    Returns
-    -------
-    str
-        What to print.
+    `folder`: holds ``input/`` and ``run/`` afterwards. `force`: replace an earlier demo. `command`:
+    for the record. Returns the text to print.
     """
     folder = Path(folder)
     known = {"input", "run"}
@@ -138,12 +126,13 @@ def demo(folder: str | Path, *, force: bool = False, command: str = "") -> str:
     matches, truth = simulate_wise(N_STARS, rng=np.random.default_rng(SEED))
     write_simulation(folder / "input", matches, truth, simulation_config("W2"))
     run(folder / "input" / "config.toml", folder / "run", force=force, command=command)
-    session = Session(RunDirectory.open(folder / "run"))
-    return f"{_against_truth(session, truth)}\n\n{results_text(session)}"
+    finished = RunDirectory.open(folder / "run")
+    results = results_of(finished)
+    against = _against_truth(results.posterior, results.fit, truth)
+    return f"{against}\n\n{results_text(finished)}"
 
 
-def _against_truth(session: Session, truth: Truth) -> str:
-    posterior, fit = session.posterior, session.fit
+def _against_truth(posterior: Posterior, fit: LinearFit, truth: Truth) -> str:
     rows = []
     for k, name in enumerate(posterior.model.names):
         rows.append(

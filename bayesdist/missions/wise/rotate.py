@@ -31,26 +31,10 @@ def rotate(
 ) -> str:
     """Write a SIP header or WISE meta-data in rotated or mirrored pixels.
 
-    Parameters
-    ----------
-    path : path
-    output : path
-        Of the same kind as the input; a SIP header is a FITS file where the name ends in .fits.
-    degrees, mirror
-        As `rotated_sip`.
-    force : bool
-        Replace a file that is there.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For a file of another kind, an output in use, an angle that is no finite number, and of
-        WISE meta-data one that is no multiple of 90 degrees, or a skew.
+    `output`: of the same kind as the input; a SIP header is a FITS file where the name ends in
+    .fits. `degrees`, `mirror`: as `rotated_sip`. `force`: replace a file that is there. Returns the
+    text to print. InputError for a file of another kind, an output in use, an angle that is no
+    finite number, and of WISE meta-data one that is no multiple of 90 degrees, or a skew.
     """
     path, output = Path(path), Path(output)
     refuse_existing(output, force)

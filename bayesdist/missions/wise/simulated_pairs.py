@@ -13,7 +13,7 @@ from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 from bayesdist.missions.wise.demo import simulation_config, write_simulation
 from bayesdist.missions.wise.simulate import WiseSet, simulate_wise, wise_set, write_wise_set
-from bayesdist.missions.wise.simulate.stand_in import STAND_IN_TURN, write_stand_in
+from bayesdist.missions.wise.simulate.optical import DELIVERED_TURN, write_optical_model
 
 __all__ = ["simulate_sets", "simulate_table"]
 
@@ -22,6 +22,7 @@ WISE_CONFIG = """\
 # {truth} holds what they were made from
 [data]
 matches = "{folder}"
+simulated = true
 format = "rvb"
 band = "{band}"
 columns = {{exposure = ""}}    # without the frames: one distortion serves all
@@ -70,27 +71,8 @@ def simulate_table(
 ) -> str:
     """One small table of one band, and how to calibrate it.
 
-    Parameters
-    ----------
-    output : path
-        Folder.
-    stars : int
-    band : str
-    fraction : float
-        Of false matches.
-    seed : int
-    force : bool
-        Replace a configuration that is there.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For options that cannot be used, and a folder in use.
+    `output`: folder. `fraction`: of false matches. `force`: replace a configuration that is there.
+    Returns the text to print. InputError for options that cannot be used, and a folder in use.
     """
     if stars < 1 or not 0 <= fraction < 1:
         raise InputError(
@@ -123,30 +105,10 @@ def simulate_sets(
 ) -> str:
     """Full sets of bands in Parquet, and how to calibrate them.
 
-    Parameters
-    ----------
-    output : path
-        Folder.
-    bands : sequence of str
-    pairs : int, optional
-        Of each band; by default those of section 4 of WSDC D-T033.
-    false_share : float
-        Fraction of false matches.
-    partition_pattern : bool
-        Blocks in the residuals.
-    seed : int
-    force : bool
-        Replace sets that are there.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For options that cannot be used, and a folder in use.
+    `output`: folder. `pairs`: of each band; by default those of section 4 of WSDC D-T033.
+    `false_share`: fraction of false matches. `partition_pattern`: blocks in the residuals. `force`:
+    replace sets that are there. Returns the text to print. InputError for options that cannot be
+    used, and a folder in use.
     """
     folder = Path(output)
     if len(set(bands)) < len(bands):
@@ -183,11 +145,11 @@ def simulate_sets(
             }
         )
         lines.append(f"bayesdist run {folder / f'{name}.toml'} -o {folder / f'run_{name}'}")
-    write_stand_in(folder / "optical_w2.hdr")
+    write_optical_model(folder / "optical_w2.hdr")
     runs = " ".join(str(folder / f"run_{name}") for name in names)
     compare = (
         f"compare them:\n  bayesdist wise bands {runs} -o {folder / 'bands'} "
-        f"--optical {folder / 'optical_w2.hdr'} --rotation {STAND_IN_TURN}"
+        f"--optical {folder / 'optical_w2.hdr'} --rotation {DELIVERED_TURN}"
     )
     return f"{table_text(rows)}\n\ncalibrate them:\n  " + "\n  ".join([*lines, compare])
 

@@ -13,9 +13,9 @@ from scipy.interpolate import PchipInterpolator
 from bayesdist.assess.budget.surface import JOINT, BudgetSurface, GridRow
 from bayesdist.assess.terms.forms import MEASURED, Row
 from bayesdist.assess.terms.given import CENTROID
+from bayesdist.numbers import ladder
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
-from bayesdist.report.numbers import ladder
 from bayesdist.report.style import CYCLE, SEQUENTIAL
 
 __all__ = ["budget_data", "map_data"]

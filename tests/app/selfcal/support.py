@@ -9,12 +9,10 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.config import load_config
+from bayesdist.app.results import Results
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.selfcal.session import SelfcalSession
-from bayesdist.app.sessions import own_stages, session_of
-from bayesdist.app.stages import run_stage
 from bayesdist.simulate.dithers import DitheredField
-from tests.app.support import write_config
+from tests.app.support import after_stages, write_config
 from tests.infer.selfcal.fields import SIZE, field
 
 SCALE_MAS = 50.0
@@ -99,18 +97,13 @@ def affine_left(here: np.ndarray, there: np.ndarray, at: np.ndarray, kind: str) 
     return np.column_stack([moved.real, moved.imag])
 
 
-def fitted(folder: Path, config: Path) -> SelfcalSession:
-    """The session of a run after its stages 'match' and 'fit'."""
+def fitted(folder: Path, config: Path) -> Results:
+    """Results of a run after its stages 'match' and 'fit'."""
     given, text = load_config(config)
     run = RunDirectory.plan(folder, given, text, config.parent)
-    run.begin()
-    session = session_of(run)
-    for stage in ("match", "fit"):
-        run_stage(session, stage, own_stages(session)[stage])
-    assert isinstance(session, SelfcalSession)
-    return session
+    return after_stages(run, "match", "fit", rehearsed=False)
 
 
-def directions(session: SelfcalSession) -> dict[str, dict[str, Any]]:
+def directions(results: Results) -> dict[str, dict[str, Any]]:
     """What summary.json says of each property of the solution, by name."""
-    return {d["name"]: d for d in session.run.summary["selfcal"]["gauge"]["directions"]}
+    return {d["name"]: d for d in results.run.summary["selfcal"]["gauge"]["directions"]}

@@ -71,9 +71,7 @@ def test_stars_that_are_seen_once(truth, tmp_path):
 
 def test_stars_with_too_few_detections(truth, tmp_path):
     table = list_table(truth)
-    _refused_by_the_match(
-        tmp_path, table, "no star is seen 9 times", selfcal={"least_detections": 9}
-    )
+    _refused_by_the_match(tmp_path, table, "no star is seen 9 times", selfcal={"min_detections": 9})
 
 
 def test_an_exposure_turned_by_half_a_turn(tmp_path):
@@ -84,7 +82,7 @@ def test_an_exposure_turned_by_half_a_turn(tmp_path):
     table["x"][rows] = SIZE[0] + 1 - table["x"][rows]
     table["y"][rows] = SIZE[1] + 1 - table["y"][rows]
     words = ["e003", "half a turn", "180 degrees"]
-    _refused_by_the_match(tmp_path, table, *words, selfcal={"rounds": 4})
+    _refused_by_the_match(tmp_path, table, *words, selfcal={"max_iterations": 4})
 
 
 @pytest.mark.parametrize(
@@ -120,10 +118,10 @@ def test_a_single_exposure(truth, tmp_path):
         ({"selfcal": {"start_radius": 0.1}}, ["start_radius", "match_radius"]),
         ({"selfcal": {"match_radii": 0.1}}, ["'match_radii'", "'match_radius'"]),
         ({"selfcal": {"unit": "arcsec"}, "detector": {"size": SIZE}}, ["detector.scale_mas"]),
-        ({"selfcal": {"least_detections": 1}}, ["least_detections"]),
+        ({"selfcal": {"min_detections": 1}}, ["min_detections"]),
         ({"selfcal": {"motion": "proper_motion"}}, ["dates"]),
         ({"selfcal": {"exposures": "log.ecsv"}}, ["log.ecsv"]),
-        ({"selfcal": {"start": "nowhere.fits"}}, ["nowhere.fits"]),
+        ({"selfcal": {"initial_distortion": "nowhere.fits"}}, ["nowhere.fits"]),
         ({"selfcal": {"mag": (30.0, 31.0)}}, ["e000", "cuts"]),
         ({"model": {"order": 3, "frames": "affine"}}, ["model.frames", "selfcal.frames"]),
         ({"fit": {"clip_chi2": 9.0}}, ["fit", "[selfcal]"]),

@@ -11,12 +11,12 @@ from astropy.table import Table
 from astropy.wcs import WCS
 from scipy import stats
 
+from bayesdist.app.output import write_table
 from bayesdist.app.selfcal.stars import star_table
-from bayesdist.app.session import write_table
 from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.infer import load_fit
 from bayesdist.infer.selfcal import star_catalogue
-from bayesdist.infer.selfcal.moves import functionals
+from bayesdist.infer.selfcal.sky_moves import functionals
 from bayesdist.simulate.dithers import pixels_of
 from tests.app.selfcal.support import (
     SCALE_MAS,
@@ -44,12 +44,12 @@ def test_chips_lie_as_their_stars_say(tmp_path):
     config = write_selfcal(
         tmp_path / "input", list_table(truth), chip=blocks, detector=None, model={"order": 3}
     )
-    session = fitted(tmp_path / "run", config)
-    found = directions(session)
-    model, theta = session.model, session.solved.theta
+    results = fitted(tmp_path / "run", config)
+    found = directions(results)
+    model, theta = results.fit.model, results.fitted.solved.solution.theta
     rows = functionals(truth.model, truth.theta)
     # by how much the solution differs from the truth in what both chips say of each other
-    off = {name: rows[name] @ (_as_true(session, truth) - truth.theta) for name in rows}
+    off = {name: rows[name] @ (_as_true(results, truth) - truth.theta) for name in rows}
     for name in ("C2.shift_u", "C2.shift_v", "C2.rotation", "C2.scale"):
         assert found[name]["state"] == "known" and found[name]["fixed_by"] == "detections"
         assert abs(off[name]) < 4 * found[name]["sigma_detections"], name
@@ -59,9 +59,13 @@ def test_chips_lie_as_their_stars_say(tmp_path):
     assert np.hypot(*gap[0]) == pytest.approx(SIZE[1] + 50, rel=0.02)
 
 
-def _as_true(session, truth):
+def _as_true(results, truth):
     """The solution, moved along free directions to where the truth has what the gauge holds."""
-    theta, null, held = session.solved.theta, session.gauge.null, session.gauge.held
+    theta, null, held = (
+        results.fitted.solved.solution.theta,
+        results.fitted.solved.gauge.null,
+        results.fitted.solved.gauge.held,
+    )
     first = theta - null @ np.linalg.solve(null[held], (theta - truth.theta)[held])
     for _ in range(3):  # of a large rotation the moves are not linear
         first -= null @ np.linalg.solve(null[held], (first - truth.theta)[held])
@@ -91,9 +95,9 @@ def test_vafactor_is_applied(tmp_path):
         folder.mkdir()
         config = write_selfcal(folder / "input", lists, selfcal=block | {"exposures": "log.ecsv"})
         _log(truth, config.parent, factors if name == "with" else np.ones(8))
-        session = fitted(folder / "run", config)
-        sigma = np.sqrt(np.diag(session.solved.cov))[at]
-        scales.append((session.solved.theta[at], sigma))
+        results = fitted(folder / "run", config)
+        sigma = np.sqrt(np.diag(results.fitted.solved.solution.cov))[at]
+        scales.append((results.fitted.solved.solution.theta[at], sigma))
     (known, sigma), (unknown, _) = scales
     # the simulated sky is smaller on the detector where the frame's scale is larger: what the
     # frames have without VAFACTOR is VAFACTOR, and with it what is left is its square
@@ -126,15 +130,15 @@ def test_motions_of_stars_that_do_not_move(tmp_path):
     config = write_selfcal(
         tmp_path / "input",
         list_table(truth),
-        selfcal={"exposures": "log.ecsv", "motion": "proper_motion", "least_detections": 4},
+        selfcal={"exposures": "log.ecsv", "motion": "proper_motion", "min_detections": 4},
     )
     _log(truth, config.parent, np.ones(8))
-    session = fitted(tmp_path / "run", config)
-    stars = star_catalogue(session.solved)
+    results = fitted(tmp_path / "run", config)
+    stars = star_catalogue(results.fitted.solved.solution)
     assert stars.values.shape[1] == 4 and stars.epoch == pytest.approx(EPOCHS.mean())
-    assert session.gauge.rates == ("drift_u", "drift_v", "spin")
-    assert not session.gauge.unnamed
-    assert "motions are relative" in " ".join(session.gauge.sentences)
+    assert results.fitted.solved.gauge.rates == ("drift_u", "drift_v", "spin")
+    assert not results.fitted.solved.gauge.unnamed
+    assert "motions are relative" in " ".join(results.fitted.solved.gauge.sentences)
     place, motion = (stars.values[:, k : k + 2] @ [1, 1j] for k in (0, 2))
     sigma = np.sqrt(np.einsum("naa->n", stars.own[:, 2:, 2:]) / 2)
     design = np.column_stack([np.ones(len(stars)), 1j * place]) / sigma[:, None]
@@ -146,7 +150,7 @@ def test_motions_of_stars_that_do_not_move(tmp_path):
     inside = np.mean(np.abs(pulls) < 2)
     # the distortion's errors come on top of the stars' own
     assert inside > 0.93 - 3 * np.sqrt(0.95 * 0.05 / len(pulls))
-    assert "pm_u" in Table.read(_stars(session)).colnames
+    assert "pm_u" in Table.read(_stars(results)).colnames
 
 
 def test_parallaxes(tmp_path):
@@ -168,7 +172,7 @@ def test_parallaxes(tmp_path):
         selfcal={
             "exposures": "log.ecsv",
             "motion": "parallax",
-            "least_detections": 5,
+            "min_detections": 5,
             "unit": "mas",
         },
         gauge={"reference": {"catalog": "reference.ecsv", "tangent_point": [RA, DEC]}},
@@ -176,10 +180,13 @@ def test_parallaxes(tmp_path):
     Table({"exposure": model.exposures, "epoch": epochs}).write(config.parent / "log.ecsv")
     known = rng.choice(len(truth.sky), 200, replace=False)
     _on_the_sky(truth.sky[known] - truth.sky.mean(axis=0)).write(config.parent / "reference.ecsv")
-    session = fitted(tmp_path / "run", config)
-    assert "parallax" in session.gauge.rates
-    assert "parallax of the whole sky" in " ".join(session.gauge.sentences)
-    problem, stars = session.solved.problem, star_catalogue(session.solved)
+    results = fitted(tmp_path / "run", config)
+    assert "parallax" in results.fitted.solved.gauge.rates
+    assert "parallax of the whole sky" in " ".join(results.fitted.solved.gauge.sentences)
+    problem, stars = (
+        results.fitted.solved.solution.problem,
+        star_catalogue(results.fitted.solved.solution),
+    )
     whose = d.star[problem.rows[problem.starts[:-1]]]
     sigma = np.sqrt(stars.own[:, 4, 4])
     off = stars.values[:, 4] - parallax[whose]
@@ -189,7 +196,7 @@ def test_parallaxes(tmp_path):
     low, high = stats.chi2.ppf([1e-3, 1 - 1e-3], len(pulls) - 1)
     # the distortion's errors come on top of the stars' own
     assert low < (pulls**2).sum() < 1.15 * high
-    table = star_table(session, stars)
+    table = star_table(results.fitted.solved.solution, stars)
     assert table["parallax"].unit == "mas" and table["pm_u"].unit == "mas / yr"
 
 
@@ -208,9 +215,12 @@ def _on_the_sky(places: np.ndarray) -> Table:
     return Table(columns, units={"ra": "deg", "dec": "deg", "ra_error": "mas", "dec_error": "mas"})
 
 
-def _stars(session) -> Path:
-    path = session.run / "stars.ecsv"
-    write_table(star_table(session, star_catalogue(session.solved)), path)
+def _stars(results) -> Path:
+    path = results.run / "stars.ecsv"
+    write_table(
+        star_table(results.fitted.solved.solution, star_catalogue(results.fitted.solved.solution)),
+        path,
+    )
     return path
 
 
@@ -219,20 +229,20 @@ def test_a_start_from_an_earlier_run(three_rolls, tmp_path):
     config = write_selfcal(
         tmp_path / "input",
         list_table(three_rolls.truth),
-        selfcal={"start": str(three_rolls.path), "start_radius": 0.5},
+        selfcal={"initial_distortion": str(three_rolls.path), "start_radius": 0.5},
     )
-    session = fitted(tmp_path / "run", config)
+    results = fitted(tmp_path / "run", config)
     before = load_fit(three_rolls.path / "fit.nc")
     # frames turn about another point: the polynomials are to be compared
     free = np.flatnonzero(before.sigma[: before.model.n_polynomial] > 0)
     # held coefficients are those of the start here, and of no distortion there
     moved = (
-        session.gauge.null
+        results.fitted.solved.gauge.null
         @ np.linalg.lstsq(
-            session.gauge.null[session.gauge.held],
-            (before.mean - session.fit.mean)[session.gauge.held],
+            results.fitted.solved.gauge.null[results.fitted.solved.gauge.held],
+            (before.mean - results.fit.mean)[results.fitted.solved.gauge.held],
             rcond=None,
         )[0]
     )
-    off = np.abs(session.fit.mean + moved - before.mean)
+    off = np.abs(results.fit.mean + moved - before.mean)
     assert (off[free] < 0.2 * before.sigma[free]).all()

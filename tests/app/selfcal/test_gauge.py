@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy.table import Table, vstack
@@ -46,8 +48,8 @@ def offsets(truth, tmp_path_factory):
 
 def test_scale_and_rotation_from_offsets(truth, offsets):
     """The errors are those of a regression through the offsets: sigma over their lever arm."""
-    session, table = offsets
-    found = directions(session)
+    results, table = offsets
+    found = directions(results)
     at = np.column_stack([table["du"], table["dv"]])
     lever = np.sqrt(((at - at.mean(axis=0)) ** 2).sum())
     for name in ("scale", "rotation"):
@@ -56,18 +58,18 @@ def test_scale_and_rotation_from_offsets(truth, offsets):
         # the offsets' own errors, a thousandth of them here, move the lever arm
         assert found[name]["sigma_fixed"] == pytest.approx(SIGMA / lever, rel=5e-3)
     assert found["zero_point_u"]["fixed_by"] == "convention"
-    assert session.run.summary["selfcal"]["gauge"]["held"] == ["u_0_0", "v_0_0"]
+    assert results.run.summary["selfcal"]["gauge"]["held"] == ["u_0_0", "v_0_0"]
 
 
 def test_offsets_that_contradict_the_detections_are_told(truth, offsets, tmp_path):
-    session, table = offsets
-    assert not any("contradict" in text for text in session.doubts)
+    results, table = offsets
+    assert not results.fitted.solved.contradictions
     wrong = table.copy()
     wrong["du"][3] += 8 * SIGMA
     config = write_selfcal(tmp_path, list_table(truth), gauge={"offsets": "offsets.ecsv"})
     wrong.write(config.parent / "offsets.ecsv")
-    doubts = fitted(tmp_path / "run", config).doubts
-    assert any("commanded offsets contradict" in text for text in doubts)
+    contradictions = fitted(tmp_path / "run", config).fitted.solved.contradictions
+    assert any("commanded offsets contradict" in one for one in contradictions)
 
 
 def test_an_exposure_whose_offset_stands_twice(truth, offsets, tmp_path):
@@ -80,23 +82,23 @@ def test_an_exposure_whose_offset_stands_twice(truth, offsets, tmp_path):
 
 
 def test_the_error_of_the_configuration_goes_before_that_of_the_table(truth, offsets, tmp_path):
-    session, table = offsets
+    results, table = offsets
     gauge = {"offsets": "offsets.ecsv", "offset_sigma": 3 * SIGMA}
     config = write_selfcal(tmp_path, list_table(truth), gauge=gauge)
     table.write(config.parent / "offsets.ecsv")
-    found, before = directions(fitted(tmp_path / "run", config)), directions(session)
+    found, before = directions(fitted(tmp_path / "run", config)), directions(results)
     ratio = found["scale"]["sigma_fixed"] / before["scale"]["sigma_fixed"]
     assert ratio == pytest.approx(3, rel=0.01)
 
 
 def test_the_scale_is_that_of_the_offsets(truth, offsets):
-    session, _ = offsets
-    sigma = directions(session)["scale"]["sigma_fixed"]
-    assert abs(_pixel(session) - _pixel_of(truth.model, truth.theta)) < 4 * sigma
+    results, _ = offsets
+    sigma = directions(results)["scale"]["sigma_fixed"]
+    assert abs(_pixel(results) - _pixel_of(truth.model, truth.theta)) < 4 * sigma
 
 
-def _pixel(session):
-    return _pixel_of(session.model, session.solved.theta)
+def _pixel(results):
+    return _pixel_of(results.fit.model, results.fitted.solved.solution.theta)
 
 
 def _pixel_of(model, theta):
@@ -111,9 +113,9 @@ def test_relative_errors_are_the_same_in_every_gauge(free, offsets):
     maps = [
         [
             uncertainty_map(one, grid=(9, 9)).radius
-            for one in (gauge_free(session.fit, session.gauge.null), session.fit)
+            for one in (gauge_free(results.fit, results.fitted.solved.gauge.null), results.fit)
         ]
-        for session in (free, offsets[0])
+        for results in (free, offsets[0])
     ]
     relative, absolute = zip(*maps, strict=True)
     # the two solutions differ by a scale and rotation, and their curvature by the jitter found
@@ -123,10 +125,10 @@ def test_relative_errors_are_the_same_in_every_gauge(free, offsets):
 
 def test_a_free_direction_is_no_relative_error(free):
     """Whatever is added along free directions, relative errors stay."""
-    fit, null = free.fit, free.gauge.null
+    fit, null = free.fit, free.fitted.solved.gauge.null
     rng = np.random.default_rng(2)
     move = null @ rng.standard_normal((null.shape[1], 2))
-    wider = type(fit)(**{**fit.__dict__, "cov": fit.cov + move @ move.T})
+    wider = replace(fit, cov=fit.cov + move @ move.T)
     one, other = (
         uncertainty_map(gauge_free(each, null), grid=(7, 7)).radius for each in (fit, wider)
     )
@@ -138,11 +140,11 @@ def test_the_scale_of_another_detector(truth, tmp_path):
     """The pixel is as large as was said, and as well known."""
     tie = {"mas": 1.001 * SCALE_MAS, "sigma": 3e-5, "detector": "WFC"}
     config = write_selfcal(tmp_path / "input", list_table(truth), gauge={"scale": tie})
-    session = fitted(tmp_path / "run", config)
-    scale = directions(session)["scale"]
+    results = fitted(tmp_path / "run", config)
+    scale = directions(results)["scale"]
     assert scale["fixed_by"] == "scale of WFC"
     assert scale["sigma_fixed"] == pytest.approx(3e-5, rel=1e-6)
-    assert _pixel(session) == pytest.approx(1.001, abs=1e-5)
+    assert _pixel(results) == pytest.approx(1.001, abs=1e-5)
 
 
 def test_rolls(tmp_path):
@@ -151,12 +153,12 @@ def test_rolls(tmp_path):
     gauge = {"offsets": "offsets.ecsv", "roll_sigma_deg": 0.01}
     config = write_selfcal(tmp_path / "input", list_table(truth), gauge=gauge)
     commanded(truth, SIGMA, np.random.default_rng(3)).write(config.parent / "offsets.ecsv")
-    session = fitted(tmp_path / "run", config)
-    found = directions(session)
+    results = fitted(tmp_path / "run", config)
+    found = directions(results)
     assert found["scale"]["fixed_by"] == "commanded offsets"
     # offsets see a skew as they see a scale
     assert found["skew_plus"]["fixed_by"] == "commanded offsets"
-    assert len(session.gauge.held) == 2
+    assert len(results.fitted.solved.gauge.held) == 2
 
 
 def _references(truth, sigma_mas, n, rng):
@@ -186,32 +188,32 @@ def test_reference_stars(truth, tmp_path):
     rng, sigma = np.random.default_rng(4), 1.0
     table = _references(truth, sigma, 150, rng)
     table.write(config.parent / "reference.ecsv")
-    session = fitted(tmp_path / "run", config)
-    found = directions(session)
+    results = fitted(tmp_path / "run", config)
+    found = directions(results)
     for name in ("zero_point_u", "zero_point_v", "scale", "rotation"):
         assert found[name]["state"] == "free"
         assert found[name]["fixed_by"] == "reference stars"
-    assert not session.run.summary["selfcal"]["gauge"]["held"]
-    used = session.solved.problem.priors.informed
+    assert not results.run.summary["selfcal"]["gauge"]["held"]
+    used = results.fitted.solved.solution.problem.priors.informed
     assert used.sum() > 100
     # the closed form for stars whose own detections have no errors: it is the lower bound
-    at = session.solved.stars[used]
+    at = results.fitted.solved.solution.stars[used]
     lever = np.sqrt(((at - at.mean(axis=0)) ** 2).sum())
     scale = found["scale"]["sigma_fixed"]
     assert sigma / lever < scale < 2 * sigma / lever
-    stars = star_catalogue(session.solved)
+    stars = star_catalogue(results.fitted.solved.solution)
     # every star, reference star or not, lies where the catalogue's sky has it
     where = np.column_stack([table["u"], table["v"]]) * 1000
     distance = np.sqrt(((stars.values[used, None] - where) ** 2).sum(axis=2)).min(axis=1)
     # of the catalogue's errors, Rayleigh: 99.9 % within 3.7 sigma
     assert np.quantile(distance, 0.99) < 3.7 * sigma
     true = SCALE_MAS * _pixel_of(truth.model, truth.theta)
-    assert _pixel(session) == pytest.approx(true, rel=4 * scale)
+    assert _pixel(results) == pytest.approx(true, rel=4 * scale)
 
 
 def test_check_tells_what_fixes_the_scale(truth, offsets, tmp_path):
-    session, _ = offsets
-    config = session.base / "config.toml"
+    results, _ = offsets
+    config = results.base / "config.toml"
     out = good("check", config).out
     assert "scale: fixed by commanded offsets, sigma" in out
     assert "2 of them held by convention" in out

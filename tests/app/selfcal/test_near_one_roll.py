@@ -76,9 +76,9 @@ def _calibrated(folder, seed, scatter_deg, n_chips):
     [(2, 2, 0.001), (2, 2, 0.0015), (2, 2, 0.003), (2, 2, 0.005), (2, 1, 0.005), (5, 1, 0.005)],
 )
 def test_what_is_held_is_free_in_every_covariance(tmp_path, seed, n_chips, scatter_deg):
-    session, bends = _calibrated(tmp_path, seed, scatter_deg, n_chips)
-    model, gauge, fit = session.model, session.gauge, session.fit
-    summary = session.run.summary["selfcal"]["gauge"]
+    results, bends = _calibrated(tmp_path, seed, scatter_deg, n_chips)
+    model, gauge, fit = results.fit.model, results.fitted.solved.gauge, results.fit
+    summary = results.run.summary["selfcal"]["gauge"]
     without_error = {model.names[k] for k in np.flatnonzero(np.diag(fit.cov) == 0)}
     assert set(summary["held"]) == without_error
     assert len(without_error) == gauge.null.shape[1] == summary["n_free"]

@@ -11,10 +11,17 @@ from astropy.io import fits
 from astropy.table import Table
 from scipy import stats
 
-from bayesdist.app import sessions
+from bayesdist.app.config import load_config
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.results import results_of
+from bayesdist.app.run import STAGES
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.sessions import session_of
-from bayesdist.infer import load_posterior
+from bayesdist.app.selfcal.fit import fit_selfcal
+from bayesdist.app.selfcal.given import read_given
+from bayesdist.app.selfcal.matching import match_dithers
+from bayesdist.app.store import as_json
+from bayesdist.infer import load_fit, load_posterior
+from bayesdist.infer.selfcal import gauge_free
 from tests.app.selfcal.support import affine_left
 from tests.app.support import cli, good, one_sentence, snapshot, summary_of
 
@@ -31,10 +38,10 @@ def _grid(n: int = 12) -> tuple[np.ndarray, np.ndarray]:
 def test_the_distortion_is_within_its_errors(name, kind, n_free, request):
     """Chi-square of the coefficients, but for the sky's free maps, which theta's null space has."""
     finished = request.getfixturevalue(name)
-    with_session = session_of(RunDirectory.open(finished.path))
-    posterior, gauge = with_session.posterior, with_session.gauge
+    results = results_of(RunDirectory.open(finished.path))
+    posterior, gauge = results.posterior, results.fitted.solved.gauge
     assert gauge.null.shape[1] == gauge.open.shape[1] == n_free
-    relative = with_session.relative
+    relative = gauge_free(results.solution, gauge.null)
     model, truth = posterior.model, finished.truth
     x, y = _grid()
     first = np.zeros(len(x), np.int64)
@@ -71,11 +78,33 @@ def test_false_detections_are_told_as_in_the_posterior(name, request):
     assert abs(int((said > 0.5).sum()) - posterior.n_flagged) <= 2 + 0.1 * posterior.n_flagged
 
 
+def test_functions_find_what_the_run_has_found(one_roll):
+    """Lists become stars and a solution without a run's folder, the very ones that a run reads."""
+    config, _ = load_config(one_roll.config)
+    base = one_roll.config.parent
+    matched = match_dithers(read_given(config, base), config, base)
+    fitted = fit_selfcal(matched)
+    known = load_fit(one_roll.path / "fit.nc")
+    np.testing.assert_array_equal(fitted.linear.mean, known.mean)
+    np.testing.assert_array_equal(fitted.linear.cov, known.cov)
+    results = results_of(RunDirectory.open(one_roll.path))
+    np.testing.assert_array_equal(
+        fitted.solved.solution.stars, results.fitted.solved.solution.stars
+    )
+    np.testing.assert_array_equal(fitted.solved.gauge.held, results.fitted.solved.gauge.held)
+    assert fitted.solved.fixed == results.fitted.solved.fixed
+    made, read = FitData(matched, fitted).stars, results.data.stars
+    for name in ("x", "u", "sigma_u", "exposure", "row"):
+        np.testing.assert_array_equal(getattr(made, name), getattr(read, name))
+    facts, summary = as_json(fitted.facts["selfcal"]), summary_of(one_roll.path)["selfcal"]
+    assert {name: summary[name] for name in facts} == facts
+
+
 def test_stars_are_where_they_were(three_rolls):
     """But for a similarity of the sky, and by the errors of their own detections."""
     stars, truth = Table.read(three_rolls.path / "stars.ecsv"), three_rolls.truth
     found = np.column_stack([stars["u"], stars["v"]])
-    problem = session_of(RunDirectory.open(three_rolls.path)).solved.problem
+    problem = results_of(RunDirectory.open(three_rolls.path)).fitted.solved.solution.problem
     every = np.split(truth.detections.star[problem.rows], problem.starts[1:-1])
     whose = np.array([np.median(one) for one in every]).astype(int)
     assert len(np.unique(whose)) == len(whose) == len(stars)
@@ -177,12 +206,12 @@ def test_a_run_that_was_killed_goes_on(three_rolls, tmp_path, monkeypatch, no_re
     shutil.copytree(three_rolls.config.parent, tmp_path / "input")
     config, run = tmp_path / "input" / "config.toml", tmp_path / "run"
 
-    def killed(session):
+    def killed(results):
         raise Killed
 
     for stage, flag in (("fit", ()), ("sample", ("--resume",)), ("assess", ("--resume",))):
         with monkeypatch.context() as patch:
-            patch.setitem(sessions.SELFCAL_STAGES, stage, killed)
+            patch.setitem(STAGES, stage, killed)
             with pytest.raises(Killed):
                 cli("run", config, "-o", run, *flag)
     good("run", config, "-o", run, "--resume")

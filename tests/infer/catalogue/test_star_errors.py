@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -13,8 +13,9 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Rejection, fit_linear
 from bayesdist.infer.catalogue import star_sums as module
-from bayesdist.infer.catalogue.star_errors import star_covariance
+from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
 from bayesdist.infer.exposures.hierarchy import fit_hierarchical
+from bayesdist.infer.solution import Solution
 from bayesdist.infer.transforms import linear_terms, reference_gauge
 from bayesdist.model import DistortionModel
 
@@ -24,27 +25,27 @@ from ..support import CHIP, SIZE, UNCLIPPED, columns_of, legendre_design, simula
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
+def alike(sigma_u, sigma_v, n_stars):
+    """Errors of positions that are those of all stars."""
+    return StarErrors(np.tile([sigma_u, sigma_v], (n_stars, 1)))
+
+
 def some(seed=1, n_stars=70):
     """Frames, drift, two chips, uneven errors; any star may be anywhere."""
     model, matches, _ = campaign(seed, 4, 80, order=2)
     rng = np.random.default_rng(seed)
     n, code = len(matches), rng.integers(n_stars, size=len(matches))
-    catalogue = {
-        "sigma_u": rng.uniform(0.0, 0.02, n_stars),
-        "sigma_v": rng.uniform(0.0, 0.02, n_stars),
-        "motion_u": rng.uniform(0.0, 0.01, n_stars),
-        "motion_v": rng.uniform(0.0, 0.01, n_stars),
-        "epoch0": rng.uniform(2003.0, 2006.0, n_stars),
-    }
-    dt = matches.epoch - catalogue["epoch0"][code]
+    position, motion = (rng.uniform(0.0, most, (2, n_stars)).T for most in (0.02, 0.01))
+    catalogue = StarErrors(position, motion, rng.uniform(2003.0, 2006.0, n_stars))
+    dt = matches.epoch - catalogue.epoch[code]
     matches = matches.with_sigma(
         *(
             np.sqrt(
                 rng.uniform(0.01, 0.05, n) ** 2
-                + catalogue[f"sigma_{a}"][code] ** 2
-                + (dt * catalogue[f"motion_{a}"][code]) ** 2
+                + catalogue.position[code, a] ** 2
+                + (dt * catalogue.motion[code, a]) ** 2
             )
-            for a in "uv"
+            for a in (0, 1)
         )
     )
     named = {
@@ -64,11 +65,10 @@ def dense(fit, matches, code, catalogue, weight):
     W = np.stack([weight / matches.sigma_u**2, weight / matches.sigma_v**2], axis=1)
     response = np.einsum("pq,naq,na->pna", fit.cov, J, W)  # of the parameters to each match
     same = code[:, None] == code
-    dt = matches.epoch - catalogue["epoch0"][code]
+    dt = matches.epoch - catalogue.epoch[code]
     total, counted = np.zeros_like(fit.cov), np.zeros_like(fit.cov)
-    for axis, letter in enumerate("uv"):
-        position = catalogue[f"sigma_{letter}"][code] ** 2
-        motion = catalogue[f"motion_{letter}"][code] ** 2
+    for axis in (0, 1):
+        position, motion = catalogue.position[code, axis] ** 2, catalogue.motion[code, axis] ** 2
         C = same * (position + motion * np.outer(dt, dt))
         R = response[:, :, axis]
         total += R @ C @ R.T
@@ -85,7 +85,7 @@ def test_it_is_the_dense_formula(scratch, monkeypatch):
     assert 0 < (~used).sum() < 100
     pairs = {tuple(p) for p in np.column_stack([code, matches.exposure, matches.chip])}
     assert len(pairs) < len(matches)  # some do stand twice
-    found = star_covariance(fit, matches, star=code, **catalogue)
+    found = star_covariance(fit, matches, catalogue, star=code)
     total, counted = dense(fit, matches, code, catalogue, used.astype(float))
     scale = np.sqrt(np.diag(total))
     unit = np.outer(scale, scale)
@@ -98,22 +98,22 @@ def test_it_is_the_dense_formula(scratch, monkeypatch):
 def test_motions_are_the_part_that_is_left_without_errors_of_positions(frames):
     _, matches, fit, code, catalogue = some(3)
     options = {"star": code, "frames": frames}
-    found = star_covariance(fit, matches, **options, **catalogue)
-    exact = catalogue | {"sigma_u": 0.0, "sigma_v": 0.0}
-    alone = star_covariance(fit, matches, **options, **exact).total
+    found = star_covariance(fit, matches, catalogue, **options)
+    exact = replace(catalogue, position=0 * catalogue.position)
+    alone = star_covariance(fit, matches, exact, **options).total
     scale = np.sqrt(np.diag(found.total))
     np.testing.assert_allclose(
         found.motions / np.outer(scale, scale), alone / np.outer(scale, scale), atol=1e-10
     )
-    still = catalogue | {"motion_u": 0.0, "motion_v": 0.0}
-    assert star_covariance(fit, matches, **options, **still).motions is None
+    still = replace(catalogue, motion=0 * catalogue.motion)
+    assert star_covariance(fit, matches, still, **options).motions is None
 
 
 def test_without_the_frames_the_polynomials_are_the_same():
     """And the frames follow by regression: nothing else is said of them."""
     model, matches, fit, code, catalogue = some(11)
     whole, part = (
-        star_covariance(fit, matches, star=code, frames=f, **catalogue) for f in (True, False)
+        star_covariance(fit, matches, catalogue, star=code, frames=f) for f in (True, False)
     )
     n = model.n_distortion
     for a, b in ((whole.total, part.total), (whole.counted, part.counted)):
@@ -134,7 +134,7 @@ def test_without_the_frames_the_polynomials_are_the_same():
 def test_memberships_weigh_the_matches():
     _, matches, fit, code, catalogue = some(2)
     weight = np.random.default_rng(0).uniform(size=len(matches))
-    found = star_covariance(fit, matches, star=code, weight=weight, included=False, **catalogue)
+    found = star_covariance(fit, matches, catalogue, star=code, weight=weight, included=False)
     total, _ = dense(fit, matches, code, catalogue, weight)
     scale = np.sqrt(np.diag(total))
     np.testing.assert_allclose(
@@ -145,8 +145,8 @@ def test_memberships_weigh_the_matches():
 
 def test_the_column_of_the_table_is_used():
     _, matches, fit, code, catalogue = some(3)
-    a = star_covariance(fit, matches._with(star=code), **catalogue)
-    b = star_covariance(fit, matches, star=code, **catalogue)
+    a = star_covariance(fit, matches._with(star=code), catalogue)
+    b = star_covariance(fit, matches, catalogue, star=code)
     np.testing.assert_array_equal(a.extra, b.extra)
 
 
@@ -154,7 +154,7 @@ def test_stars_that_are_seen_once_add_nothing():
     model, matches, _ = simulated(4, 200, order=2)
     fit = fit_linear(matches, model)
     found = star_covariance(
-        fit, matches, 0.03, 0.04, star=np.random.default_rng(0).permutation(200)
+        fit, matches, alike(0.03, 0.04, 200), star=np.random.default_rng(0).permutation(200)
     )
     scale = np.sqrt(np.diag(found.total))
     assert (scale > 0).all()
@@ -183,7 +183,7 @@ def test_more_exposures_of_the_same_pixels_do_not_help_against_the_catalogue():
     """Closed form: centroids of 0.02 px average over 9 exposures, the catalogue's errors do not."""
     model, matches, n = repeated()
     fit = fit_linear(matches, model, **UNCLIPPED)
-    solution = with_star_errors(fit, star_covariance(fit, matches, 0.05, 0.03))
+    solution = with_star_errors(fit, star_covariance(fit, matches, alike(0.05, 0.03, 60)))
     A = legendre_design(2, matches.x[:60], matches.y[:60])
     inverse = np.linalg.inv(A.T @ A)
     K = model.n_terms
@@ -229,7 +229,7 @@ def test_repeated_catalogues():
 
 def test_draws_are_spread_to_the_covariance():
     _, matches, fit, code, catalogue = some(7)
-    solution = with_star_errors(fit, star_covariance(fit, matches, star=code, **catalogue))
+    solution = with_star_errors(fit, star_covariance(fit, matches, catalogue, star=code))
     draws = solution.draws(4000, np.random.default_rng(1))
     white = np.linalg.solve(np.linalg.cholesky(solution.cov), (draws - solution.mean).T)
     assert stats.kstest((white**2).sum(axis=0), stats.chi2(len(fit.mean)).cdf).pvalue > 1e-3
@@ -240,7 +240,7 @@ def test_draws_are_spread_to_the_covariance():
 
 
 @dataclass(frozen=True, eq=False)
-class Skewed:
+class Skewed(Solution):
     """A posterior that is no Gaussian: gamma variables."""
 
     model: DistortionModel
@@ -257,10 +257,10 @@ class Skewed:
 def test_a_posterior_keeps_its_shape_and_stays_one():
     _, matches, fit, code, catalogue = some(8)
     posterior = Skewed(fit.model, fit.mean, fit.cov)
-    found = star_covariance(posterior, matches, star=code, weight=fit.uses(matches), **catalogue)
+    found = star_covariance(posterior, matches, catalogue, star=code, weight=fit.uses(matches))
     solution = with_star_errors(posterior, found)
     assert solution.convergence == "judged" and solution.approximation == ""
-    assert not hasattr(with_star_errors(fit, found), "convergence")
+    assert with_star_errors(fit, found).convergence is None
     first = (solution.draws(20_000, np.random.default_rng(2)) - solution.mean)[:, 0]
     assert first.std() / solution.sigma[0] == pytest.approx(1, abs=0.03)
     assert stats.skew(first) == pytest.approx(1.0, abs=0.15)  # 2 / sqrt(4)
@@ -273,7 +273,7 @@ def test_views_carry_it_on():
     x, y = np.int64(matches.x // 400), np.int64(matches.y // 400)
     code = (matches.chip * 11 + x) * 6 + y
     found = fit_hierarchical(matches, model)
-    stars = star_covariance(found, matches, 0.01, 0.01, star=code)
+    stars = star_covariance(found, matches, alike(0.01, 0.01, code.max() + 1), star=code)
     wide = with_star_errors(found, stars)
     a, b = (linear_terms(reference_gauge(s), 1, epoch=2004.5) for s in (wide, found))
     np.testing.assert_array_equal(a.values, b.values)
@@ -285,17 +285,24 @@ def test_views_carry_it_on():
 
 def test_what_is_wrong_is_said():
     _, matches, fit, code, _ = some(10)
+    n = code.max() + 1
     with pytest.raises(InputError, match="do not say which star is which"):
-        star_covariance(fit, matches, 0.01, 0.01)
+        star_covariance(fit, matches, alike(0.01, 0.01, n))
     for wrong in (code[:-1], code - 5, code.astype(float)):
         with pytest.raises(InputError, match="star codes have shape"):
-            star_covariance(fit, matches, 0.01, 0.01, star=wrong)
-    with pytest.raises(InputError, match=r"sigma_v has shape \(3,\)"):
-        star_covariance(fit, matches, 0.01, [0.1, 0.2, 0.3], star=code)
-    with pytest.raises(InputError, match=r"sigma_u is -0\.01"):
-        star_covariance(fit, matches, -0.01, 0.01, star=code)
+            star_covariance(fit, matches, alike(0.01, 0.01, n), star=wrong)
+    with pytest.raises(InputError, match="position is given for 3 stars, and codes go up"):
+        star_covariance(fit, matches, alike(0.01, 0.01, 3), star=code)
+    with pytest.raises(InputError, match=r"position is -0\.01"):
+        star_covariance(fit, matches, alike(-0.01, 0.01, n), star=code)
     with pytest.raises(InputError, match="need the catalogue's epoch"):
-        star_covariance(fit, matches, 0.01, 0.01, motion_u=0.1, motion_v=0.1, star=code)
+        moving = replace(alike(0.01, 0.01, n), motion=np.full((n, 2), 0.1))
+        star_covariance(fit, matches, moving, star=code)
+    dated = replace(moving, epoch=np.full(n, 2004.0))
+    with pytest.raises(InputError, match="need the epochs of the matches"):
+        star_covariance(fit, replace(matches, epoch=None), dated, star=code)
+    with pytest.raises(InputError, match="epoch is nan"):
+        star_covariance(fit, matches, replace(moving, epoch=np.full(n, np.nan)), star=code)
     with pytest.raises(InputError, match=r"sigma_u: the quoted errors of \d+ matches are smaller"):
-        star_covariance(fit, matches, 0.03, 0.01, star=code)
-    star_covariance(fit, matches, 0.03, 0.01, star=code, included=False)
+        star_covariance(fit, matches, alike(0.03, 0.01, n), star=code)
+    star_covariance(fit, matches, alike(0.03, 0.01, n), star=code, included=False)

@@ -127,10 +127,7 @@ def test_a_catalogue_that_both_sides_share_is_no_change(full) -> None:
         new = replace(new, exposure=new.exposure - 24, exposure_names=names[24:])
         model = replace(one.model, exposures=names[:24])
         joint = fit_hierarchical(old, model, n_tau=64, **UNCLIPPED)
-        shared = star_covariance(
-            joint.fit, old, *one.errors.position.T, motion_u=one.errors.motion[:, 0],
-            motion_v=one.errors.motion[:, 1], epoch0=one.errors.epoch,
-        )  # fmt: skip
+        shared = star_covariance(joint.fit, old, one.errors)
         release = with_star_errors(joint, shared)
         tau = np.sqrt((joint.tau_draws**2).mean(axis=0))
         scatter = dict(zip(joint.scatter.kinds, tau, strict=True))

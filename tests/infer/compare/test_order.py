@@ -13,7 +13,7 @@ from bayesdist.data import open_matches, write_partitioned
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import Rejection, fit_linear
 from bayesdist.infer.compare.order import select_order
-from bayesdist.infer.compare.order_sums import bin_sums, departures, held_out_gain, share_sums
+from bayesdist.infer.compare.order_sums import bin_sums, departures, fold_sums, held_out_gain
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import Chip, DistortionModel
@@ -118,12 +118,12 @@ def test_surfaces_are_fits_to_the_means_of_bins(small):
 
 def test_shares_are_even_and_know_nothing_of_order_and_pieces(small):
     matches, fit, _, stars = small
-    whole = share_sums(stars, fit.mean, fit.clip, 10)
+    whole = fold_sums(stars, fit.mean, fit.clip, 10)
     assert stats.chisquare(whole.count).pvalue > 1e-3
     turned = matches.select(np.random.default_rng(1).permutation(len(matches)))
     halves = [turned.select(np.arange(a, len(matches), 2)) for a in (0, 1)]
     first, second = (
-        share_sums(prepare(fit.model, half)[0], fit.mean, fit.clip, 10) for half in halves
+        fold_sums(prepare(fit.model, half)[0], fit.mean, fit.clip, 10) for half in halves
     )
     both = first + second
     np.testing.assert_array_equal(both.count, whole.count)
@@ -142,7 +142,7 @@ def nulls(n, seed0, **options):
             orders=(2, 3, 4),
             bins=9,
             regions=5,
-            shares=20,
+            folds=20,
             rejection=Rejection(np.inf, None),
         )
 

@@ -18,8 +18,8 @@ from bayesdist.infer.density.coordinates import Split
 from bayesdist.infer.density.laplace import conditional_mode, starting_point
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.kernel import circle
-from bayesdist.infer.posterior.likelihood import Scores
 from bayesdist.infer.posterior.memberships import memberships, star_log_likelihood
+from bayesdist.infer.stars.likelihood import MixtureAt
 from tests.seeds import over
 
 from ..selected import SIGMA, selected
@@ -244,7 +244,7 @@ def test_scores_are_the_gradient_of_each_star(kind):
     n = target.n_theta
     constants = target.hyper.constants(psi[None, n:])
     stars = stars_of(target.model, matches)
-    scores = Scores(psi[:n], None, constants).of(stars)
+    scores = MixtureAt(psi[:n], constants).scores(stars)
 
     def each(shift):
         theta = psi[:n].copy()

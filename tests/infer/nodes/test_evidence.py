@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.infer.nodes.evidence import Evidence, fitted_field
-from bayesdist.infer.nodes.matern import SMOOTHNESS, Matern
+from bayesdist.infer.nodes.hyperparameters import SMOOTHNESS, Evidence, Matern, fitted_field
 from bayesdist.infer.nodes.sums import node_sums
 from tests.infer.nodes.support import (
     CHIP,

@@ -7,7 +7,13 @@ import pytest
 from scipy.stats import binomtest
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.nodes import Matern, TablePosterior, binned_table, field_table
+from bayesdist.infer.nodes import (
+    Matern,
+    TablePosterior,
+    binned_table,
+    field_table,
+    fit_mixture,
+)
 from tests.infer.nodes.support import (
     CHIP,
     ORDER,
@@ -182,16 +188,14 @@ def test_where_there_are_no_stars_the_prior_speaks(rng):
 @pytest.mark.parametrize("fraction", [0.03, 0.10])
 def test_false_matches_do_not_pull(rng, fraction):
     """With weights from the mixture; the same stars with all weights one go far astray."""
-    from bayesdist.infer.nodes.trust import fitted_trust
-
     x, y = places(rng, 30_000)
     d = pattern(rng, Matern(0.02, 70.0, 1.5))
     r, variance = measured(rng, x, y, d)
     false = rng.random(len(x)) < fraction
     r[false] = rng.normal([0.5, -0.5], 0.8, (false.sum(), 2))
-    trust = fitted_trust(r, variance)
-    assert abs(trust.fraction - fraction) < 0.15 * fraction
-    got = table_of(x, y, r, variance, weight=trust.probability)
+    mixture = fit_mixture(r, variance)
+    assert abs(mixture.fraction - fraction) < 0.15 * fraction
+    got = table_of(x, y, r, variance, weight=mixture.probability)
     pull = (flat(got.table.values) - d) / flat(got.table.sigma)
     assert abs(pull.mean()) < 0.2 and (pull**2).mean() < 1.4
     naive = table_of(x, y, r, variance)

@@ -9,13 +9,12 @@ import pytest
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.infer.nodes import fit_with_tables
-from bayesdist.infer.nodes.alternation import with_columns
-from bayesdist.infer.nodes.table_fit import held_sigma
+from bayesdist.infer.nodes import fit_with_tables, held_sigma
+from bayesdist.infer.nodes.corrected import with_columns
 from bayesdist.model import DistortionModel
 from bayesdist.model.lookup import LookupTable, corrected
 from tests.infer.nodes.support import CHIP, ORDER, SIZE, STEP, grid, pattern, places
-from tests.infer.nodes.test_alternation import OPTIONS, bent
+from tests.infer.nodes.test_fit import OPTIONS, bent
 
 NOISE = 0.02
 DETECTOR, FILTER = "F606W", "F814W"
@@ -55,53 +54,48 @@ def matches(model):
 
 
 @pytest.fixture(scope="module")
-def together(matches, model):
-    return fit_with_tables(matches, model, base=DETECTOR, **OPTIONS)
+def detector(matches, model):
+    """The detector's table, from the first filter."""
+    return fit_with_tables(matches.select(matches.filter == 0), model, **OPTIONS)
 
 
 @pytest.fixture(scope="module")
-def alone(matches, model, together):
-    """The second filter by itself, over the detector's tables of the first."""
-    return fit_with_tables(
-        matches.select(matches.filter == 1),
-        model,
-        base=FILTER,
-        detector=together.part().tables,
-        **OPTIONS,
-    )
-
-
-def test_a_filter_alone_over_held_tables_is_that_filter_beside_the_base(together, alone):
-    assert [t.filter for t in alone.tables] == ["", FILTER]
-    one, other = together.part(FILTER).tables[0], alone.part().tables[0]
-    np.testing.assert_allclose(one.values, other.values, atol=1e-9)
-    np.testing.assert_array_equal(alone.tables[0].values, together.tables[0].values)
-    x, y = places(np.random.default_rng(1), 50)
-    np.testing.assert_allclose(
-        together.predict(x, y, chip=1, filter=FILTER), alone.predict(x, y, chip=1), atol=1e-9
-    )
-
-
-def test_a_held_table_is_a_correction_made_beforehand(matches, model, alone):
-    """Second route: pixels corrected first, and then a table of nothing but the filter."""
+def over(matches, model, detector):
+    """The second filter over that table: with its covariance, and with the nodes' errors alone."""
     some = matches.select(matches.filter == 1)
-    x, y = corrected(alone.held, some.x, some.y, chip=1)
+    return [
+        fit_with_tables(some, model, filter=FILTER, beneath=beneath, **OPTIONS)
+        for beneath in (detector.fitted, detector.tables)
+    ]
+
+
+def test_tables_do_not_depend_on_what_is_known_of_those_beneath(detector, over):
+    joint, bound = over
+    for fit in over:
+        assert [t.filter for t in fit.tables] == ["", FILTER]
+        np.testing.assert_array_equal(fit.tables[0].values, detector.tables[0].values)
+    np.testing.assert_array_equal(joint.tables[1].values, bound.tables[1].values)
+    x, y = places(np.random.default_rng(1), 50)
+    np.testing.assert_array_equal(joint.predict(x, y, chip=1), bound.predict(x, y, chip=1))
+
+
+def test_a_held_table_is_a_correction_made_beforehand(matches, model, over):
+    """Second route: pixels corrected first, and then a table of nothing but the filter."""
+    some, fit = matches.select(matches.filter == 1), over[1]
+    x, y = corrected(fit.tables[:1], some.x, some.y, chip=1)
     inside = (x > 0.5) & (x < SIZE[0] + 0.5) & (y > 0.5) & (y < SIZE[1] + 0.5)
     moved = with_columns(some.select(inside), x=x[inside], y=y[inside])
-    found = fit_with_tables(moved, model, base=FILTER, **OPTIONS)
-    sigma = alone.part().tables[0].sigma
+    found = fit_with_tables(moved, model, **OPTIONS)
     # the few stars at the rim are left out here
-    assert (np.abs(found.tables[0].values - alone.part().tables[0].values) < 0.3 * sigma).all()
+    assert (np.abs(found.tables[0].values - fit.tables[1].values) < 0.3 * fit.tables[1].sigma).all()
 
 
-def test_the_error_with_held_nodes_is_not_below_that_with_their_covariance(together, alone):
+def test_the_error_with_held_nodes_is_not_below_that_with_their_covariance(over):
     """Their nodes' errors alone bound what their covariance would say."""
     x, y = places(np.random.default_rng(2), 300)
-    known = together.table_sigma(x, y, chip=1, filter=FILTER)
-    bound = alone.table_sigma(x, y, chip=1)
+    known, bound = (fit.table_sigma(x, y, chip=1) for fit in over)
     assert (bound > 0.999 * known).all()
-    total = alone.position_sigma(x, y, chip=1)
-    assert (total > bound).all()
+    assert (over[1].position_sigma(x, y, chip=1) > bound).all()
 
 
 def test_nodes_that_err_together_reach_the_bound():
@@ -123,4 +117,4 @@ def test_nodes_that_err_together_reach_the_bound():
 def test_a_table_of_a_filter_is_not_the_detectors(matches, model):
     alien = LookupTable(1, np.zeros((2, 4, 4)), FILTER, (80.5, 64.5), (160.0, 128.0))
     with pytest.raises(InputError, match="not the detector's"):
-        fit_with_tables(matches, model, detector=[alien], step=STEP)
+        fit_with_tables(matches, model, beneath=[alien], step=STEP)

@@ -7,7 +7,7 @@ import pytest
 
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.linear import LinearFit
-from bayesdist.infer.nodes import pixel_jacobian, pixel_shifts
+from bayesdist.infer.nodes import pixel_shifts
 from bayesdist.model import TimeDependence
 from bayesdist.model.frames import nearest_frame
 from tests.infer.support import TWO_CHIPS, columns_of, numerical_gradient, simulated, table
@@ -58,7 +58,7 @@ def turned():
 def test_jacobian_is_the_slope_of_predict(turned):
     model, theta, matches = turned
     of = columns_of(matches)
-    got = pixel_jacobian(model, theta, matches.x, matches.y, **of)
+    got = model.slopes(theta, matches.x, matches.y, **of)
     for k in range(0, 600, 60):
         one = {name: None if v is None else v[k] for name, v in of.items()}
 
@@ -93,7 +93,7 @@ def test_variances_turn_with_the_roll(turned, rng):
     sigma = np.array([0.1, 0.01])
     quoted = matches.with_sigma(*sigma)
     variance = pixel_shifts(Solution(model, theta), quoted).variance
-    J = pixel_jacobian(model, theta, matches.x, matches.y, **columns_of(matches))
+    J = model.slopes(theta, matches.x, matches.y, **columns_of(matches))
     noise = sigma * rng.standard_normal((4000, 2))
     for k in (0, 250, 599):
         scatter = np.linalg.solve(J[k], noise.T).var(axis=1)
@@ -107,7 +107,7 @@ def test_residuals_are_those_of_the_fit(rng):
     fit = fit_linear(matches, model)
     assert isinstance(fit, LinearFit)
     shifts = pixel_shifts(fit, matches)
-    J = pixel_jacobian(model, fit.mean, matches.x, matches.y)
+    J = model.slopes(fit.mean, matches.x, matches.y)
     np.testing.assert_allclose(
         np.einsum("nab,nb->na", J, shifts.shift), residuals(fit, matches), atol=1e-9
     )

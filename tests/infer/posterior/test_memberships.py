@@ -9,12 +9,7 @@ from bayesdist.data import matches as tables
 from bayesdist.infer import GaussianPriors, OutlierMixture, load, memberships
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.posterior import memberships as membership
-from bayesdist.infer.posterior.memberships import (
-    count_outliers,
-    sampled_points,
-    some_draws,
-    star_log_likelihood,
-)
+from bayesdist.infer.posterior.memberships import count_outliers, some_draws, star_log_likelihood
 
 from ..oracle import star_terms
 from ..support import MIXTURES, TWO_CHIPS, posterior_at, residual_of, simulated, table, target_of
@@ -94,7 +89,7 @@ def test_some_of_the_stars_are_as_in_the_whole(known):
 
 def test_points_are_those_that_were_sampled(known):
     target, posterior, _, _, _, psi = known
-    theta, h = sampled_points(posterior)
+    theta, h = posterior.sampled_points
     np.testing.assert_array_equal(theta, psi[:, : target.n_theta])
     np.testing.assert_allclose(h, psi[:, target.n_theta :], rtol=1e-12, atol=1e-12)
 

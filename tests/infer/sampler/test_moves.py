@@ -18,9 +18,9 @@ from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.sampler.ensembles import Whitening
 from bayesdist.infer.sampler.move_schedule import (
-    boundaries,
+    block_schedule,
+    doubling_schedule,
     expected_passes,
-    ladder,
     pilot_steps,
     plan_moves,
     walkers_for,
@@ -121,37 +121,45 @@ def test_whitening_is_undone_and_whitens():
 @pytest.mark.parametrize(
     ("every", "most"), [(200, 20_000), (1000, 3000), (30, 100), (50, 77), (7, 3)]
 )
-def test_boundaries(every, most):
-    ends = list(boundaries(every, most))
+def test_doubling_schedule(every, most):
+    ends = [one.end for one in doubling_schedule(0, every, most)]
     assert ends[-1] == most
     lengths = np.diff([0, *ends])
     assert (lengths > 0).all() and (lengths <= max(every, 1)).all()
     # whatever the total, a longer run passes through the same boundaries: resuming is possible
-    longer = list(boundaries(every, 2 * most))
+    longer = [one.end for one in doubling_schedule(0, every, 2 * most)]
     assert ends[:-1] == longer[: len(ends) - 1]
 
 
-def test_boundaries_are_those_documented():
-    assert list(boundaries(200, 1000)) == [50, 100, 200, 400, 600, 800, 1000]
+def test_schedule_is_the_one_documented():
+    assert [one.end for one in doubling_schedule(0, 200, 1000)] == [
+        50,
+        100,
+        200,
+        400,
+        600,
+        800,
+        1000,
+    ]
 
 
 @pytest.mark.parametrize("n_stars", [100, 5_000, 1_000_000, 10**10])
 @pytest.mark.parametrize(
     ("every", "most"), [(200, 20_000), (1000, 3000), (30, 100), (4, 77), (7, 3)]
 )
-def test_ladder(every, most, n_stars):
+def test_block_schedule(every, most, n_stars):
     pilot = 15
-    rungs = list(ladder(pilot, every, most, n_stars))
+    rungs = list(block_schedule(pilot, every, most, n_stars))
     assert rungs[0].begin == 0 and rungs[-1].end == most
     for one, following in pairwise(rungs):
         assert one.end == one.full == following.begin
     for rung in rungs:
         assert 0 < rung.end - rung.begin <= every
         assert rung.end <= rung.full
-        assert rung.full <= pilot or rung.begin >= pilot  # pilot and later pages are never mixed
+        assert rung.full <= pilot or rung.begin >= pilot  # pilot and later batches are never mixed
         # what is added is in proportion to what there is
         assert rung.begin < pilot or rung.full - rung.begin <= 0.25 * rung.begin + 1
-    longer = list(ladder(pilot, every, 2 * most, n_stars))
+    longer = list(block_schedule(pilot, every, 2 * most, n_stars))
     assert [(r.begin, r.full) for r in rungs] == [(r.begin, r.full) for r in longer[: len(rungs)]]
 
 

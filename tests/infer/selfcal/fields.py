@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.infer.selfcal.problem import prepared
+from bayesdist.infer.selfcal.problem import prepare
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate.dithers import dither_pattern, simulate_dithers, smooth_distortion
 
@@ -28,7 +28,7 @@ def field(seed, n_exposures=8, n_stars=400, *, order=3, n_chips=1, rolls=(0, 60,
 def problem_of(simulated, model: DistortionModel | None = None, **more):
     """Its problem with the true stars, linearised at the truth."""
     model = model or simulated.model
-    found = prepared(model, simulated.detections, simulated.theta, match_radius=1.0, **more)
+    found = prepare(model, simulated.detections, simulated.theta, match_radius=1.0, **more)
     stars = found.mean_places(simulated.theta)
     for _ in range(3):
         found = found.at(simulated.theta, stars)

@@ -18,7 +18,7 @@ def test_a_star_without_members_is_somewhere_in_the_match_circle():
         match_radius=radius,
         start_radius=2.0,
     )
-    catalogue = star_catalogue(found.solution)
+    catalogue = star_catalogue(found.mode)
     lost = catalogue.n_members < 0.01
     assert lost.sum() > 10
     off = np.sqrt(np.trace(catalogue.own, axis1=1, axis2=2) / 2)

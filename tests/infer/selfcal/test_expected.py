@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from bayesdist.data.detections import Detections
+from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.expected import expected_solution
-from bayesdist.infer.selfcal.information import Information, frame_information
+from bayesdist.infer.selfcal.prior import frame_prior
 from bayesdist.simulate.dithers import dithered_model, sky_seen, stars_on_detector
 from bayesdist.simulate.patterns import flat_coefficients
 from tests.infer.selfcal.fields import SIZE, chips
@@ -32,7 +33,7 @@ def _expected(offsets, rolls, frames="shift_rotation", order=3, information=None
     detections = Detections(
         x, y, exposure, model.exposures, chip, sigma=np.full(len(x), 0.02), star=star
     )
-    known = information(model, truth) if information else Information.none(truth)
+    known = information(model, truth) if information else Prior.none(truth)
     return expected_solution(model, truth, detections, known)
 
 
@@ -88,7 +89,7 @@ def test_commanded_rolls_add_as_independent_measurements():
     known = _expected(
         SPREAD,
         ROLLS,
-        information=lambda m, t: frame_information(m, t, "rotation", ROLLS, sigma),
+        information=lambda m, t: frame_prior(m, t, "rotation", ROLLS, sigma),
     )
     free = _expected(SPREAD, ROLLS)
     # the zero point of the commands is unknown: of rotation on the sky they say nothing

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.infer.selfcal import pointing_information, tie
+from bayesdist.infer.equations.priors import Prior
+from bayesdist.infer.selfcal import pointing_prior, tie
+from bayesdist.infer.selfcal.elimination import Mixture, expand
 from bayesdist.infer.selfcal.gauge import find_gauge
-from bayesdist.infer.selfcal.information import Information
-from bayesdist.infer.selfcal.moves import POINTS, functionals, moves
-from bayesdist.infer.selfcal.normal import Mixture, expand
+from bayesdist.infer.selfcal.sky_moves import POINTS, functionals, moves
 from tests.infer.selfcal.fields import field, problem_of
 
 ALWAYS = {*POINTS, "scale", "rotation"}
@@ -19,7 +19,7 @@ SKEW = {"skew_plus", "skew_cross"}
 def _gauge(simulated, information=None):
     problem, stars = problem_of(simulated)
     found = expand(problem, simulated.theta, Mixture(0.0, 0.01), stars, observed=False)
-    information = information or Information.none(simulated.theta)
+    information = information or Prior.none(simulated.theta)
     return find_gauge(problem, simulated.theta, found.curvature, information), found
 
 
@@ -82,7 +82,7 @@ def test_scale_from_commanded_offsets():
     x, y = (np.full(10, c) for c in model.chips[0].reference_pixel)
     true = model.predict(theta, x, y, exposure=np.arange(10))
     sigma = 0.3
-    information = pointing_information(model, theta, true, np.full(10, sigma))
+    information = pointing_prior(model, theta, true, np.full(10, sigma))
     gauge, _ = _gauge(simulated, information)
     scale = next(d for d in gauge.directions if d.name == "scale")
     rotation = next(d for d in gauge.directions if d.name == "rotation")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.polynomial.legendre import legder, legval, legvander
 
+from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal import sample_selfcal
-from bayesdist.infer.selfcal.information import Information
-from bayesdist.infer.selfcal.solve import solve
+from bayesdist.infer.selfcal.mode import solve
 from tests.infer.selfcal.fields import SIZE, field, problem_of
 
 pytestmark = pytest.mark.slow
@@ -102,10 +102,10 @@ def _nuts(simulated, problem, solution, draws, seed):
 
 def test_agrees_with_nuts(full, capsys):
     simulated = field(6, 5, 70, order=2, disturbed=0.04)
-    problem, _ = problem_of(simulated, least=3)
+    problem, _ = problem_of(simulated, min_detections=3)
     K = simulated.model.n_terms
     free = np.setdiff1d(np.arange(simulated.model.n_params), [0, 1, K, K + 1])
-    solution = solve(problem, simulated.theta, free, Information.none(simulated.theta))
+    solution = solve(problem, simulated.theta, free, Prior.none(simulated.theta))
     posterior = sample_selfcal(solution, target_ess=20_000 if full else 6000, seed=4)
     assert posterior.convergence.converged
     h = {k: v.ravel() for k, v in posterior.hyper.items()}

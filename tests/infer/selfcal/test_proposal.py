@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from bayesdist.errors import DegenerateError
-from bayesdist.infer.selfcal import proposal
-from bayesdist.infer.selfcal.information import Information
-from bayesdist.infer.selfcal.solve import solve
-from bayesdist.infer.selfcal.target import SelfTarget
+from bayesdist.infer.equations.priors import Prior
+from bayesdist.infer.selfcal import posterior
+from bayesdist.infer.selfcal.mode import solve
+from bayesdist.infer.selfcal.posterior import SelfTarget
 
 from .fields import field, problem_of
 
@@ -19,7 +19,7 @@ from .fields import field, problem_of
 def indefinite(when):
     """`expand` with a negative curvature in those passes for which `when(observed, k)` is true."""
     passes = {True: 0, False: 0}
-    expand = proposal.expand
+    expand = posterior.expand
 
     def wrapped(*args, observed=True):
         passes[observed] += 1
@@ -34,16 +34,16 @@ def indefinite(when):
 @pytest.fixture(scope="module")
 def target():
     simulated = field(6, 5, 70, order=2, disturbed=0.04)
-    problem, _ = problem_of(simulated, least=3)
+    problem, _ = problem_of(simulated, min_detections=3)
     K = simulated.model.n_terms
     free = np.setdiff1d(np.arange(simulated.model.n_params), [0, 1, K, K + 1])
-    return SelfTarget(solve(problem, simulated.theta, free, Information.none(simulated.theta)))
+    return SelfTarget(solve(problem, simulated.theta, free, Prior.none(simulated.theta)))
 
 
 def test_nodes_are_found_past_an_indefinite_curvature(target, monkeypatch):
-    plain = proposal.propose(target)
-    monkeypatch.setattr(proposal, "expand", indefinite(lambda observed, k: observed and k == 2))
-    found = proposal.propose(target)
+    plain = posterior.propose(target)
+    monkeypatch.setattr(posterior, "expand", indefinite(lambda observed, k: observed and k == 2))
+    found = posterior.propose(target)
     sigma = np.sqrt(np.diag(target.solution.cov)[target.solution.free])
     assert len(found.nodes) == len(plain.nodes)
     for a, b in zip(found.nodes, plain.nodes, strict=True):
@@ -52,6 +52,6 @@ def test_nodes_are_found_past_an_indefinite_curvature(target, monkeypatch):
 
 
 def test_what_is_indefinite_with_any_weights_is_refused(target, monkeypatch):
-    monkeypatch.setattr(proposal, "expand", indefinite(lambda *_: True))
+    monkeypatch.setattr(posterior, "expand", indefinite(lambda *_: True))
     with pytest.raises(DegenerateError, match="do not determine"):
-        proposal.propose(target)
+        posterior.propose(target)

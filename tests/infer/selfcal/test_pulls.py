@@ -20,9 +20,14 @@ def _one(seed, n_exposures, n_stars, rolls):
     start[3:K] *= 0.9
     start[K + 3 : 2 * K] *= 0.9
     found = self_calibrate(
-        simulated.model, simulated.unlabelled, start, match_radius=1.0, start_radius=2.0, least=3
+        simulated.model,
+        simulated.unlabelled,
+        start,
+        match_radius=1.0,
+        start_radius=2.0,
+        min_detections=3,
     )
-    solution, gauge = found.solution, found.gauge
+    solution, gauge = found.mode, found.gauge
     shift = aligned(solution.theta, truth, gauge) - truth
     chi2 = shift[solution.free] @ solution.precision @ shift[solution.free]
     pulls = shift[solution.free] / np.sqrt(np.diag(np.linalg.inv(solution.precision)))
@@ -31,7 +36,7 @@ def _one(seed, n_exposures, n_stars, rolls):
 
 def _stars(simulated, found):
     """Distances of two stars each from the true ones over their errors, in the own gauge."""
-    solution, p = found.solution, found.solution.problem
+    solution, p = found.mode, found.mode.problem
     catalogue = star_catalogue(solution)
     true = simulated.detections.star[p.rows]
     whose = np.array([np.bincount(t[t >= 0]).argmax() if (t >= 0).any() else -1

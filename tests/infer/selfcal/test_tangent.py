@@ -74,7 +74,7 @@ def _start(detections, pointings, rolls):
 
 def _chi2(found, bends):
     """Chi-square of relative positions against the true camera, and its degrees of freedom."""
-    theta, model = found.solution.theta, found.solution.problem.model
+    theta, model = found.mode.theta, found.mode.problem.model
     null, at = found.gauge.null, (np.arange(20) + 0.5) * N / 20 + 0.5
     x, y = (z.ravel() for z in np.meshgrid(at, at))
     first = np.zeros(len(x), np.int64)
@@ -82,13 +82,13 @@ def _chi2(found, bends):
     J = model.jacobian(theta, x, y, exposure=first).reshape(-1, model.n_params)
     off = off - J @ null @ np.linalg.lstsq(J @ null, off, rcond=None)[0]
     S = gauge_free_matrix(model, theta, null)
-    values, vectors = np.linalg.eigh(J @ S @ found.solution.cov @ S.T @ J.T)
+    values, vectors = np.linalg.eigh(J @ S @ found.mode.cov @ S.T @ J.T)
     n = model.n_polynomial - null.shape[1]
     return ((vectors[:, -n:].T @ off) ** 2 / values[-n:]).sum(), n
 
 
 def _pointing_test(found):
-    return next(t for t in selfcal_score_tests(found.solution) if t.name == "pointing")
+    return next(t for t in selfcal_score_tests(found.mode) if t.name == "pointing")
 
 
 def test_a_wide_field():

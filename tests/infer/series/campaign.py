@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.infer.series import Course, Series
+from bayesdist.infer.series import Series, TrendModel
 
 COEFFICIENTS = ("A_2", "B_2", "B_3")
 REFERENCE = (2004.5, 2012.5)
@@ -20,7 +20,7 @@ SIGMA_BETA = np.array([[6.85e-7, 6.893e-7, 9.37e-7], [8.40e-7, 1.418e-6, 8.17e-7
 SCATTER = np.sqrt(55) * np.array([9.14e-7, 9.206e-7, 1.25e-6])
 CORRELATION = np.array([[1.0, -0.3, 0.5], [-0.3, 1.0, 0.0], [0.5, 0.0, 1.0]])
 FORMAL = 1.0e-6
-LINES = Course("lines", (BREAK,), reference=REFERENCE)
+LINES = TrendModel("lines", (BREAK,), reference=REFERENCE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ def campaign(
 
 
 def drifting(seed: int, n: int = 80, memory: float = 0.7, k: int = 2) -> Series:
-    """No course at all, but deviations that successive exposures share (first-order process)."""
+    """No trend at all, but deviations that successive exposures share (first-order process)."""
     rng = np.random.default_rng([48, seed])
     epoch = 2013 + np.sort(rng.uniform(0, 6, n))
     noise = rng.standard_normal((n, k))

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.series.course import Course
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.series import Series
+from bayesdist.infer.series.trend import TrendModel
 
 __all__ = ["StraightLines", "straight_lines"]
 
@@ -48,17 +48,17 @@ class StraightLines:
     count: NDArray[np.int64]
 
 
-def straight_lines(series: Series, course: Course, *, weighted: bool = False) -> StraightLines:
+def straight_lines(series: Series, trend: TrendModel, *, weighted: bool = False) -> StraightLines:
     """Line of each coefficient in each segment.
 
     By default each exposure counts the same, and the errors come from the scatter about the line;
     with `weighted` the formal errors weight, and are propagated.
     """
-    design = Design(course, series)
+    design = Design(trend, series)
     segment = design.segment(series.epoch)[0]
-    shape = (course.n_segments, series.n_coefficients)
+    shape = (trend.n_segments, series.n_coefficients)
     alpha, beta, s_alpha, s_beta, rms, chi2 = (np.zeros(shape) for _ in range(6))
-    for s in range(course.n_segments):
+    for s in range(trend.n_segments):
         rows = segment == s
         since = series.epoch[rows] - design.reference[s]
         columns = np.stack([np.ones(rows.sum()), since], axis=1)
@@ -76,5 +76,5 @@ def straight_lines(series: Series, course: Course, *, weighted: bool = False) ->
             errors = np.sqrt(np.diag(cov)) * (1.0 if weighted else rms[s, j])
             alpha[s, j], beta[s, j] = fit[0] + series.centre[j], fit[1]
             s_alpha[s, j], s_beta[s, j] = errors
-    count = np.array([(segment == s).sum() for s in range(course.n_segments)])
+    count = np.array([(segment == s).sum() for s in range(trend.n_segments)])
     return StraightLines(design.reference, alpha, beta, s_alpha, s_beta, rms, chi2, count)

@@ -7,14 +7,14 @@ import pytest
 from scipy import stats
 
 from bayesdist.infer.series import (
-    Course,
     Design,
     Series,
+    TrendModel,
     exposure_folds,
     fit_series,
     held_out,
 )
-from bayesdist.infer.series.problem import WIDE, Problem, course_equations
+from bayesdist.infer.series.problem import WIDE, Problem, trend_equations
 from bayesdist.infer.series.small import cholesky, precision_of
 
 from .straight import straight_lines
@@ -49,15 +49,16 @@ def least_squares(series: Series, columns: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 @pytest.mark.parametrize(
-    "course", [Course("line"), Course("lines", (2009.4,)), Course("piecewise", (2006.0, 2010.0))]
+    "trend",
+    [TrendModel("line"), TrendModel("lines", (2009.4,)), TrendModel("piecewise", (2006.0, 2010.0))],
 )
-def test_known_scatter_is_generalised_least_squares(course, rng):
+def test_known_scatter_is_generalised_least_squares(trend, rng):
     series = some_series(rng)
-    design = Design(course, series)
+    design = Design(trend, series)
     problem = Problem.of(series, design, SCATTER, outliers=False)
     columns = problem.columns(np.zeros((1, 0)))
     covariance = problem.formal[:, :, None] + problem.sigma[:, :, None, None]
-    matrix, right = course_equations(
+    matrix, right = trend_equations(
         problem, precision_of(cholesky(covariance)), columns, np.ones((1, 2))
     )
     unit = np.repeat(series.spread, design.n_columns)
@@ -68,9 +69,9 @@ def test_known_scatter_is_generalised_least_squares(course, rng):
 
 def test_draws_are_those_of_generalised_least_squares(rng):
     series = some_series(rng)
-    course = Course("lines", (2009.4,))
-    posterior = fit_series(series, course, scatter=SCATTER, outliers=False)
-    columns = Design(course, series).matrix(series.epoch, series.group_code)[0]
+    trend = TrendModel("lines", (2009.4,))
+    posterior = fit_series(series, trend, scatter=SCATTER, outliers=False)
+    columns = Design(trend, series).matrix(series.epoch, series.group_code)[0]
     mean, cov = least_squares(series, columns)
     b = posterior.raw.b.reshape(-1, *posterior.raw.b.shape[2:]) * series.spread[:, None]
     white = np.linalg.solve(np.linalg.cholesky(cov), (b.reshape(len(b), -1) - mean).T)
@@ -87,16 +88,16 @@ def test_textbook_line(rng):
     epoch = rng.uniform(2002, 2007, n)
     values = 0.98 - 3e-3 * (epoch - 2004.5) + s * rng.standard_normal(n)
     series = Series.of(epoch, values, s, coefficients=("A_2",))
-    weighted = straight_lines(series, Course("line"), weighted=True)
+    weighted = straight_lines(series, TrendModel("line"), weighted=True)
     assert weighted.sigma_alpha[0, 0] == pytest.approx(s / np.sqrt(n), rel=1e-9)
     assert weighted.sigma_beta[0, 0] == pytest.approx(s / np.sqrt(n) / epoch.std(), rel=1e-9)
-    free = straight_lines(series, Course("line", reference=(2004.5,)))
+    free = straight_lines(series, TrendModel("line", reference=(2004.5,)))
     book = stats.linregress(epoch - 2004.5, values)
     assert free.beta[0, 0] == pytest.approx(book.slope, rel=1e-9)
     assert free.alpha[0, 0] == pytest.approx(book.intercept, rel=1e-12)
     assert free.sigma_beta[0, 0] == pytest.approx(book.stderr, rel=1e-9)
     assert free.sigma_alpha[0, 0] == pytest.approx(book.intercept_stderr, rel=1e-9)
-    posterior = fit_series(series, Course("line"), scatter=[[0.0]], outliers=False)
+    posterior = fit_series(series, TrendModel("line"), scatter=[[0.0]], outliers=False)
     assert posterior.beta.std() == pytest.approx(s / np.sqrt(n) / epoch.std(), rel=0.04)
 
 
@@ -107,8 +108,8 @@ def test_one_scatter_is_a_one_dimensional_integral(formal, rng):
     epoch = rng.uniform(2002, 2014, n)
     values = rng.standard_normal(n) + formal * rng.standard_normal(n) + 0.1 * (epoch - 2008)
     series = Series.of(epoch, values, formal, coefficients=("a",))
-    course = Course("line")
-    columns = Design(course, series).matrix(epoch, series.group_code)[0]
+    trend = TrendModel("line")
+    columns = Design(trend, series).matrix(epoch, series.group_code)[0]
     y, unit = values - series.centre[0], series.spread[0]
     grid = np.exp(np.linspace(np.log(1e-4), np.log(30), 4000)) * unit
     log_p, mean, variance = np.empty(len(grid)), np.empty(len(grid)), np.empty(len(grid))
@@ -122,10 +123,10 @@ def test_one_scatter_is_a_one_dimensional_integral(formal, rng):
         mean[i], variance[i] = b[1], cov[1, 1]
     p = np.exp(log_p - log_p.max())
     p /= p.sum()
-    years = Design(course, series).years
+    years = Design(trend, series).years
     beta = p @ mean / years
     sigma_beta = np.sqrt(p @ (variance + mean**2) - (p @ mean) ** 2) / years
-    posterior = fit_series(series, course, outliers=False, target_ess=2000)
+    posterior = fit_series(series, trend, outliers=False, target_ess=2000)
     assert posterior.convergence.converged
     ess = posterior.convergence.ess_bulk_min
     assert posterior.beta.mean() == pytest.approx(beta, abs=4.5 * sigma_beta / np.sqrt(ess))
@@ -140,7 +141,7 @@ def test_held_out_density_of_a_constant(rng):
     n, k = 30, 2
     values = rng.multivariate_normal([0, 0], SCATTER, n)
     series = Series.of(rng.uniform(2002, 2014, n), values, coefficients=("a", "b"))
-    posterior = fit_series(series, Course("constant"), scatter=SCATTER, outliers=False)
+    posterior = fit_series(series, TrendModel("constant"), scatter=SCATTER, outliers=False)
     got = held_out(posterior, exposure_folds(series.epoch, n))
     expected = np.empty(n)
     for e in range(n):
@@ -163,7 +164,7 @@ def test_date_of_a_break_is_a_sum_over_gaps(rng):
     values = rng.standard_normal(n) + 1.2 * (epoch > 2007)
     series = Series.of(epoch, values, coefficients=("a",))
     posterior = fit_series(
-        series, Course("step", find=1), scatter=[[1.0]], outliers=False, target_ess=1500
+        series, TrendModel("step", find=1), scatter=[[1.0]], outliers=False, target_ess=1500
     )
     assert posterior.convergence.converged
     y, unit = values - series.centre[0], series.spread[0]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.series import Course, filter_dependence
+from bayesdist.infer.series import TrendModel, filter_dependence
 
 from .campaign import LINES, campaign
 
@@ -45,7 +45,7 @@ def test_wrong_questions():
     with pytest.raises(DegenerateError, match="2 exposures of group 'F814W'"):
         filter_dependence(truth.series, LINES)
     with pytest.raises(InputError, match="no slopes"):
-        filter_dependence(truth.series, Course("constant"))
+        filter_dependence(truth.series, TrendModel("constant"))
     with pytest.raises(InputError, match="no two filters"):
         filter_dependence(campaign(13).series, LINES)
     common = campaign(14, filters={"F606W": 40, "F814W": 20})

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.series import Course, Series, fit_series
+from bayesdist.infer.series import Series, TrendModel, fit_series
 
 from .campaign import ALPHA, BETA, BREAK, LINES, REFERENCE, SCATTER, campaign
 
@@ -43,9 +43,9 @@ def test_uncertainty_grows_away_from_the_data(posterior):
     assert (np.diff(before.sigma, axis=0) > 0).all()
 
 
-@pytest.mark.parametrize("kind", ["spline", "wander"])
+@pytest.mark.parametrize("kind", ["spline", "random_walk"])
 def test_a_drift_is_unknown_where_it_was_not_seen(kind, truth):
-    posterior = fit_series(truth.series, Course(kind))
+    posterior = fit_series(truth.series, TrendModel(kind))
     last = posterior.series.span[1]
     at = posterior.predict(last + np.array([0.0, 1, 3, 10]), extrapolate=True)
     assert (np.diff(at.sigma, axis=0) > 0).all()
@@ -103,7 +103,7 @@ def test_new_exposures_are_as_wide_as_said(posterior):
 
 def test_same_seed_same_draws(truth):
     some = truth.series.take(np.arange(0, 110, 3))
-    a, b, c = (fit_series(some, Course("line"), seed=s) for s in (5, 5, 6))
+    a, b, c = (fit_series(some, TrendModel("line"), seed=s) for s in (5, 5, 6))
     np.testing.assert_array_equal(a.alpha, b.alpha)
     assert not np.array_equal(a.alpha, c.alpha)
 
@@ -114,13 +114,13 @@ def test_units_do_not_matter(rng):
     values = 0.98 + 1e-5 * rng.standard_normal(40)
     one = Series.of(epoch, values, 1e-6, coefficients=("A_2",))
     other = Series.of(epoch, values * 5e4, 5e-2, coefficients=("A_2",))
-    a, b = (fit_series(s, Course("line")) for s in (one, other))
+    a, b = (fit_series(s, TrendModel("line")) for s in (one, other))
     np.testing.assert_allclose(a.beta * 5e4, b.beta, rtol=1e-3, atol=1e-6)
 
 
 def test_known_scatter_must_fit(truth):
     with pytest.raises(InputError, match="scatter has shape"):
-        fit_series(truth.series, Course("line"), scatter=[[1.0]])
+        fit_series(truth.series, TrendModel("line"), scatter=[[1.0]])
     exact = Series.of(truth.series.epoch, truth.series.values, coefficients=("a", "b", "c"))
     with pytest.raises(DegenerateError, match="no error at all"):
-        fit_series(exact, Course("line"), scatter=np.zeros((3, 3)))
+        fit_series(exact, TrendModel("line"), scatter=np.zeros((3, 3)))

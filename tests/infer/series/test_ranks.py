@@ -1,6 +1,6 @@
 """Simulation-based calibration (Talts et al. 2018): truths from the prior rank uniformly.
 
-Everything that a sweep moves is in it: course, scatter, correlation, outliers, breaks and drifts.
+Everything that a sweep moves is in it: trend, scatter, correlation, outliers, breaks and drifts.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ import pytest
 from scipy.stats import chisquare
 
 from bayesdist.infer.convergence import Limits
-from bayesdist.infer.series import Course, Design, Series
+from bayesdist.infer.series import Design, Series, TrendModel
 from bayesdist.infer.series.chains import run
 from bayesdist.infer.series.problem import WIDE, Problem
-from bayesdist.infer.series.walk import FRACTION_MOST, FRACTION_PRIOR, KAPPA_LEAST, KAPPA_RATE
+from bayesdist.infer.series.scatter import FRACTION_PRIOR, KAPPA_RATE, MAX_FRACTION, MIN_KAPPA
 from tests.infer.calibration import over_seeds
 
 from .test_scatter import prior_draws
@@ -21,10 +21,10 @@ from .test_scatter import prior_draws
 pytestmark = pytest.mark.slow
 
 THINNED = 199
-COURSES = {
-    "line": Course("line"),
-    "step": Course("step", find=1),
-    "spline": Course("spline"),
+TRENDS = {
+    "line": TrendModel("line"),
+    "step": TrendModel("step", find=1),
+    "spline": TrendModel("spline"),
 }
 
 
@@ -38,21 +38,19 @@ def truncated(draw, inside) -> float:
 def ranks_of(name: str, seed: int) -> dict[str, float]:
     """Rank of each true value among thinned posterior draws."""
     rng = np.random.default_rng([83, seed, len(name)])
-    n, k, course = 24, 2, COURSES[name]
+    n, k, trend = 24, 2, TRENDS[name]
     epoch = np.sort(rng.uniform(2002, 2014, n))
     dummy = Series.of(epoch, rng.standard_normal((n, k)), coefficients=("a", "b"))
-    design = Design(course, dummy)
+    design = Design(trend, dummy)
     sigma = prior_draws(k, 1, rng)[..., 0]
-    fraction = truncated(lambda: rng.beta(*FRACTION_PRIOR), lambda f: f <= FRACTION_MOST)
-    kappa = truncated(
-        lambda: np.sqrt(KAPPA_RATE / rng.standard_gamma(1)), lambda v: v >= KAPPA_LEAST
-    )
+    fraction = truncated(lambda: rng.beta(*FRACTION_PRIOR), lambda f: f <= MAX_FRACTION)
+    kappa = truncated(lambda: np.sqrt(KAPPA_RATE / rng.standard_gamma(1)), lambda v: v >= MIN_KAPPA)
     drift = np.abs(rng.standard_t(2, size=k))
     breaks = np.zeros((1, 0))
-    if course.find:
+    if trend.find:
         dates = np.sort(epoch)
         breaks = np.array([[rng.uniform(dates[4], dates[-5])]])
-    columns = design.matrix(epoch, dummy.group_code, breaks if course.find else None)
+    columns = design.matrix(epoch, dummy.group_code, breaks if trend.find else None)
     columns = columns.reshape(n, -1)
     b = WIDE * rng.standard_normal((k, columns.shape[1]))
     b[:, design.n_fixed :] = drift[:, None] * rng.standard_normal(
@@ -82,9 +80,9 @@ def ranks_of(name: str, seed: int) -> dict[str, float]:
         "correlation": rank(correlation, sigma[0, 1] / np.sqrt(sigma[0, 0] * sigma[1, 1])),
         "fraction": rank(draws.fraction, fraction),
         "inflation": rank(draws.kappa2, kappa**2),
-        "course": rank(draws.b[..., 0, 1], b[0, 1]),
+        "trend": rank(draws.b[..., 0, 1], b[0, 1]),
     }
-    if course.find:
+    if trend.find:
         out["break"] = rank(draws.breaks, breaks[0, 0])
     if design.drift:
         out["drift"] = rank(draws.drift[..., 0], drift[0])

@@ -7,10 +7,10 @@ import pytest
 from astropy.table import Table
 
 from bayesdist.infer.series import (
-    Course,
     HeldOut,
     Series,
     SeriesPosterior,
+    TrendModel,
     describe,
     exposure_folds,
     fit_series,
@@ -69,7 +69,7 @@ def answers(series: list[Series]) -> list[tuple[SeriesPosterior, HeldOut]]:
     """A constant with scatter, and what it says of held-out exposures."""
     out = []
     for one in series:
-        posterior = fit_series(one, Course("constant"))
+        posterior = fit_series(one, TrendModel("constant"))
         out.append((posterior, held_out(posterior, exposure_folds(one.epoch))))
     return out
 
@@ -110,7 +110,7 @@ def test_decam_scatter_is_far_above_the_formal_errors(decam_answers):
         ratio = posterior.scatter_sigma.mean(axis=0) / np.median(one.sigma, axis=0)
         assert (ratio > 5).all(), one.source
         # chi2 of a line against the formal errors: hundreds for each degree of freedom
-        lines = straight_lines(one, Course("line"), weighted=True)
+        lines = straight_lines(one, TrendModel("line"), weighted=True)
         assert (lines.chi2[0] / (len(one) - 2) > 100).all()
 
 
@@ -128,10 +128,10 @@ def test_decam_exposures_hang_together_and_no_line_is_claimed(decam, full):
     """Slopes of more than three sigma if exposures were independent, and yet no line."""
     ratios = []
     for one in some(decam, full, 24):
-        verdict = describe(one, (Course("line"),))
+        verdict = describe(one, (TrendModel("line"),))
         assert verdict.comparison.scheme == "blocks"
         assert not verdict.is_line, verdict.text
-        line = next(p for p in verdict.comparison.posteriors if p.course.kind == "line")
+        line = next(p for p in verdict.comparison.posteriors if p.trend.kind == "line")
         assert serial_correlation(line) > 0.3
         ratios.append(np.abs(line.beta.mean(axis=0) / line.beta.std(axis=0)))
     assert (np.array(ratios) > 3).mean() > 0.05
@@ -141,14 +141,14 @@ def test_tess_has_no_line(tess, full):
     chosen = list(tess) if full else [(3, 2)]
     for key in chosen:
         measured = tess[key].take(np.array(tess[key].names, int) <= LAST_MEASURED)
-        verdict = describe(measured, (Course("line"),))
+        verdict = describe(measured, (TrendModel("line"),))
         assert not verdict.is_line, verdict.text
 
 
 def test_the_end_of_the_measured_sectors_is_found(tess):
     """Where the table goes from measured to predicted coefficients, with nobody telling."""
     whole = tess[3, 2]
-    verdict = describe(whole, (Course("line"), Course("step", find=1)))
+    verdict = describe(whole, (TrendModel("line"), TrendModel("step", find=1)))
     place = whole.names.index(str(LAST_MEASURED))
     assert whole.epoch[place] < verdict.breaks[0, 0] < whole.epoch[place + 2]
     assert "no line" in verdict.claim
@@ -160,7 +160,7 @@ def test_decam_breaks_are_found(decam):
     """CCD S13 jumps in magnification between two seasons in 2015, or on the first dates of the
     second: plain to see, and told by nobody."""
     one = decam["S13"].only("mag")
-    posterior = fit_series(one, Course("lines", find=1))
+    posterior = fit_series(one, TrendModel("lines", find=1))
     low, high = np.quantile(posterior.breaks[:, 0], [0.005, 0.995])
     dates = np.sort(one.epoch)
     season = int(np.searchsorted(dates, 2015.4))
@@ -173,12 +173,12 @@ def test_a_step_put_into_real_scatter_is_found(decam):
     """Of six times the CCD's own scatter, at a date that differs from CCD to CCD."""
     for i, name in enumerate(("N4", "N14", "S2", "S21")):
         one = decam[name].only("e1")
-        posterior = fit_series(one, Course("constant"))
+        posterior = fit_series(one, TrendModel("constant"))
         size = 6 * posterior.scatter_sigma.mean()
         order = np.sort(one.epoch)
         date = (order[25 + 9 * i] + order[26 + 9 * i]) / 2
         moved = Series(one.epoch, one.values + size * (one.epoch > date)[:, None], one.cov, ("e1",))
-        found = fit_series(moved, Course("step", find=1))
+        found = fit_series(moved, TrendModel("step", find=1))
         low, high = np.quantile(found.breaks[:, 0], [0.005, 0.995])
         assert low - 0.02 < date < high + 0.02 and high - low < 1.0
         level, _ = found.change()
@@ -189,7 +189,7 @@ def second_half(series: Series, kind: str) -> np.ndarray:
     """Predictive probability of less than measured, of the later half from the earlier one."""
     order = np.argsort(series.epoch, kind="stable")
     first, later = series.take(order[: len(order) // 2]), series.take(order[len(order) // 2 :])
-    draws = fit_series(first, Course(kind)).new_exposures(
+    draws = fit_series(first, TrendModel(kind)).new_exposures(
         later.epoch, np.random.default_rng(3), cov=later.cov, extrapolate=True
     )
     return (draws < later.values).mean(axis=0)

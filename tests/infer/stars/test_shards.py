@@ -15,6 +15,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer import Compute, GaussianPriors, OutlierMixture, Rejection, fit_linear, load
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.equations.normal import least_squares, mixture
+from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.shards import total
 from bayesdist.infer.stars.stars import in_table_order, prepare
 from bayesdist.model import DistortionModel, TimeDependence
@@ -63,8 +64,8 @@ def sums_of(shards, theta):
     target = Target(shards, MIXTURE, GaussianPriors.none(shards.model))
     psi = np.concatenate([theta, PSI])
     return {
-        "least squares": shards.sum(least_squares, theta, theta + 1e-5, 30.0, 1.0, 2.0),
-        "squared weights": shards.sum(least_squares, theta, None, np.inf, np.inf, 2.0, 2),
+        "least squares": shards.sum(least_squares, theta, Clip(theta + 1e-5, 30.0, 1.0), 2.0),
+        "squared weights": shards.sum(least_squares, theta, None, 2.0, 2),
         "mixture": shards.sum(mixture, theta, constants),
         "EM": shards.sum(mixture, theta, constants, True),
     }, target.log_density(np.array([psi, psi + 1e-4]))

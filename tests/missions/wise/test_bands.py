@@ -15,7 +15,8 @@ from astropy.io import fits
 from astropy.table import Table
 
 from bayesdist.infer import load_fit, load_posterior
-from bayesdist.missions.wise.simulate import WISE_ARRAYS, wise_solution
+from bayesdist.missions.wise.published import WISE_ARRAYS
+from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import read_wise_meta
 from bayesdist.simulate import simulate_matches
@@ -290,7 +291,7 @@ def test_a_run_that_has_not_converged_is_said_on_top(compared, tmp_path):
 def test_a_run_that_is_not_finished_is_refused(compared, tmp_path):
     shutil.copytree(compared.run("W4"), tmp_path / "run")
     record = json.loads((tmp_path / "run" / "run.json").read_text(encoding="utf-8"))
-    del record["stages"]["sample"]
+    del record["artefacts"]["sample"]
     (tmp_path / "run" / "run.json").write_text(json.dumps(record), encoding="utf-8")
     words = ["needs stage 'sample'", "bayesdist stage sample"]
     refused(tmp_path, "wise", "bands", tmp_path / "run", "-o", tmp_path / "out", words=words)

@@ -7,15 +7,15 @@ import pytest
 from astropy.table import Table
 from scipy import stats
 
-from bayesdist.data import read_rvb
-from bayesdist.data.frame_stars import FrameStars
 from bayesdist.data.matching.pairs import mutual_pairs
-from bayesdist.data.rvb_accept import RadialLimit
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bring_up.iterate import bring_up
+from bayesdist.missions.wise.frame_stars import FrameStars
+from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
+from bayesdist.missions.wise.pairs.read import read_rvb
 from bayesdist.missions.wise.simulate import wise_solution
-from bayesdist.missions.wise.simulate.bringup import optical_model, simulate_unpaired
-from bayesdist.missions.wise.simulate.stand_in import write_stand_in
+from bayesdist.missions.wise.simulate.bringup import simulate_unpaired
+from bayesdist.missions.wise.simulate.optical import optical_model, write_optical_model
 from bayesdist.model import Chip, DistortionModel
 from tests.app.support import good, refused
 
@@ -213,7 +213,7 @@ def write_lists(scene, folder):
         table = Table({key: getattr(stars, key) for key in ("x", "y", "sigma")})
         table["frame"] = [f"{k:02d}a" for k in stars.frame]
         table.write(folder / f"{name}.ecsv")
-    write_stand_in(folder / "optical.hdr")
+    write_optical_model(folder / "optical.hdr")
     return folder / "detections.ecsv", folder / "reference.ecsv"
 
 

@@ -12,7 +12,8 @@ from scipy import stats
 
 from bayesdist.errors import InputError
 from bayesdist.infer import Rejection, fit_linear
-from bayesdist.missions.wise.simulate import WISE_COEFFICIENTS, simulate_wise, wise_solution
+from bayesdist.missions.wise.published import WISE_COEFFICIENTS
+from bayesdist.missions.wise.simulate import simulate_wise, wise_solution
 from bayesdist.model import polynomial_terms
 
 # fmt: off

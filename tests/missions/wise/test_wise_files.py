@@ -12,17 +12,14 @@ from bayesdist.app.check import check
 from bayesdist.data import read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Rejection, fit_linear
-from bayesdist.missions.wise.simulate import (
+from bayesdist.missions.wise.published import (
     RADIAL_RESIDUALS,
     RESIDUAL_SIGMAS,
     SAMPLE_SIZES,
     WISE_BANDS,
-    files,
-    sets,
-    wise_set,
-    write_wise_set,
 )
-from bayesdist.missions.wise.simulate.interlopers import match_radius
+from bayesdist.missions.wise.simulate import files, sets, wise_set, write_wise_set
+from bayesdist.missions.wise.simulate.survey import match_radius
 from bayesdist.missions.wise.simulated_pairs import simulate_sets
 
 COLUMNS = {"sigma_u": "sigma", "sigma_v": "sigma", "exposure": "frame"}
@@ -88,10 +85,10 @@ def test_false_matches_depend_on_density_and_radius(many):
     """As often as sources without counterpart find a star: 1 - exp(-density pi R^2) of them."""
     one, chunk = many
     r2 = scaled_r2(one, chunk)
-    chance = 1 - np.exp(-one.interlopers.density[chunk.frame] * np.pi * match_radius(r2) ** 2)
-    odds = one.interlopers.unlisted * chance / (1 - one.interlopers.unlisted)
+    chance = 1 - np.exp(-one.false_matches.density[chunk.frame] * np.pi * match_radius(r2) ** 2)
+    odds = one.false_matches.unlisted * chance / (1 - one.false_matches.unlisted)
     p = odds / (1 + odds)
-    for of in (r2, one.interlopers.density[chunk.frame]):
+    for of in (r2, one.false_matches.density[chunk.frame]):
         rows = np.array_split(np.argsort(of, kind="stable"), 8)
         found = np.array([chunk.false[k].sum() for k in rows])
         mean = np.array([p[k].sum() for k in rows])

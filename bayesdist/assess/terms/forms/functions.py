@@ -85,12 +85,12 @@ class FunctionField(ErrorField):
     domain: EvaluationDomain
 
     @property
-    def rows(self) -> tuple[Row, ...]:  # type: ignore[override]
+    def rows(self) -> tuple[Row, ...]:
         """The row."""
         return (self.of.row,)
 
     @property
-    def n_draws(self) -> int:  # type: ignore[override]
+    def n_draws(self) -> int:
         """Number of draws."""
         return self.of.n_draws
 
@@ -100,8 +100,8 @@ class FunctionField(ErrorField):
         return max(len(values) for values, _ in self._parts)
 
     @property
-    def uniform(self) -> bool:  # type: ignore[override]
-        """Whether the error is the same at all positions."""
+    def uniform(self) -> bool:
+        """True if the error is the same at all positions."""
         return self.of.uniform
 
     @cached_property

@@ -89,17 +89,10 @@ class NoiseField(ErrorField):
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Displacements that are known, and no error.
+    """Displacements that are known, and no error."""
 
-    Parameters
-    ----------
-    row : Row
-        In no total.
-    shift : callable
-        Takes pixels x, y (N,), a chip number and an epoch (or None) to (N, 2).
-    """
-
-    row: Row
+    row: Row  # in no total
+    # takes pixels x, y (N,), a chip number and an epoch (or None) to (N, 2)
     shift: Callable[[Float, Float, int, float | None], Float]
 
     @property

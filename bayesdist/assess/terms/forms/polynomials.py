@@ -33,19 +33,9 @@ def polynomial_errors(
 ) -> Float:
     """Legendre coefficients (n, 2, K) of errors of parameters, along the axes of the gauge.
 
-    Parameters
-    ----------
-    model : DistortionModel
-    mean : ndarray, shape (D,)
-        Where there is no error.
-    theta : ndarray, shape (n, D)
-    epoch : float or None
-        Decimal years.
-    chip : int
-        Chip number.
-    exposure : int or ndarray of int, shape (n,), optional
-        Code of the exposure, of all draws or of each, whose frame is among the parameters that err;
-        None for errors of the polynomials and their drift alone.
+    `mean`: (D,), where there is no error. `theta`: (n, D). `epoch`: decimal years. `chip`: chip
+    number. `exposure`: (n,), code of the exposure, of all draws or of each, whose frame is among
+    the parameters that err; None for errors of the polynomials and their drift alone.
     """
     if isinstance(exposure, np.ndarray):
         out = np.empty((len(theta), 2, model.n_terms))
@@ -114,20 +104,11 @@ class Polynomials:
 
 @dataclass(frozen=True, eq=False)
 class PolynomialField(ErrorField):
-    """Errors that are polynomials of the pixel.
+    """Errors that are polynomials of the pixel."""
 
-    Parameters
-    ----------
-    rows : tuple of Row
-        One, or none for a sum of rows.
-    domain : EvaluationDomain
-    coefficients : dict of int to ndarray, shape (n, 2, K)
-        By chip number.
-    """
-
-    rows: tuple[Row, ...]
+    rows: tuple[Row, ...]  # one, or none for a sum of rows
     domain: EvaluationDomain
-    coefficients: dict[int, Float]
+    coefficients: dict[int, Float]  # (n, 2, K), by chip number
 
     @classmethod
     def of(
@@ -148,7 +129,7 @@ class PolynomialField(ErrorField):
         return cls(rows, domain, without_rigid(every, positions, model))
 
     @property
-    def n_draws(self) -> int:  # type: ignore[override]
+    def n_draws(self) -> int:
         """Number of draws."""
         return len(next(iter(self.coefficients.values())))
 

@@ -1,4 +1,4 @@
-"""What an error term has to give: rows of a budget, draws, and fields of these at positions.
+"""The protocol of error terms: rows of a budget, draws, and fields of these at positions.
 
 A term draws its chance once, for all chips, epochs and questions; its draws are evaluated at the
 positions of a domain wherever they are asked for.  Terms are independent of each other: what is
@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,10 +125,19 @@ class ErrorField(ABC):
     """Errors of a term at the N positions of a domain."""
 
     domain: EvaluationDomain
-    rows: tuple[Row, ...]
-    n_draws: int
 
-    uniform = False  # the same at all positions
+    if TYPE_CHECKING:  # read-only: fields of some subclasses, computed by others
+
+        @property
+        def rows(self) -> tuple[Row, ...]: ...
+
+        @property
+        def n_draws(self) -> int: ...
+
+    @property
+    def uniform(self) -> bool:
+        """True if the error is the same at all positions."""
+        return False
 
     @property
     def n_different(self) -> int:
@@ -149,15 +158,15 @@ class ErrorField(ABC):
         return self.by_draws(slice(0, self.n_different))
 
     def noise(self, scale: Scale) -> Iterator[Noise]:
-        """What is independent from position to position, rows multiplied by factors."""
+        """Parts that are independent from position to position, rows multiplied by factors."""
         yield from ()
 
     def relative_error(self, name: str, chip: int, monte_carlo: float) -> float | None:
-        """How well the size of a row is known on a chip, relative to it; None where it is not."""
+        """Relative error of the size of a row on a chip; None where it is not known."""
         return monte_carlo
 
     def of_parameters(self, name: str) -> bool:
-        """Whether a row is an error of parameters."""
+        """True if a row is an error of parameters."""
         return False
 
     def by_draws(self, draws: slice) -> Float:

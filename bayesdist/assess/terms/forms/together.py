@@ -21,7 +21,7 @@ class Together:
     """Rows of one term: the same draw number in each, so that they may be correlated.
 
     The joint error is the sum of the rows that are in the total.  Rows that are not are held by it:
-    where one of them shrinks, the joint error does so at each position as the row's share in its
+    where one of them shrinks, the joint error does so at each position as the row's fraction of its
     variance says.
 
     Parameters
@@ -43,30 +43,20 @@ class Together:
 
 @dataclass(frozen=True, eq=False)
 class TogetherField(ErrorField):
-    """Rows of one term at the positions of a domain.
-
-    Parameters
-    ----------
-    domain : EvaluationDomain
-    parts : tuple of ErrorField
-    whole : ErrorField or None
-        The joint error, where it is more than the sum of the rows.
-    remainder : bool
-        As of `Together`.
-    """
+    """Rows of one term at the positions of a domain."""
 
     domain: EvaluationDomain
     parts: tuple[ErrorField, ...]
-    whole: ErrorField | None = None
-    remainder: bool = False
+    whole: ErrorField | None = None  # the joint error, where it is more than the sum of the rows
+    remainder: bool = False  # as of `Together`
 
     @property
-    def rows(self) -> tuple[Row, ...]:  # type: ignore[override]
+    def rows(self) -> tuple[Row, ...]:
         """Rows of all parts."""
         return tuple(row for part in self.parts for row in part.rows)
 
     @property
-    def n_draws(self) -> int:  # type: ignore[override]
+    def n_draws(self) -> int:
         """Number of draws."""
         return self.parts[0].n_draws
 
@@ -96,7 +86,7 @@ class TogetherField(ErrorField):
         return np.asarray(out if factor is None else factor * out)
 
     def _factor(self, scale: Scale) -> Float | None:
-        """What multiplies the joint error (N, 2) where rows shrink that it holds."""
+        """Factor (N, 2) of the joint error where rows shrink that it holds."""
         held = [r.name for r in self.rows if not r.in_total and r.name in scale]
         if not held:
             return None

@@ -1,1 +1,1 @@
-"""What section 4.1 of the ACS handbook shows of a detector, for any calibration."""
+"""Figures and numbers of section 4.1 of the ACS handbook, for any calibration."""

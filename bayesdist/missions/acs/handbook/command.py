@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from astropy.table import Table
 
 from bayesdist.app.calibrations import calibration_at
-from bayesdist.app.folder import whole_folder
+from bayesdist.app.folder import atomic_directory
+from bayesdist.app.output import write_table
+from bayesdist.app.results import open_results
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import table_text
-from bayesdist.app.session import write_table
-from bayesdist.app.sessions import session_of
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
 from bayesdist.missions.acs.handbook.numbers import detector_numbers
+from bayesdist.missions.acs.handbook.published import acs_detector, handbook_rows
 from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 
 if TYPE_CHECKING:
@@ -38,30 +38,10 @@ def handbook(
 ) -> str:
     """Write the figures and the numbers of a calibration.
 
-    Parameters
-    ----------
-    path : path
-        As of `calibration_at`.
-    output : path
-        New or empty folder.
-    filter, scale
-        As of `calibration_at`.
-    epoch : float, optional
-        Decimal years, for what depends on time.
-    detector : str, optional
-        WFC, HRC or SBC, whose printed numbers stand beside; that of an IDCTAB of ACS by default.
-    magnification : float, optional
-        Of the vectors.
-
-    Returns
-    -------
-    str
-        The numbers.
-
-    Raises
-    ------
-    InputError
-        For what cannot be read or written.
+    `path`: as of `calibration_at`. `output`: new or empty folder. `filter`, `scale`: as of
+    `calibration_at`. `epoch`: decimal years, for what depends on time. `detector`: WFC, HRC or SBC,
+    whose printed numbers stand beside; that of an IDCTAB of ACS by default. `magnification`: of the
+    vectors. Returns the numbers. InputError for what cannot be read or written.
     """
     # figures take seconds to import
     from bayesdist.missions.acs.handbook.figures import (
@@ -69,12 +49,10 @@ def handbook(
         non_linear_figure,
         residual_figure,
     )
-    from bayesdist.missions.acs.handbook.published import handbook_rows
-    from bayesdist.products.detectors import acs_detector
     from bayesdist.report.drawing import save_figures
 
     if detector is not None:
-        detector = acs_detector(detector).name
+        detector = acs_detector(detector)
     if magnification is not None and not magnification > 0:
         raise InputError(
             f"the magnification is {magnification}",
@@ -87,7 +65,7 @@ def handbook(
         detector = found.detector
     whole = WholeDetector(found.in_frame(epoch), pixel)
     title = _title(found, filter, epoch)
-    with whole_folder(Path(output)) as folder:
+    with atomic_directory(Path(output)) as folder:
         figures = {
             "non_linear": non_linear_figure(whole, title, magnification=magnification),
             "pixel_area": area_figure(whole, title),
@@ -118,9 +96,9 @@ def _residuals(path: Path) -> tuple[Mapping[int, BinnedResiduals], str]:
     if not (home / "run.json").exists():
         return {}, "; no residuals, which only runs have"
     try:
-        with closing(session_of(RunDirectory.open(home))) as session:
-            chips = session.fit.model.chips
-            sums = zip(chips, session.shown_sums, strict=True)
+        with open_results(RunDirectory.open(home)) as results:
+            chips = results.fit.model.chips
+            sums = zip(chips, results.diagnostics.shown, strict=True)
             return {chip.number: one.residuals() for chip, one in sums}, ""
     except InputError as error:  # matches that were moved away: all else can be shown without them
         return {}, f"; no residuals: {error}"

@@ -17,55 +17,26 @@ _GRID = 129
 
 @dataclass(frozen=True)
 class DetectorNumbers:
-    """What section 4.1 of the ACS handbook tells of a detector.
+    """Numbers of a detector that section 4.1 of the ACS handbook gives."""
 
-    Parameters
-    ----------
-    non_linear_max : float
-        Largest non-linear displacement, output pixels.
-    non_linear_at : tuple of float
-        Where, pixels of the detector as one array.
-    scale_x, scale_y : float
-        Size of a pixel along the detector's axes at its centre.
-    mean_scale_x, mean_scale_y : float
-        The same, mean over all pixels.
-    scale_range : float
-        Largest size of a pixel (root of its area) over the smallest, less 1.
-    angle : float
-        Between the detector's axes at its centre, degrees.
-    elongation : float
-        Largest over smallest size of a pixel in any direction at the centre, less 1.
-    area_min, area_max : float
-        Pixel area over that at the centre.
-    size : tuple of float
-        Length of the array along its axes, gaps included: mean scales times pixels.
-    """
-
-    non_linear_max: float
-    non_linear_at: tuple[float, float]
-    scale_x: float
+    non_linear_max: float  # largest non-linear displacement, output pixels
+    non_linear_at: tuple[float, float]  # where, pixels of the detector as one array
+    scale_x: float  # size of a pixel along the detector's axes at its centre
     scale_y: float
-    mean_scale_x: float
+    mean_scale_x: float  # the same, mean over all pixels
     mean_scale_y: float
-    scale_range: float
-    angle: float
+    scale_range: float  # largest size of a pixel (root of its area) over the smallest, less 1
+    angle: float  # between the detector's axes at its centre, degrees
+    # largest over smallest size of a pixel in any direction at the centre, less 1
     elongation: float
-    area_min: float
+    area_min: float  # pixel area over that at the centre
     area_max: float
+    # length of the array along its axes, gaps included: mean scales times pixels
     size: tuple[float, float]
 
 
 def detector_numbers(detector: WholeDetector) -> DetectorNumbers:
-    """What section 4.1 of the ACS handbook tells, of any detector.
-
-    Parameters
-    ----------
-    detector : WholeDetector
-
-    Returns
-    -------
-    DetectorNumbers
-    """
+    """Numbers of any detector as section 4.1 of the ACS handbook gives them."""
     best, where = -1.0, (0.0, 0.0)
     low, high = np.inf, 0.0
     scales, pixels = np.zeros(2), 0.0

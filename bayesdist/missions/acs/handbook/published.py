@@ -1,4 +1,4 @@
-"""What section 4.1 of the ACS handbook prints of each detector, beside what a calibration gives.
+"""Numbers of section 4.1 of the ACS handbook for each detector, beside those of a calibration.
 
 Its Table 4.1 is not here: only what its text says.
 """
@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from bayesdist.errors import InputError
 from bayesdist.missions.acs.handbook.numbers import DetectorNumbers
 
-__all__ = ["handbook_rows"]
+__all__ = ["acs_detector", "handbook_rows"]
 
 # detector: quantity: as printed
 _PUBLISHED: dict[str, dict[str, str]] = {
@@ -45,25 +46,26 @@ _PUBLISHED: dict[str, dict[str, str]] = {
 _ANGLES = ("non-linear arcsec", "size x", "size y", "output scale")
 
 
+def acs_detector(name: str) -> str:
+    """Name of a detector of ACS in capitals; any other is refused."""
+    found = name.strip().upper()
+    if found not in _PUBLISHED:
+        raise InputError(
+            f"ACS has no detector {name!r}",
+            where="detector",
+            do=f"choose one of {', '.join(_PUBLISHED)}",
+        )
+    return found
+
+
 def handbook_rows(
     numbers: DetectorNumbers, *, scale: float, unit: str, detector: str = ""
 ) -> list[dict[str, Any]]:
     """Rows of the table: quantity, unit, published, ours.
 
-    Parameters
-    ----------
-    numbers : DetectorNumbers
-    scale : float
-        Size of an output pixel, in `unit`.
-    unit : str
-        Of the undistorted plane.
-    detector : str
-        WFC, HRC or SBC of ACS; of others nothing is printed.
-
-    Returns
-    -------
-    list of dict
-        Keys quantity, unit, published (text, empty where the handbook has nothing), value.
+    `scale`: size of an output pixel, in `unit`. `unit`: of the undistorted plane. `detector`: WFC,
+    HRC or SBC of ACS; of others nothing is printed. Returns keys quantity, unit, published (text,
+    empty where the handbook has nothing), value.
     """
     n = numbers
     angle = unit if unit != "pix" else "pix of u, v"

@@ -27,27 +27,15 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ChipField:
-    """The non-linear part of the distortion on a grid of one chip.
-
-    Parameters
-    ----------
-    chip : int
-    x : ndarray, shape (nx,)
-    y : ndarray, shape (ny,)
-        Pixels of the detector as one array.
-    du, dv : ndarray, shape (ny, nx)
-        Along the axes of the undistorted frame, output pixels.
-    along_x, along_y : ndarray, shape (ny, nx)
-        The same vectors along the detector's axes, in its pixels.
-    """
+    """The non-linear part of the distortion on a grid of one chip."""
 
     chip: int
-    x: Float
-    y: Float
-    du: Float
-    dv: Float
-    along_x: Float
-    along_y: Float
+    x: Float  # (nx,)
+    y: Float  # (ny,), pixels of the detector as one array
+    du: Float  # (ny, nx), along the axes of the undistorted frame, output pixels
+    dv: Float  # (ny, nx)
+    along_x: Float  # (ny, nx), the same vectors along the detector's axes, in its pixels
+    along_y: Float  # (ny, nx)
 
     @property
     def length(self) -> Float:
@@ -59,21 +47,12 @@ class ChipField:
 class WholeDetector:
     """Chips that share one undistorted plane.
 
-    Parameters
-    ----------
-    chips : mapping of int to ChipMap
-        By chip number; the first one's pixels are those of the whole array.
-    scale : float
-        Size of an output pixel, in the unit of the calibrations.
-
-    Raises
-    ------
-    InputError
-        Without chips, for a scale that is not positive, or a chip without area.
+    InputError without chips, for a scale that is not positive, or a chip without area.
     """
 
+    # by chip number; the first one's pixels are those of the whole array
     chips: Mapping[int, ChipMap]
-    scale: float
+    scale: float  # size of an output pixel, in the unit of the calibrations
 
     def __post_init__(self) -> None:
         if not self.chips:
@@ -92,7 +71,7 @@ class WholeDetector:
 
     @cached_property
     def places(self) -> dict[int, tuple[float, float]]:
-        """What is added to a chip's pixels to make them pixels of the whole array.
+        """Offset of a chip's pixels from pixels of the whole array.
 
         The gap between two chips is the way between their nearest edges in the undistorted plane,
         in pixels of the mean of both.
@@ -156,18 +135,9 @@ class WholeDetector:
         return np.stack([np.ones_like(x), x + px - cx, y + py - cy], axis=1)
 
     def non_linear(self, number: int, x: ArrayLike, y: ArrayLike) -> ChipField:
-        """What the linear map leaves on a grid of a chip.
+        """Displacements that the linear map leaves on a grid of a chip.
 
-        Parameters
-        ----------
-        number : int
-        x : array_like, shape (nx,)
-        y : array_like, shape (ny,)
-            FITS 1-based pixels of the chip.
-
-        Returns
-        -------
-        ChipField
+        `x`: (nx,). `y`: (ny,), FITS 1-based pixels of the chip.
         """
         x, y = np.asarray(x, float), np.asarray(y, float)
         X, Y = mesh(x, y)
@@ -203,7 +173,7 @@ class WholeDetector:
         return np.array([cx - px]), np.array([cy - py])
 
     def _beyond(self, number: int) -> float:
-        """How far the centre of the array lies beyond a chip's edge, pixels."""
+        """Distance of the centre of the array beyond a chip's edge, pixels."""
         size = self.chips[number].basis.size
         return max(
             max(0.5 - float(v[0]), float(v[0]) - n - 0.5, 0.0)

@@ -13,7 +13,7 @@ from bayesdist.data.starlists import read_star_lists
 from bayesdist.data.write import write_columns
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path, made_folder
-from bayesdist.missions.acs.simulate.campaign import AcsCampaign
+from bayesdist.missions.acs.simulate.truth import AcsCampaign
 from bayesdist.missions.acs.simulate.truth_files import read_truth, write_truth
 
 __all__ = ["read_acs", "write_acs"]

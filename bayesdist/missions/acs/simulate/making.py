@@ -10,14 +10,13 @@ import numpy as np
 
 from bayesdist.data.exposures import Exposure, ExposureLog
 from bayesdist.errors import InputError
-from bayesdist.missions.acs.simulate.campaign import AcsCampaign
 from bayesdist.missions.acs.simulate.detections import Detector, star_list
 from bayesdist.missions.acs.simulate.distortion import ACS_FILTERS, acs_solution
 from bayesdist.missions.acs.simulate.files import write_acs
 from bayesdist.missions.acs.simulate.pointings import exposures_of, frames_of
 from bayesdist.missions.acs.simulate.stars import measured_catalogs, true_stars
 from bayesdist.missions.acs.simulate.tables import detector_tables, filter_tables
-from bayesdist.missions.acs.simulate.truth import AcsTruth
+from bayesdist.missions.acs.simulate.truth import AcsCampaign, AcsTruth
 
 __all__ = ["simulate_acs"]
 

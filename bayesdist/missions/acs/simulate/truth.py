@@ -1,4 +1,4 @@
-"""Truth of a simulated campaign, and its maps between pixels and the catalogue."""
+"""A simulated campaign and its truth, with maps between pixels and the catalogue."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import ArrayLike, NDArray
 
+from bayesdist.data import ReferenceCatalog
 from bayesdist.data.exposures import ExposureLog
+from bayesdist.data.starlists import StarList
 from bayesdist.missions.acs.simulate.pointings import AcsFrames
 from bayesdist.missions.acs.simulate.stars import TrueStars
 from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.lookup import LookupTable, corrected
 
-__all__ = ["LINEAR_TERMS", "AcsTruth", "DetectionTruth"]
+__all__ = ["LINEAR_TERMS", "AcsCampaign", "AcsTruth", "DetectionTruth"]
 
 Float = NDArray[np.float64]
 
@@ -175,6 +177,30 @@ class AcsTruth:
         out: Float = self.frames.vafactor[e] * np.array([[c, -s], [s, c]]) @ self._in_gauge(e, chip)
         out[:, 0] += self.frames.centre[e]
         return out
+
+
+@dataclass(frozen=True, eq=False)
+class AcsCampaign:
+    """A simulated campaign.
+
+    Parameters
+    ----------
+    catalog : ReferenceCatalog
+        Standard catalogue: epoch 2004.5, with proper motions.
+    early, late : ReferenceCatalog
+        Mean positions before and after SM4, of the same stars in the same order.
+    log : ExposureLog
+    lists : tuple of StarList
+        Raw detections of each exposure, in the order of the log.
+    truth : AcsTruth
+    """
+
+    catalog: ReferenceCatalog
+    early: ReferenceCatalog
+    late: ReferenceCatalog
+    log: ExposureLog
+    lists: tuple[StarList, ...]
+    truth: AcsTruth
 
 
 class Field:

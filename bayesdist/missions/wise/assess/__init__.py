@@ -1,1 +1,1 @@
-"""What the WISE report (WSDC D-T033) prints, and its residual tables beside it."""
+"""Residual tables and fields of the WISE report (WSDC D-T033), printed and measured."""

@@ -1,4 +1,4 @@
-"""What the sigma of a residual table is made of, and why it is not the printed one.
+"""Parts of the sigma of a residual table, and why it is not the printed one.
 
 sigma^2 of means of bins is noise^2 + partition^2 + rest^2: the errors of single stars, blocks of
 the array that stand apart, and what is left.  Of a printed sigma the noise alone can be told, from
@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.assess.wise.rows import StatisticsRow
-from bayesdist.assess.wise.tables import StatisticsTable
+from bayesdist.diagnose.residuals.rows import StatisticsRow
+from bayesdist.diagnose.residuals.tables import StatisticsTable
 from bayesdist.missions.wise.assess.contradictions import (
     contradictions_across,
     contradictions_within,
@@ -26,7 +26,8 @@ from bayesdist.missions.wise.assess.published import (
     noise_of_bins,
     printed_rows,
 )
-from bayesdist.missions.wise.simulate import SAMPLE_SIZES
+from bayesdist.missions.wise.assess.residual_structure import ResidualPartition
+from bayesdist.missions.wise.published import SAMPLE_SIZES
 
 __all__ = [
     "LONGEST_DIFFERENCES",
@@ -34,6 +35,7 @@ __all__ = [
     "PRINTED_TABLES",
     "RowAccount",
     "accounts",
+    "partition_parts",
 ]
 
 PRINTED_BINS = 31
@@ -57,25 +59,16 @@ def _range(low: float, high: float) -> str:
 
 @dataclass(frozen=True)
 class RowAccount:
-    """The parts of one row's sigma, and the printed row beside it.
-
-    Parameters
-    ----------
-    row : StatisticsRow
-    partition : float or None
-        Rms that blocks of the array add, their noise subtracted; None where none were found, or
-        the row is not of what blocks act on.
-    printed : PrintedRow or None
-    printed_noise : tuple of float or None
-        Least and most noise that the printed sigma holds.
-    contradictions : tuple of str
-        What the printed numbers contradict in themselves or in each other.
-    """
+    """The parts of one row's sigma, and the printed row beside it."""
 
     row: StatisticsRow
+    # rms that blocks of the array add, their noise subtracted; None where none were found, or the
+    # row is not of what blocks act on
     partition: float | None
     printed: PrintedRow | None = None
+    # least and most noise that the printed sigma holds
     printed_noise: tuple[float, float] | None = None
+    # what the printed numbers contradict in themselves or in each other
     contradictions: tuple[str, ...] = ()
 
     @property
@@ -176,22 +169,9 @@ def accounts(
     How much noise a printed sigma holds follows from the printed mean length of single residuals
     and their distribution.  That is not printed: it may be normal, or as it is here.
 
-    Parameters
-    ----------
-    tables : mapping of str to StatisticsTable
-        By '5-1', '5-2' and '5-3'.
-    parts : mapping
-        Rms of the partition by table and label, as of `partition_parts`.
-    arcsec : mapping of str to float
-        Arcsec per pixel of each band.
-    n_used : mapping of str to int
-        Pairs of each band in the bins.
-    published : bool
-        Whether the bands are those of WSDC D-T033 in as many bins.
-
-    Returns
-    -------
-    dict of str to tuple of RowAccount
+    `tables`: by '5-1', '5-2' and '5-3'. `parts`: rms of the partition by table and label, as of
+    `partition_parts`. `arcsec`: arcsec per pixel of each band. `n_used`: pairs of each band in the
+    bins. `published`: True if the bands are those of WSDC D-T033 in as many bins.
     """
     out = {
         name: tuple(RowAccount(row, parts.get((name, row.label))) for row in table.rows)
@@ -208,6 +188,45 @@ def accounts(
         )
         for name, several in out.items()
     }
+
+
+def partition_parts(
+    partitions: Mapping[str, ResidualPartition], arcsec: Mapping[str, float]
+) -> dict[tuple[str, str], float]:
+    """Rms that significant partitions add to the sigma of each row.
+
+    `partitions`: by band, of residuals in pixels; bands without one that is significant count as
+    having none. The result is by table and label: rms over the array without the noise of the
+    fitted blocks, in the unit of the table.
+    """
+    found = {name: p for name, p in partitions.items() if p.significant}
+    out: dict[tuple[str, str], float] = {}
+    names = list(partitions)
+    for k, axis in enumerate("XY"):
+        for name, p in found.items():
+            out["5-1", f"{name}/{axis}"] = p.rms[k]
+            out["5-3", f"{name}/{axis}"] = float(np.sqrt(2)) * arcsec[name] * p.rms[k]
+        for i, earlier in enumerate(names):
+            for later in names[i + 1 :]:
+                here = {name: found[name] for name in (earlier, later) if name in found}
+                if here:
+                    out["5-2", f"{later}-{earlier}/{axis}"] = _difference(here, arcsec, earlier, k)
+    return out
+
+
+def _difference(
+    found: Mapping[str, ResidualPartition], arcsec: Mapping[str, float], minus: str, axis: int
+) -> float:
+    """Rms of the difference of two patterns, which may be alike, without their noise."""
+    scaled = [
+        (-1 if name == minus else 1) * arcsec[name] * p.pattern[axis] for name, p in found.items()
+    ]
+    total = float(np.nanvar(np.sum(scaled, axis=0)))
+    noise = sum(
+        arcsec[name] ** 2 * (float(np.nanmean(p.pattern[axis] ** 2)) - p.rms[axis] ** 2)
+        for name, p in found.items()
+    )
+    return float(np.sqrt(max(total - noise, 0.0)))
 
 
 def _with_printed(

@@ -1,4 +1,4 @@
-"""Where the numbers of residual tables contradict each other.
+"""Contradictions between the numbers of residual tables.
 
 What statistics of any numbers must satisfy, and what differences of two bands or of all pairs of
 bins must be, is known without the data: it tells misprints, and tables made from other models.
@@ -11,26 +11,19 @@ from itertools import pairwise
 
 import numpy as np
 
-from bayesdist.assess.wise.bands import WISE_ARCSEC
+from bayesdist.diagnose.residuals.tables import WISE_ARCSEC
 from bayesdist.missions.wise.assess.published import PrintedRow
 
 __all__ = ["contradictions_across", "contradictions_within"]
 
 
 def contradictions_within(row: PrintedRow) -> list[str]:
-    """What in a row no set of numbers can have.
+    """Sentences on statistics of a row that no set of numbers can have.
 
     The order of extremes, percentiles and median; a mean at most one sigma from the median; and
     sigma^2 <= (max - mean) (mean - min), Bhatia and Davis.
 
-    Parameters
-    ----------
-    row : PrintedRow
-
-    Returns
-    -------
-    list of str
-        One sentence for each contradiction beyond the rounding of the digits.
+    Returns one sentence for each contradiction beyond the rounding of the digits.
     """
     v, h = row.value, row.rounding
     out = []
@@ -60,24 +53,15 @@ def contradictions_across(
     *,
     arcsec: Mapping[str, float] = WISE_ARCSEC,
 ) -> list[str]:
-    """What in Tables 5-2 and 5-3 does not follow from Table 5-1.
+    """Sentences on numbers of Tables 5-2 and 5-3 that do not follow from Table 5-1.
 
     All pairs of the bins of one band have sqrt(2) times the sigma, and the range as maximum.  Two
     bands have the difference of the means, and a sigma within what theirs allow.  And within Table
     5-2 a difference must be what the way over any third band gives.
 
-    Parameters
-    ----------
-    fitting, band_to_band, multiframe : mapping of str to PrintedRow
-        Tables 5-1 (pixels), 5-2 and 5-3 (arcsec).
-    arcsec : mapping of str to float
-        Arcsec per pixel of each band.
-
-    Returns
-    -------
-    list of str
-        One sentence for each contradiction beyond the rounding of the digits, with the value that
-        the other numbers imply.
+    `fitting`, `band_to_band`, `multiframe`: Tables 5-1 (pixels), 5-2 and 5-3 (arcsec). `arcsec`:
+    arcsec per pixel of each band. Returns one sentence for each contradiction beyond the rounding
+    of the digits, with the value that the other numbers imply.
     """
     out = []
     for label, row in multiframe.items():

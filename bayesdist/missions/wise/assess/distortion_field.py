@@ -12,8 +12,9 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.solution import place_of
 from bayesdist.assess.vectors import VectorMap, distortion_vectors
+from bayesdist.infer.solution import Solution
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.grid import grid_pixels
 
@@ -24,31 +25,19 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class DistortionField:
-    """Vectors from array positions to undistorted ones, zero at the reference pixel.
+    """Vectors from array positions to undistorted ones, zero at the reference pixel."""
 
-    Parameters
-    ----------
-    basis : PolynomialBasis
-        Over the array.
-    polynomial : ndarray, shape (2, K)
-        Legendre coefficients of the vectors along x and y, in pixels of the array.
-    to_pixels : ndarray, shape (2, 2)
-        Takes offsets in the (u, v) of the solution to offsets along x and y in pixels.
-    """
-
-    basis: PolynomialBasis
+    basis: PolynomialBasis  # over the array
+    # (2, K), Legendre coefficients of the vectors along x and y, in pixels of the array
     polynomial: Float
+    # (2, 2), takes offsets in the (u, v) of the solution to offsets along x and y in pixels
     to_pixels: Float
 
     @classmethod
     def of(cls, basis: PolynomialBasis, polynomial: Float, to_pixels: Float) -> DistortionField:
         """The field without its value at the reference pixel.
 
-        Parameters
-        ----------
-        basis : PolynomialBasis
-        polynomial : ndarray, shape (2, K)
-        to_pixels : ndarray, shape (2, 2)
+        `polynomial`: (2, K). `to_pixels`: (2, 2).
         """
         polynomial = np.array(polynomial, float)
         x, y = basis.reference_pixel
@@ -65,16 +54,8 @@ class DistortionField:
     def minus(self, other: DistortionField, ratio: float = 1.0) -> DistortionField:
         """This field less another one that covers the same part of the sky.
 
-        Parameters
-        ----------
-        other : DistortionField
-        ratio : float
-            Pixels of this array in one of the other: 0.5 where this one's are twice as wide.
-
-        Returns
-        -------
-        DistortionField
-            In pixels of this array.
+        `ratio`: pixels of this array in one of the other: 0.5 where this one's are twice as wide.
+        The result is in pixels of this array.
         """
         basis = max((self.basis, other.basis), key=lambda b: b.order)
         # terms of a lower order are the first of a higher one, and Legendre products belong to the
@@ -89,17 +70,7 @@ class DistortionField:
     def vectors(self, grid: tuple[int, int], part_note: str = "") -> VectorMap:
         """Vectors on a grid from pixel 1 to the last, both ends.
 
-        Parameters
-        ----------
-        grid : tuple of int
-            Points on x and y.
-        part_note : str
-            For people.
-
-        Returns
-        -------
-        VectorMap
-            In pixels.
+        `grid`: points on x and y. `part_note`: for people. The result is in pixels.
         """
         x, y = grid_pixels(self.basis.size, grid)
         du, dv = self.at_scaled(*np.meshgrid(*self.basis.scaled(x, y)))
@@ -109,20 +80,8 @@ class DistortionField:
 def field_of_solution(solution: Solution, *, epoch: float | None = None) -> DistortionField:
     """The distortion of a solution's mean on its first chip, as `distortion_vectors` defines it.
 
-    Parameters
-    ----------
-    solution : LinearFit or Posterior
-    epoch : float, optional
-        Decimal years; needed by a model with time dependence.
-
-    Returns
-    -------
-    DistortionField
-
-    Raises
-    ------
-    InputError
-        As `distortion_vectors`.
+    `epoch`: decimal years; needed by a model with time dependence. InputError as
+    `distortion_vectors`.
     """
     place = place_of(solution.model, epoch=epoch)
     similarity = distortion_vectors(solution, grid=(2, 2), epoch=epoch).similarity

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.wise.bands import BandBins, band_bins
-from bayesdist.infer.linear import Clip
+from bayesdist.diagnose.residuals.binned import BinnedSums, band_bins
+from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.missions.wise.assess.distortion_field import DistortionField
 
@@ -29,20 +29,11 @@ _BLOCK = 2**16  # stars
 
 @dataclass(frozen=True, eq=False)
 class ResidualHistogram:
-    """Counts of the residuals along x and y; those of pieces of the data add.
+    """Counts of the residuals along x and y; those of pieces of the data add."""
 
-    Parameters
-    ----------
-    reach : float
-        The bins run evenly from -reach to reach, in pixels.
-    counts : ndarray of int, shape (2, B)
-    outside : ndarray of int, shape (2,)
-        Residuals beyond.
-    """
-
-    reach: float
-    counts: Int
-    outside: Int
+    reach: float  # the bins run evenly from -reach to reach, in pixels
+    counts: Int  # (2, B)
+    outside: Int  # (2,), residuals beyond
 
     def __add__(self, other: ResidualHistogram) -> ResidualHistogram:
         if self.reach != other.reach or self.counts.shape != other.counts.shape:
@@ -81,16 +72,7 @@ class ResidualHistogram:
 def histogram(residual: Float, reach: float, bins: int = HISTOGRAM_BINS) -> ResidualHistogram:
     """Count residuals.
 
-    Parameters
-    ----------
-    residual : ndarray, shape (2, N)
-        Along x and y, pixels.
-    reach : float
-    bins : int
-
-    Returns
-    -------
-    ResidualHistogram
+    `residual`: (2, N), along x and y, pixels.
     """
     counts, outside = [], []
     for values in residual:
@@ -103,17 +85,10 @@ def histogram(residual: Float, reach: float, bins: int = HISTOGRAM_BINS) -> Resi
 
 @dataclass(frozen=True, eq=False)
 class BandSums:
-    """What one pass over the stars of a band gives; parts add.
+    """Bins and histograms of one pass over the stars of a band; parts add."""
 
-    Parameters
-    ----------
-    bins : BandBins
-        Of the stars that the fit used, pixels.
-    histograms : mapping of str to ResidualHistogram
-        Of all stars; that of the calibration under `CALIBRATED`.
-    """
-
-    bins: BandBins
+    bins: BinnedSums  # of the stars that the fit used, pixels
+    # of all stars; that of the calibration under `CALIBRATED`
     histograms: Mapping[str, ResidualHistogram]
 
     def __add__(self, other: BandSums) -> BandSums:
@@ -132,27 +107,10 @@ def band_sums(
 ) -> BandSums:
     """Bins and histograms of some stars: a task for `Shards.sum`.
 
-    Parameters
-    ----------
-    stars : Stars
-        Of a model with one chip.
-    theta : ndarray, shape (D,)
-        The calibration.
-    clip : Clip
-        Says which stars go into the bins.
-    to_pixels : ndarray, shape (2, 2)
-        Takes residuals to pixels along x and y.
-    without : mapping of str to DistortionField
-        What the residuals are longer by in another case: the distortion itself where nothing is
-        corrected, or its difference from another model.
-    reach : float
-        Of the histograms, pixels.
-    bins : int
-        On each axis.
-
-    Returns
-    -------
-    BandSums
+    `stars`: of a model with one chip. `theta`: (D,), the calibration. `clip`: says which stars go
+    into the bins. `to_pixels`: (2, 2), takes residuals to pixels along x and y. `without`: what the
+    residuals are longer by in another case: the distortion itself where nothing is corrected, or
+    its difference from another model. `reach`: of the histograms, pixels. `bins`: on each axis.
     """
     residual = to_pixels @ stars.residuals(theta).T
     used = clip.keeps_of(stars)

@@ -1,4 +1,4 @@
-"""The residual tables printed in WSDC D-T033, and how much of them is noise."""
+"""The residual tables printed in WSDC D-T033, and the errors of pairs that its numbers imply."""
 
 from __future__ import annotations
 
@@ -8,20 +8,27 @@ from decimal import Decimal
 
 import numpy as np
 
-from bayesdist.assess.wise.rows import STATISTICS
+from bayesdist.diagnose.residuals.rows import STATISTICS
 from bayesdist.errors import InputError
+from bayesdist.model.basis import polynomial_terms
 
 __all__ = [
+    "HEADS",
     "TABLE_5_1",
     "TABLE_5_2",
     "TABLE_5_3",
     "TABLE_C_1",
     "PrintedRow",
+    "implied_sigma",
     "noise_of_bins",
     "printed_rows",
 ]
 
-# columns: mean, sigma, min, max, median, 1 %, 99 %
+HEADS = dict(
+    zip(STATISTICS, ("Mean", "Sigma", "Min", "Max", "Median", "1%-tile", "99%-tile"), strict=True)
+)
+
+# columns as in HEADS
 TABLE_5_1 = """
 W1/X 0.002070 0.01949 -0.08298 0.06435 0.002512 -0.04942 0.04579
 W1/Y -0.009074 0.01159 -0.04935 0.04348 -0.00373 -0.03837 0.0251
@@ -75,38 +82,18 @@ JD412.5/Y 0.00544 0.01675 -0.04477 0.07794 0.00426 -0.03108 0.04950
 
 @dataclass(frozen=True)
 class PrintedRow:
-    """A row as printed.
-
-    Parameters
-    ----------
-    label : str
-    value : mapping of str to float
-        By the names in `STATISTICS`.
-    rounding : mapping of str to float
-        Half a unit of the last digit printed.
-    """
+    """A row as printed."""
 
     label: str
-    value: Mapping[str, float]
-    rounding: Mapping[str, float]
+    value: Mapping[str, float]  # by the names in `STATISTICS`
+    rounding: Mapping[str, float]  # half a unit of the last digit printed
 
 
 def printed_rows(text: str) -> dict[str, PrintedRow]:
     """Rows of a printed table, by label.
 
-    Parameters
-    ----------
-    text : str
-        One row on a line: the label, then seven numbers in the order of `STATISTICS`.
-
-    Returns
-    -------
-    dict of str to PrintedRow
-
-    Raises
-    ------
-    InputError
-        For a row that has not seven numbers.
+    `text`: one row on a line: the label, then seven numbers in the order of `STATISTICS`.
+    InputError for a row that has not seven numbers.
     """
     out = {}
     for k, line in enumerate(text.strip().splitlines(), 1):
@@ -135,17 +122,24 @@ def noise_of_bins(mean_length: float, n_pairs: float, n_bins: int = 31 * 31) -> 
     A residual of normal errors s on each axis has the mean length sqrt(pi / 2) s, which the radial
     rows of Table 5-1 give; a bin's mean has the noise s / sqrt(pairs in the bin).
 
-    Parameters
-    ----------
-    mean_length : float
-        Mean of a radial row.
-    n_pairs : float
-        Pairs of the band (section 4 gives them), evenly over the bins.
-    n_bins : int
-
-    Returns
-    -------
-    float
-        Of each axis, in the unit of `mean_length`.
+    `mean_length`: mean of a radial row. `n_pairs`: pairs of the band (section 4 gives them), evenly
+    over the bins. The result is of each axis, in the unit of `mean_length`.
     """
     return float(mean_length / np.sqrt(np.pi / 2) / np.sqrt(n_pairs / n_bins))
+
+
+def implied_sigma(radius_max: float, n_pairs: int, *, order: int = 4) -> float:
+    """Error of a pair, equal on both axes, that a largest radius hypot(sigma_x, sigma_y) implies.
+
+    Pairs that lie evenly over the array determine products of Legendre polynomials independently of
+    each other: that of degrees i and j has the variance (2i + 1)(2j + 1) / N in a corner, where the
+    radius is largest.
+
+    `radius_max`: largest hypot(sigma_x, sigma_y) of a polynomial's position over the array.
+    `n_pairs`: pairs that determine the polynomial, evenly over the array. `order`: of the
+    polynomial. The result is in the unit of the radius. InputError for no pairs.
+    """
+    if n_pairs < 1:
+        raise InputError(f"{n_pairs} pairs are given", do="give one pair or more")
+    corner = sum((2 * i + 1) * (2 * j + 1) for i, j in polynomial_terms(order))
+    return float(radius_max / np.sqrt(2 * corner / n_pairs))

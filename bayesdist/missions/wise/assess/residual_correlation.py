@@ -22,35 +22,20 @@ _PAIRS = (("uu", 0, 0), ("vv", 1, 1), ("uv", 0, 1))
 
 @dataclass(frozen=True, eq=False)
 class ResidualCorrelation:
-    """Mean products of the residuals of two bins, by their separation.
+    """Mean products of the residuals of two bins, by their separation."""
 
-    Parameters
-    ----------
-    separation : ndarray, shape (R,)
-        Mean distance of the pairs of bins in a ring, in pixels.
-    uu, vv, uv : ndarray, shape (R,)
-        Mean products, in the squared unit of the residuals, less what noise makes of them once a
-        polynomial is fitted: it is slightly below zero.
-    sigma_uu, sigma_vv, sigma_uv : ndarray, shape (R,)
-        Their standard deviations where noise is all there is.
-    n_pairs : ndarray of int, shape (R,)
-        Pairs of bins in the ring.
-    chi2 : float
-        Sum of the squares of all three functions over their sigmas.
-    p_value : float
-        Share of noise fields with as large a sum; not below 1 / 500.
-    """
-
-    separation: Float
+    separation: Float  # (R,), mean distance of the pairs of bins in a ring, in pixels
+    # (R,), mean products, in the squared unit of the residuals, less what noise makes of them once
+    # a polynomial is fitted: it is slightly below zero
     uu: Float
-    vv: Float
-    uv: Float
-    sigma_uu: Float
-    sigma_vv: Float
-    sigma_uv: Float
-    n_pairs: NDArray[np.int64]
-    chi2: float
-    p_value: float
+    vv: Float  # (R,)
+    uv: Float  # (R,)
+    sigma_uu: Float  # (R,), their standard deviations where noise is all there is
+    sigma_vv: Float  # (R,)
+    sigma_uv: Float  # (R,)
+    n_pairs: NDArray[np.int64]  # (R,), pairs of bins in the ring
+    chi2: float  # sum of the squares of all three functions over their sigmas
+    p_value: float  # share of noise fields with as large a sum; not below 1 / 500
 
     @property
     def reach(self) -> float:
@@ -70,21 +55,8 @@ def residual_correlation(
     independent between bins, adds nothing.  The fitted polynomial makes it slightly dependent:
     mean and sigma come from noise fields that lost the same polynomial.
 
-    Parameters
-    ----------
-    bins : BinnedResiduals
-    order : int
-        Of the polynomial fitted to these stars.
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    ResidualCorrelation
-
-    Raises
-    ------
-    InputError, DegenerateError
-        As `bayesdist.missions.wise.assess.residual_field.residual_field`.
+    `order`: of the polynomial fitted to these stars. InputError, DegenerateError as
+    `bayesdist.missions.wise.assess.residual_field.residual_field`.
     """
     field = residual_field(bins, order=order)
     rings = _Rings.of(field)

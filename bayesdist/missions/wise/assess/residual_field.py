@@ -22,29 +22,14 @@ _FEWEST_STARS = 5
 
 @dataclass(frozen=True, eq=False)
 class ResidualField:
-    """Mean residuals of both axes over the used bins, and the noise they hold.
+    """Mean residuals of both axes over the used bins, and the noise they hold."""
 
-    Parameters
-    ----------
-    x : ndarray, shape (nx,)
-    y : ndarray, shape (ny,)
-        Centres of the bins, FITS 1-based pixels.
-    used : ndarray of bool, shape (ny, nx)
-        Bins of five stars or more.
-    sem : ndarray, shape (2, M)
-        Noise of the means in u and v of the M used bins.
-    white : ndarray, shape (2, M)
-        Means over their noise, the polynomial removed.
-    absorbed : ndarray, shape (2, M, K)
-        Orthonormal columns: what polynomials can do to the whitened means.
-    """
-
-    x: Float
-    y: Float
-    used: NDArray[np.bool_]
-    sem: Float
-    white: Float
-    absorbed: Float
+    x: Float  # (nx,)
+    y: Float  # (ny,), centres of the bins, FITS 1-based pixels
+    used: NDArray[np.bool_]  # (ny, nx), bins of five stars or more
+    sem: Float  # (2, M), noise of the means in u and v of the M used bins
+    white: Float  # (2, M), means over their noise, the polynomial removed
+    absorbed: Float  # (2, M, K), orthonormal columns: what polynomials can do to the whitened means
 
     @property
     def n_used(self) -> int:
@@ -75,24 +60,11 @@ class ResidualField:
 def residual_field(bins: BinnedResiduals, *, order: int = 0) -> ResidualField:
     """Prepare binned residuals for tests of structure.
 
-    Parameters
-    ----------
-    bins : BinnedResiduals
-    order : int
-        Total order of the polynomial that was fitted to these stars.  Its freedom is removed from
-        the means and from the noise they are compared with; a lower order than the fit's lets
-        the fit's own work look like structure.
-
-    Returns
-    -------
-    ResidualField
-
-    Raises
-    ------
-    InputError
-        For a negative order, or fewer than four bins on an axis.
-    DegenerateError
-        When the bins that hold five stars are not twice as many as the polynomial's terms.
+    `order`: total order of the polynomial that was fitted to these stars.  Its freedom is removed
+    from the means and from the noise they are compared with; a lower order than the fit's lets the
+    fit's own work look like structure. InputError for a negative order, or fewer than four bins on
+    an axis. DegenerateError when the bins that hold five stars are not twice as many as the
+    polynomial's terms.
     """
     if order < 0:
         raise InputError(f"the order is {order}", where="order", do="give 0 or more")

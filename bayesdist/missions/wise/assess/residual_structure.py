@@ -17,6 +17,7 @@ from scipy.stats import f as f_distribution
 
 from bayesdist.diagnose.residuals.binned import BinnedResiduals
 from bayesdist.errors import DegenerateError, InputError
+from bayesdist.limits import STRUCTURE
 from bayesdist.missions.wise.assess.residual_field import ResidualField, residual_field, scaled
 from bayesdist.model.basis import polynomial_terms
 
@@ -26,7 +27,6 @@ Float = NDArray[np.float64]
 Base = tuple[Float, Float]
 
 PARTITIONS = tuple(range(2, 13))
-SIGNIFICANT = 1e-4  # as that of a misfit
 DRAWS = 999
 # log likelihood that blocks must gain over a polynomial of as many terms: odds of 1000 to 1
 _EDGES = float(np.log(1000.0))
@@ -38,45 +38,32 @@ _RANK = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class ResidualPartition:
-    """The k x k partition that explains most of binned residuals.
+    """The k x k partition that explains most of binned residuals."""
 
-    Parameters
-    ----------
-    k : int
-        Blocks on each axis.
-    p_value : float
-        Probability that noise alone explains as much under the best of all k tried.
-    gain : mapping of int to float
-        By k: gain in log likelihood by the blocks; negative where they differ less than the rest.
-    gain_smooth : float
-        The same for a polynomial over the detector of as many free terms as the blocks have.
-    rms : tuple of float
-        Of the blocks over the detector in u and v, their noise subtracted, in the unit of the
-        residuals.
-    pattern : ndarray, shape (2, ny, nx)
-        The blocks as fitted, in the bins; NaN in bins not used.
-    """
-
-    k: int
-    p_value: float
+    k: int  # blocks on each axis
+    p_value: float  # probability that noise alone explains as much under the best of all k tried
+    # by k: gain in log likelihood by the blocks; negative where they differ less than the rest
     gain: Mapping[int, float]
+    # the same for a polynomial over the detector of as many free terms as the blocks have
     gain_smooth: float
+    # of the blocks over the detector in u and v, their noise subtracted, in the unit of the
+    # residuals
     rms: tuple[float, float]
-    pattern: Float
+    pattern: Float  # (2, ny, nx), the blocks as fitted, in the bins; NaN in bins not used
 
     @property
     def significant(self) -> bool:
-        """Whether there is more than chance."""
-        return self.p_value < SIGNIFICANT
+        """True if there is more than chance."""
+        return not STRUCTURE.met_by(self.p_value)
 
     @property
     def edges_seen(self) -> bool:
-        """Whether it is blocks: a polynomial of as many terms explains smooth structure better."""
+        """True if it is blocks: a polynomial of as many terms explains smooth structure better."""
         return self.significant and self.gain[self.k] - self.gain_smooth > _EDGES
 
     @property
     def sentence(self) -> str:
-        """What was found."""
+        """Sentence on what was found."""
         if not self.significant:
             return f"No partition of the detector stands out in residuals (p = {self.p_value:.2g})."
         size = float(np.hypot(*self.rms))
@@ -115,26 +102,11 @@ def residual_partition(
     Bonferroni's bound on the F test is given if that is smaller.  Noise counts as independent
     between bins and between axes.
 
-    Parameters
-    ----------
-    bins : BinnedResiduals
-        31 on an axis show up to 10 blocks, 45 all twelve.
-    order : int
-        Of the polynomial fitted to these stars.
-    tried : sequence of int
-        Numbers of blocks on an axis, at least 2; those above a third of the bins are left out.
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    ResidualPartition
-
-    Raises
-    ------
-    InputError
-        For a number of blocks below 2, none that the bins can show, and as `residual_field`.
-    DegenerateError
-        As `residual_field`, and when blocks have no freedom beside the polynomial or leave none.
+    `bins`: 31 on an axis show up to 10 blocks, 45 all twelve. `order`: of the polynomial fitted to
+    these stars. `tried`: numbers of blocks on an axis, at least 2; those above a third of the bins
+    are left out. InputError for a number of blocks below 2, none that the bins can show, and as
+    `residual_field`. DegenerateError as `residual_field`, and when blocks have no freedom beside
+    the polynomial or leave none.
     """
     field = residual_field(bins, order=order)
     if any(k < 2 or int(k) != k for k in tried):

@@ -7,20 +7,19 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 
-from bayesdist.app.folder import whole_folder
-from bayesdist.app.rundir import versions, write_json
+from bayesdist.app.folder import atomic_directory, versions
 from bayesdist.app.screen import table_text
+from bayesdist.app.store import write_json
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bands.context import BandsInput
 from bayesdist.missions.wise.bands.findings import overview_table
 from bayesdist.missions.wise.bands.inputs import BandRun, open_bands
 from bayesdist.missions.wise.bands.measure import measure_bands
 from bayesdist.missions.wise.bands.optical import optical_models
-from bayesdist.missions.wise.bands.page import draw_bands, write_bands
+from bayesdist.missions.wise.bands.page import write_bands
 from bayesdist.missions.wise.bands.record import record_of, write_tables
-from bayesdist.missions.wise.simulate import WISE_BANDS
+from bayesdist.missions.wise.published import WISE_BANDS
 from bayesdist.products import sip_from_solution, write_wise_meta
-from bayesdist.report.drawing import save_drawings
 
 __all__ = ["bands_of_runs"]
 
@@ -42,33 +41,13 @@ def bands_of_runs(
 ) -> str:
     """Compare bands and write everything into a new folder.
 
-    Parameters
-    ----------
-    runs : sequence of path
-        Finished runs, one for each band.
-    output : path
-        New or empty folder.  It appears with all files in it, or not at all.
-    bins : int
-        Of residuals, on each axis.
-    optical : sequence of path
-        SIP headers or WISE meta-data of an optical model: one, or one for each run.
-    rotation : float
-        Degrees by which that is turned, from x towards y.
-    published : bool
-        Whether WISE's bands have the values of WSDC D-T033 beside them.
-    command : str
-        For the record.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For runs that are not finished or do not go together, an optical model that cannot be used,
-        and a folder that is in use.
+    `runs`: finished runs, one for each band. `output`: new or empty folder.  It appears with all
+    files in it, or not at all. `bins`: of residuals, on each axis. `optical`: SIP headers or WISE
+    meta-data of an optical model: one, or one for each run. `rotation`: degrees by which that is
+    turned, from x towards y. `published`: True if WISE's bands have the values of WSDC D-T033
+    beside them. `command`: for the record. Returns the text to print. InputError for runs that are
+    not finished or do not go together, an optical model that cannot be used, and a folder that is
+    in use.
     """
     if bins < FEWEST_BINS:
         raise InputError(
@@ -77,9 +56,9 @@ def bands_of_runs(
     with ExitStack() as stack:
         bands = open_bands(runs)
         for band in bands.values():
-            stack.enter_context(closing(band.session))
-        folder = stack.enter_context(whole_folder(Path(output)))
-        order = {str(band.session.run.path): name for name, band in bands.items()}
+            stack.enter_context(closing(band.results))
+        folder = stack.enter_context(atomic_directory(Path(output)))
+        order = {str(band.results.run.path): name for name, band in bands.items()}
         named = [order[str(Path(path))] for path in runs]
         inputs = measure_bands(
             bands,
@@ -88,25 +67,20 @@ def bands_of_runs(
             published=published,
             provenance={"command": command, **versions()},
         )
-        files = [*write_tables(inputs, folder), *_meta(bands, folder)]
-        drawings = draw_bands(inputs)
-        save_drawings(drawings, folder / "figures")
-        write_bands(folder / "bands.html", inputs, drawings)
-        files += ["bands.html", *(f"figures/{name}.png" for name in drawings)]
-        files += [f"figures/{name}.pdf" for name in drawings]
+        files = [*write_tables(inputs, folder), *_meta(bands, folder), *write_bands(folder, inputs)]
         write_json(folder / "bands.json", record_of(inputs) | {"files": files})
     return _text(Path(output), inputs)
 
 
 def _meta(bands: Mapping[str, BandRun], folder: Path) -> list[str]:
     """WISE meta-data, where all bands are WISE's and in pixels."""
-    models = [band.session.posterior.model for band in bands.values()]
+    models = [band.results.posterior.model for band in bands.values()]
     if not set(bands) <= set(WISE_BANDS) or any(model.unit != "pix" for model in models):
         return []
     headers = {
         int(name[1:]): sip_from_solution(
-            band.session.solution,
-            epoch=band.session.epoch,
+            band.results.solution,
+            epoch=band.results.epoch,
             linear="sip",
             inverse_order=META_ORDER,
             scale_arcsec=band.arcsec,

@@ -1,4 +1,4 @@
-"""What a comparison of bands is shown from, and the sections of its page."""
+"""Input of the page that compares bands, and its sections."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bayesdist.report.registry import Registry, Section
 
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap
-    from bayesdist.assess.wise import StatisticsTable
+    from bayesdist.diagnose.residuals import StatisticsTable
     from bayesdist.missions.wise.assess.account import RowAccount
     from bayesdist.missions.wise.assess.histograms import BandSums
     from bayesdist.missions.wise.assess.residual_correlation import ResidualCorrelation
@@ -35,106 +35,56 @@ BANDS = Registry(
 
 @dataclass(frozen=True)
 class Printed:
-    """What a published report says of a band.
+    """Numbers of a band that a published report gives."""
 
-    Parameters
-    ----------
-    longest_vector, longest_here, formal_radius : float
-        Printed, found over the same part of the array, and printed; pixels.
-    implied_sigma : float
-        Error of a pair that the radius implies, with all pairs evenly over the array; pixels.
-    """
-
-    longest_vector: float
+    longest_vector: float  # printed, found over the same part of the array, and printed; pixels
     longest_here: float
     formal_radius: float
+    # error of a pair that the radius implies, with all pairs evenly over the array; pixels
     implied_sigma: float
 
 
 @dataclass(frozen=True, eq=False)
 class BandResult:
-    """One band.
+    """One band."""
 
-    Parameters
-    ----------
-    name, path : str
-        Of the band, and of its run.
-    converged : bool
-    reasons : tuple of str
-        Why it has not.
-    arcsec : float
-        Per pixel.
-    size : tuple of float
-        Columns and rows of the array.
-    order : int
-    n_pairs, n_used : int
-        All pairs, and those that the least-squares fit used.
-    sums : BandSums
-        In pixels.
-    partition : ResidualPartition
-    correlation : ResidualCorrelation
-    vectors : VectorMap
-        The distortion without its constant, pixels.
-    formal_map, posterior_map : UncertaintyMap
-    minus_optical : VectorMap or None
-        The distortion less the optical model, pixels.
-    printed : Printed or None
-    """
-
-    name: str
+    name: str  # of the band, and of its run
     path: str
     converged: bool
-    reasons: tuple[str, ...]
-    arcsec: float
-    size: tuple[float, float]
+    reasons: tuple[str, ...]  # why it has not
+    arcsec: float  # per pixel
+    size: tuple[float, float]  # columns and rows of the array
     order: int
-    n_pairs: int
+    n_pairs: int  # all pairs, and those that the least-squares fit used
     n_used: int
-    sums: BandSums
+    sums: BandSums  # in pixels
     partition: ResidualPartition
     correlation: ResidualCorrelation
-    vectors: VectorMap
+    vectors: VectorMap  # the distortion without its constant, pixels
     formal_map: UncertaintyMap
     posterior_map: UncertaintyMap
-    minus_optical: VectorMap | None = None
+    minus_optical: VectorMap | None = None  # the distortion less the optical model, pixels
     printed: Printed | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class BandsInput:
-    """Several bands, and what is said of them together.
+    """Several bands, and what is said of them together."""
 
-    Parameters
-    ----------
-    bands : tuple of BandResult
-        In the order of the tables.
-    tables : mapping of str to StatisticsTable
-        By '5-1', '5-2', '5-3' as WSDC D-T033 numbers them; the second only of two bands or more.
-    accounts : mapping of str to tuple of RowAccount
-        Likewise.
-    differences : mapping of str to VectorMap
-        Later bands less the first, as 'W2-W1', in pixels of the first.
-    n_bins : int
-        On each axis.
-    wise : bool
-        Whether published values stand beside ours, which are those of WISE.
-    optical : str
-        What the optical model is; empty without one.
-    provenance : mapping
-    """
-
-    bands: tuple[BandResult, ...]
+    bands: tuple[BandResult, ...]  # in the order of the tables
+    # by '5-1', '5-2', '5-3' as WSDC D-T033 numbers them; the second only of two bands or more
     tables: Mapping[str, StatisticsTable]
-    accounts: Mapping[str, tuple[RowAccount, ...]]
+    accounts: Mapping[str, tuple[RowAccount, ...]]  # likewise
+    # later bands less the first, as 'W2-W1', in pixels of the first
     differences: Mapping[str, VectorMap]
-    n_bins: int = 31
-    wise: bool = False
-    optical: str = ""
+    n_bins: int = 31  # on each axis
+    wise: bool = False  # True if published values stand beside ours, which are those of WISE
+    optical: str = ""  # what the optical model is; empty without one
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def provisional(self) -> bool:
-        """Whether some band must not be relied on."""
+        """True if some band must not be relied on."""
         return bool(self.not_converged)
 
     @property

@@ -6,7 +6,7 @@ import numpy as np
 
 from bayesdist.missions.wise.assess.residual_correlation import DRAWS
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput
-from bayesdist.report.numbers import probability
+from bayesdist.numbers import probability
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import INK, PALETTE, WIDTH, figure_style, new_figure
 

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput
+from bayesdist.numbers import size_of
 from bayesdist.report.arrows import Arrows, cross_map, magnification_of, spacing, vector_map
 from bayesdist.report.fields import Grid, scalar_map
-from bayesdist.report.numbers import size_of
 from bayesdist.report.panels import ArrayPanels
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import nice_below
@@ -77,7 +77,7 @@ def differences(inputs: BandsInput) -> Plot:
     "vectors", when=lambda inputs: any(b.minus_optical for b in inputs.bands), printed=True
 )
 def minus_optical(inputs: BandsInput) -> Plot:
-    """What an optical model leaves of the distortion of each band."""
+    """Distortion of each band less an optical model."""
     found = {b.name: (b.minus_optical, b.arcsec) for b in inputs.bands}
     maps = {f"{name} − optical": v for name, (v, _) in found.items() if v is not None}
     arcsec = {f"{name} − optical": size for name, (_, size) in found.items()}
@@ -263,7 +263,7 @@ def coverage(inputs: BandsInput) -> Plot:
     """Pairs used in each bin over the mean of all bins."""
     images, titles = {}, []
     for b in inputs.bands:
-        count = b.sums.bins.axes.count
+        count = b.sums.bins.count
         expected = float(count.mean())
         images[b.name] = count / expected
         titles.append(

@@ -9,7 +9,7 @@ import numpy as np
 from bayesdist.missions.wise.assess.account import LONGEST_DIFFERENCES
 from bayesdist.missions.wise.bands.context import BANDS, BandResult, BandsInput
 from bayesdist.missions.wise.bands.curves import CASES, chance_of
-from bayesdist.report.numbers import MISSING, count, number, percent, probability, size_of
+from bayesdist.numbers import MISSING, count, number, percent, probability, size_of
 from bayesdist.report.texttable import TextTable, listing
 
 __all__ = [
@@ -76,7 +76,7 @@ def _structure(b: BandResult) -> str:
 
 
 def _counted_out(b: BandResult) -> bool:
-    """Whether no noise field reached the correlation: as little as draws can tell."""
+    """True if no noise field reached the correlation: as little as draws can tell."""
     return chance_of(b.correlation.p_value).startswith("p <")
 
 
@@ -200,7 +200,7 @@ def coverage_table(inputs: BandsInput) -> TextTable:
     """Pairs in bins against even coverage."""
     rows = []
     for b in inputs.bands:
-        n = b.sums.bins.axes.count
+        n = b.sums.bins.count
         mean = float(n.mean())
         chi2 = float(((n - mean) ** 2).sum() / mean)
         rows.append(
@@ -250,5 +250,5 @@ def formal_table(inputs: BandsInput) -> TextTable:
 
 @BANDS.table("provenance")
 def provenance_table(inputs: BandsInput) -> TextTable:
-    """What made the page."""
+    """Table of what made the page."""
     return listing("", {key: str(value) for key, value in inputs.provenance.items()})

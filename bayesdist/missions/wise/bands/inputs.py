@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from bayesdist.app.results import Results, results_of
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.session import Session
-from bayesdist.app.stages import require
 from bayesdist.assess import pixel_scale_of
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.simulate import WISE_BANDS
+from bayesdist.missions.wise.published import WISE_BANDS
 from bayesdist.model import Chip
 
 __all__ = ["BandRun", "open_bands"]
@@ -21,30 +20,21 @@ SAME_FIELD = 0.01  # by so much the fields of two bands may differ in size
 
 @dataclass(frozen=True, eq=False)
 class BandRun:
-    """A finished run of a band.
+    """A finished run of a band."""
 
-    Parameters
-    ----------
-    name : str
-        Of its detector.
-    session : Session
-    arcsec : float
-        Per pixel.
-    """
-
-    name: str
-    session: Session
-    arcsec: float
+    name: str  # of its detector
+    results: Results
+    arcsec: float  # per pixel
 
     @property
     def path(self) -> str:
         """Folder of the run."""
-        return str(self.session.run.path)
+        return str(self.results.run.path)
 
     @property
     def chip(self) -> Chip:
         """The one chip."""
-        return self.session.posterior.model.chips[0]
+        return self.results.posterior.model.chips[0]
 
     @property
     def field_of_view(self) -> tuple[float, float]:
@@ -56,20 +46,9 @@ class BandRun:
 def open_bands(paths: Sequence[str | Path]) -> dict[str, BandRun]:
     """Open the runs of several bands.
 
-    Parameters
-    ----------
-    paths : sequence of path
-
-    Returns
-    -------
-    dict of str to BandRun
-        In the order given; those of WISE in their own.
-
-    Raises
-    ------
-    InputError
-        For a run that is not finished, has several chips or no scale, for two runs of one band, and
-        for bands that do not see one field.
+    The result is in the order given; those of WISE in their own. InputError for a run that is not
+    finished, has several chips or no scale, for two runs of one band, and for bands that do not see
+    one field.
     """
     out: dict[str, BandRun] = {}
     for path in paths:
@@ -99,24 +78,24 @@ def _opened(path: str | Path) -> BandRun:
             where=str(path),
             do="give runs of matched stars, one for each band",
         )
-    session = Session(run)
-    require(session, "bands", ("fit", "sample"))
-    chips = session.posterior.model.chips
+    results = results_of(run)
+    run.require("bands", ("fit", "sample"))
+    chips = results.posterior.model.chips
     if len(chips) > 1:
         raise InputError(
             f"has {len(chips)} chips, and bands are compared on one",
             where=str(path),
             do="give runs of one chip each",
         )
-    config = session.config
-    scale = pixel_scale_of(session.posterior, scale_mas=config.detector.scale_mas)
+    config = results.config
+    scale = pixel_scale_of(results.posterior, scale_mas=config.detector.scale_mas)
     if scale is None:
         raise InputError(
             "the size of a pixel is not known",
             where=f"{path}, detector.scale_mas",
             do="give it in the configuration and run again",
         )
-    return BandRun(config.detector.name or run.path.resolve().name, session, scale / 1000)
+    return BandRun(config.detector.name or run.path.resolve().name, results, scale / 1000)
 
 
 def _require_one_field(bands: Mapping[str, BandRun]) -> None:

@@ -1,4 +1,4 @@
-"""What is measured on each band, and on several together."""
+"""Measurements on each band, and on several together."""
 
 from __future__ import annotations
 
@@ -7,24 +7,28 @@ from collections.abc import Mapping
 import numpy as np
 
 from bayesdist.assess import uncertainty_map
-from bayesdist.assess.wise import (
-    BandBins,
+from bayesdist.diagnose.residuals import (
+    BinnedSums,
     StatisticsTable,
     band_to_band_table,
     fitting_table,
     multiframe_table,
 )
-from bayesdist.missions.wise.assess.account import PRINTED_BINS, accounts
+from bayesdist.missions.wise.assess.account import PRINTED_BINS, accounts, partition_parts
 from bayesdist.missions.wise.assess.distortion_field import DistortionField, field_of_solution
-from bayesdist.missions.wise.assess.formal_radii import implied_sigma
 from bayesdist.missions.wise.assess.histograms import band_sums
-from bayesdist.missions.wise.assess.partition_parts import partition_parts
+from bayesdist.missions.wise.assess.published import implied_sigma
 from bayesdist.missions.wise.assess.residual_correlation import residual_correlation
 from bayesdist.missions.wise.assess.residual_structure import residual_partition
 from bayesdist.missions.wise.bands.context import BandResult, BandsInput, Printed
 from bayesdist.missions.wise.bands.inputs import BandRun
 from bayesdist.missions.wise.bands.optical import OpticalModel
-from bayesdist.missions.wise.simulate import FORMAL_RADII, LONGEST_VECTORS, SAMPLE_SIZES, WISE_BANDS
+from bayesdist.missions.wise.published import (
+    FORMAL_RADII,
+    LONGEST_VECTORS,
+    SAMPLE_SIZES,
+    WISE_BANDS,
+)
 from bayesdist.model.basis import polynomial_terms
 
 __all__ = ["measure_bands"]
@@ -43,31 +47,13 @@ def measure_bands(
 ) -> BandsInput:
     """Everything that tables and diagrams show.
 
-    Parameters
-    ----------
-    runs : mapping of str to BandRun
-        Their stars are read once and let go of, band by band.
-    bins : int
-        On each axis.
-    optical : mapping of str to OpticalModel, optional
-    published : bool
-        Whether values of WSDC D-T033 stand beside those of WISE's bands.
-    provenance : mapping, optional
-
-    Returns
-    -------
-    BandsInput
-
-    Raises
-    ------
-    InputError
-        For an optical model of another shape.
-    DegenerateError
-        When too few bins hold stars.
+    `runs`: their stars are read once and let go of, band by band. `bins`: on each axis.
+    `published`: True if values of WSDC D-T033 stand beside those of WISE's bands. InputError for an
+    optical model of another shape. DegenerateError when too few bins hold stars.
     """
     wise = published and set(runs) <= set(WISE_BANDS)
     fields = {
-        name: field_of_solution(run.session.solution, epoch=run.session.epoch)
+        name: field_of_solution(run.results.solution, epoch=run.results.epoch)
         for name, run in runs.items()
     }
     bands = tuple(
@@ -113,25 +99,25 @@ def _times(field: DistortionField, factor: float, like: DistortionField) -> Dist
 def _measured(
     run: BandRun, field: DistortionField, optical: OpticalModel | None, bins: int, wise: bool
 ) -> BandResult:
-    session, fit = run.session, run.session.fit
+    results, fit = run.results, run.results.fit
     less = None if optical is None else field.minus(optical.field(run.chip, run.arcsec))
     vectors = field.vectors(GRID)
     without = {"no correction": field} | ({} if less is None else {"optical model": less})
     rms = float(np.linalg.norm(field.to_pixels) * max(fit.rms_u, fit.rms_v) / np.sqrt(2))
-    sums = session.shards.sum(
+    sums = results.data.shards.sum(
         band_sums,
-        session.solution.mean,
+        results.solution.mean,
         fit.clip,
         field.to_pixels,
         without,
         1.25 * vectors.length_max + 4 * rms,
         bins,
     )
-    session.close()
-    order = session.posterior.model.order
-    binned, rng = sums.bins.axes.residuals(), np.random.default_rng(SEED)
-    where = {"grid": GRID, "epoch": session.epoch}
-    convergence = session.posterior.convergence
+    results.close()
+    order = results.posterior.model.order
+    binned, rng = sums.bins.residuals(), np.random.default_rng(SEED)
+    where = {"grid": GRID, "epoch": results.epoch}
+    convergence = results.posterior.convergence
     return BandResult(
         name=run.name,
         path=run.path,
@@ -147,7 +133,7 @@ def _measured(
         correlation=residual_correlation(binned, order=order, rng=rng),
         vectors=vectors,
         formal_map=uncertainty_map(fit, **where),
-        posterior_map=uncertainty_map(session.solution, **where),
+        posterior_map=uncertainty_map(results.solution, **where),
         minus_optical=None if less is None else less.vectors(GRID),
         printed=_printed(run.name, field) if wise else None,
     )
@@ -164,9 +150,7 @@ def _printed(band: str, field: DistortionField) -> Printed:
         LONGEST_VECTORS[band],
         longest,
         FORMAL_RADII[band],
-        implied_sigma(
-            FORMAL_RADII[band], SAMPLE_SIZES[band], order=field.basis.order, size=field.basis.size
-        ),
+        implied_sigma(FORMAL_RADII[band], SAMPLE_SIZES[band], order=field.basis.order),
     )
 
 
@@ -177,7 +161,7 @@ def _tables(bands: tuple[BandResult, ...]) -> dict[str, StatisticsTable]:
     terms = {b.name: len(polynomial_terms(b.order)) for b in bands}
 
     def rows(function: object, *several: BandResult, **options: object) -> StatisticsTable:
-        sums: dict[str, BandBins] = {b.name: b.sums.bins for b in several}
+        sums: dict[str, BinnedSums] = {b.name: b.sums.bins for b in several}
         absorbed = max(terms[b.name] for b in several)
         return function(sums, rng=rng, absorbed=absorbed, **options)  # type: ignore[operator]
 

@@ -21,37 +21,16 @@ OTHER_FIELD = 1.5  # by this factor in extent the header's image is of another i
 
 @dataclass(frozen=True, eq=False)
 class OpticalModel:
-    """An optical model as it is compared with a band.
+    """An optical model as it is compared with a band."""
 
-    Parameters
-    ----------
-    label : str
-        The file, and by how much it was turned.
-    sip : SipHeader
-        Turned.
-    """
-
-    label: str
-    sip: SipHeader
+    label: str  # the file, and by how much it was turned
+    sip: SipHeader  # turned
 
     def field(self, chip: Chip, arcsec: float) -> DistortionField:
         """The model over an array that sees the same field, in that array's pixels.
 
-        Parameters
-        ----------
-        chip : Chip
-        arcsec : float
-            Per pixel of the array.
-
-        Returns
-        -------
-        DistortionField
-
-        Raises
-        ------
-        InputError
-            When the header's image has another shape than the array, or covers a field of quite
-            another size by its CD matrix.
+        `arcsec`: per pixel of the array. InputError when the header's image has another shape than
+        the array, or covers a field of quite another size by its CD matrix.
         """
         size = self.sip.size or chip.size
         times = [own / n for own, n in zip(size, chip.size, strict=True)]
@@ -92,24 +71,9 @@ def optical_models(
 ) -> dict[str, OpticalModel]:
     """Optical models of some bands.
 
-    Parameters
-    ----------
-    paths : sequence of path
-        One for all bands, or one for each; none for no model.
-    turn : float
-        Degrees by which they are turned, from x towards y.
-    bands : sequence of str
-
-    Returns
-    -------
-    dict of str to OpticalModel
-        By band.
-
-    Raises
-    ------
-    InputError
-        For a number of files that is neither one nor that of the bands, a file that cannot be read,
-        or meta-data without a band.
+    `paths`: one for all bands, or one for each; none for no model. `turn`: degrees by which they
+    are turned, from x towards y. The result is by band. InputError for a number of files that is
+    neither one nor that of the bands, a file that cannot be read, or meta-data without a band.
     """
     if not paths:
         return {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 from bayesdist.files import atomic_path
@@ -10,58 +9,22 @@ from bayesdist.files import atomic_path
 # importing them registers what the page shows
 from bayesdist.missions.wise.bands import curves, figures, findings, tables  # noqa: F401
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput
-from bayesdist.report.drawing import Drawing, draw_all
+from bayesdist.report.drawing import draw_all, save_drawings
 from bayesdist.report.page import parts_of, template
 
-__all__ = ["draw_bands", "render_bands", "write_bands"]
+__all__ = ["write_bands"]
 
 
-def draw_bands(inputs: BandsInput) -> dict[str, Drawing]:
-    """All figures of the page as files, by name, in its order.
+def write_bands(folder: Path, inputs: BandsInput) -> list[str]:
+    """Names of bands.html and its figures, once they are written into a folder.
 
-    Parameters
-    ----------
-    inputs : BandsInput
-
-    Returns
-    -------
-    dict of str to Drawing
+    InputError when a file cannot be written.
     """
-    return draw_all(BANDS, inputs)
-
-
-def render_bands(inputs: BandsInput, drawings: Mapping[str, Drawing]) -> str:
-    """The page as text.
-
-    Parameters
-    ----------
-    inputs : BandsInput
-    drawings : mapping of str to Drawing
-        As of `draw_bands`.
-
-    Returns
-    -------
-    str
-        A whole HTML document without scripts and without links to other files.
-    """
+    drawings = draw_all(BANDS, inputs)
+    save_drawings(drawings, folder / "figures")
     overview, *parts = parts_of(BANDS, inputs, drawings)
-    return template("bands.html.jinja").render(run=inputs, overview=overview, parts=parts)
-
-
-def write_bands(path: Path, inputs: BandsInput, drawings: Mapping[str, Drawing]) -> None:
-    """Write the page.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-    inputs : BandsInput
-    drawings : mapping of str to Drawing
-
-    Raises
-    ------
-    InputError
-        When the file cannot be written.
-    """
-    text = render_bands(inputs, drawings)
-    with atomic_path(path) as temporary:
+    text = template("bands.html.jinja").render(run=inputs, overview=overview, parts=parts)
+    with atomic_path(folder / "bands.html") as temporary:
         temporary.write_text(text, encoding="utf-8")
+    drawn = [f"figures/{name}.{kind}" for kind in ("png", "pdf") for name in drawings]
+    return ["bands.html", *drawn]

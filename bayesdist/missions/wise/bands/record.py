@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.session import write_table
+from bayesdist.app.output import write_table
 from bayesdist.missions.wise.assess.account import RowAccount
 from bayesdist.missions.wise.assess.histograms import ResidualHistogram
+from bayesdist.missions.wise.assess.published import HEADS
 from bayesdist.missions.wise.bands.context import BandResult, BandsInput
 
 __all__ = ["SCHEMA", "record_of", "write_tables"]
@@ -19,16 +20,7 @@ SCHEMA = 1
 
 
 def record_of(inputs: BandsInput) -> dict[str, Any]:
-    """Content of bands.json.
-
-    Parameters
-    ----------
-    inputs : BandsInput
-
-    Returns
-    -------
-    dict
-    """
+    """Content of bands.json."""
     return {
         "schema": SCHEMA,
         "converged": not inputs.provisional,
@@ -55,7 +47,7 @@ def record_of(inputs: BandsInput) -> dict[str, Any]:
 
 def _band(b: BandResult) -> dict[str, Any]:
     c, p = b.correlation, b.partition
-    count = b.sums.bins.axes.count
+    count = b.sums.bins.count
     out: dict[str, Any] = {
         "name": b.name,
         "run": b.path,
@@ -162,15 +154,7 @@ def _row(one: RowAccount) -> dict[str, Any]:
 def write_tables(inputs: BandsInput, folder: Path) -> tuple[str, ...]:
     """Write table_5_1.ecsv and so on, and return their names.
 
-    Parameters
-    ----------
-    inputs : BandsInput
-    folder : pathlib.Path
-
-    Raises
-    ------
-    InputError
-        When a file cannot be written.
+    InputError when a file cannot be written.
     """
     names = []
     for name, table in inputs.tables.items():
@@ -179,7 +163,7 @@ def write_tables(inputs: BandsInput, folder: Path) -> tuple[str, ...]:
         _add(out, "Sigma partition", [one.partition for one in accounts], table.unit)
         _add(out, "Sigma rest", [one.rest for one in accounts], table.unit)
         if any(one.printed is not None for one in accounts):
-            for statistic, head in _HEADS.items():
+            for statistic, head in HEADS.items():
                 values = [one.printed and one.printed.value[statistic] for one in accounts]
                 _add(out, f"{head} printed", values, table.unit)
             for k, which in enumerate(("least", "most")):
@@ -193,17 +177,6 @@ def write_tables(inputs: BandsInput, folder: Path) -> tuple[str, ...]:
         write_table(out, folder / path)
         names.append(path)
     return tuple(names)
-
-
-_HEADS = {
-    "mean": "Mean",
-    "sigma": "Sigma",
-    "min": "Min",
-    "max": "Max",
-    "median": "Median",
-    "p01": "1%-tile",
-    "p99": "99%-tile",
-}
 
 
 def _add(table: Table, name: str, values: list[float | None], unit: str) -> None:

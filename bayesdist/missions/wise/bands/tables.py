@@ -6,11 +6,11 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from bayesdist.assess.wise import STATISTICS
+from bayesdist.diagnose.residuals import STATISTICS
 from bayesdist.missions.wise.assess.account import RowAccount
-from bayesdist.missions.wise.assess.published import PrintedRow
+from bayesdist.missions.wise.assess.published import HEADS, PrintedRow
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput
-from bayesdist.report.numbers import MISSING, number, rounded
+from bayesdist.numbers import MISSING, number, rounded
 from bayesdist.report.texttable import TextTable
 
 __all__ = ["account_table", "as_printed", "contradiction_table", "statistics_table", "tables_of"]
@@ -20,7 +20,6 @@ TITLES = {
     "5-2": "Alignment of two bands observed together",
     "5-3": "Alignment within a band in many frames, all pairs of bins",
 }
-_HEADS = ("Mean", "Sigma", "Min", "Max", "Median", "1%-tile", "99%-tile")
 
 
 @BANDS.table("tables")
@@ -52,7 +51,9 @@ def statistics_table(name: str, inputs: BandsInput) -> TextTable:
             " minus 2MASS: there means and medians have the other sign, and minima and 1 % stand"
             " for maxima and 99 %."
         )
-    return TextTable(title, (table.first, "", *_HEADS), tuple(rows), words=(0, 1), note=note)
+    return TextTable(
+        title, (table.first, "", *HEADS.values()), tuple(rows), words=(0, 1), note=note
+    )
 
 
 def as_printed(row: PrintedRow, statistic: str) -> str:
@@ -62,7 +63,7 @@ def as_printed(row: PrintedRow, statistic: str) -> str:
 
 
 def account_table(name: str, inputs: BandsInput) -> TextTable:
-    """What each sigma is made of, and how the printed one differs."""
+    """Table of the parts of each sigma, and how the printed one differs."""
     unit = inputs.tables[name].unit
     several = inputs.accounts[name]
     printed = any(one.printed is not None for one in several)
@@ -119,7 +120,7 @@ def _why(one: RowAccount) -> str:
 
 @BANDS.table("tables")
 def contradiction_table(inputs: BandsInput) -> TextTable | None:
-    """Where printed rows contradict themselves or each other; None where nothing is printed."""
+    """Table of contradictions within and between printed rows; None where nothing is printed."""
     rows = [
         (f"Table {name}", sentence)
         for name, several in inputs.accounts.items()

@@ -9,19 +9,21 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.app.folder import whole_folder
+from bayesdist.app.folder import atomic_directory
+from bayesdist.app.output import write_table
 from bayesdist.app.screen import table_text
-from bayesdist.app.session import write_table
-from bayesdist.data import RadialLimit, RvbPairs
-from bayesdist.data.frame_stars import FrameStars
-from bayesdist.data.rvb_files import ARRAY_SIZE, RVB_ALIASES, band_name
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bands.optical import optical_models
 from bayesdist.missions.wise.bring_up.iterate import BringUp, bring_up
-from bayesdist.missions.wise.rvb.write import write_rvb
+from bayesdist.missions.wise.frame_stars import FrameStars
+from bayesdist.missions.wise.pairs.files import RVB_ALIASES, band_name
+from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
+from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
+from bayesdist.missions.wise.pairs.write import write_rvb
+from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["bring_up_files"]
@@ -51,43 +53,23 @@ def bring_up_files(
 ) -> str:
     """Write the pairs that matching and fitting in turn arrive at, and a table of the rounds.
 
-    Parameters
-    ----------
-    detections, reference : path
-        Tables with columns x, y, sigma and frame: detections in pixels, reference stars where an
-        array without distortion would see them in the frame, in pixels too.
-    output : path
-        New folder: pairs/ for `format = "rvb"`, rounds.ecsv.
-    band : str
-    radius, corner_radius : float
-        Within which pairs are accepted, in the array's centre and in its corners; pixels.
-    order : int
-        Of the polynomial in the end.
-    optical : path, optional
-        SIP header or WISE meta-data to begin with; by default no distortion.
-    rotation : float
-        Degrees by which that is turned, from x towards y.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For what cannot be read or written, and as `bring_up`.
+    `detections`, `reference`: Tables with columns x, y, sigma and frame: detections in pixels,
+    reference stars where an array without distortion would see them in the frame, in pixels too.
+    `output`: new folder: pairs/ for `format = "rvb"`, rounds.ecsv. `radius`, `corner_radius`:
+    within which pairs are accepted, in the array's centre and in its corners; pixels. `order`: of
+    the polynomial in the end. `optical`: SIP header or WISE meta-data to begin with; by default no
+    distortion. `rotation`: degrees by which that is turned, from x towards y. Returns the text to
+    print. InputError for what cannot be read or written, and as `bring_up`.
     """
     band = band_name(band)
-    size = ARRAY_SIZE[band]
-    centre = ((size[0] + 1) / 2, (size[1] + 1) / 2)
-    model = DistortionModel(order, (Chip(1, band, size, centre),))
+    array = WISE_ARRAYS[band]
+    model = DistortionModel(order, (Chip(1, band, array.size, array.centre),))
     start = None if optical is None else _start(model, band, optical, rotation)
     stars, others = _read_lists(Path(detections), Path(reference))
     up = bring_up(stars, others, model, start, acceptance=RadialLimit(radius, corner_radius))
     rows = [{"round": k, **asdict(one)} for k, one in enumerate(up.rounds, 1)]
     rows = [{name: row[name] for name in ("round", *_SHOWN)} for row in rows]
-    with whole_folder(Path(output)) as folder:
+    with atomic_directory(Path(output)) as folder:
         write_rvb([_pairs(up, band)], folder / "pairs")
         write_table(Table(rows), folder / "rounds.ecsv")
     return f"{table_text(rows, 4)}\n{up.sentence}\n{output}/pairs: calibrate with format = 'rvb'"
@@ -96,8 +78,7 @@ def bring_up_files(
 def _start(model: DistortionModel, band: str, optical: str | Path, rotation: float) -> Float:
     """Parameters of an optical model, without terms beyond the order of the model."""
     chip = model.chips[0]
-    arcsec = 2.75 * ARRAY_SIZE["W1"][0] / chip.size[0]
-    found = optical_models([optical], rotation, [band])[band].field(chip, arcsec)
+    found = optical_models([optical], rotation, [band])[band].field(chip, WISE_ARRAYS[band].scale)
     basis = model.basis()
     coefficients = np.zeros((2, basis.n_terms))
     n = min(basis.n_terms, found.polynomial.shape[1])

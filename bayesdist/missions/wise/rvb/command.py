@@ -9,14 +9,16 @@ from math import radians
 from operator import add
 from pathlib import Path
 
-from bayesdist.data import MatchTable, RvbPairs, stream_rvb
-from bayesdist.data.rvb import chosen_band
-from bayesdist.data.rvb_files import ARRAY_SIZE, open_rvb_files
+from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
+from bayesdist.missions.wise.pairs.files import open_rvb_files
+from bayesdist.missions.wise.pairs.read import chosen_band, stream_rvb
+from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
+from bayesdist.missions.wise.pairs.write import write_rvb
+from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.missions.wise.rvb.linear import fit_transform, linear_moments
 from bayesdist.missions.wise.rvb.solutions import read_solutions
 from bayesdist.missions.wise.rvb.transform import RvbTransform, rereference, transformed
-from bayesdist.missions.wise.rvb.write import write_rvb
 
 __all__ = ["rereference_files", "transform_files"]
 
@@ -36,35 +38,11 @@ def transform_files(
 ) -> str:
     """Pairs with all reference positions moved by one linear transformation.
 
-    Parameters
-    ----------
-    files : sequence of path
-    output : path
-        New folder.
-    band : str, optional
-        Needed where the files hold several.
-    columns : mapping of str to str, optional
-        As `stream_rvb`.
-    dx, dy : float
-        Pixels.
-    rotation : float
-        Degrees, from x towards y.
-    scale_x, scale_y : float
-        Relative to one.
-    fit : bool
-        The five parameters are those that bring reference positions to the detections, by least
-        squares.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For no transformation, one that is both given and to be fitted, and as `stream_rvb`,
-        `transformed` and `write_rvb`.
+    `output`: new folder. `band`: needed where the files hold several. `columns`: as `stream_rvb`.
+    `dx`, `dy`: pixels. `rotation`: degrees, from x towards y. `scale_x`, `scale_y`: relative to
+    one. `fit`: the five parameters are those that bring reference positions to the detections, by
+    least squares. Returns the text to print. InputError for no transformation, one that is both
+    given and to be fitted, and as `stream_rvb`, `transformed` and `write_rvb`.
     """
     transform = RvbTransform(dx, dy, radians(rotation), scale_x, scale_y)
     if (transform == RvbTransform()) != fit:
@@ -81,11 +59,11 @@ def transform_files(
     if fit:
         pieces = stream_rvb(files, band=band, columns=columns)
         best = fit_transform(
-            reduce(add, (linear_moments(one.matches, _centre(band)) for one in pieces))
+            reduce(add, (linear_moments(one.matches, WISE_ARRAYS[band].centre) for one in pieces))
         )
         transform, found = best.transform, f"\n{best.sentence}"
     else:
-        transform = replace(transform, centre=_centre(band))
+        transform = replace(transform, centre=WISE_ARRAYS[band].centre)
     written = _written(
         files, output, band, columns, lambda matches: transformed(matches, transform)
     )
@@ -103,39 +81,18 @@ def rereference_files(
 ) -> str:
     """Pairs brought from the frame solutions that they were made with to others.
 
-    Parameters
-    ----------
-    files : sequence of path
-    output : path
-        New folder.
-    free, fixed : path
-        Tables of solutions: those of the pairs, and those that they are brought to.
-    band, columns
-        As of `transform_files`.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        As `stream_rvb`, `read_solutions`, `rereference` and `write_rvb`.
+    `output`: new folder. `free`, `fixed`: Tables of solutions: those of the pairs, and those that
+    they are brought to. `band`, `columns`: as of `transform_files`. Returns the text to print.
+    InputError as `stream_rvb`, `read_solutions`, `rereference` and `write_rvb`.
     """
     columns = columns or {}
     band = _band(files, band, columns)
-    old, new = (read_solutions(path, centre=_centre(band)) for path in (free, fixed))
+    old, new = (read_solutions(path, centre=WISE_ARRAYS[band].centre) for path in (free, fixed))
     return _written(files, output, band, columns, lambda matches: rereference(matches, old, new))
 
 
 def _band(files: Sequence[str | Path], band: str | None, columns: Mapping[str, str]) -> str:
     return chosen_band(open_rvb_files(files, columns), band)
-
-
-def _centre(band: str) -> tuple[float, float]:
-    nx, ny = ARRAY_SIZE[band]
-    return (nx + 1) / 2, (ny + 1) / 2
 
 
 def _written(

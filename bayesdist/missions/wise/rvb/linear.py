@@ -32,25 +32,13 @@ _RANK = 1e-12  # eigenvalues of the unit-diagonal normal matrix below this are z
 
 @dataclass(frozen=True, eq=False)
 class LinearMoments:
-    """All that pairs say about a linear transformation: sums, which add over pieces of the data.
+    """All that pairs say about a linear transformation: sums, which add over pieces of the data."""
 
-    Parameters
-    ----------
-    weight : ndarray, shape (2, 3, 3)
-        sum of w p p^T with p = (1, u - centre, v - centre), for the axes x and y.
-    right : ndarray, shape (2, 3)
-        sum of w p times the offset of the detection, x - u or y - v.
-    chi2 : float
-        sum of w times the squared offsets.
-    n : int
-        Pairs.
-    centre : tuple of float
-    """
-
+    # (2, 3, 3), sum of w p p^T with p = (1, u - centre, v - centre), for the axes x and y
     weight: Float
-    right: Float
-    chi2: float
-    n: int
+    right: Float  # (2, 3), sum of w p times the offset of the detection, x - u or y - v
+    chi2: float  # sum of w times the squared offsets
+    n: int  # pairs
     centre: tuple[float, float]
 
     def __add__(self, other: LinearMoments) -> LinearMoments:
@@ -68,21 +56,8 @@ class LinearMoments:
 def linear_moments(matches: MatchTable, centre: tuple[float, float]) -> LinearMoments:
     """Sums over some pairs.
 
-    Parameters
-    ----------
-    matches : MatchTable
-        With errors, and u, v in pixels of the array.
-    centre : tuple of float
-        Of the transformation that will be fitted: the array's centre.
-
-    Returns
-    -------
-    LinearMoments
-
-    Raises
-    ------
-    InputError
-        Without errors, and for another unit.
+    `matches`: with errors, and u, v in pixels of the array. `centre`: of the transformation that
+    will be fitted: the array's centre. InputError without errors, and for another unit.
     """
     where = ", ".join(matches.sources)
     if matches.sigma_u is None or matches.sigma_v is None:
@@ -108,19 +83,11 @@ def linear_moments(matches: MatchTable, centre: tuple[float, float]) -> LinearMo
 
 @dataclass(frozen=True, eq=False)
 class TransformFit:
-    """A fitted linear transformation from reference stars to detections.
-
-    Parameters
-    ----------
-    transform : RvbTransform
-    cov : ndarray, shape (6, 6)
-        Formal covariance in the order of `PARAMETERS`; zero for what was held.  Distortion that is
-        not yet corrected is no noise: where chi2 / dof is far from one it says more than this.
-    chi2 : float
-    dof : int
-    """
+    """A fitted linear transformation from reference stars to detections."""
 
     transform: RvbTransform
+    # (6, 6), formal covariance in the order of `PARAMETERS`; zero for what was held.  Distortion
+    # that is not yet corrected is no noise: where chi2 / dof is far from one it says more than this
     cov: Float
     chi2: float
     dof: int
@@ -146,25 +113,10 @@ def fit_transform(
 ) -> TransformFit:
     """Weighted least squares for up to six parameters of the map from (u, v) to (x, y).
 
-    Parameters
-    ----------
-    moments : LinearMoments
-    free : sequence of str
-        Of `PARAMETERS`; five by default.
-    start : RvbTransform, optional
-        Values of the parameters that are held; the identity by default.
-
-    Returns
-    -------
-    TransformFit
-        `transformed` with its transform takes constant and linear offsets out of the pairs.
-
-    Raises
-    ------
-    InputError
-        For unknown parameters, or none.
-    DegenerateError
-        When the pairs do not determine the free ones, as when they lie on a line.
+    `free`: of `PARAMETERS`; five by default. `start`: values of the parameters that are held; the
+    identity by default. Returns `transformed` with its transform takes constant and linear offsets
+    out of the pairs. InputError for unknown parameters, or none. DegenerateError when the pairs do
+    not determine the free ones, as when they lie on a line.
     """
     unknown = [name for name in free if name not in PARAMETERS]
     if unknown or not free:

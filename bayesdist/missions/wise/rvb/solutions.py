@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.data.rvb_files import RVB_ALIASES
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError
+from bayesdist.missions.wise.pairs.files import RVB_ALIASES
 from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform
 
 __all__ = ["SOLUTION_ALIASES", "read_solutions"]
@@ -32,26 +32,12 @@ def read_solutions(
 ) -> dict[str, RvbTransform]:
     """Solutions of the frames of one band, as `rereference` takes them.
 
-    Parameters
-    ----------
-    path : path-like
-        An IPAC table or any other that `read_matches` knows, with a row for each frame.
-    centre : tuple of float
-        Point about which the frames were solved: the centre of the array, FITS 1-based pixels.
-    columns : mapping of str to str, optional
-        Column of each quantity: frame shift_u shift_v rotation scale_u scale_v skew.  A parameter
-        without a column is zero in all frames; scales are relative to one, the rotation in radians
-        unless the column has a unit.
-
-    Returns
-    -------
-    dict of str to RvbTransform
-
-    Raises
-    ------
-    InputError
-        For a missing column of frames, no parameter at all, a frame that stands twice, and for what
-        is no number.
+    `path`: an IPAC table or any other that `read_matches` knows, with a row for each frame.
+    `centre`: point about which the frames were solved: the centre of the array, FITS 1-based
+    pixels. `columns`: column of each quantity: frame shift_u shift_v rotation scale_u scale_v skew.
+    A parameter without a column is zero in all frames; scales are relative to one, the rotation in
+    radians unless the column has a unit. InputError for a missing column of frames, no parameter at
+    all, a frame that stands twice, and for what is no number.
     """
     file = Path(path)
     table = read_table(file)

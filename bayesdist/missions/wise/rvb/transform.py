@@ -35,31 +35,16 @@ class RvbTransform:
     R turns by `rotation` from u towards v, S scales by 1 + scale_u and 1 + scale_v, and
     K = [[1, skew], [0, 1]].
 
-    Parameters
-    ----------
-    shift_u, shift_v : float
-        In the unit of u, v.
-    rotation : float
-        Radians.
-    scale_u, scale_v : float
-        Relative to one, above -1.
-    skew : float
-        Radians.
-    centre : tuple of float
-        The point that rotation and scales leave where it is; by default the centre of a W1 array.
-
-    Raises
-    ------
-    InputError
-        For values that are not finite, and scales that leave nothing or mirror.
+    InputError for values that are not finite, and scales that leave nothing or mirror.
     """
 
-    shift_u: float = 0.0
+    shift_u: float = 0.0  # in the unit of u, v
     shift_v: float = 0.0
-    rotation: float = 0.0
-    scale_u: float = 0.0
+    rotation: float = 0.0  # radians
+    scale_u: float = 0.0  # relative to one, above -1
     scale_v: float = 0.0
-    skew: float = 0.0
+    skew: float = 0.0  # radians
+    # the point that rotation and scales leave where it is; by default the centre of a W1 array
     centre: tuple[float, float] = (508.5, 508.5)
 
     def __post_init__(self) -> None:
@@ -90,13 +75,7 @@ class RvbTransform:
     def __call__(self, points: ArrayLike) -> Float:
         """Transformed points.
 
-        Parameters
-        ----------
-        points : array_like, shape (..., 2)
-
-        Returns
-        -------
-        ndarray, same shape
+        `points`: (..., 2).
         """
         offset = np.asarray(points, float) - self.centre
         return offset @ self.matrix.T + self.centre + self.shift
@@ -105,16 +84,7 @@ class RvbTransform:
     def of_matrix(matrix: ArrayLike, shift: ArrayLike, centre: tuple[float, float]) -> RvbTransform:
         """The transformation with a given matrix and shift.
 
-        Parameters
-        ----------
-        matrix : array_like, shape (2, 2)
-            Without a mirror: its determinant is positive.
-        shift : array_like, shape (2,)
-        centre : tuple of float
-
-        Returns
-        -------
-        RvbTransform
+        `matrix`: (2, 2), without a mirror: its determinant is positive. `shift`: (2,).
         """
         matrix, shift = np.asarray(matrix, float), np.asarray(shift, float)
         along = float(np.hypot(*matrix[:, 0]))
@@ -132,7 +102,7 @@ class RvbTransform:
         )
 
     def about(self, centre: tuple[float, float]) -> RvbTransform:
-        """The same map with another centre."""
+        """Transformation of the same positions about another centre."""
         away = np.subtract(centre, self.centre)
         shift = self.shift + (self.matrix - np.eye(2)) @ away
         return replace(self, shift_u=float(shift[0]), shift_v=float(shift[1]), centre=centre)
@@ -151,10 +121,8 @@ class RvbTransform:
     def jacobian(self) -> Float:
         """Derivatives of shift and matrix by the parameters.
 
-        Returns
-        -------
-        ndarray, shape (6, 6)
-            Rows: both shifts, then the matrix row by row; columns in the order of `PARAMETERS`.
+        Returns (6, 6), rows: both shifts, then the matrix row by row; columns in the order of
+        `PARAMETERS`.
         """
         c, s = np.cos(self.rotation), np.sin(self.rotation)
         turn, turned = np.array([[c, -s], [s, c]]), np.array([[-s, -c], [c, -s]])
@@ -178,20 +146,8 @@ class RvbTransform:
 def transformed(matches: MatchTable, transform: RvbTransform) -> MatchTable:
     """Pairs with their reference positions transformed, and the errors with them.
 
-    Parameters
-    ----------
-    matches : MatchTable
-    transform : RvbTransform
-
-    Returns
-    -------
-    MatchTable
-
-    Raises
-    ------
-    InputError
-        When errors of u and v would come out correlated by more than 0.1, which a table of matches
-        does not hold: unequal errors turned by an angle that is neither small nor a right one.
+    InputError when errors of u and v would come out correlated by more than 0.1, which a table of
+    matches does not hold: unequal errors turned by an angle that is neither small nor a right one.
     """
     everywhere = np.zeros(len(matches), np.int64)
     return _moved(matches, everywhere, transform.matrix[None], transform.shift[None],
@@ -211,23 +167,10 @@ def rereference(
     they do, and so do shifts and rotations between bands.  The pairs alone cannot tell what a free
     solution took up: it has to be given.
 
-    Parameters
-    ----------
-    matches : MatchTable
-        Made with the free solutions.
-    free, fixed : mapping of str to RvbTransform
-        Solution of each frame: from nominal pixels, which are common to both, to the band frame.
-        Those of other bands than the one that is solved for are its solution, then the band's
-        translation and rotation known beforehand (`RvbTransform.then`).
-
-    Returns
-    -------
-    MatchTable
-
-    Raises
-    ------
-    InputError
-        For a frame without a solution, and as `transformed`.
+    `matches`: made with the free solutions. `free`, `fixed`: solution of each frame: from nominal
+    pixels, which are common to both, to the band frame. Those of other bands than the one that is
+    solved for are its solution, then the band's translation and rotation known beforehand
+    (`RvbTransform.then`). InputError for a frame without a solution, and as `transformed`.
     """
     moves = []
     used, code = np.unique(matches.exposure, return_inverse=True)

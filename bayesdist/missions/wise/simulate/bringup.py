@@ -1,9 +1,4 @@
-"""First weeks of a calibration: unpaired lists of stars, and a poor initial distortion.
-
-The distortion is WISE's of WSDC D-T033.  The initial one is an optical model like its Code V model:
-turned by 270 degrees it resembles the truth (section 4: longest vector 3.513 px, longest difference
-to W2 1.658 px); as delivered it is worse than none (section 2).
-"""
+"""First weeks of a calibration: lists of stars that nobody has paired."""
 
 from __future__ import annotations
 
@@ -12,81 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.frame_stars import FrameStars
 from bayesdist.errors import InputError
+from bayesdist.missions.wise.frame_stars import FrameStars
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import DistortionModel
 
-__all__ = ["UnpairedStars", "optical_model", "simulate_unpaired"]
+__all__ = ["UnpairedStars", "simulate_unpaired"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-# A field that grows as the cube of the radius, and its direction against the radius: with W2 these
-# give the two longest vectors that the report prints.
-DIFFERENCE = 1.658  # px in the corners
-DIRECTION = -1.12  # radians
-
-QUARTERS = {0: 0, 90: 1, 180: 2, 270: 3}
 MARGIN = 40.0  # pixels by which the reference catalogue reaches beyond the detector
 CENTROID = (0.05, 0.20)  # px, from the brightest to the faintest detection
 REFERENCE_SIGMA = 0.03  # px: 2MASS, some 80 mas
-
-
-def optical_model(band: str = "W2", turn: int = 270) -> tuple[DistortionModel, Float]:
-    """Optical model that resembles the true distortion once it is turned.
-
-    Parameters
-    ----------
-    band : str
-    turn : int
-        Degrees, from x towards y, by which it must be turned to fit: 0, 90, 180 or 270.  270 is the
-        model as it was delivered, 0 the model already turned.
-
-    Returns
-    -------
-    model : DistortionModel
-    theta : ndarray, shape (D,)
-        Its parameters, without constant terms.
-
-    Raises
-    ------
-    InputError
-        For another angle or an unknown band.
-    """
-    if turn not in QUARTERS:
-        raise InputError(
-            f"the optical model is turned by {turn} degrees",
-            where="turn",
-            do="choose 0, 90, 180 or 270",
-        )
-    model, truth = wise_solution(band)
-    basis = model.basis()
-    half = basis.half_size
-    none = np.zeros((2, basis.n_terms))
-    cubic = np.zeros((2, basis.n_terms))
-    for axis, terms in enumerate((((3, 0), (1, 2)), ((2, 1), (0, 3)))):
-        linear = basis.terms.index((1, 0) if axis == 0 else (0, 1))
-        none[axis, [0, linear]] = model.chips[0].reference_pixel[axis], 1.0
-        for i, j in terms:
-            cubic[axis, basis.terms.index((i, j))] = half[0] ** -i * half[1] ** -j
-    none, cubic = basis.from_monomials(none), basis.from_monomials(cubic)
-    c, s = np.cos(DIRECTION), np.sin(DIRECTION)
-    # in the corners x (x^2 + y^2) and y (x^2 + y^2) are 2, in units of the half size
-    field = truth.reshape(2, -1) - none
-    field[:, 0] -= field @ basis.monomial_matrix[0]
-    field += DIFFERENCE / np.sqrt(8) * (np.array([[c, -s], [s, c]]) @ cubic)
-    for _ in range(QUARTERS[turn]):
-        field = _turned_back(field, basis.terms)
-    return model, (none + field).ravel()
-
-
-def _turned_back(field: Float, terms: tuple[tuple[int, int], ...]) -> Float:
-    """Field (2, K) of Legendre products over a square, turned by -90 degrees."""
-    there = np.empty_like(field)  # at the position (-y, x)
-    for k, (i, j) in enumerate(terms):
-        there[:, terms.index((j, i))] = (-1) ** i * field[:, k]
-    return np.stack([there[1], -there[0]])
 
 
 @dataclass(frozen=True, eq=False)

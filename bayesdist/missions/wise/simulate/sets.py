@@ -11,18 +11,17 @@ from numpy.typing import NDArray
 
 from bayesdist.data.pieces import even_edges
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.simulate.interlopers import Interlopers, interlopers
-from bayesdist.missions.wise.simulate.pattern import BLOCKS, PartitionPattern, partition_pattern
-from bayesdist.missions.wise.simulate.published import (
+from bayesdist.missions.wise.published import (
     RESIDUAL_SIGMAS,
     SAMPLE_SIZES,
     WISE_ARRAYS,
     WISE_BANDS,
     WiseArray,
 )
+from bayesdist.missions.wise.simulate.pattern import BLOCKS, PartitionPattern, partition_pattern
 from bayesdist.missions.wise.simulate.solution import wise_solution
 from bayesdist.missions.wise.simulate.stars import POPULATIONS
-from bayesdist.missions.wise.simulate.survey import Survey, survey
+from bayesdist.missions.wise.simulate.survey import FalseMatches, Survey, false_matches, survey
 from bayesdist.model import DistortionModel
 
 __all__ = ["CHUNK", "PairChunk", "WiseSet", "wise_set"]
@@ -81,7 +80,7 @@ class WiseSet:
     theta : ndarray, shape (30,)
         The published distortion: the truth.
     survey : Survey
-    interlopers : Interlopers
+    false_matches : FalseMatches
     pattern : PartitionPattern or None
         Pattern in the residuals, where it is asked for.
     """
@@ -93,7 +92,7 @@ class WiseSet:
     model: DistortionModel
     theta: Float
     survey: Survey
-    interlopers: Interlopers
+    false_matches: FalseMatches
     pattern: PartitionPattern | None
 
     @property
@@ -131,8 +130,8 @@ class WiseSet:
         X, Y = rng.uniform(-1.0, 1.0, size=(2, n))
         r2 = (X**2 + Y**2) / 2.0
         error = sigma * rng.standard_normal((2, n))
-        false = rng.uniform(size=n) < self.interlopers.probability(frame, r2)
-        error[:, false] = self.interlopers.offsets(r2[false], rng).T
+        false = rng.uniform(size=n) < self.false_matches.probability(frame, r2)
+        error[:, false] = self.false_matches.offsets(r2[false], rng).T
         colour = population.colours(false, rng)
         x, y = (
             centre + half * scaled
@@ -226,7 +225,7 @@ def wise_set(
         model=model,
         theta=theta,
         survey=frames,
-        interlopers=interlopers(frames, WISE_ARRAYS[band].scale, false_share),
+        false_matches=false_matches(frames, WISE_ARRAYS[band].scale, false_share),
         pattern=pattern,
     )
 

@@ -1,17 +1,20 @@
-"""Published distortion of a band as a model, and small tables of pairs that follow it."""
+"""Published distortion of a band as a model, and pairs with the errors of W2 that follow it."""
 
 from __future__ import annotations
+
+import os
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.simulate.published import WISE_ARRAYS, WISE_COEFFICIENTS
+from bayesdist.missions.wise.published import SAMPLE_SIZES, WISE_ARRAYS, WISE_COEFFICIENTS
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate.matches import Truth, simulate_matches
+from bayesdist.simulate.partitioned import simulate_partitioned
 
-__all__ = ["simulate_wise", "wise_solution"]
+__all__ = ["simulate_wise", "simulate_wise_partitioned", "wise_solution"]
 
 Float = NDArray[np.float64]
 
@@ -108,3 +111,49 @@ def simulate_wise(
         jitter=jitter,
         outlier_scale=outlier_scale,
     )
+
+
+def simulate_wise_partitioned(
+    folder: str | os.PathLike[str],
+    n: int = SAMPLE_SIZES["W2"],
+    *,
+    band: str = "W2",
+    rng: np.random.Generator,
+    fraction: float = 0.03,
+    jitter: float = 0.03,
+    outlier_scale: float = 1.0,
+) -> Truth:
+    """Pairs of WISE detections and 2MASS stars, written to a folder of Parquet files as they come.
+
+    Up to a million pairs are those of `simulate_wise`.
+
+    Parameters
+    ----------
+    folder : path-like
+        As `write_partitioned`.
+    n : int, optional
+    band, rng, fraction, jitter, outlier_scale
+        As `simulate_wise`.
+
+    Returns
+    -------
+    Truth
+        `false` has one byte for each pair, in the order of the files.
+
+    Raises
+    ------
+    InputError
+        As `simulate_wise` and `write_partitioned`.
+    """
+
+    def simulate(size: int) -> tuple[MatchTable, Truth]:
+        return simulate_wise(
+            size,
+            band=band,
+            rng=rng,
+            fraction=fraction,
+            jitter=jitter,
+            outlier_scale=outlier_scale,
+        )
+
+    return simulate_partitioned(folder, n, simulate)

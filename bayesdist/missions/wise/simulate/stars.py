@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.missions.wise.simulate.published import WISE_ARRAYS
+from bayesdist.missions.wise.published import WISE_ARRAYS
 
 __all__ = ["POPULATIONS", "Population"]
 

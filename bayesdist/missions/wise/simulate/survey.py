@@ -1,13 +1,20 @@
-"""Frames of the pairs: their epochs, and the density of stars on their sky."""
+"""Frames of the pairs: their epochs, the density of stars on their sky, and their false matches.
+
+False matches are sources that 2MASS does not list, paired with a star that happens to be near.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial import legendre
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
-__all__ = ["FRAMES", "Survey", "survey"]
+from bayesdist.errors import InputError
+
+__all__ = ["FRAMES", "FalseMatches", "Survey", "false_matches", "match_radius", "survey"]
 
 Float = NDArray[np.float64]
 
@@ -22,6 +29,9 @@ POLE = 2500.0  # 2MASS sources per square degree at the galactic poles
 THINNEST = 0.05  # the sine of the latitude below which the plane-parallel layer is cut off
 HIGHEST = 0.98  # sine of the highest galactic latitude on the orbit
 ARCSEC2 = 3600.0**2
+
+RADIUS = (1.5, 3.0)  # of the match circle, in pixels: at the centre of the array, in its corners
+NODES = 16  # on half an axis, for means over the array
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,3 +63,65 @@ def survey(n_frames: int = FRAMES) -> Survey:
         for s, f in zip(scan.tolist(), frame.tolist(), strict=True)
     )
     return Survey(names, START + number * CADENCE_S / YEAR_S, POLE / sine / ARCSEC2)
+
+
+def match_radius(r2: Float) -> Float:
+    """Radius of the match circle in pixels: tight at the centre, wider where distortion is large.
+
+    `r2` is the squared distance from the centre of the array, 1 in the corners.
+    """
+    return RADIUS[0] + (RADIUS[1] - RADIUS[0]) * r2
+
+
+@dataclass(frozen=True, eq=False)
+class FalseMatches:
+    """Probability of false pairs, by the density of the frame and the position on the array."""
+
+    density: Float  # (F,), reference stars per square pixel of each frame
+    unlisted: float  # fraction of sources without a counterpart in the reference
+
+    def probability(self, frame: NDArray[np.int64], r2: Float) -> Float:
+        """Probability that pairs (N,) are false.
+
+        Of sources with a counterpart all are paired with it, of those without one each that has a
+        star within the match circle.
+        """
+        caught = self.unlisted * _chance(self.density[frame], r2)
+        return caught / (caught + (1.0 - self.unlisted))
+
+    def offsets(self, r2: Float, rng: np.random.Generator) -> Float:
+        """Offsets (N, 2) of false matches in pixels: uniform on the match circle."""
+        radius = match_radius(r2) * np.sqrt(rng.uniform(size=r2.size))
+        angle = rng.uniform(0.0, 2.0 * np.pi, size=r2.size)
+        return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
+
+
+def false_matches(survey: Survey, scale: float, share: float) -> FalseMatches:
+    """False matches whose expected fraction of all pairs is `share`, at `scale` arcsec per pixel.
+
+    InputError for a fraction outside [0, 1).
+    """
+    if not 0.0 <= share < 1.0:
+        raise InputError(
+            f"the share of false matches is {share:g}", where="false_share", do="give one in [0, 1)"
+        )
+    density = survey.density * scale**2
+    if share == 0.0:
+        return FalseMatches(density, 0.0)
+    nodes, weights = legendre.leggauss(NODES)
+    half, weight = (nodes + 1.0) / 2.0, weights / 2.0
+    r2 = ((half[:, None] ** 2 + half**2) / 2.0).ravel()
+    chance = _chance(density[:, None], r2)
+    of_frame, of_place = survey.share(), np.outer(weight, weight).ravel()
+
+    def excess(logit: float) -> float:
+        odds = np.exp(logit) * chance
+        return float(of_frame @ (odds / (odds + 1.0)) @ of_place) - share
+
+    odds = np.exp(brentq(excess, -40.0, 40.0, xtol=1e-10))
+    return FalseMatches(density, float(odds / (1.0 + odds)))
+
+
+def _chance(density: Float, r2: Float) -> Float:
+    """Probability that some star lies within the match circle."""
+    return -np.expm1(-np.pi * density * match_radius(r2) ** 2)

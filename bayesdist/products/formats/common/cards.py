@@ -8,6 +8,8 @@ from textwrap import wrap
 
 from astropy.io import fits
 
+from bayesdist.infer.solution import Solution
+
 __all__ = ["card_images", "header_of", "holds_wcs", "keyword_of", "number_card", "text_card"]
 
 # Without one of these nothing ties pixels to a world.
@@ -31,13 +33,12 @@ def text_card(keyword: str, value: str, comment: str = "") -> str:
     return fits.Card(keyword, value, comment).image
 
 
-def convergence_cards(solution: object) -> list[str]:
+def convergence_cards(solution: Solution) -> list[str]:
     """Cards that tell if the posterior behind a product has converged; none for a linear fit."""
-    convergence = getattr(solution, "convergence", None)
+    convergence = solution.convergence
     if convergence is None:
         return []
-    label = getattr(solution, "approximation", "")
-    notes = [text_card("COMMENT", line) for line in wrap(label, 70)]
+    notes = [text_card("COMMENT", line) for line in wrap(solution.approximation, 70)]
     if convergence.converged:
         return [text_card("BDCONV", "YES", "has the sampler converged?"), *notes]
     return [

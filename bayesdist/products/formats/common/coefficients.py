@@ -103,17 +103,8 @@ def largest_magnitude(
     The border is looked at every unit step and the interior on a grid; the best points of both are
     refined by steps that are halved, so that the result is a maximum and not a sample.
 
-    Parameters
-    ----------
-    coefficients : mapping of (int, int) to float
-    x_range, y_range : tuple of float
-        Lowest and highest values.
-    order : int, optional
-        Terms above this total order are left out.
-
-    Returns
-    -------
-    float
+    `x_range`, `y_range`: lowest and highest values. `order`: terms above this total order are left
+    out.
     """
     c = coefficient_matrix(coefficients, order)
     low = np.array([x_range[0], y_range[0]], float)

@@ -35,21 +35,12 @@ LEVELS = ("error", "warning", "note")
 
 @dataclass(frozen=True)
 class Finding:
-    """One finding.
+    """One finding."""
 
-    Parameters
-    ----------
-    level : {'error', 'warning', 'note'}
-        'error': programs will fail or misplace stars; 'warning': they may; 'note': good to know.
-    where : str
-        Keyword, column or row.
-    message : str
-        One clause.
-    """
-
+    # 'error': programs will fail or misplace stars; 'warning': they may; 'note': good to know
     level: str
-    where: str
-    message: str
+    where: str  # keyword, column or row
+    message: str  # one clause
 
     def __str__(self) -> str:
         return f"{self.level}: {self.where}: {self.message}"
@@ -78,19 +69,12 @@ def finding_lines(findings: Sequence[Finding]) -> list[str]:
 
 @dataclass(frozen=True)
 class Choice:
-    """Choice among the calibrations of a file, and values that the file may lack.
+    """Choice among the calibrations of a file, and values that the file may lack."""
 
-    Parameters
-    ----------
-    filter : str, optional
-        Of an IDCTAB, where names of both wheels may be joined by a comma; the band of WISE
-        meta-data, as in "W2".
-    size : tuple of float, optional
-        Columns and rows, for a header that lacks them.
-    """
-
+    # of an IDCTAB, where names of both wheels may be joined by a comma; the band of WISE meta-data,
+    # as in "W2"
     filter: str | None = None
-    size: tuple[float, float] | None = None
+    size: tuple[float, float] | None = None  # columns and rows, for a header that lacks them
 
 
 class FormatSettings(BaseModel):

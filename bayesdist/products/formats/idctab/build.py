@@ -9,10 +9,10 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.calibration.calibration import Calibration, as_calibration
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import InputError
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.solution import Solution
 from bayesdist.products.formats.common.cards import convergence_cards, number_card, text_card
 from bayesdist.products.formats.common.content import hdus_of
 from bayesdist.products.formats.idctab.cards import closure_cards, provenance_cards, tdd_cards
@@ -27,16 +27,17 @@ from bayesdist.products.formats.idctab.numbers import (
 )
 from bayesdist.products.formats.idctab.table import IdcTab
 
-__all__ = ["build_idctab", "idctab_from_solution"]
+__all__ = ["idctab_from_solution"]
 
 Float = NDArray[np.float64]
 Filter = str | tuple[str, ...]
+Source = Solution | Calibration
 
 DESCRIPTION = "Geometric distortion with its uncertainty, by bayesdist"
 
 
 def idctab_from_solution(
-    solution: Solution | Mapping[Filter, Solution],
+    solution: Source | Mapping[Filter, Source],
     *,
     instrument: str,
     detector: str,
@@ -65,10 +66,10 @@ def idctab_from_solution(
 
     Parameters
     ----------
-    solution : Solution, or mapping of filter to Solution
-        A fit or a posterior.  The filter of a mapping is one name ("F814W", whose other wheel is
-        clear), or a tuple with those of both wheels; filters with the very same solution object
-        share its rows.
+    solution : Solution or Calibration, or mapping of filter to them
+        A fit or a posterior, or the calibration of one.  The filter of a mapping is one name
+        ("F814W", whose other wheel is clear), or a tuple with those of both wheels; filters with
+        the very same solution object share its rows.
     instrument, detector : str
         INSTRUME and DETECTOR, as "ACS" and "WFC".
     scale_arcsec : float, optional
@@ -117,52 +118,7 @@ def idctab_from_solution(
     TDD_DATE is the reference date of the fit.  stwcs dates an exposure by year + day of year /
     365.25, which is within about a day of the decimal year.
     """
-    named: Calibration | dict[Filter, Calibration]
-    if isinstance(solution, Mapping):
-        made: dict[int, Calibration] = {}  # filters with the very same solution share its rows
-        named = {
-            filter: made.setdefault(id(one), calibration_of(one))
-            for filter, one in solution.items()
-        }
-    else:
-        named = calibration_of(solution)
-    return build_idctab(
-        named,
-        instrument=instrument,
-        detector=detector,
-        scale_arcsec=scale_arcsec,
-        v2ref=v2ref,
-        v3ref=v3ref,
-        vafactor=vafactor,
-        filters=filters,
-        useafter=useafter,
-        pedigree=pedigree,
-        description=description,
-        chips=chips,
-        inverse=inverse,
-        history=history,
-    )
-
-
-def build_idctab(
-    calibration: Calibration | Mapping[Filter, Calibration],
-    *,
-    instrument: str,
-    detector: str,
-    scale_arcsec: float | None = None,
-    v2ref: float = 0.0,
-    v3ref: float = 0.0,
-    vafactor: float = 1.0,
-    filters: Sequence[str] | Sequence[Sequence[str]] | None = None,
-    useafter: str | None = None,
-    pedigree: str | None = None,
-    description: str = DESCRIPTION,
-    chips: Sequence[int] | None = None,
-    inverse: bool = False,
-    history: Sequence[str] = (),
-) -> IdcTab:
-    """IDCTAB of a calibration, or of one for each filter; arguments of `idctab_from_solution`."""
-    entries = _entries(calibration, filters, instrument)
+    entries = _entries(solution, filters, instrument)
     first = entries[0][0]
     model = first.model
     parity = parity_of(instrument, detector)
@@ -214,27 +170,27 @@ def build_idctab(
 
 
 def _entries(
-    calibration: Calibration | Mapping[Filter, Calibration],
+    solution: Source | Mapping[Filter, Source],
     filters: Sequence[str] | Sequence[Sequence[str]] | None,
     instrument: str,
 ) -> list[tuple[Calibration, tuple[tuple[str, ...], ...]]]:
     """Calibrations, each with the filter combinations of its rows; () for rows of all filters."""
     where = "products.idctab.filters"
-    named: list[tuple[tuple[str, ...], Calibration]]
-    if isinstance(calibration, Mapping):
+    named: list[tuple[tuple[str, ...], Source]]
+    if isinstance(solution, Mapping):
         if filters:
             raise InputError(
                 "the filters are given twice", where=where, do="leave them to the solutions"
             )
-        named = [(combination_of(filter, instrument), one) for filter, one in calibration.items()]
+        named = [(combination_of(filter, instrument), one) for filter, one in solution.items()]
         if not named:
             raise InputError("no filter is given", where="solutions", do="give at least one")
     elif not filters:
-        return [(calibration, ((),))]
+        return [(as_calibration(solution), ((),))]
     elif all(isinstance(f, str) for f in filters):
-        named = [(tuple(map(str, filters)), calibration)]
+        named = [(tuple(map(str, filters)), solution)]
     else:
-        named = [(tuple(map(str, names)), calibration) for names in filters]
+        named = [(tuple(map(str, names)), solution) for names in filters]
     wanted = 2 if instrument == "ACS" else 1
     out: dict[int, tuple[Calibration, list[tuple[str, ...]]]] = {}
     seen: set[tuple[str, ...]] = set()
@@ -250,7 +206,9 @@ def _entries(
                 f"the filter combination {names} stands twice", where=where, do="name each one once"
             )
         seen.add(names)
-        out.setdefault(id(one), (one, []))[1].append(names)
+        if id(one) not in out:  # filters with the very same solution share its rows
+            out[id(one)] = as_calibration(one), []
+        out[id(one)][1].append(names)
     return [(one, tuple(combinations)) for one, combinations in out.values()]
 
 

@@ -15,11 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.calibration.calibration import (
-    Calibration,
-    calibration_of_maps,
-    gaussian_solution,
-)
+from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.inverse import ExplicitInverse
 from bayesdist.calibration.plane import Plane
@@ -169,7 +165,7 @@ def _with_covariance(
                 if (rate := f"{RATES[letter, i, j]}{number}") in place:
                     jacobian[first + t, place[rate]] = hx**i * hy**j
     cov = jacobian @ np.asarray(entries["COV"], float) @ jacobian.T
-    solution = gaussian_solution(model, np.asarray(calibration.solution.mean), (cov + cov.T) / 2)
+    solution = GaussianSolution(model, np.asarray(calibration.solution.mean), (cov + cov.T) / 2)
     return replace(calibration, solution=solution, errors="covariance")
 
 

@@ -59,6 +59,7 @@ def provenance_cards(
 
 
 def _orientation_cards(orientation: Orientation, vafactor: float) -> list[str]:
+    """Cards on the orientation, its error and its agreement with the reference."""
     sigma = orientation.sigma
     scale = orientation.scale / vafactor
     degrees = np.rad2deg([orientation.angle, sigma["angle"]]).tolist()
@@ -69,12 +70,9 @@ def _orientation_cards(orientation: Orientation, vafactor: float) -> list[str]:
         number_card("BDSCASIG", scale * sigma["log_scale"], "[arcsec] 1-sigma of BDSCALE"),
         number_card("BDV2SIG", sigma["shift_x"], "[arcsec] 1-sigma of V2 of (u, v) = 0"),
         number_card("BDV3SIG", sigma["shift_y"], "[arcsec] 1-sigma of V3 of (u, v) = 0"),
+        number_card("BDAGRRMS", orientation.agreement.rms, "[mas] rms distance to reference"),
+        number_card("BDAGRMAX", orientation.agreement.worst, "[mas] largest distance"),
     ]
-    if orientation.agreement is not None:
-        cards += [
-            number_card("BDAGRRMS", orientation.agreement.rms, "[mas] rms distance to reference"),
-            number_card("BDAGRMAX", orientation.agreement.worst, "[mas] largest distance"),
-        ]
     source = wrap(f"V2/V3: {orientation.source}", 72)
     return cards + [text_card("HISTORY", line) for line in source]
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import InputError
-from bayesdist.infer.transforms import Solution, View
+from bayesdist.infer.solution import Solution, TransformedSolution
 from bayesdist.infer.transforms import segment as segment_of
 from bayesdist.model import TimeDependence
 
@@ -149,7 +149,7 @@ def storable(
         return of_view(theta)[..., columns]
 
     cov = np.asarray(view.cov, float)[np.ix_(columns, columns)]
-    held = View(new, np.asarray(view.mean, float)[columns], cov, solution, transform)
+    held = TransformedSolution(new, np.asarray(view.mean, float)[columns], cov, solution, transform)
     shared = calibration.with_plane
     with_plane = None if shared is None else transform(shared.T).T  # the transformation is linear
     return replace(calibration, solution=held, with_plane=with_plane), lost

@@ -13,7 +13,7 @@ from bayesdist.products.formats.common.document import (
     Format,
     FormatSettings,
 )
-from bayesdist.products.formats.idctab.build import build_idctab
+from bayesdist.products.formats.idctab.build import idctab_from_solution
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
 from bayesdist.products.formats.idctab.lint import lint_idctab
 from bayesdist.products.formats.idctab.table import IdcTab
@@ -52,7 +52,7 @@ def _calibration(tab: IdcTab, _: str, choice: Choice) -> Calibration:
 def _build(
     calibration: Calibration, settings: Settings, options: BuildOptions
 ) -> tuple[Built, ...]:
-    tab = build_idctab(
+    tab = idctab_from_solution(
         calibration,
         scale_arcsec=options.scale_arcsec,
         history=calibration.notes,

@@ -21,16 +21,7 @@ _SCALE_RATIO = 1.25
 
 
 def lint_idctab(tab: IdcTab) -> tuple[Finding, ...]:
-    """Findings in an IDCTAB; those of many rows are gathered in one.
-
-    Parameters
-    ----------
-    tab : IdcTab
-
-    Returns
-    -------
-    tuple of Finding
-    """
+    """Findings in an IDCTAB; those of many rows are gathered in one."""
     finite = _not_finite(tab)
     return (
         *finite,

@@ -41,21 +41,11 @@ _FILTERS = ("FILTER1", "FILTER2", "FILTER")
 class LookupFile:
     """D2IMFILE or NPOLFILE: all its HDUs, and their meaning.
 
-    Parameters
-    ----------
-    hdus : tuple of Hdu
-        All HDUs.
-    name : str
-        Name of the file in errors.
-
-    Raises
-    ------
-    FormatError
-        When there is no image extension DX or DY.
+    FormatError when there is no image extension DX or DY.
     """
 
-    hdus: tuple[Hdu, ...]
-    name: str = "look-up tables"
+    hdus: tuple[Hdu, ...]  # all HDUs
+    name: str = "look-up tables"  # name of the file in errors
 
     def __post_init__(self) -> None:
         if not self.planes:
@@ -120,10 +110,7 @@ class LookupFile:
     def pair(self, chip: int) -> tuple[Plane, Plane]:
         """Extensions DX and DY of a chip.
 
-        Raises
-        ------
-        FormatError
-            When one is missing or repeated, or when the two have no common grid.
+        FormatError when one is missing or repeated, or when the two have no common grid.
         """
         x, y = (self._one(chip, axis) for axis in AXES)
         if x.nodes.shape != y.nodes.shape or x.first != y.first or x.step != y.step:
@@ -165,24 +152,9 @@ class LookupFile:
     ) -> LookupTable:
         """Values on the grid of a chip.
 
-        Parameters
-        ----------
-        chip : int
-        values, sigma : ndarray, shape (2, ny, nx)
-            Pixels, as in `LookupTable`; `sigma` may be None.
-        filter : str
-            As in `LookupTable`.
-        first : sequence of float, optional
-            Pixel (x, y) of the first node, in place of the file's own.
-
-        Returns
-        -------
-        LookupTable
-
-        Raises
-        ------
-        FormatError
-            As `pair`, and for values that `LookupTable` refuses.
+        `values`, `sigma`: (2, ny, nx), pixels, as in `LookupTable`; `sigma` may be None. `filter`:
+        as in `LookupTable`. `first`: pixel (x, y) of the first node, in place of the file's own.
+        FormatError as `pair`, and for values that `LookupTable` refuses.
         """
         x, _ = self.pair(chip)
         place = x.first if first is None else (float(first[0]), float(first[1]))
@@ -197,20 +169,8 @@ class LookupFile:
 def read_lookup_file(path: str | os.PathLike[str]) -> LookupFile:
     """Read a D2IMFILE or NPOLFILE as it stands.
 
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    LookupFile
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read.
-    FormatError
-        When it is no FITS file, is truncated, or has no tables.
+    InputError when the file cannot be read. FormatError when it is no FITS file, is truncated, or
+    has no tables.
     """
     return LookupFile(read_hdus(path), str(path))
 
@@ -218,15 +178,7 @@ def read_lookup_file(path: str | os.PathLike[str]) -> LookupFile:
 def write_lookup_file(file: LookupFile, path: str | os.PathLike[str]) -> None:
     """Write a D2IMFILE or NPOLFILE, whole or not at all; one that was read stays the same bits.
 
-    Parameters
-    ----------
-    file : LookupFile
-    path : path-like
-
-    Raises
-    ------
-    InputError
-        When the file cannot be written.
+    InputError when the file cannot be written.
     """
     write_hdus(file.hdus, path)
 

@@ -19,18 +19,7 @@ _PLACE = ("CRPIX1", "CRPIX2", "CRVAL1", "CRVAL2")
 def lint_lookup_file(file: LookupFile) -> tuple[Finding, ...]:
     """Findings in a D2IMFILE or NPOLFILE.
 
-    Parameters
-    ----------
-    file : LookupFile
-
-    Returns
-    -------
-    tuple of Finding
-
-    Raises
-    ------
-    FormatError
-        When a keyword that must be a number is none.
+    FormatError when a keyword that must be a number is none.
     """
     return (
         *_header(file),

@@ -9,19 +9,19 @@ from textwrap import wrap
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.calibration.calibration import Calibration, as_calibration
 from bayesdist.calibration.chip_map import Monomials
 from bayesdist.calibration.inverse import fit_inverse
-from bayesdist.calibration.plane import ARCSEC, Plane
+from bayesdist.calibration.plane import ARCSEC
 from bayesdist.calibration.sky import reprojected
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.solution import Solution
 from bayesdist.products.formats.common.cards import convergence_cards, number_card, text_card
 from bayesdist.products.formats.common.coefficients import largest_magnitude
 from bayesdist.products.formats.sip.families import offset_ranges
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader, worst_closure
 
-__all__ = ["build_sip", "sip_from_solution"]
+__all__ = ["sip_from_solution"]
 
 Float = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ _NEAR_IDENTITY = 0.5
 
 
 def sip_from_solution(
-    solution: Solution,
+    solution: Solution | Calibration,
     *,
     chip: int | None = None,
     epoch: float | None = None,
@@ -50,7 +50,7 @@ def sip_from_solution(
 
     Parameters
     ----------
-    solution : LinearFit or Posterior
+    solution : LinearFit, Posterior or Calibration
     chip : int, optional
         Chip number; the first chip by default.
     epoch : float, optional
@@ -65,10 +65,11 @@ def sip_from_solution(
     crval : tuple of float, optional
         Sky position that the header states, degrees.  With `tangent_point` that of the reference
         pixel by default, and CRPIX is the pixel of any other one that is given; where the solution
-        has no such pixel, A_0_0 and B_0_0 follow.  Without `tangent_point` it is
-        written as it is, (0, 0) by default.
+        has no such pixel, A_0_0 and B_0_0 follow.  Without `tangent_point` it is written as it is,
+        (0, 0) by default.
     tangent_point : tuple of float, optional
-        Sky position of (u, v) = (0, 0), degrees: `MatchTable.tangent_point`.  The polynomial is
+        Sky position of (u, v) = (0, 0), degrees: `MatchTable.tangent_point`; by default that of the
+        calibration's plane, where it is on the sky.  The polynomial is
         brought to the plane of CRVAL, to 1e-5 pixels, with a higher order where that takes one.
     scale_arcsec : float, optional
         Arcseconds per pixel, for u, v in pixels; without it 1 arcsec is written and called nominal.
@@ -93,33 +94,9 @@ def sip_from_solution(
         part that is singular ('cd') or far from the identity ('sip'), a distortion without inverse,
         a tangent point of u, v in pixels, or a `crval` that is no position of the field.
     """
-    plane = None if tangent_point is None else Plane("sky", point=tangent_point)
-    return build_sip(
-        calibration_of(solution, plane=plane),
-        chip=chip,
-        epoch=epoch,
-        inverse_order=inverse_order,
-        linear=linear,
-        crval=crval,
-        scale_arcsec=scale_arcsec,
-        origin=origin,
-        notes=notes,
-    )
-
-
-def build_sip(
-    calibration: Calibration,
-    *,
-    chip: int | None = None,
-    epoch: float | None = None,
-    inverse_order: int | None = None,
-    linear: str = "cd",
-    crval: tuple[float, float] | None = None,
-    scale_arcsec: float | None = None,
-    origin: tuple[float, float] | None = None,
-    notes: Sequence[str] = (),
-) -> SipHeader:
-    """SIP header of a calibration, on the sky where its plane is; as `sip_from_solution`."""
+    calibration = as_calibration(solution)
+    if tangent_point is None:
+        tangent_point = calibration.plane.point
     if linear not in ("cd", "sip"):
         raise InputError(
             f"linear is {linear!r}", where="products.sip.linear", do="choose 'cd' or 'sip'"
@@ -133,7 +110,6 @@ def build_sip(
             where="products.sip.epoch",
             do="give an epoch in decimal years",
         )
-    tangent_point = calibration.plane.point
     number = calibration.numbers[0] if chip is None else chip
     one = calibration.chip(number, epoch, origin="stated")
     poly = one.monomials()

@@ -49,12 +49,13 @@ def _build(
     calibration: Calibration, settings: Settings, options: BuildOptions
 ) -> tuple[Built, ...]:
     """Headers, one for each chip."""
-    from bayesdist.products.formats.sip.build import build_sip  # no file that is read needs it
+    # no file that is read needs it
+    from bayesdist.products.formats.sip.build import sip_from_solution
 
     notes = [*calibration.notes, *([calibration.plane.note] if calibration.plane.note else [])]
     out = []
     for number in calibration.numbers:
-        sip = build_sip(
+        sip = sip_from_solution(
             calibration,
             chip=number,
             epoch=options.epoch,

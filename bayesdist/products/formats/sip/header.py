@@ -163,22 +163,8 @@ class SipHeader:
 def worst_closure(sip: SipHeader, size: tuple[float, float]) -> float:
     """Largest distance between a pixel and the inverse of its forward position.
 
-    Parameters
-    ----------
-    sip : SipHeader
-        With an inverse.
-    size : tuple of float
-        Columns and rows.
-
-    Returns
-    -------
-    float
-        Pixels, over a grid of 257 x 257 pixels from corner to corner.
-
-    Raises
-    ------
-    InputError
-        When the header has no inverse.
+    `sip`: with an inverse. `size`: columns and rows. Returns pixels, over a grid of 257 x 257
+    pixels from corner to corner. InputError when the header has no inverse.
     """
     x, y = detector_grid(size)
     back_x, back_y = sip.inverse(*sip.forward(x, y))

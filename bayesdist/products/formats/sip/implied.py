@@ -45,29 +45,15 @@ _NODES, _SAMPLED = 129, 2e-4
 
 @dataclass(frozen=True)
 class Implied:
-    """Value of one coefficient that all other numbers of a header imply.
-
-    Parameters
-    ----------
-    keyword : str
-    printed : float
-        Its value in the header.
-    value, sigma : float
-        Mean and standard deviation of the implied value.
-    interval : tuple of float
-        That holds 95 % of the probability.
-    probability : float
-        That this coefficient is the wrong one, if exactly one is and any might be.
-    sources : tuple of str
-        Sources that the value agrees with: the other pair of polynomials, and A_DMAX or B_DMAX.
-    """
+    """Value of one coefficient that all other numbers of a header imply."""
 
     keyword: str
-    printed: float
-    value: float
+    printed: float  # its value in the header
+    value: float  # mean and standard deviation of the implied value
     sigma: float
-    interval: tuple[float, float]
-    probability: float
+    interval: tuple[float, float]  # that holds 95 % of the probability
+    probability: float  # that this coefficient is the wrong one, if exactly one is and any might be
+    # sources that the value agrees with: the other pair of polynomials, and A_DMAX or B_DMAX
     sources: tuple[str, ...]
 
     @property
@@ -88,23 +74,10 @@ def implied_values(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple
     function.  With a scale-free prior of both variances, the coefficient has a Student t
     distribution.  A_DMAX or B_DMAX restricts it to the values that its printed digits allow.
 
-    Parameters
-    ----------
-    sip : SipHeader
-        With an inverse.
-    size : tuple of int, optional
-        Columns and rows of the detector; by default those of the header.
-
-    Returns
-    -------
-    tuple of Implied
-        The most probable suspect first.  A stated maximum or a repeated value that a suspect leaves
-        unexplained costs it odds of 100 to 1.
-
-    Raises
-    ------
-    InputError
-        Without a size or an inverse, or with orders that programs ignore.
+    `sip`: with an inverse. `size`: columns and rows of the detector; by default those of the
+    header. Returns the most probable suspect first.  A stated maximum or a repeated value that a
+    suspect leaves unexplained costs it odds of 100 to 1. InputError without a size or an inverse,
+    or with orders that programs ignore.
     """
     size = size or sip.size
     if size is None or not (forward_is_used(sip) and inverse_is_used(sip)):

@@ -45,16 +45,8 @@ _SAME_SIZE = 0.05
 def lint_sip(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Finding, ...]:
     """Findings in a SIP header.
 
-    Parameters
-    ----------
-    sip : SipHeader
-    size : tuple of int, optional
-        Columns and rows of the detector; by default those of the header.  Without either, the
-        checks that need a detector are left out, with a note.
-
-    Returns
-    -------
-    tuple of Finding
+    `size`: columns and rows of the detector; by default those of the header.  Without either, the
+    checks that need a detector are left out, with a note.
     """
     size = size or sip.size
     findings = [

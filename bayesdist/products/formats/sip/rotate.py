@@ -28,28 +28,14 @@ def rotated_sip(sip: SipHeader, degrees: float, *, mirror: bool = False) -> SipH
     The sky stays where it is: forward terms, inverse terms, CD and CRPIX change together, so that
     every star has the same position as before at its new pixel.
 
-    Parameters
-    ----------
-    sip : SipHeader
-    degrees : float
-        Rotation of the pixel frame from u towards v.  At multiples of 90 degrees coefficients only
-        change places and signs, to the last bit.
-    mirror : bool
-        Change the sign of u first.
-
-    Returns
-    -------
-    SipHeader
-        At multiples of 90 degrees A_DMAX, B_DMAX, the standard deviations and the size follow, and
-        CRPIX is that of the rotated image, whose first pixel is (1, 1) again.  Without a size, and
-        at any other angle, CRPIX stays, about which the frame is rotated.  At any other angle the
-        image is no rectangle along the axes, so that size, A_DMAX and B_DMAX are left out;
-        standard deviations are too, because they then need the covariance: see `coefficient_map`.
-
-    Raises
-    ------
-    InputError
-        When the angle is no finite number.
+    `degrees`: rotation of the pixel frame from u towards v.  At multiples of 90 degrees
+    coefficients only change places and signs, to the last bit. `mirror`: change the sign of u
+    first. The result is at multiples of 90 degrees A_DMAX, B_DMAX, the standard deviations and the
+    size follow, and CRPIX is that of the rotated image, whose first pixel is (1, 1) again.  Without
+    a size, and at any other angle, CRPIX stays, about which the frame is rotated.  At any other
+    angle the image is no rectangle along the axes, so that size, A_DMAX and B_DMAX are left out;
+    standard deviations are too, because they then need the covariance: see `coefficient_map`.
+    InputError when the angle is no finite number.
     """
     M = pixel_matrix(degrees, mirror=mirror)
     exact = is_exact(M)

@@ -67,14 +67,7 @@ def sip_text(sip: SipHeader) -> str:
 def sip_header(sip: SipHeader) -> fits.Header:
     """Whole header, as astropy.wcs.WCS takes it.
 
-    Parameters
-    ----------
-    sip : SipHeader
-
-    Returns
-    -------
-    astropy.io.fits.Header
-        The cards that were read, except where fields differ.
+    Returns the cards that were read, except where fields differ.
     """
     return header_of(_cards(sip))
 

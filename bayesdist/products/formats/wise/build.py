@@ -41,20 +41,11 @@ def write_wise_meta(
     the pixels in W1 to W3 (u, v within +-507.5), to the edges of the array in W4 (+-254).  In
     comment lines stand standard deviations (AE_p_q, BE_p_q) and the worst error of AP, BP (BDCLOS).
 
-    Parameters
-    ----------
-    path : path-like
-    bands : mapping of int to SipHeader
-        By the number of the band.  CD is a pure scale and the reference pixel the middle of the
-        array, as ``sip_from_solution(..., linear="sip")`` has it: the file states neither.
-    skew : mapping of int to float, optional
-        SKEW of each band, radians; zero by default.
-
-    Raises
-    ------
-    InputError
-        For no band or an unknown one, a header that has no inverse, another array, a CD that holds
-        more than a scale, a number that is not finite, or a file that cannot be written.
+    `bands`: by the number of the band.  CD is a pure scale and the reference pixel the middle of
+    the array, as ``sip_from_solution(..., linear="sip")`` has it: the file states neither. `skew`:
+    SKEW of each band, radians; zero by default. InputError for no band or an unknown one, a header
+    that has no inverse, another array, a CD that holds more than a scale, a number that is not
+    finite, or a file that cannot be written.
     """
     text = wise_text(bands, skew)
     with atomic_path(path) as temporary:

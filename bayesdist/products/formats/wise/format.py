@@ -15,8 +15,10 @@ from bayesdist.products.formats.common.document import (
     Finding,
     Format,
     FormatSettings,
+    finding_lines,
 )
-from bayesdist.products.formats.sip.header import SIP_ORDERS
+from bayesdist.products.formats.sip.header import SIP_ORDERS, worst_closure
+from bayesdist.products.formats.sip.text import coefficient_lines
 from bayesdist.products.formats.wise.build import wise_text
 from bayesdist.products.formats.wise.lint import lint_wise_band
 from bayesdist.products.formats.wise.meta import (
@@ -26,7 +28,6 @@ from bayesdist.products.formats.wise.meta import (
     holds_wise_meta,
     wise_calibration,
 )
-from bayesdist.products.formats.wise.text import describe_wise_meta
 
 __all__ = ["FORMAT", "Settings"]
 
@@ -68,7 +69,23 @@ def _parse(content: Content) -> tuple[str, Bands] | None:
 
 
 def _describe(named: tuple[str, Bands]) -> list[str]:
-    return describe_wise_meta(named[1], named[0])
+    """Lines of text on the bands, each with its contradictions."""
+    name, bands = named
+    lines = [f"{name}: WISE meta-data, {', '.join(f'W{one.band}' for one in bands)}"]
+    for one in bands:
+        sip, (side, _) = one.sip, ARRAYS[one.band]
+        size = sip.size or (side, side)
+        lines += ["", f"W{one.band}: {size[0]} x {size[1]} px, A_ORDER {sip.order[0]}, "
+                  f"B_ORDER {sip.order[1]}, SKEW {one.skew:g} rad"]  # fmt: skip
+        lines += [
+            f"  {prefix}_DMAX    {one.printed[f'{prefix}_DMAX']} px"
+            for prefix in "AB"
+            if f"{prefix}_DMAX" in one.printed
+        ]
+        if sip.has_inverse:
+            lines.append(f"  closure   {worst_closure(sip, size):.2g} px at worst")
+        lines += [*coefficient_lines(sip), "", *finding_lines(lint_wise_band(one))]
+    return lines
 
 
 def _lint(named: tuple[str, Bands]) -> list[Finding]:
@@ -81,7 +98,8 @@ def _calibration(named: tuple[str, Bands], name: str, choice: Choice) -> Calibra
 
 def _build(calibration: Calibration, _: Settings, options: BuildOptions) -> tuple[Built, ...]:
     """WISE's form: all linear terms in A and B, and an inverse of equal order."""
-    from bayesdist.products.formats.sip.build import build_sip  # no file that is read needs it
+    # no file that is read needs it
+    from bayesdist.products.formats.sip.build import sip_from_solution
 
     band = _band(calibration.detector)
     if band is None:
@@ -90,7 +108,7 @@ def _build(calibration: Calibration, _: Settings, options: BuildOptions) -> tupl
             where="products.wise_meta",
             do="name the band as detector.name, or leave wise_meta out",
         )
-    sip = build_sip(
+    sip = sip_from_solution(
         replace(calibration, plane=Plane("free")),  # the entries cannot state a sky position
         epoch=options.epoch,
         inverse_order=max(calibration.model.order, SIP_ORDERS[0]),

@@ -36,15 +36,9 @@ _ALLOWED_SIGMAS = 4.0
 def lint_wise_band(band: WiseBand) -> tuple[Finding, ...]:
     """Findings in the entries of one band of a WISE meta-data file.
 
-    Parameters
-    ----------
-    band : WiseBand
-
-    Returns
-    -------
-    tuple of Finding
-        Findings of `lint_sip`, and on the text itself: coefficients that are missing, numbers with
-        another count of digits than the rest, comments that name another monomial than the keyword.
+    Returns findings of `lint_sip`, and on the text itself: coefficients that are missing, numbers
+    with another count of digits than the rest, comments that name another monomial than the
+    keyword.
     """
     # a finding on parity would be on the nominal CD, which is not in the file
     findings = [f for f in lint_sip(band.sip) if f.where != "CD"]

@@ -37,25 +37,14 @@ ARRAYS = {1: (1016, 2.75), 2: (1016, 2.75), 3: (1016, 2.75), 4: (508, 5.5)}
 
 @dataclass(frozen=True, eq=False)
 class WiseBand:
-    """Distortion entries of one band in a WISE meta-data file.
-
-    Parameters
-    ----------
-    band : int
-    sip : SipHeader
-        The reference pixel is the middle of the array.  The file has no sky position: CRVAL is
-        zero, and CD has the nominal scale.
-    skew : float
-        Of the CD matrix, radians.
-    printed : mapping of str to str
-        Numbers as they stand in the file, by keyword.
-    comments : mapping of str to str
-    """
+    """Distortion entries of one band in a WISE meta-data file."""
 
     band: int
+    # the reference pixel is the middle of the array.  The file has no sky position: CRVAL is zero,
+    # and CD has the nominal scale
     sip: SipHeader
-    skew: float
-    printed: Mapping[str, str]
+    skew: float  # of the CD matrix, radians
+    printed: Mapping[str, str]  # numbers as they stand in the file, by keyword
     comments: Mapping[str, str]
 
 
@@ -66,22 +55,8 @@ def read_wise_meta(path: str | os.PathLike[str]) -> tuple[WiseBand, ...]:
     keyword, type, value, comment.  Entries of other kinds are passed over, and comment lines but
     for the standard deviations and the closure that `write_wise_meta` puts there.
 
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    tuple of WiseBand
-        In the order of the bands.
-
-    Raises
-    ------
-    FormatError
-        When there is no such entry, or one is broken, contradicts itself, comes twice or is
-        missing.
-    InputError
-        When the file cannot be read.
+    The result is in the order of the bands. FormatError when there is no such entry, or one is
+    broken, contradicts itself, comes twice or is missing. InputError when the file cannot be read.
     """
     return bands_of(read_content(path))
 

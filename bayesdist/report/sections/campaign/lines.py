@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
+from bayesdist.numbers import MISSING, count, display_scale, interval, number, rounded
 from bayesdist.report.campaign import CampaignResults
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, campaign_of
-from bayesdist.report.numbers import MISSING, count, display_scale, interval, number, rounded
 from bayesdist.report.sections.campaign.published import Published, PublishedLine, published_terms
 from bayesdist.report.sections.campaign.terms import name_of_scatter, name_of_term
 from bayesdist.report.texttable import TextTable, listing

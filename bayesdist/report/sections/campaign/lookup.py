@@ -11,12 +11,12 @@ from matplotlib.colors import Normalize
 from numpy.typing import NDArray
 
 from bayesdist.model import LookupTable
+from bayesdist.numbers import count, display_scale, number, size_of
 from bayesdist.report.arrows import Arrows, magnification_of, spacing, vector_map
 from bayesdist.report.campaign import CampaignResults, ChipResiduals
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, campaign_of
 from bayesdist.report.fields import Grid, scalar_map
-from bayesdist.report.numbers import count, display_scale, number, size_of
 from bayesdist.report.panels import ChipPanels
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.run.residuals import residual_panels

@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.ticker import ScalarFormatter
 
+from bayesdist.numbers import count, number, percent, size_of
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, campaign_of
-from bayesdist.report.numbers import count, number, percent, size_of
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import (
     GUIDE,

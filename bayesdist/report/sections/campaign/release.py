@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from bayesdist.diagnose.overlap import OverlapTest
+from bayesdist.numbers import MISSING, count, number, size_of
 from bayesdist.report.arrows import Arrows, magnification_of, vector_map
-from bayesdist.report.campaign import OverlapTest
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, campaign_of
-from bayesdist.report.numbers import MISSING, count, number, size_of
 from bayesdist.report.panels import Panels
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import WIDTH, figure_style, new_figure, nice_below

@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
+from bayesdist.numbers import MISSING, count, display_scale, number, percent, with_mas
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, SelfcalResults
-from bayesdist.report.numbers import MISSING, count, display_scale, number, percent, with_mas
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import CYCLE, INK, PALE, WIDTH, figure_style, new_figure
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing

@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from bayesdist.numbers import count, display_scale, number, size_of
 from bayesdist.report.campaign import CampaignResults
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, campaign_of
-from bayesdist.report.numbers import count, display_scale, number, size_of
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.campaign.terms import (
     TermCourse,

@@ -12,10 +12,10 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.patches import Patch
 
 from bayesdist.assess.terms.forms import PRODUCT
+from bayesdist.numbers import MISSING, display_scale, percent, with_mas
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.fields import Grid, scalar_map
-from bayesdist.report.numbers import MISSING, display_scale, percent, with_mas
 from bayesdist.report.panels import ChipPanels
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.gauge import gauge_of_new_exposure

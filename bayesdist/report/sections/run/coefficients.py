@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from bayesdist.numbers import MISSING, interval, number, rounded
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
-from bayesdist.report.numbers import MISSING, interval, number, rounded
 from bayesdist.report.sections.gauge import gauge_mark, gauge_note
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further
 

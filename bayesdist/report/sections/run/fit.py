@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess import residual_statistics
-from bayesdist.diagnose.score.result import FAMILY_LEVEL, POWER
+from bayesdist.diagnose.score.result import POWER
 from bayesdist.infer.skew import skew_of
+from bayesdist.limits import SCORE_TESTS
+from bayesdist.numbers import MISSING, count, display_scale, number, rounded, with_mas
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
-from bayesdist.report.numbers import MISSING, count, display_scale, number, rounded, with_mas
 from bayesdist.report.texttable import TextTable, listing
 
 __all__ = [
@@ -166,8 +167,8 @@ def score_test_table(r: ReportInput) -> TextTable:
         rows,
         words=(0, 5),
         stacked=(5,),
-        note=f"Found: more than chance at {FAMILY_LEVEL:g} over all these tests together (Holm)."
-        " Size: rms over the detector; of the noise rms difference of its standard deviations; of"
-        " the gap its drift, and of motions their rms, in a year;"
+        note=f"Found: more than chance at {SCORE_TESTS.value:g} over all these tests together"
+        " (Holm). Size: rms over the detector; of the noise rms difference of its standard"
+        " deviations; of the gap its drift, and of motions their rms, in a year;"
         f" beside it the smallest that would have been seen with probability {POWER:g}.",
     )

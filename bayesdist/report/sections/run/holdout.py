@@ -11,10 +11,10 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.patches import Rectangle
 from scipy.stats import binom
 
-from bayesdist.diagnose.holdout.validation import DOUBTFUL, HeldOutTruth
+from bayesdist.diagnose.holdout.validation import HoldoutValidation
+from bayesdist.numbers import count, number
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import Check, ReportInput
-from bayesdist.report.numbers import count, number, probability
+from bayesdist.report.context import ReportInput
 from bayesdist.report.panels import chip_axes
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import CYCLE, INK, WIDTH, figure_style, new_figure
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "holdout",
-    "holdout_checks",
     "holdout_coverage",
     "holdout_table",
 ]
@@ -35,20 +34,6 @@ _LEAST_RANGE = 0.3  # of the factor on the errors, above 1: chance alone must no
 _FEWEST = 20  # stars of a region that is coloured
 _MOST_TESTS = 12
 _KEY = 3.0  # length of the arrow in the key, in sigma
-
-
-def holdout_checks(found: HeldOutTruth | None) -> tuple[Check, ...]:
-    """Status rows of the verdict of the held-out stars; none where there are none."""
-    if found is None:
-        return ()
-    return (
-        Check(
-            f"Held-out stars ({count(found.n)})",
-            f"{found.verdict}" if found.level != "pass" else f"agree, {probability(found.p_value)}",
-            f"p at least {number(DOUBTFUL, 1)}",
-            found.level,
-        ),
-    )
 
 
 def _with_coverage(r: ReportInput) -> bool:
@@ -104,7 +89,7 @@ def holdout_table(r: ReportInput) -> TextTable:
 
 def _question(test: HeldTest, unit: str) -> str:
     return {
-        "offset": f"offset, largest [{unit}]" if test.together else f"offset [{unit}]",
+        "offset": f"offset, largest [{unit}]" if test.is_omnibus else f"offset [{unit}]",
         "spread": "residuals / predicted",
         "distribution": "largest difference of distributions",
         "tails": "fraction of stars",
@@ -154,7 +139,7 @@ def holdout(r: ReportInput) -> Plot:
     )
 
 
-def _histogram(ax: Axes, found: HeldOutTruth, k: int) -> None:
+def _histogram(ax: Axes, found: HoldoutValidation, k: int) -> None:
     counts = found.pit[k]
     bins = len(counts)
     low, high = binom.ppf([0.005, 0.995], found.n, 1 / bins) * bins / found.n
@@ -169,7 +154,7 @@ def _histogram(ax: Axes, found: HeldOutTruth, k: int) -> None:
         ax.set_ylabel("stars / predicted")
 
 
-def _limit(found: HeldOutTruth) -> float:
+def _limit(found: HoldoutValidation) -> float:
     """Largest factor that the colours show."""
     good = found.region_scale[found.region_n >= _FEWEST]
     far = np.exp(np.abs(np.log(good)).max()) if good.size else 1.0
@@ -177,7 +162,7 @@ def _limit(found: HeldOutTruth) -> float:
 
 
 def _regions(
-    ax: Axes, found: HeldOutTruth, k: int, size: tuple[float, float], norm: TwoSlopeNorm
+    ax: Axes, found: HoldoutValidation, k: int, size: tuple[float, float], norm: TwoSlopeNorm
 ) -> PatchCollection:
     """Draw regions of one chip: their colour is the factor, their arrow the offset in sigma."""
     chips = list(dict.fromkeys(bin_.chip for bin_ in found.regions))

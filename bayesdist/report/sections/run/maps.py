@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
+from bayesdist.numbers import display_scale, number, size_of, with_mas
 from bayesdist.report.arrows import (
     Arrows,
     cross_map,
@@ -19,7 +20,6 @@ from bayesdist.report.arrows import (
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.fields import Grid, contour_levels, scalar_map
-from bayesdist.report.numbers import display_scale, number, size_of, with_mas
 from bayesdist.report.panels import ChipPanels
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.gauge import gauge_mark, gauge_of_maps

@@ -6,10 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesdist.report.arrows import CHANCE, Arrows, magnification_of, spacing, vector_map
-from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput
-from bayesdist.report.numbers import (
+from bayesdist.numbers import (
     MISSING,
     count,
     display_scale,
@@ -19,14 +16,17 @@ from bayesdist.report.numbers import (
     size_of,
     with_mas,
 )
+from bayesdist.report.arrows import CHANCE, Arrows, magnification_of, spacing, vector_map
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import ReportInput
 from bayesdist.report.panels import ChipPanels
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import nice_below
 from bayesdist.report.texttable import TextTable, listing
 
 if TYPE_CHECKING:
-    from bayesdist.assess.periods import TimeVariation
-    from bayesdist.assess.wise import StatisticsTable
+    from bayesdist.diagnose.periods import TimeVariation
+    from bayesdist.diagnose.residuals import StatisticsTable
     from bayesdist.model import Chip
 
 __all__ = [

@@ -11,10 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from bayesdist.infer.catalogue.added_errors import DECISIVE
-from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput
-from bayesdist.report.corners import Column, corner_figure
-from bayesdist.report.numbers import (
+from bayesdist.numbers import (
     MISSING,
     Scale,
     broken_name,
@@ -25,6 +22,9 @@ from bayesdist.report.numbers import (
     percent,
     rounded,
 )
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import ReportInput
+from bayesdist.report.corners import Column, corner_figure
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import CYCLE, HYPER_LABELS, INK, WIDTH, figure_style, new_figure
 from bayesdist.report.texttable import TextTable

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from bayesdist.numbers import MISSING, count, number, percent
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
-from bayesdist.report.numbers import MISSING, count, number, percent
 from bayesdist.report.sections.checks import check_cells
 from bayesdist.report.texttable import Level, TextTable, listing, short_paths
 

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
+from bayesdist.numbers import display_scale
 from bayesdist.report.arrows import (
     CHANCE,
     Arrows,
@@ -22,7 +23,6 @@ from bayesdist.report.arrows import (
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.numbers import display_scale
 from bayesdist.report.panels import ChipPanels, Panels
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure, nice_below

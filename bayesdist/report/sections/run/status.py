@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.assess.requirements.verdict import LEAST_CHI2, scatter_too_small
+from bayesdist.checks import Check
+from bayesdist.numbers import number, rounded, with_mas
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import Check, ReportInput
-from bayesdist.report.numbers import count, number, percent, rounded, with_mas
-from bayesdist.report.sections.campaign.checks import campaign_checks
-from bayesdist.report.sections.checks import check_cells, structure_check
-from bayesdist.report.sections.run.holdout import holdout_checks
+from bayesdist.report.context import ReportInput
+from bayesdist.report.sections.checks import check_cells
 from bayesdist.report.sections.run.margins import VERDICT_LEVELS
 from bayesdist.report.texttable import TextTable
 
@@ -23,12 +21,7 @@ __all__ = [
     "verdict",
 ]
 
-_PARETO_K = 0.7  # above it importance weights cannot be trusted (Vehtari et al. 2024)
-_EFFICIENCY = 0.1
-_MCSE = 0.1  # of a posterior sd: adds half a percent to the error of a mean
-_MOST_CHI2 = 1.5  # per degree of freedom: quoted errors right within some twenty percent
-_LEFT_OUT = 0.2  # of the stars: rejection of more has shaped the result that it was to protect
-_CONDITION = 1e8  # leaves half the digits of a double
+GROUPS = ("Held-out truth", "Campaign", "Sampling", "Fit")
 
 
 @dataclass(frozen=True)
@@ -46,13 +39,10 @@ def status_checks(r: ReportInput) -> dict[str, tuple[Check, ...]]:
     Groups are 'Held-out truth', 'Campaign', 'Sampling', 'Fit', 'Requirements', 'Products'.
     """
     groups = {
-        "Held-out truth": holdout_checks(r.held_out),
-        "Campaign": () if r.campaign is None else campaign_checks(r.campaign),
-        "Sampling": _sampling_checks(r),
-        "Fit": _fit_checks(r),
+        **{name: tuple(c for c in r.checks if c.group == name and c.name) for name in GROUPS},
         "Requirements": _margin_checks(r),
         "Products": tuple(
-            Check(f"{p.path}: {c.name}", c.value, c.limit, c.level)
+            replace(c, name=f"{p.path}: {c.name}")
             for p in r.products
             for c in p.checks
             if c.level != "note"
@@ -73,92 +63,10 @@ def status_table(r: ReportInput) -> TextTable:
     return TextTable("Status", heads, rows, words=tuple(range(5)), stacked=(2, 3), grouped=True)
 
 
-def _level(good: bool, bad: str = "fail") -> str:
-    return "pass" if good else bad
-
-
-def _sampling_checks(r: ReportInput) -> tuple[Check, ...]:
-    if r.posterior is None:
-        return (Check("Posterior", "not sampled", "sampled and converged", "warn"),)
-    c = r.posterior.convergence
-    D = len(r.posterior.mean)
-    sd = np.sqrt(np.diag(r.posterior.cov))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        mcse = float(np.nanmax(np.where(sd > 0, c.mcse_mean[:D] / sd, 0.0), initial=0.0))
-    # advice does not fail by itself: the limits of R-hat and ESS decide
-    return (
-        Check("Converged", "yes" if c.converged else "NO", "yes", _level(c.converged)),
-        Check(
-            f"Largest R-hat, {r.posterior.sampler.ensembles} independent ensembles",
-            f"{c.rhat_max:.4f}" if np.isfinite(c.rhat_max) else "∞",
-            f"at most {c.limits.rhat:g}",
-            _level(c.rhat_max <= c.limits.rhat),
-        ),
-        Check(
-            "Smallest bulk effective sample size",
-            count(np.floor(c.ess_bulk_min)),
-            f"at least {c.limits.ess:g}",
-            _level(c.ess_bulk_min >= c.limits.ess),
-        ),
-        Check(
-            "Smallest tail effective sample size",
-            count(np.floor(c.ess_tail_min)),
-            f"at least {c.limits.ess:g}",
-            _level(c.ess_tail_min >= c.limits.ess),
-        ),
-        Check(
-            "Largest Monte-Carlo error of a mean, in posterior sd",
-            number(mcse, 2),
-            f"at most {_MCSE:g}",
-            _level(mcse <= _MCSE, "warn"),
-        ),
-        Check(
-            "Pareto k of the proposal",
-            number(c.pareto_k, 2),
-            f"at most {_PARETO_K:g}",
-            _level(c.pareto_k <= _PARETO_K, "warn"),
-        ),
-        Check(
-            "Importance efficiency of the proposal",
-            percent(c.importance_efficiency, 2),
-            f"at least {percent(_EFFICIENCY, 2)}",
-            _level(c.importance_efficiency >= _EFFICIENCY, "warn"),
-        ),
-    )
-
-
-def _fit_checks(r: ReportInput) -> tuple[Check, ...]:
-    fit = r.fit
-    ratio = fit.chi2 / fit.dof if fit.dof > 0 else float("nan")
-    left_out = fit.n_rejected / fit.n_rows
-    small = scatter_too_small(fit.chi2, fit.dof)
-    structure = (structure_check(r.misfits, fit="the fit"),) if r.misfits else ()
-    return (
-        Check(
-            "Chi-square per degree of freedom, quoted errors",
-            number(ratio),
-            f"{LEAST_CHI2:g} to {_MOST_CHI2:g}",
-            _level(not small and ratio <= _MOST_CHI2, "warn"),
-        ),
-        Check(
-            f"{r.words.things.capitalize()} left out by the {r.words.chooser}",
-            percent(left_out),
-            f"at most {percent(_LEFT_OUT, 2)}",
-            _level(left_out <= _LEFT_OUT, "warn"),
-        ),
-        Check(
-            "Condition number of the scaled normal matrix",
-            number(fit.condition, 2),
-            f"at most {number(_CONDITION, 1)}",
-            _level(fit.condition <= _CONDITION, "warn"),
-        ),
-        *structure,
-    )
-
-
 def _margin_checks(r: ReportInput) -> tuple[Check, ...]:
     return tuple(
         Check(
+            "Requirements",
             f"{m.requirement.name}: {m.requirement.statistic}, {m.verdict}",
             f"{rounded(m.value, (m.interval[1] - m.interval[0]) / 4)}\u202f{m.unit}, probability"
             f" {number(m.probability_met)}",

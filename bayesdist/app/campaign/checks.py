@@ -1,0 +1,100 @@
+"""Checks of a campaign's matching, tables and series, and what its stages found odd."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from bayesdist.checks import LARGER, Check, level_of
+from bayesdist.limits import COMPLETENESS, FALSE_MATCHES
+from bayesdist.numbers import count, percent
+
+__all__ = ["campaign_checks", "campaign_remarks"]
+
+GROUP = "Campaign"
+
+# sections whose warnings a reader has to know, and what these do to verdicts; deviations that go
+# with time are in no draw of the errors of a later exposure
+WARNING = {"matching": "", "deviations": LARGER, "tables": "", "time_dependence": ""}
+
+
+def campaign_remarks(summary: Mapping[str, Any]) -> tuple[Check, ...]:
+    """What the stages found odd.
+
+    Parameters
+    ----------
+    summary : mapping
+        As summary.json.
+
+    Returns
+    -------
+    tuple of Check
+    """
+    return tuple(
+        Check(GROUP, level="warn", sentence=text, doubt=doubt)
+        for part, doubt in WARNING.items()
+        for text in summary.get(part, {}).get("warnings", [])
+    )
+
+
+def campaign_checks(summary: Mapping[str, Any], remarks: Sequence[Check] = ()) -> tuple[Check, ...]:
+    """Criteria of matching, tables and series, and a row of remarks.
+
+    Parameters
+    ----------
+    summary : mapping
+        As summary.json.
+    remarks : sequence of Check
+        What else was found odd: of the stages, and by tests of the residuals.
+
+    Returns
+    -------
+    tuple of Check
+    """
+    m, tables, time = (summary.get(k) or {} for k in ("matching", "tables", "time_dependence"))
+    least = float(m["completeness"]["least"])
+    false = float(m["false_share"])
+    out = [
+        Check(
+            GROUP,
+            "Matching: completeness of the exposures",
+            f"{percent(m['completeness']['median'])} at the median, {percent(least)} at least",
+            f"at least {percent(COMPLETENESS.value, 2)} in each",
+            level_of(COMPLETENESS.met_by(least), "warn"),
+        ),
+        Check(
+            GROUP,
+            "Matching: false pairs expected",
+            percent(false, 2),
+            f"at most {percent(FALSE_MATCHES.value, 2)}",
+            level_of(FALSE_MATCHES.met_by(false), "warn"),
+        ),
+    ]
+    if m.get("left_out"):
+        names = "; ".join(m["left_out"])
+        out.append(Check(GROUP, "Matching: exposures left out", names, "none", "warn"))
+    if "converged" in tables:
+        out.append(_converged("Look-up tables converged", tables))
+    if "converged" in time:
+        out.append(_converged("Series of linear terms converged", time))
+        off = len(time.get("outlying_exposures", ()))
+        out.append(Check(GROUP, "Exposures that lie off the lines", count(off)))
+    wrong = summary.get("exposures_outlying") or ()
+    if wrong:
+        names = ", ".join(str(name) for name in wrong)
+        out.append(
+            Check(GROUP, "Exposures that went wrong in the joint fit", names, "none", "warn")
+        )
+    skipped = summary.get("exposures_skipped") or {}
+    if skipped:
+        what = "Exposures that could not be fitted alone"
+        out.append(Check(GROUP, what, ", ".join(skipped), "none", "warn"))
+    texts = [one.text for one in remarks if one.sentence]
+    found = "; ".join(texts) or "none"
+    out.append(Check(GROUP, "Other doubts", found, "none", level_of(not texts, "warn")))
+    return tuple(out)
+
+
+def _converged(what: str, section: Mapping[str, Any]) -> Check:
+    good = bool(section["converged"])
+    return Check(GROUP, what, "yes" if good else "NO", "yes", level_of(good, "warn"))

@@ -1,0 +1,144 @@
+"""What is assessed: where and when, errors that the data cannot show, requirements."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+from pydantic import Field, PositiveFloat, field_validator, model_validator
+from pydantic_core import PydanticCustomError
+
+from bayesdist.app.config.data import Unit
+from bayesdist.app.config.section import Section
+from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
+from bayesdist.assess.terms.forms import GIVEN
+from bayesdist.assess.terms.given import TERM_KINDS
+from bayesdist.assess.terms.parameters import one_size_kinds
+from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
+
+__all__ = [
+    "CATALOGUE_WORDS",
+    "MEASURED_TERMS",
+    "Assess",
+    "BudgetBlock",
+    "Periods",
+    "RequirementBlock",
+    "require_own_names",
+]
+
+Probability = Annotated[float, Field(gt=0, lt=1)]
+
+# by which a row of the budget says that it is the error of the reference catalogue
+CATALOGUE_WORDS = ("catalog", "reference")
+
+# rows of every budget, and what its totals are called
+MEASURED_TERMS = (
+    *(COEFFICIENTS, TIME_DEPENDENCE, EXPOSURE_FRAME),
+    *("total", "model", STRUCTURE, STRUCTURE_IN_FIT, DEVIATIONS, "look-up tables"),
+)
+
+
+def require_own_names(block: str, names: Sequence[str]) -> None:
+    """Refuse blocks of one name.
+
+    Raises
+    ------
+    ValueError
+        As validators raise it.
+    """
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ValueError(f"two [[{block}]] blocks have the name {twice!r}; give each its own")
+
+
+class Periods(Section):
+    """Periods whose models are compared."""
+
+    centres: list[float]
+    days: PositiveFloat
+
+
+class Assess(Section):
+    """Where and when errors are assessed."""
+
+    epoch: float | None = None
+    grid: tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]] = (33, 17)
+    draws: Annotated[int, Field(ge=100)] = 4000
+    exposure: Literal["mean", "single"] = "mean"
+    horizon: Annotated[float, Field(ge=0)] = 10.0
+
+
+class BudgetBlock(Section):
+    """An error term that the data cannot show."""
+
+    name: str
+    kind: str
+    sigma_u: Annotated[float, Field(ge=0)] | None = None
+    sigma_v: Annotated[float, Field(ge=0)] | None = None
+    sigma: Annotated[float, Field(ge=0)] | None = None
+    unit: Unit = "pix"
+    source: str = GIVEN
+    included_in_scatter: bool = False
+
+    @field_validator("kind")
+    @classmethod
+    def _known_kind(cls, kind: str) -> str:
+        *others, last = known = (*TERM_KINDS, *one_size_kinds())
+        if kind not in known:  # in the words of a Literal
+            listed = ", ".join(map(repr, others))
+            raise PydanticCustomError("literal_error", f"Input should be {listed} or {last!r}")
+        return kind
+
+    def names(self, *words: str) -> bool:
+        """Boolean: one of some words is in the row's name."""
+        return any(word in self.name.lower() for word in words)
+
+    @property
+    def of_catalogue(self) -> bool:
+        """Boolean: the row is the error of the reference catalogue."""
+        return self.names(*CATALOGUE_WORDS)
+
+    @property
+    def stated(self) -> bool:
+        """Boolean: the row states an error; one of size 0 does so with its source only."""
+        sizes = (self.sigma_u, self.sigma_v, self.sigma)
+        return any(sizes) or self.source != GIVEN
+
+    @model_validator(mode="after")
+    def _sigma_of_its_kind(self) -> BudgetBlock:
+        axes = self.sigma_u is not None and self.sigma_v is not None
+        neither = self.sigma_u is None and self.sigma_v is None
+        if self.kind not in TERM_KINDS:
+            if self.sigma is None or not neither:
+                raise ValueError(
+                    f"a budget term of kind {self.kind!r} has one sigma, relative or in radians; "
+                    "give sigma, and neither sigma_u nor sigma_v"
+                )
+        elif not axes or self.sigma is not None:
+            raise ValueError(
+                f"a budget term of kind {self.kind!r} has a sigma on each axis; give sigma_u and "
+                "sigma_v, and no sigma"
+            )
+        if self.included_in_scatter and self.kind != "random":
+            raise ValueError(
+                "included_in_scatter is of a random budget term, which scatters from star to star; "
+                "leave it out"
+            )
+        return self
+
+
+class RequirementBlock(Section):
+    """A limit on a statistic of the position error."""
+
+    name: str
+    statistic: str
+    limit: PositiveFloat
+    unit: Unit = "pix"
+    probability: Probability = 0.95
+    epoch: float | None = None
+    chip: int | None = None
+    region: str | list[tuple[float, float]] = "whole"
+    epochs: tuple[float, float] | None = None
+    relative: bool = False
+    separation: PositiveFloat | None = None
+    magnitude: float | None = None

@@ -1,0 +1,154 @@
+"""What the configurations of all kinds of runs have in common."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pydantic import model_validator
+
+from bayesdist.app.config.assess import (
+    MEASURED_TERMS,
+    Assess,
+    BudgetBlock,
+    RequirementBlock,
+    require_own_names,
+)
+from bayesdist.app.config.detector import ChipBlock, Detector, chips_of, require_detector
+from bayesdist.app.config.model import (
+    CampaignModel,
+    CampaignOutliers,
+    DiscrepancyBlock,
+    MatchedModel,
+    Outliers,
+    Sampler,
+    SelfcalModel,
+    SelfcalOutliers,
+    SelfcalSampler,
+)
+from bayesdist.app.config.products import Products
+from bayesdist.app.config.section import Section
+from bayesdist.assess import Requirement, UserTerm
+from bayesdist.assess.terms.forms import ErrorTerm
+from bayesdist.assess.terms.given import said_by_user
+from bayesdist.assess.terms.parameters import one_size_term
+from bayesdist.infer import OutlierMixture
+from bayesdist.infer.solution import Solution
+from bayesdist.model import Chip, TimeDependence
+
+__all__ = ["RunConfig"]
+
+
+class RunConfig(Section):
+    """What every configuration of a run has; each kind lists its sections with their types."""
+
+    if TYPE_CHECKING:
+        model: MatchedModel | CampaignModel | SelfcalModel
+        detector: Detector
+        chip: list[ChipBlock]
+        outliers: Outliers | CampaignOutliers | SelfcalOutliers
+        sampler: Sampler | SelfcalSampler
+        assess: Assess
+        budget: list[BudgetBlock]
+        requirement: list[RequirementBlock]
+        discrepancy: DiscrepancyBlock
+        products: Products
+
+    @model_validator(mode="after")
+    def _names_of_their_own(self) -> RunConfig:
+        require_own_names("budget", [b.name for b in self.budget])
+        require_own_names("requirement", [r.name for r in self.requirement])
+        taken = next((b.name for b in self.budget if b.name in MEASURED_TERMS), None)
+        if taken is not None:
+            raise ValueError(
+                f"a [[budget]] block has the name {taken!r}, which is that of a measured row; "
+                "give it another"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _chips_or_detector(self) -> RunConfig:
+        require_detector(self.chip, self.detector, self.model.reference_pixel)
+        return self
+
+    @model_validator(mode="after")
+    def _files_of_this_detector(self) -> RunConfig:
+        for settings in self.products.asked().values():
+            settings.check(self.named_detector, self.detector.size, self.model.reference_pixel)
+        return self
+
+    @property
+    def named_detector(self) -> str:
+        """Name by which formats of one detector know theirs."""
+        return self.detector.name
+
+    @property
+    def compares_jitters(self) -> bool:
+        """Boolean: groups of stars may have jitters of their own, if the data ask for it."""
+        return False
+
+    def refuse_circle(self) -> None:
+        """Refuse what cannot go with matches in a circle about their nominal positions.
+
+        Raises
+        ------
+        ValueError
+            As validators raise it.
+        """
+
+    def chips(self) -> tuple[Chip, ...]:
+        """Chips of the model; empty for a detector of one chip."""
+        return chips_of(self.chip)
+
+    def time(self) -> TimeDependence | None:
+        """Time dependence of the model."""
+        return None if self.model.tdd is None else self.model.tdd.time()
+
+    def mixture(self) -> OutlierMixture:
+        """The outlier mixture."""
+        return self.outliers.mixture()
+
+    def spans(self) -> dict[str, tuple[float, float]]:
+        """Begin and end of each of the periods, decimal years; empty where none are asked for."""
+        return {}
+
+    def states(self, *words: str) -> bool:
+        """Boolean: a [[budget]] row with one of some words in its name states an error."""
+        return any(row.stated and row.names(*words) for row in self.budget)
+
+    def user_terms(self) -> tuple[UserTerm, ...]:
+        """The user's terms of the error budget that are the same at every position."""
+        return tuple(
+            UserTerm(
+                b.name,
+                b.kind,
+                b.sigma_u,
+                b.sigma_v,
+                b.unit,
+                said_by_user(b.source),
+                varies=b.of_catalogue,
+            )
+            for b in self.budget
+            if b.sigma_u is not None and b.sigma_v is not None
+        )
+
+    def linear_terms(self, solution: Solution) -> tuple[ErrorTerm, ...]:
+        """The user's terms of the error budget that have one size: scale, rotation, a mission's."""
+        return tuple(
+            one_size_term(b.name, b.kind, b.sigma, solution, said_by_user(b.source))
+            for b in self.budget
+            if b.sigma is not None
+        )
+
+    def in_residuals(self) -> tuple[UserTerm, ...]:
+        """User's terms that the scatter of the residuals includes."""
+        included = {b.name for b in self.budget if b.included_in_scatter}
+        return tuple(t for t in self.user_terms() if t.name in included)
+
+    def held_in_residuals(self, unit: str) -> list[tuple[str, float, float]]:
+        """Name and standard deviation on each axis of these terms, in the unit of u and v."""
+        scale = self.detector.scale_mas
+        return [(t.name, *t.sigma(unit, scale)) for t in self.in_residuals()]
+
+    def requirements(self) -> tuple[Requirement, ...]:
+        """The requirements."""
+        return tuple(Requirement(**r.model_dump()) for r in self.requirement)

@@ -1,0 +1,69 @@
+"""The detector: one chip, or several with a frame of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pydantic import PositiveFloat
+
+from bayesdist.app.config.section import Section
+from bayesdist.model import Chip
+
+__all__ = ["ChipBlock", "Detector", "Pair", "chips_of", "reference_first", "require_detector"]
+
+Pair = tuple[PositiveFloat, PositiveFloat]
+
+
+class Detector(Section):
+    """A detector of one chip."""
+
+    name: str = ""
+    size: Pair | None = None
+    scale_mas: PositiveFloat | None = None
+
+
+class ChipBlock(Section):
+    """One of several chips."""
+
+    number: int
+    name: str
+    size: Pair
+    reference_pixel: Pair
+    reference: bool = False
+
+
+def require_detector(
+    chips: Sequence[ChipBlock], detector: Detector, reference_pixel: Pair | None
+) -> None:
+    """Refuse chips that contradict each other, or no detector at all.
+
+    Raises
+    ------
+    ValueError
+        As validators raise it.
+    """
+    if sum(c.reference for c in chips) > 1:
+        raise ValueError("reference = true stands in several [[chip]] blocks; keep it in one")
+    for key in ("number", "name"):
+        values = [getattr(c, key) for c in chips]
+        twice = next((v for v in values if values.count(v) > 1), None)
+        if twice is not None:
+            raise ValueError(f"two [[chip]] blocks have the {key} {twice!r}; give each its own")
+    if chips and (detector.size or reference_pixel):
+        raise ValueError(
+            "[[chip]] blocks stand in place of detector.size and model.reference_pixel; "
+            "give one of the two"
+        )
+    if not chips and detector.size is None:
+        raise ValueError("detector.size is missing; give it, or [[chip]] blocks")
+
+
+def reference_first(chips: Sequence[ChipBlock]) -> list[ChipBlock]:
+    """The blocks with the reference chip in front: it defines the frame."""
+    return sorted(chips, key=lambda c: not c.reference)
+
+
+def chips_of(chips: Sequence[ChipBlock]) -> tuple[Chip, ...]:
+    """Chips of the model."""
+    blocks = reference_first(chips)
+    return tuple(Chip(c.number, c.name, c.size, c.reference_pixel) for c in blocks)

@@ -1,0 +1,43 @@
+"""Files for pipelines that a run is asked for: a table for each format that can be built."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from pydantic import create_model
+
+from bayesdist.app.config.campaign import ReleaseBlock
+from bayesdist.app.config.section import Section
+from bayesdist.products.formats.common.document import FormatSettings
+from bayesdist.products.registry import product_settings
+
+__all__ = ["CampaignProducts", "MatchedProducts", "Products", "SelfcalProducts"]
+
+
+class Products(Section):
+    """Files for pipelines."""
+
+    def asked(self) -> dict[str, FormatSettings]:
+        """Settings of the files that are asked for, by format."""
+        found = {key: getattr(self, key, None) for key in product_settings()}
+        return {key: settings for key, settings in found.items() if settings is not None}
+
+
+class _Single(Products):
+    release: ClassVar[ReleaseBlock | None] = None  # the set of a release is of a campaign
+
+
+class _Release(Products):
+    release: ReleaseBlock | None = None
+
+
+def _products(name: str, base: type[Products], *without: str) -> Any:
+    """The base with a table for each format, but for those that this kind of run does not make."""
+    known = product_settings()
+    fields: dict[str, Any] = {key: (known[key] | None, None) for key in known if key not in without}
+    return create_model(name, __base__=base, **fields)
+
+
+MatchedProducts = _products("MatchedProducts", _Single)
+CampaignProducts = _products("CampaignProducts", _Release)
+SelfcalProducts = _products("SelfcalProducts", _Single, "wise_meta")

@@ -1,0 +1,161 @@
+"""Configurations and other files of sections, read and checked."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, TypeAdapter, ValidationError
+
+from bayesdist.app.config.assess import RequirementBlock
+from bayesdist.app.config.errors import as_config_error
+from bayesdist.app.config.kinds import CONFIG, KINDS, Config
+from bayesdist.app.config.section import Section
+from bayesdist.assess import Requirement
+from bayesdist.errors import ConfigError, InputError
+
+__all__ = [
+    "config_of_record",
+    "load_config",
+    "load_requirements",
+    "load_text",
+    "parse_config",
+    "validated",
+]
+
+
+class _RequirementFile(Section):
+    requirement: Annotated[list[RequirementBlock], Field(min_length=1)]
+
+
+def load_config(path: str | Path) -> tuple[Config, str]:
+    """Read a configuration file.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    config : Config
+    text : str
+        The file as it stands.
+
+    Raises
+    ------
+    ConfigError
+        With file, key and reason; an unknown key names the nearest known one, or the kind of run
+        that has it.
+    """
+    text = load_text(path)
+    return parse_config(text, str(path)), text
+
+
+def parse_config(text: str, where: str) -> Config:
+    """A configuration from the text of a file; `where` names it in errors."""
+    raw = _settings(text, where, begin="write one by 'bayesdist init'")
+    config = _validated(CONFIG, KINDS, raw, where)
+    try:
+        config.time()
+        config.mixture()
+        config.user_terms()
+        config.requirements()
+        config.spans()
+    except InputError as error:
+        raise ConfigError(error.cause, where=f"{where}: {error.where}", do=error.do) from error
+    return config
+
+
+def config_of_record(settings: Mapping[str, Any], where: str) -> Config:
+    """A configuration as the record of a run holds it.
+
+    Raises
+    ------
+    ConfigError
+        For settings that another version allowed.
+    """
+    try:
+        return CONFIG.validate_python(settings)
+    except ValidationError as error:
+        raise as_config_error(KINDS, error, where) from error
+
+
+def load_requirements(path: str | Path) -> tuple[Requirement, ...]:
+    """Read a file of ``[[requirement]]`` blocks.
+
+    Raises
+    ------
+    ConfigError
+    """
+    text, begin = load_text(path), "give it [[requirement]] blocks"
+    blocks = validated(_RequirementFile, text, str(path), begin=begin).requirement
+    try:
+        return tuple(Requirement(**r.model_dump()) for r in blocks)
+    except InputError as error:
+        raise ConfigError(error.cause, where=f"{path}: {error.where}", do=error.do) from error
+
+
+def load_text(path: str | Path) -> str:
+    """Text of a file as it stands, with its line ends.
+
+    Raises
+    ------
+    ConfigError
+    """
+    try:
+        with open(path, encoding="utf-8", newline="") as stream:
+            return stream.read()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise ConfigError(
+            f"cannot be read ({reason})", where=str(path), do="check the path and the file"
+        ) from error
+
+
+def validated(kind: type[Section], text: str, where: str, *, begin: str) -> Any:
+    """A file of sections from its text.
+
+    Parameters
+    ----------
+    kind : type of Section
+    text : str
+    where : str
+        The file, for errors.
+    begin : str
+        What to do about an empty one.
+
+    Raises
+    ------
+    ConfigError
+    """
+    return _validated(TypeAdapter(kind), kind, _settings(text, where, begin=begin), where)
+
+
+def _settings(text: str, where: str, *, begin: str) -> dict[str, Any]:
+    """Settings of a TOML text, of which there have to be some."""
+    try:
+        raw = tomllib.loads(text.removeprefix("\ufeff"))
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(
+            f"is not valid TOML ({error})", where=where, do="correct it there"
+        ) from error
+    if not raw:
+        raise ConfigError("holds no settings", where=where, do=begin)
+    return raw
+
+
+def _validated(
+    adapter: TypeAdapter[Any],
+    kinds: type[Section] | Mapping[str, type[Section]],
+    raw: Mapping[str, Any],
+    where: str,
+) -> Any:
+    """Settings as sections; `kinds` names these in errors."""
+    try:
+        # by way of JSON: there arrays may become tuples, but no text a number
+        return adapter.validate_json(json.dumps(raw, default=str), strict=True)
+    except ValidationError as error:
+        raise as_config_error(kinds, error, where) from error

@@ -1,0 +1,1 @@
+"""What `match`, `fit` and `sample` make of each kind of run, as values and pure functions."""

@@ -1,0 +1,113 @@
+"""A fit and the stars that it was made from, as whatever follows the fit takes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
+from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.kinds.matched import Matched
+from bayesdist.app.kinds.reader import StarReader
+from bayesdist.assess import SAMPLE
+from bayesdist.data.matches import MatchTable
+from bayesdist.diagnose.residuals.quoted import error_scale_sentence
+from bayesdist.infer import LinearFit, Shards
+from bayesdist.infer.exposures.frame_choice import FrameChoice, frames_that_help
+from bayesdist.infer.stars.shards import Matches
+from bayesdist.model import DistortionModel
+
+__all__ = ["FitData"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FitData:
+    """A fit and its stars: where its tables move them, with its errors.
+
+    Parameters
+    ----------
+    matched : Matched
+    fitted : Fitted
+    reader : StarReader
+        Reads the stars once for all passes over them.
+    """
+
+    matched: Matched
+    fitted: Fitted
+    reader: StarReader = field(default_factory=StarReader)
+
+    @property
+    def fit(self) -> LinearFit:
+        """The least-squares fit."""
+        return self.fitted.linear
+
+    @property
+    def model(self) -> DistortionModel:
+        """The model that was fitted."""
+        return self.fit.model
+
+    @cached_property
+    def placed(self) -> Matches:
+        """Stars at the pixels that the tables move them to, with their quoted errors."""
+        return self.fitted.placed(self.matched.stars)
+
+    @property
+    def _law(self) -> ErrorLaw:
+        """Errors on top of those of the placed stars: detections of solved stars have theirs."""
+        return QUOTED if self.fitted.solved is not None else self.fitted.errors
+
+    @cached_property
+    def stars(self) -> Matches:
+        """Stars that were fitted, with their errors."""
+        return self.reader.matches(self.placed, self._law)
+
+    @cached_property
+    def held(self) -> Matches | None:
+        """Stars that are held out, in the same way; None where there are none."""
+        held = self.matched.held
+        return None if held is None else self.fitted.errors.applied(self.fitted.placed(held))
+
+    @property
+    def shards(self) -> Shards:
+        """All stars that were fitted, as passes go over them."""
+        return self.reader.shards(self.model, self.placed, self._law)
+
+    @property
+    def sample(self) -> MatchTable:
+        """Evenly spread ones of them, or all."""
+        return self.reader.sample(self.placed, self._law)
+
+    @cached_property
+    def dates(self) -> Float:
+        """Distinct dates of the stars, decimal years; none where they have none."""
+        table = self.placed if isinstance(self.placed, MatchTable) else self.sample
+        return np.zeros(0) if table.epoch is None else np.unique(table.epoch)
+
+    @cached_property
+    def median_epoch(self) -> float:
+        """Median date of the stars, decimal years; they have dates where the model drifts."""
+        table = self.placed if isinstance(self.placed, MatchTable) else self.placed.sample(SAMPLE)
+        assert table.epoch is not None
+        return float(np.median(table.epoch))
+
+    @cached_property
+    def better_frames(self) -> FrameChoice | None:
+        """Frames with which matches of several exposures scatter far less; None where none do."""
+        return frames_that_help(self.placed.sample(SAMPLE), self.model)
+
+    @property
+    def error_scale_sentence(self) -> str:
+        """What was done to quoted errors that are far too small; empty where they will do."""
+        if self.fitted.errors.factor == 1.0:
+            return ""
+        return error_scale_sentence(
+            self.fitted.errors.factor,
+            self.shards.survey.reference_sigma,
+            self.model.unit,
+            by_magnitude=self.placed.has_mag,
+        )

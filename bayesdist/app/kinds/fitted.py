@@ -1,0 +1,106 @@
+"""What the stage 'fit' makes: the least-squares solution, and what its stars were given."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.app.kinds.errors import ErrorLaw
+from bayesdist.app.kinds.exposures import FIT_AGAIN, ExposureScatter, write_hierarchy, write_series
+from bayesdist.app.kinds.table_file import StoredLookupTables, write_tables
+from bayesdist.app.selfcal.solved import SelfCalibrated
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import InputError
+from bayesdist.infer import GaussianPriors, LinearFit, save_fit
+from bayesdist.infer.catalogue.added_errors import GroupedErrors
+from bayesdist.infer.nodes import corrected_matches, inside_chips, on_the_chips
+from bayesdist.infer.series import Series
+from bayesdist.infer.stars.shards import Matches
+
+__all__ = ["FIT", "TABLES", "Fitted", "required"]
+
+FIT, TABLES = "fit.nc", "tables.h5"
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A least-squares solution with all that it rests on; what a kind of run lacks is None.
+
+    Parameters
+    ----------
+    linear : LinearFit
+    errors : ErrorLaw
+        Of fitted and held-out stars.
+    priors : GaussianPriors
+    grouped : GroupedErrors or None
+        Errors beyond the quoted ones, where groups of stars were compared.
+    tables : StoredLookupTables
+        Empty where there are none.
+    scatter : ExposureScatter or None
+        How exposures deviate, where they were fitted jointly.
+    alone : Series or None
+        Linear terms of exposures that were each fitted alone.
+    solved : SelfCalibrated or None
+        Solution and gauge of detections whose stars are not known otherwise.
+    facts : mapping
+        Sections of summary.json that only the making of the fit knows.
+    """
+
+    linear: LinearFit
+    errors: ErrorLaw
+    priors: GaussianPriors
+    grouped: GroupedErrors | None = None
+    tables: StoredLookupTables = field(default_factory=StoredLookupTables)
+    scatter: ExposureScatter | None = None
+    alone: Series | None = None
+    solved: SelfCalibrated | None = None
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    def placed(self, stars: Matches) -> Matches:
+        """Stars at the pixels that the tables move them to, on their chips, with quoted errors.
+
+        Of a self-calibration they are the detections beside the stars as they were solved.
+        """
+        if self.solved is not None:
+            return self.solved.matches
+        if not self.tables.tables or not isinstance(stars, MatchTable):
+            return stars
+        return on_the_chips(corrected_matches(self.tables.tables, stars), self.linear.model)
+
+    def inside(self, stars: MatchTable) -> NDArray[np.bool_]:
+        """Boolean mask (N,) of the stars that the tables do not move off their chip."""
+        if not self.tables.tables:
+            return np.ones(len(stars), bool)
+        return inside_chips(corrected_matches(self.tables.tables, stars), self.linear.model)
+
+    def save(self, folder: Path) -> None:
+        """Write the files of a run's folder that belong to it."""
+        write_tables(folder / TABLES, self.tables)
+        self.errors.save(folder)
+        save_fit(self.linear, folder / FIT)
+        if self.scatter is not None:
+            write_hierarchy(folder, self.scatter, self.priors)
+        if self.alone is not None:
+            write_series(folder, self.alone)
+        if self.solved is not None:
+            self.solved.save(folder)
+
+
+def required(part: T | None, what: str) -> T:
+    """A part of a fit that its kind of run has.
+
+    Raises
+    ------
+    InputError
+        For a fit of another kind.
+    """
+    if part is None:
+        raise InputError(f"has no {what}", where=FIT, do=FIT_AGAIN)
+    return part

@@ -1,0 +1,147 @@
+"""What the three kinds of runs do in their own way: all that comes before the posterior."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from bayesdist.app.campaign.check import campaign_lines
+from bayesdist.app.campaign.fit import fit_campaign, load_fitted_campaign
+from bayesdist.app.campaign.inputs import read_campaign
+from bayesdist.app.campaign.matched import campaign_matches, load_matched_campaign
+from bayesdist.app.campaign.matching import match_lists
+from bayesdist.app.campaign.soundness import refuse_campaign
+from bayesdist.app.config import Config
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.kinds.matched import Matched
+from bayesdist.app.kinds.reader import StarReader
+from bayesdist.app.kinds.stars import (
+    fit_stars,
+    load_fitted_stars,
+    match_stars,
+    read_stars,
+    sample_stars,
+)
+from bayesdist.app.selfcal.check import selfcal_lines
+from bayesdist.app.selfcal.fit import fit_selfcal, load_fitted_selfcal, sample_detections
+from bayesdist.app.selfcal.given import read_given, refuse_given
+from bayesdist.app.selfcal.matched import load_matched_selfcal, selfcal_matches
+from bayesdist.app.selfcal.matching import match_dithers
+from bayesdist.infer import Posterior
+
+__all__ = ["Kind", "kind_of"]
+
+
+class Sampler(Protocol):
+    """The posterior of a fit; checkpoints are in the folder."""
+
+    def __call__(
+        self,
+        data: FitData,
+        config: Config,
+        *,
+        folder: Path | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Posterior: ...
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Matched stars, a campaign, or a self-calibration.
+
+    Parameters
+    ----------
+    rows : str
+        What a row of the data is, in words.
+    chooser : str
+        What leaves out rows that are far off, in words.
+    begins_with : str
+        Its first stage: 'match', or 'fit' where stars are matched already.
+    read : callable
+        Of (config, base): all that a run begins with, its inputs; paths are relative to `base`.
+    refuse : callable
+        Of (inputs, config, base): refuses what does not go together.
+    match : callable
+        Of (inputs, config, base): stars that are fitted, and those that are held out.
+    fit : callable
+        Of (matched, config, base, reader): the least-squares solution.
+    sample : callable
+        The posterior of the fit.
+    load_matched : callable
+        Of (folder, inputs, config, base, summary): the matches of an earlier stage, from a run's
+        folder and its summary.json.
+    load_fitted : callable
+        Of (folder, matched, config, summary): the fit of an earlier stage; `matched` is called
+        where that needs the matches.
+    lines : callable
+        Of (inputs, config): what `check` says of the inputs; None where the fit says more.
+    """
+
+    rows: str
+    chooser: str
+    begins_with: str
+    read: Callable[[Config, Path], Any]
+    refuse: Callable[[Any, Config, Path], None]
+    match: Callable[[Any, Config, Path], Matched]
+    fit: Callable[[Matched, Config, Path, StarReader], Fitted]
+    sample: Sampler
+    load_matched: Callable[[Path, Any, Config, Path, Mapping[str, Any]], Matched]
+    load_fitted: Callable[[Path, Callable[[], Matched], Config, Mapping[str, Any]], Fitted]
+    lines: Callable[[Any, Config], Iterator[str] | None]
+
+
+MATCHES = Kind(
+    "stars",
+    "least-squares fit",
+    "fit",
+    read_stars,
+    lambda inputs, config, base: None,  # what is wrong shows in their fit
+    match_stars,
+    lambda matched, config, base, reader: fit_stars(matched, config, reader=reader),
+    sample_stars,
+    lambda folder, inputs, config, base, summary: match_stars(inputs, config, base),
+    lambda folder, matched, config, summary: load_fitted_stars(folder, config, summary),
+    lambda inputs, config: None,
+)
+
+CAMPAIGN = Kind(
+    "stars",
+    "least-squares fit",
+    "match",
+    read_campaign,
+    refuse_campaign,
+    match_lists,
+    lambda matched, config, base, reader: fit_campaign(campaign_matches(matched), config, base),
+    sample_stars,
+    lambda folder, inputs, config, base, summary: load_matched_campaign(
+        folder, config, inputs, summary
+    ),
+    lambda folder, matched, config, summary: load_fitted_campaign(folder, summary),
+    campaign_lines,
+)
+
+SELFCAL = Kind(
+    "detections",
+    "limits of residuals",
+    "match",
+    read_given,
+    refuse_given,
+    match_dithers,
+    lambda matched, config, base, reader: fit_selfcal(selfcal_matches(matched)),
+    sample_detections,
+    lambda folder, inputs, config, base, summary: load_matched_selfcal(folder, inputs, summary),
+    lambda folder, matched, config, summary: load_fitted_selfcal(
+        folder, selfcal_matches(matched()), summary
+    ),
+    lambda inputs, config: selfcal_lines(inputs),
+)
+
+
+def kind_of(config: Config) -> Kind:
+    """The kind of run that a configuration is of."""
+    if config.campaign is not None:
+        return CAMPAIGN
+    return SELFCAL if config.selfcal is not None else MATCHES

@@ -1,0 +1,112 @@
+"""What the stage 'match' makes: the stars of a run, and what is known of their matching."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+from astropy.table import Table
+
+from bayesdist.app.config import Config
+from bayesdist.app.output import write_table
+from bayesdist.data.matches import MatchTable
+from bayesdist.diagnose.overlap import OverlapTest
+from bayesdist.infer import Posterior
+from bayesdist.infer.catalogue.star_influence import StarErrors
+from bayesdist.infer.stars.shards import Matches
+from bayesdist.model import LookupTable
+
+__all__ = ["Matched"]
+
+MATCHING = "matching.ecsv"
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """Matches of a run, in two parts, as they were read or found.
+
+    Parameters
+    ----------
+    stars : MatchTable or PartitionedMatches
+        Those that are fitted.
+    held : MatchTable or PartitionedMatches or None
+        Those that are held out; None where none are.
+    whole : tuple of str
+        Exposures that are held out whole.
+    facts : mapping
+        Section of summary.json; empty for stars that were given as matches.
+    table : astropy.table.Table or None
+        One row for each exposure; None for stars that were given as matches.
+
+    Attributes
+    ----------
+    section : str
+        Name of the section of summary.json that has the facts.
+    has_catalogue : bool
+        The positions of stars come from a reference catalogue.
+    """
+
+    section: ClassVar[str] = ""
+    has_catalogue: ClassVar[bool] = True
+
+    stars: Matches
+    held: Matches | None = None
+    whole: tuple[str, ...] = ()
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    table: Table | None = None
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What was odd in the matching, each as a clause."""
+        return tuple(self.facts.get("warnings", ()))
+
+    @property
+    def tangent_point(self) -> tuple[float, float] | None:
+        """Sky position of (u, v) = (0, 0), degrees; None where u, v are not along the sky."""
+        return self.stars.tangent_point
+
+    @property
+    def filter(self) -> str:
+        """The one filter of the exposures; empty where it has no name."""
+        return ""
+
+    @property
+    def states_errors(self) -> bool:
+        """Boolean: the catalogue has columns of errors."""
+        return False
+
+    @property
+    def states_motion_errors(self) -> bool:
+        """Boolean: the catalogue has columns of errors of proper motions."""
+        return False
+
+    @property
+    def star_errors(self) -> StarErrors | None:
+        """Errors of the catalogue by code of the star; None where it has none."""
+        return None
+
+    @property
+    def catalogue_name(self) -> str:
+        """Name of the file of the reference catalogue, or what it is."""
+        return "catalogue"
+
+    def with_motions(self, table: MatchTable) -> MatchTable:
+        """Matches with what the catalogue states of the motions of their stars."""
+        return table
+
+    def overlap(
+        self, posterior: Posterior, tables: tuple[LookupTable, ...], config: Config, base: Path
+    ) -> OverlapTest | None:
+        """Two exposures far apart in time laid on each other; None where none are known so."""
+        return None
+
+    def reopened(self, folder: Path, config: Config) -> Matched:
+        """Matches as a run that is resumed reads them from its folder."""
+        return self
+
+    def save(self, folder: Path) -> None:
+        """Write the files of a run's folder that belong to it."""
+        if self.table is not None:
+            write_table(self.table, folder / MATCHING)

@@ -1,0 +1,69 @@
+"""Stars set aside before the fit: which ones."""
+
+from __future__ import annotations
+
+from typing import TypeVar, cast
+
+from bayesdist.app.config import Config
+from bayesdist.app.config.holdout import HoldoutBlock
+from bayesdist.data.holdout import SetAside, exposures_drawn, split_matches
+from bayesdist.errors import InputError
+from bayesdist.infer.stars.shards import Matches
+from bayesdist.limits import HELD_OUT
+
+__all__ = ["set_aside"]
+
+M = TypeVar("M", bound=Matches)
+
+
+def set_aside(config: Config, matches: M, needed: int = 0) -> tuple[M, M | None, tuple[str, ...]]:
+    """Matches that are fitted, those that are held out, and exposures that are so as a whole.
+
+    Parameters
+    ----------
+    config : Config
+    matches : MatchTable or PartitionedMatches
+    needed : int
+        So many of the first exposures define the gauge and cannot be held out.
+
+    Returns
+    -------
+    fitted : MatchTable or PartitionedMatches
+    held : MatchTable or PartitionedMatches or None
+        None where the configuration holds nothing out.
+    whole : tuple of str
+
+    Raises
+    ------
+    InputError
+        For an unknown exposure or one that is needed, and when nothing would be left, or too
+        little set aside.
+    """
+    block = config.holdout
+    if block is None:
+        return matches, None, ()
+    whole = _whole_exposures(block, config.sampler.seed, matches.exposure_names, needed)
+    split = split_matches(matches, SetAside(block.fraction, whole, config.sampler.seed))
+    if not HELD_OUT.met_by(len(split.held)):
+        raise InputError(
+            f"{len(split.held)} of {len(matches)} stars are held out, which say too little",
+            where=", ".join(matches.sources),
+            do=f"hold out at least {HELD_OUT.value}: raise holdout.fraction",
+        )
+    return cast(M, split.kept), cast(M, split.held), whole
+
+
+def _whole_exposures(
+    block: HoldoutBlock, seed: int, names: tuple[str, ...], needed: int
+) -> tuple[str, ...]:
+    """Exposures that are set aside whole: the named ones, or so many drawn by the seed."""
+    if isinstance(block.exposures, int):
+        return exposures_drawn(names[needed:], block.exposures, seed)
+    for name in block.exposures:
+        if name in names[:needed]:
+            raise InputError(
+                f"exposure {name!r} is to be held out, and defines the gauge",
+                where="holdout.exposures",
+                do="name another one",
+            )
+    return tuple(dict.fromkeys(block.exposures))

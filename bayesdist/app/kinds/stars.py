@@ -1,0 +1,274 @@
+"""Matched stars: read, fitted and sampled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayesdist.app.added_errors import compared_errors, grouped_errors_of, knows_circle
+from bayesdist.app.chips import check_chips
+from bayesdist.app.config import Config
+from bayesdist.app.kinds.errors import QUOTED, ErrorLaw, read_magnitude_errors
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.fitted import FIT, Fitted
+from bayesdist.app.kinds.matched import Matched
+from bayesdist.app.kinds.reader import StarReader
+from bayesdist.app.kinds.split import set_aside
+from bayesdist.app.match_sources import read_configured
+from bayesdist.assess import SAMPLE
+from bayesdist.diagnose.residuals.quoted import error_scale
+from bayesdist.errors import ConfigError, DegenerateError, InputError, NotSettledError
+from bayesdist.infer import (
+    GaussianPriors,
+    LinearFit,
+    Posterior,
+    Shards,
+    build_model,
+    fit_by_magnitude,
+    fit_linear,
+    load_fit,
+    sample,
+)
+from bayesdist.infer.exposures.frame_choice import frames_that_help
+from bayesdist.infer.linear import Rejection
+from bayesdist.infer.stars.shards import Matches
+from bayesdist.model import DistortionModel
+
+__all__ = [
+    "fit_stars",
+    "load_fitted_stars",
+    "match_stars",
+    "model_of",
+    "priors_of",
+    "read_stars",
+    "sample_stars",
+    "shards_of",
+]
+
+SAMPLING = 1  # of the random streams that follow from the one seed: that of the stage 'sample'
+
+
+def match_stars(stars: Matches, config: Config, base: Path) -> Matched:
+    """Matched stars of a configuration, those that are fitted and those that are held out.
+
+    Parameters
+    ----------
+    stars : MatchTable or PartitionedMatches
+        As `read_stars` reads them.
+    config : Config
+        With a section [data].
+    base : Path
+        Folder that its files are relative to.
+
+    Returns
+    -------
+    Matched
+
+    Raises
+    ------
+    InputError
+        For files that cannot be read, and as `set_aside`.
+    ConfigError
+        For settings that do not go with nominal positions.
+    """
+    if stars.has_nominal:
+        try:  # columns may be found by their names
+            config.refuse_circle()
+        except ValueError as error:
+            cause, _, do = str(error).partition("; ")
+            raise ConfigError(cause, where=", ".join(stars.sources), do=do) from None
+    return Matched(*set_aside(config, stars))
+
+
+def read_stars(config: Config, base: Path) -> Matches:
+    """The matched stars that a configuration names.
+
+    Raises
+    ------
+    InputError
+        For a configuration that names none, and for files that cannot be read.
+    """
+    data = config.data
+    if data is None:
+        raise InputError("names no matched stars", where="data", do="give data.matches")
+    names = data.matches
+    path = base / names if isinstance(names, str) else [base / name for name in names]
+    return read_configured(path, data, size=config.detector.size, chips=config.chip)
+
+
+def model_of(stars: Matches, config: Config) -> DistortionModel:
+    """The model that a configuration asks for, for these stars.
+
+    Raises
+    ------
+    InputError
+        For chips that only one side knows, and as `build_model`.
+    """
+    check_chips(config.chips(), stars.chip_numbers)
+    return build_model(
+        stars,
+        order=config.model.order,
+        size=config.detector.size,
+        reference_pixel=config.model.reference_pixel,
+        name=config.detector.name,
+        chips=config.chips(),
+        frames=config.model.frames,
+        time=config.time(),
+    )
+
+
+def fit_stars(matched: Matched, config: Config, *, reader: StarReader | None = None) -> Fitted:
+    """The linear fit of matched stars, with the errors that its residuals ask for.
+
+    Parameters
+    ----------
+    matched : Matched
+    config : Config
+    reader : StarReader, optional
+        Has the stars in the end, for the passes that follow.
+
+    Returns
+    -------
+    Fitted
+
+    Raises
+    ------
+    InputError
+        Where it cannot be made; with the frames of the exposures that would help.
+    """
+    if reader is None:
+        with closing(StarReader(config.resources())) as reader:
+            return fit_stars(matched, config, reader=reader)
+    model = model_of(matched.stars, config)
+    try:
+        return _fitted(matched.stars, model, config, reader)
+    except (DegenerateError, NotSettledError) as error:
+        better = frames_that_help(matched.stars.sample(SAMPLE), model)
+        if better is None:
+            raise
+        raise type(error)(error.cause, where=error.where, do=better.sentence) from error
+
+
+def _fitted(stars: Matches, model: DistortionModel, config: Config, reader: StarReader) -> Fitted:
+    """The fit with errors by magnitude, or with the quoted ones as far as they will do."""
+    priors = priors_of(model, config)
+    rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs, config.fit.radial_weight)
+    if config.data is not None and config.data.sigma == "by_magnitude":
+        linear, _, by_magnitude = fit_by_magnitude(
+            stars, model, rejection=rejection, priors=priors, compute=reader.compute
+        )
+        return Fitted(linear, ErrorLaw(by_magnitude=by_magnitude), priors)
+
+    def fitted(errors: ErrorLaw) -> LinearFit:
+        shards = shards_of(stars, model, config, errors, reader)
+        return fit_linear(shards, model, rejection=rejection, priors=priors)
+
+    errors = QUOTED
+    linear = fitted(errors)
+    factor = error_scale(linear, reader.sample(stars, errors))
+    if factor != 1.0:
+        errors = ErrorLaw(factor)
+        linear = fitted(errors)
+    grouped = compared_errors(config, linear, reader.sample(stars, errors), priors)
+    if grouped is not None and grouped.added is not None:
+        errors = ErrorLaw(factor, added=grouped.added)
+        linear = fitted(errors)
+    return Fitted(linear, errors, priors, grouped)
+
+
+def shards_of(
+    stars: Matches, model: DistortionModel, config: Config, errors: ErrorLaw, reader: StarReader
+) -> Shards:
+    """Stars as passes go over them, none of them outside the circle in which it was matched.
+
+    Raises
+    ------
+    InputError
+        Naming a star that is.
+    """
+    shards = reader.shards(model, stars, errors)
+    if knows_circle(config) and stars.has_nominal:
+        shards.survey.check_circle(config.outliers.match_radius)
+    return shards
+
+
+def priors_of(model: DistortionModel, config: Config) -> GaussianPriors:
+    """Priors of the parameters, as the configuration gives them.
+
+    Raises
+    ------
+    InputError
+        For a parameter that the model does not have.
+    """
+    return GaussianPriors.of(model, {p.parameter: (p.mean, p.sigma) for p in config.prior})
+
+
+def load_fitted_stars(folder: Path, config: Config, summary: Mapping[str, Any]) -> Fitted:
+    """The fit of an earlier stage.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the run.
+    config : Config
+    summary : mapping
+        Content of summary.json.
+    """
+    linear, known = load_fit(folder / FIT), summary.get("fit", {})
+    by_magnitude = config.data is not None and config.data.sigma == "by_magnitude"
+    grouped = grouped_errors_of(known.get("added_errors"))
+    errors = ErrorLaw(
+        float(known.get("error_scale", 1.0)),
+        read_magnitude_errors(folder) if by_magnitude else None,
+        None if grouped is None else grouped.added,
+    )
+    return Fitted(linear, errors, priors_of(linear.model, config), grouped)
+
+
+def sample_stars(
+    data: FitData,
+    config: Config,
+    *,
+    folder: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Posterior:
+    """The posterior of a fit; of exposures that were fitted jointly with the chips averaged.
+
+    Parameters
+    ----------
+    data : FitData
+    config : Config
+    folder : Path, optional
+        For checkpoints.
+    progress : callable, optional
+        Called with (steps made, most steps).
+
+    Returns
+    -------
+    Posterior
+    """
+    s = config.sampler
+    posterior = sample(
+        data.fit,
+        data.shards,
+        outliers=config.mixture(),
+        priors=data.fitted.priors,
+        seed=s.seed,
+        ensembles=s.ensembles,
+        walkers=s.walkers,
+        target_ess=s.target_ess,
+        target_rhat=s.target_rhat,
+        max_steps=s.max_steps,
+        checkpoint_every=s.checkpoint_every,
+        folder=folder,
+        progress=progress,
+        method=s.method,
+        second_stage=s.second_stage,
+    )
+    if data.fitted.scatter is None:
+        return posterior
+    return data.fitted.scatter.averaged(posterior, np.random.default_rng([s.seed, SAMPLING]))

@@ -1,0 +1,239 @@
+"""The artefacts of a run: made by its stages, or loaded from its folder when they are asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from bayesdist.app.assessment import evaluation_settings
+from bayesdist.app.checks import run_checks
+from bayesdist.app.config import Config
+from bayesdist.app.diagnosing import diagnose_fit_of_run, diagnose_run
+from bayesdist.app.diagnostics_files import load_diagnostics
+from bayesdist.app.error_terms import errors_of_run
+from bayesdist.app.evaluation_files import load_evaluation
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.kinds.kind import Kind, kind_of
+from bayesdist.app.kinds.matched import Matched
+from bayesdist.app.kinds.reader import StarReader
+from bayesdist.app.made_files import ProductInput, product_input
+from bayesdist.app.match_sources import RunInput, input_of_run
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.assess.error_model import ErrorModel, solution_with_errors
+from bayesdist.assess.evaluation import Evaluation, EvaluationSettings
+from bayesdist.checks import Check, in_order
+from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.infer import LinearFit, Posterior, load_posterior
+
+__all__ = ["Results", "open_results", "results_of"]
+
+# each rests on those before it
+ARTEFACTS = ("inputs", "matched", "fitted", "data", "posterior", "stored", "evaluation")
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """The artefacts of a run, and what follows from them.
+
+    Parameters
+    ----------
+    run : RunDirectory
+    reader : StarReader
+        Reads the stars once for all stages.
+    made : mapping
+        Artefacts of this process, in place of those in the folder.
+    source : RunInput, optional
+        Pairs in RvB files, which may have to be selected before they are read.
+    """
+
+    run: RunDirectory
+    reader: StarReader
+    made: Mapping[str, Any] = field(default_factory=dict)
+    source: RunInput | None = None
+
+    def having(self, **artefacts: Any) -> Results:
+        """Results with artefacts in place of earlier ones, without any that rested on those."""
+        first = min(ARTEFACTS.index(name) for name in artefacts)
+        known = {**self.made, **vars(self)}
+        kept = {name: known[name] for name in ARTEFACTS[:first] if name in known}
+        return replace(self, made={**kept, **artefacts})
+
+    def adopting_inputs(self) -> Results:
+        """Results whose inputs lie in the run's folder, where they were prepared beside it."""
+        if self.source is None or not self.source.move_into_run():
+            return self
+        moved = self.having(inputs=self.source.load())
+        self.reader.moved(moved.matched.stars)
+        return moved.having(matched=moved.matched).having(fitted=self.fitted)
+
+    def close(self) -> None:
+        """Let go of the stars, and of what was written of them beside the run's folder."""
+        self.reader.close()
+        if self.source is not None:
+            self.source.close()
+
+    # -- artefacts --------------------------------------------------------------------------------
+
+    @cached_property
+    def config(self) -> Config:
+        """The resolved configuration."""
+        return self.run.config
+
+    @cached_property
+    def base(self) -> Path:
+        """Folder that the configuration's files are relative to."""
+        return Path(self.run.record["base"])
+
+    @cached_property
+    def kind(self) -> Kind:
+        """What the run does in its own way."""
+        return kind_of(self.config)
+
+    @cached_property
+    def inputs(self) -> Any:
+        """All that the run begins with."""
+        if "inputs" in self.made:
+            return self.made["inputs"]
+        if self.source is not None:
+            return self.source.load()
+        return self.kind.read(self.config, self.base)
+
+    @cached_property
+    def matched(self) -> Matched:
+        """Stars that are fitted and stars that are held out, as they were read or matched."""
+        found: Matched | None = self.made.get("matched")
+        if found is not None:
+            return found
+        summary = self.run.summary
+        return self.kind.load_matched(self.run.path, self.inputs, self.config, self.base, summary)
+
+    @cached_property
+    def fitted(self) -> Fitted:
+        """The least-squares solution, with what its stars were given."""
+        found: Fitted | None = self.made.get("fitted")
+        if found is not None:
+            return found
+        summary = self.run.summary
+        return self.kind.load_fitted(self.run.path, lambda: self.matched, self.config, summary)
+
+    @cached_property
+    def data(self) -> FitData:
+        """The fit and its stars."""
+        return self.made.get("data") or FitData(self.matched, self.fitted, self.reader)
+
+    @cached_property
+    def posterior(self) -> Posterior:
+        """The posterior as it was sampled."""
+        return self.made.get("posterior") or load_posterior(self.run / "posterior.nc")
+
+    @property
+    def is_sampled(self) -> bool:
+        """Boolean: there is a posterior."""
+        return "posterior" in self.made or (self.run / "posterior.nc").exists()
+
+    @cached_property
+    def stored(self) -> Diagnostics | None:
+        """What residuals say, as the assessment has found it; None before."""
+        return self.made.get("stored") or load_diagnostics(self.run, self.fit, self.posterior)
+
+    @cached_property
+    def diagnostics(self) -> Diagnostics:
+        """What residuals say, as found before or found now; less of a fit alone."""
+        if not self.is_sampled:
+            return diagnose_fit_of_run(self.data, self.config)
+        return self.stored or diagnose_run(self.posterior, self.data, self.config, self.base)
+
+    @cached_property
+    def evaluation(self) -> Evaluation:
+        """Maps, budget, margins and validity periods, as the assessment has found them."""
+        return self.made.get("evaluation") or load_evaluation(self.run, self.fit, self.posterior)
+
+    # -- what follows from them -------------------------------------------------------------------
+
+    @property
+    def fit(self) -> LinearFit:
+        """The least-squares fit itself."""
+        return self.fitted.linear
+
+    @cached_property
+    def solution(self) -> Posterior:
+        """What is exported and shown: with all errors of the parameters that were found.
+
+        Neither catalogue nor matches are needed for it.
+        """
+        hierarchy = None if self.fitted.scatter is None else self.fit
+        return solution_with_errors(self.posterior, self.stored, hierarchy)
+
+    @cached_property
+    def errors(self) -> ErrorModel:
+        """All errors of a position."""
+        return errors_of_run(self.posterior, self.diagnostics, self.data, self.config)
+
+    @cached_property
+    def settings(self) -> EvaluationSettings:
+        """Where and how errors are evaluated."""
+        return evaluation_settings(self.data, self.config)
+
+    @property
+    def epoch(self) -> float | None:
+        """Epoch of the assessment, decimal years; stars are read only where it is theirs."""
+        if self.config.assess.epoch is not None or self.fit.model.time is None:
+            return self.config.assess.epoch
+        return self.data.median_epoch
+
+    @property
+    def product(self) -> ProductInput:
+        """What files of the solution are made from."""
+        return product_input(self.solution, self.data, self.config, str(self.run.path))
+
+    @property
+    def gauge_words(self) -> str:
+        """In which gauge the products stand, as a sentence; empty where that is no question."""
+        return "" if self.fitted.solved is None else self.fitted.solved.gauge_words
+
+    @property
+    def series(self) -> Mapping[str, Any]:
+        """How linear terms go with time: a section of summary.json, empty where it has none."""
+        found: Mapping[str, Any] = self.run.summary.get("time_dependence", {})
+        return found
+
+    @property
+    def checks(self) -> tuple[Check, ...]:
+        """All checks but those of an evaluation."""
+        posterior = self.posterior if self.is_sampled else None
+        own = run_checks(self.data, posterior, self.diagnostics, self.config, self.series)
+        return in_order((*own, *self.diagnostics.checks))
+
+
+def results_of(run: RunDirectory) -> Results:
+    """The results of a run, which whoever asks for them closes.
+
+    Parameters
+    ----------
+    run : RunDirectory
+    """
+    return Results(run, StarReader(run.config.resources()), source=input_of_run(run))
+
+
+@contextmanager
+def open_results(run: RunDirectory) -> Iterator[Results]:
+    """The results of a run, whose stars are let go of in the end.
+
+    Parameters
+    ----------
+    run : RunDirectory
+
+    Yields
+    ------
+    Results
+    """
+    results = results_of(run)
+    try:
+        yield results
+    finally:
+        results.close()

@@ -1,0 +1,175 @@
+"""The detections of a self-calibration with their stars, and a first solution."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from astropy.table import Table
+from numpy.typing import NDArray
+
+from bayesdist.app.kinds.matched import Matched
+from bayesdist.app.selfcal.given import Given
+from bayesdist.app.selfcal.matches import matches_of
+from bayesdist.data.detections import Detections
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import InputError
+from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
+from bayesdist.infer.selfcal import SelfCalibration
+from bayesdist.infer.selfcal.elimination import Mixture
+from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.model import DistortionModel
+
+__all__ = ["SelfcalMatched", "load_matched_selfcal", "matched_of", "selfcal_matches"]
+
+Float = NDArray[np.float64]
+
+DETECTIONS = "detections.h5"
+ARRAYS = ("x", "y", "star", "sigma", "theta", "stars", "mixture", "model")
+
+
+@dataclass(frozen=True, eq=False)
+class SelfcalMatched(Matched):
+    """Detections beside their stars, by a first solution.
+
+    Parameters
+    ----------
+    given : Given
+    detections : Detections
+        With their stars and errors, on one tangent plane.
+    problem : Problem
+        Linearised at the first solution.
+    theta : ndarray, shape (D,)
+        Of the first solution.
+    places : ndarray, shape (S, q)
+        Its stars.
+    mixture : Mixture
+        Its errors.
+    magnitudes : tuple of ndarray, or None
+        Magnitudes and errors in pixels, where these were measured.
+    """
+
+    section: ClassVar[str] = "selfcal"
+    has_catalogue: ClassVar[bool] = False
+
+    stars: MatchTable
+    given: Given = field(kw_only=True)
+    detections: Detections = field(kw_only=True)
+    problem: Problem = field(kw_only=True)
+    theta: Float = field(kw_only=True)
+    places: Float = field(kw_only=True)
+    mixture: Mixture = field(kw_only=True)
+    magnitudes: tuple[Float, Float] | None = field(kw_only=True, default=None)
+
+    @property
+    def tangent_point(self) -> None:
+        """None: u and v lie along the detector."""
+        return None
+
+    @property
+    def unused(self) -> dict[str, int]:
+        """Detections that are of no star, by reason."""
+        return dict(self.facts.get("detections", {}).get("unused", {}))
+
+    def save(self, folder: Path) -> None:
+        """Write the files of a run's folder that belong to it."""
+        names, m = ("x", "y", "star", "sigma"), self.mixture
+        arrays = {name: getattr(self.detections, name) for name in names}
+        arrays |= {"theta": self.theta, "stars": self.places}
+        arrays["mixture"] = np.array([m.jitter, m.fraction])
+        text = json.dumps(self.problem.model.to_dict())
+        arrays["model"] = np.frombuffer(text.encode(), np.uint8)
+        if self.magnitudes is not None:
+            arrays["magnitudes"] = np.stack(self.magnitudes)
+        write_arrays(folder / DETECTIONS, "", arrays)
+        super().save(folder)
+
+
+def matched_of(
+    found: SelfCalibration, given: Given, facts: Mapping[str, Any], table: Table
+) -> SelfcalMatched:
+    """What a self-calibration made of its detections, as later stages take it."""
+    solution = found.mode
+    return _matched(
+        given,
+        found.detections,
+        solution.problem.model,
+        (solution.theta, solution.stars, solution.mixture),
+        facts=facts,
+        table=table,
+        magnitudes=found.magnitude_errors,
+    )
+
+
+def selfcal_matches(matched: Matched) -> SelfcalMatched:
+    """Matches that are detections of a self-calibration.
+
+    Raises
+    ------
+    InputError
+        For others.
+    """
+    if not isinstance(matched, SelfcalMatched):
+        raise InputError("are no detections of a self-calibration", do="give such a run")
+    return matched
+
+
+def load_matched_selfcal(folder: Path, given: Given, summary: Mapping[str, Any]) -> SelfcalMatched:
+    """The detections of an earlier stage.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the run.
+    given : Given
+    summary : mapping
+        Content of summary.json.
+
+    Raises
+    ------
+    InputError
+        For a missing or damaged file.
+    """
+    arrays = read_arrays(folder / DETECTIONS, "", ARRAYS, do="run the stage 'match' again")
+    model = DistortionModel.from_dict(json.loads(arrays["model"].astype(np.uint8).tobytes()))
+    detections = replace(
+        given.inputs.detections,
+        x=arrays["x"],
+        y=arrays["y"],
+        star=arrays["star"].astype(np.int64),
+        sigma=arrays["sigma"],
+    )
+    mixture = Mixture(*(float(value) for value in arrays["mixture"]))
+    first = arrays["theta"], arrays["stars"], mixture
+    return _matched(given, detections, model, first, facts=summary.get("selfcal", {}))
+
+
+def _matched(
+    given: Given,
+    detections: Detections,
+    model: DistortionModel,
+    first: tuple[Float, Float, Mixture],
+    *,
+    facts: Mapping[str, Any],
+    table: Table | None = None,
+    magnitudes: tuple[Float, Float] | None = None,
+) -> SelfcalMatched:
+    theta, places, mixture = first
+    problem = given.problem(model, detections, theta, theta)
+    unused = facts.get("detections", {}).get("unused", {})
+    return SelfcalMatched(
+        matches_of(problem, places, detections, given.inputs, unused),
+        facts=facts,
+        table=table,
+        given=given,
+        detections=detections,
+        problem=problem,
+        theta=theta,
+        places=places,
+        mixture=mixture,
+        magnitudes=magnitudes,
+    )

@@ -1,0 +1,20 @@
+"""Artefacts of a run: each is made when what it was made from has changed."""
+
+from __future__ import annotations
+
+from bayesdist.app.store.keys import Adjustable, differences
+from bayesdist.app.store.record import SCHEMA, Artefact, Record, as_json, write_json
+from bayesdist.app.store.store import Made, RunStore, Stage
+
+__all__ = [
+    "SCHEMA",
+    "Adjustable",
+    "Artefact",
+    "Made",
+    "Record",
+    "RunStore",
+    "Stage",
+    "as_json",
+    "differences",
+    "write_json",
+]

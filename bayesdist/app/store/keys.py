@@ -1,0 +1,103 @@
+"""Keys of artefacts: a hash of what each was made from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+__all__ = ["Adjustable", "canonical", "difference", "differences", "digest_of", "shown"]
+
+
+@dataclass(frozen=True)
+class Adjustable:
+    """What may change while a stage goes on from its checkpoints: in its key, not in theirs."""
+
+    value: Any
+
+
+def canonical(value: Any) -> Any:
+    """A value as JSON, the same for values that are equal.
+
+    Parameters
+    ----------
+    value : object
+        Settings, a dataclass, arrays, paths, and mappings and sequences of these.
+
+    Returns
+    -------
+    object
+        Of mappings, lists, text, numbers and None.
+
+    Raises
+    ------
+    TypeError
+        For a value whose content is not known: it must not be in a key.
+    """
+    if isinstance(value, Adjustable):
+        return canonical(value.value)
+    if isinstance(value, BaseModel):
+        return canonical(value.model_dump())
+    if is_dataclass(value) and not isinstance(value, type):
+        return {one.name: canonical(getattr(value, one.name)) for one in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): canonical(one) for key, one in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return canonical(value.tolist())
+    if isinstance(value, list | tuple):
+        return [canonical(one) for one in value]
+    if isinstance(value, Path):
+        return str(value)
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    raise TypeError(f"{type(value).__name__} has no canonical form and cannot be in a key")
+
+
+def digest_of(value: Any) -> str:
+    """SHA-256 of a value's canonical form: 64 hexadecimal digits."""
+    text = json.dumps(canonical(value), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def differences(known: Any, now: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Dotted path, old and new value of whatever differs between two canonical values.
+
+    Mappings are compared key by key, lists of equal length row by row where they hold mappings.
+    """
+    if isinstance(known, Mapping) and isinstance(now, Mapping):
+        for key in dict.fromkeys([*known, *now]):
+            at = f"{path}.{key}" if path else str(key)
+            yield from differences(known.get(key), now.get(key), at)
+    elif _rows(known) and _rows(now) and len(known) == len(now):
+        for k, (one, other) in enumerate(zip(known, now, strict=True)):
+            yield from differences(one, other, f"{path}[{k + 1}]" if path else "")
+    elif known != now:
+        yield path, known, now
+
+
+def difference(known: Any, now: Any) -> str:
+    """The first difference in words, '' where there is none."""
+    for path, old, new in differences(known, now):
+        if path.startswith("from."):
+            return f"{path.removeprefix('from.')} has other results"
+        return f"{path} {shown(old)} is now {shown(new)}"
+    return ""
+
+
+def _rows(value: Any) -> bool:
+    """Boolean: a list of mappings."""
+    return isinstance(value, list) and all(isinstance(one, Mapping) for one in value)
+
+
+def shown(value: Any, longest: int = 60) -> str:
+    """A value as text that is not too long for a line."""
+    if value is None:
+        return "none"
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= longest else f"{text[: longest - 3]}..."

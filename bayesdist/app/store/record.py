@@ -1,0 +1,157 @@
+"""run.json: what a run is made from, and for each stage what it was made from and what it wrote."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayesdist.app.store.keys import digest_of
+from bayesdist.errors import InputError
+from bayesdist.files import atomic_path, sha256_of
+
+__all__ = ["SCHEMA", "Artefact", "FileMark", "Record", "as_json", "write_json"]
+
+SCHEMA = 2
+
+
+def as_json(value: Any) -> Any:
+    """A value as plain JSON: arrays as lists, and null for what is not a finite number."""
+    if isinstance(value, Mapping):
+        return {str(k): as_json(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [as_json(v) for v in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON file, replaced atomically."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json_text(value), encoding="utf-8")
+
+
+def json_text(value: Any) -> str:
+    """A value as the text of a JSON file."""
+    return json.dumps(as_json(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+@dataclass(frozen=True)
+class FileMark:
+    """Size and SHA-256 of a file as it was written."""
+
+    size: int
+    sha256: str
+
+    @classmethod
+    def of(cls, path: Path) -> FileMark:
+        """Mark of a file as it is now."""
+        return cls(path.stat().st_size, sha256_of(path))
+
+
+@dataclass(frozen=True)
+class Artefact:
+    """What a stage was made from, and what it wrote.
+
+    Parameters
+    ----------
+    key : str
+        Hash of `parts`.
+    parts : mapping
+        Revision of the stage, settings, and digests of the artefacts before it.
+    files : mapping of str to FileMark
+        By their path in the folder.
+    sections : mapping
+        Of summary.json.
+    """
+
+    key: str
+    parts: Mapping[str, Any]
+    files: Mapping[str, FileMark] = field(default_factory=dict)
+    sections: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def digest(self) -> str:
+        """Hash of what was written; of what it was made from where nothing was."""
+        written = {name: mark.sha256 for name, mark in self.files.items()}
+        return digest_of([written, self.sections] if written or self.sections else self.parts)
+
+    @classmethod
+    def from_json(cls, raw: Mapping[str, Any]) -> Artefact:
+        """Back from run.json."""
+        files = {name: FileMark(**mark) for name, mark in raw["files"].items()}
+        return cls(**{**raw, "files": files})
+
+
+@dataclass
+class Record:
+    """Content of run.json.
+
+    Parameters
+    ----------
+    facts : dict
+        What the run is made from: configuration, inputs, versions.
+    artefacts : dict of str to Artefact
+        Of the stages that have ended.
+    stages : dict of str to dict
+        When each of them ended, and how long it took.
+    under_way : dict, optional
+        Of the stage that has begun and not ended: its name, and the files that it may have written.
+    checkpoints : dict of str to str
+        Of stages with checkpoints: the hash of what these were made from.
+    """
+
+    facts: dict[str, Any]
+    artefacts: dict[str, Artefact] = field(default_factory=dict)
+    stages: dict[str, dict[str, Any]] = field(default_factory=dict)
+    under_way: dict[str, Any] | None = None
+    checkpoints: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, path: Path) -> Record:
+        """Read run.json.
+
+        Raises
+        ------
+        InputError
+            For a file that cannot be read, and for a run of another version of the package.
+        """
+        try:
+            facts = json.loads(path.read_text(encoding="utf-8"))
+            schema = facts.pop("schema")
+            if schema == SCHEMA:
+                found = facts.pop("artefacts")
+                artefacts = {name: Artefact.from_json(one) for name, one in found.items()}
+                rest = {key: facts.pop(key) for key in ("stages", "under_way", "checkpoints")}
+                return cls(facts, artefacts, **rest)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InputError(
+                "cannot be read", where=str(path), do="restore it, or choose another folder"
+            ) from error
+        made_by = facts.get("versions", {}).get("bayesdist", "another version")
+        raise InputError(
+            f"is a run of schema {schema}, which the bayesdist that made it ({made_by}) reads, and "
+            f"this one reads schema {SCHEMA}",
+            where=str(path),
+            do="use that version, or choose another folder",
+        )
+
+    def write(self, path: Path) -> None:
+        """Replace run.json."""
+        write_json(path, self.as_dict())
+
+    def as_dict(self) -> dict[str, Any]:
+        """Content of run.json as plain values."""
+        found = {name: asdict(one) for name, one in self.artefacts.items()}
+        whole = {"schema": SCHEMA, **self.facts, "stages": self.stages, "artefacts": found}
+        return as_json(whole | {"under_way": self.under_way, "checkpoints": self.checkpoints})

@@ -1,0 +1,421 @@
+"""Artefacts in a folder: loaded where what they were made from stands, and else made."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from fnmatch import fnmatch
+from pathlib import Path
+from time import monotonic
+from typing import Any, Generic, TypeVar
+
+from bayesdist.app.store.keys import Adjustable, canonical, difference, digest_of
+from bayesdist.app.store.record import (
+    SCHEMA,
+    Artefact,
+    FileMark,
+    Record,
+    as_json,
+    json_text,
+    write_json,
+)
+from bayesdist.errors import InputError
+from bayesdist.files import is_leftover, remove_leftovers, watched_writes
+
+__all__ = ["Made", "RunStore", "Stage"]
+
+T = TypeVar("T")
+
+try:
+    import fcntl
+except ImportError:  # systems that know no such locks
+    fcntl = None  # type: ignore[assignment]
+
+RECORD, SUMMARY = "run.json", "summary.json"
+
+log = logging.getLogger("bayesdist")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What a store has to know of a stage.
+
+    Parameters
+    ----------
+    revision : int
+        Raised when the numbers of the stage change.
+    checkpoints : tuple of str
+        Patterns of the files by which it goes on where it was interrupted.
+    """
+
+    revision: int = 1
+    checkpoints: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Made(Generic[T]):
+    """An artefact that stands.
+
+    Parameters
+    ----------
+    name : str
+        Of its stage.
+    digest : str
+        Hash of what was written: what is made from the artefact has it in its key.
+    value : object
+        What the stage has given; None where it was not run now, as the artefact stood before.
+    """
+
+    name: str
+    digest: str
+    value: T | None = None
+
+
+class RunStore:
+    """Artefacts of a run.
+
+    An artefact stands while its key, a hash of what it was made from, and its files are as they
+    were.  What a stage writes is noted in run.json before it takes its name, so that all of it is
+    known at whatever moment a process is killed.
+
+    Parameters
+    ----------
+    folder : Path
+        With a run.json.
+    stages : mapping of str to Stage
+        By name, in order.
+    head : callable, optional
+        What summary.json says of the run as a whole, from the facts of run.json.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        stages: Mapping[str, Stage],
+        head: Callable[[Mapping[str, Any]], Mapping[str, Any]] = lambda facts: {},
+    ) -> None:
+        self.folder, self.stages, self.head = folder, stages, head
+        # of the stage that is being made here
+        self._making = ""
+        self._sections: dict[str, Any] = {}
+        self._written: set[str] = set()
+
+    # -- what is there ----------------------------------------------------------------------------
+
+    @property
+    def record(self) -> Record:
+        """Content of run.json."""
+        return Record.read(self.folder / RECORD)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Sections of summary.json: of the stages that have ended, and of the one under way.
+
+        A stage that is made anew sees those of the stages before it and its own.  Sections of a
+        function that is called by itself, outside of a stage, are here and in no file.
+        """
+        return self._merged(self.record, before=self._making) | self._sections
+
+    def _merged(self, record: Record, before: str = "") -> dict[str, Any]:
+        """Sections of the artefacts, later stages in place of earlier ones."""
+        out: dict[str, Any] = {}
+        for name in self.stages:
+            if name == before:  # never, where that is empty
+                break
+            if name in record.artefacts:
+                out |= record.artefacts[name].sections
+        return out
+
+    def standing(self, name: str, *made_from: object) -> Made[Any] | None:
+        """The artefact of a stage, where its key and the sizes of its files are as they were."""
+        artefact = self.record.artefacts.get(name)
+        if artefact is None or artefact.key != digest_of(self._parts(name, made_from)):
+            return None
+        if self._harmed(artefact, thorough=False):
+            return None
+        return Made(name, artefact.digest)
+
+    def _parts(self, name: str, made_from: tuple[object, ...]) -> dict[str, Any]:
+        """What an artefact is made from, as run.json has it."""
+        made = {one.name: one.digest for one in made_from if isinstance(one, Made)}
+        parts: dict[str, Any] = {"revision": self.stages[name].revision, "from": made}
+        for one in made_from:
+            if not isinstance(one, Made):
+                parts |= canonical(one)
+        return parts
+
+    def _harmed(self, artefact: Artefact, *, thorough: bool) -> str:
+        """The first file that is not as the stage left it, '' where all are."""
+        for name, mark in artefact.files.items():
+            path = self.folder / name
+            if not path.is_file() or path.stat().st_size != mark.size:
+                return name
+            if thorough and FileMark.of(path) != mark:
+                return name
+        return ""
+
+    def harmed(self, name: str, *, thorough: bool = True) -> str:
+        """The first file of a stage that has changed since it was written, '' for none."""
+        artefact = self.record.artefacts.get(name)
+        return "" if artefact is None else self._harmed(artefact, thorough=thorough)
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes from writing into the folder; the lock dies with the process.
+
+        Raises
+        ------
+        InputError
+            Where another one has it.
+        """
+        if fcntl is None:
+            yield
+            return
+        held = os.open(self.folder, os.O_RDONLY)
+        try:
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise InputError(
+                    "another process is at work on this run",
+                    where=str(self.folder),
+                    do="wait until it has ended, or choose another folder",
+                ) from error
+            except OSError as error:  # file systems that know no locks
+                log.debug("%s cannot be locked: %s", self.folder, error)
+            yield
+        finally:
+            os.close(held)
+
+    # -- making -----------------------------------------------------------------------------------
+
+    def stage(
+        self, name: str, function: Callable[[], T], *made_from: object, force: bool = False
+    ) -> Made[T]:
+        """The artefact of a stage, which is made unless it stands.
+
+        Parameters
+        ----------
+        name : str
+        function : callable
+            Writes files into the folder, and sections by `summarise`.
+        *made_from : object
+            `Made`, and mappings whose values have a canonical form.
+        force : bool
+            Make it also where it stands.
+
+        Returns
+        -------
+        Made
+        """
+        parts, record = self._parts(name, made_from), self.record
+        key, known = digest_of(parts), record.artefacts.get(name)
+        harmed = "" if known is None else self._harmed(known, thorough=True)
+        if known is not None and known.key == key and not harmed and not force:
+            log.info("%s: done before", name)
+            return Made(name, known.digest)
+        log.info("%s: begins%s", name, _reason(known, parts, harmed))
+        fixed = tuple(one for one in made_from if not isinstance(one, Adjustable))
+        self._begin(record, name, digest_of(self._parts(name, fixed)), harmed)
+        started = monotonic()
+        with self._noted(name):
+            value = function()
+        artefact = self._end(name, key, parts, monotonic() - started)
+        return Made(name, artefact.digest, value)
+
+    def summarise(self, **sections: Any) -> None:
+        """Replace sections of summary.json, for the stage that is under way."""
+        self._sections |= as_json(sections)
+
+    @contextmanager
+    def amended(self, name: str, *made_from: object) -> Iterator[dict[str, Any]]:
+        """Note what a command writes as part of a stage.
+
+        Parameters
+        ----------
+        name : str
+        *made_from : object
+            What the artefact is made from afterwards; nothing where it does not stand.
+
+        Yields
+        ------
+        dict
+            Facts of the record, which may be changed.
+        """
+        record, self._sections = self.record, {}
+        known = record.artefacts.get(name)
+        written: set[str] = set()
+
+        def note(path: Path) -> None:
+            name = self._own(path)
+            if name is not None:
+                written.add(name)
+
+        with watched_writes(note):
+            yield record.facts
+        parts = self._parts(name, made_from) if known and made_from else {}
+        known = known or Artefact("", {})
+        files = {one: FileMark.of(self.folder / one) for one in written if self._is_there(one)}
+        files = {one: mark for one, mark in known.files.items() if self._is_there(one)} | files
+        sections = {**known.sections, **self._sections}
+        key = digest_of(parts) if parts else ""
+        record.artefacts[name], self._sections = Artefact(key, parts, files, sections), {}
+        self._write(record)
+
+    def _begin(self, record: Record, name: str, checkpoints: str, harmed: str) -> None:
+        """Note that a stage begins, and remove what it wrote before: it must not see that."""
+        patterns = self.stages[name].checkpoints
+        before = record.under_way or {"stage": name, "files": []}
+        known = record.artefacts.pop(name, None)
+        record.stages.pop(name, None)
+        remove_leftovers(self.folder)
+        files = set(known.files) if known else set()
+        if before["stage"] == name:
+            files |= set(before["files"])
+        else:
+            self._remove(before["files"], record)  # of another stage that did not end
+        record.under_way = {"stage": name, "files": sorted(files)}
+        if patterns:
+            if record.checkpoints.get(name) != checkpoints or _is_one_of(harmed, patterns):
+                if record.checkpoints.pop(name, None) is not None:
+                    self._write(record)  # first: what is half removed never counts
+                self._remove(self._checkpoints(name), record)
+            record.checkpoints[name] = checkpoints
+        self._sections, self._written = {}, set()
+        self._write(record)  # first: what is half removed never counts
+        self._remove({one for one in files if not _is_one_of(one, patterns)}, record)
+
+    def _end(self, name: str, key: str, parts: Mapping[str, Any], seconds: float) -> Artefact:
+        """Note that a stage has ended."""
+        record = self.record
+        written = {one for one in self._written if self._is_there(one)}
+        written |= set(self._checkpoints(name))
+        marks = {one: FileMark.of(self.folder / one) for one in sorted(written)}
+        artefact = Artefact(key, parts, marks, self._sections)
+        self._drop_sections(record, name, artefact)
+        record.artefacts[name], record.under_way, self._sections = artefact, None, {}
+        ended = datetime.now(UTC).isoformat(timespec="seconds")
+        record.stages[name] = {"wall_s": seconds, "ended": ended}
+        record.artefacts = self._in_order(record.artefacts)
+        record.stages = self._in_order(record.stages)
+        self._write(record)
+        return artefact
+
+    def _drop_sections(self, record: Record, name: str, artefact: Artefact) -> None:
+        """Drop sections of a stage from later ones that added to them, made from something else."""
+        stale: set[str] = set()
+        for later in list(self.stages)[list(self.stages).index(name) + 1 :]:
+            known = record.artefacts.get(later)
+            made_from = {} if known is None else known.parts.get("from", {})
+            if known is not None and (
+                made_from.get(name, artefact.digest) != artefact.digest or stale & made_from.keys()
+            ):
+                stale.add(later)
+                kept = {k: v for k, v in known.sections.items() if k not in artefact.sections}
+                record.artefacts[later] = replace(known, sections=kept)
+
+    def _in_order(self, found: dict[str, Any]) -> dict[str, Any]:
+        """What there is of stages, in the order of these."""
+        return {one: found[one] for one in self.stages if one in found}
+
+    def _is_there(self, name: str) -> bool:
+        """Boolean: a file of the folder exists."""
+        return (self.folder / name).is_file()
+
+    @contextmanager
+    def _noted(self, stage: str) -> Iterator[None]:
+        """Note in run.json whatever is written, before it takes its name."""
+
+        def note(path: Path) -> None:
+            name = self._own(path)
+            if name is None:
+                return
+            self._written.add(name)
+            record = self.record
+            assert record.under_way is not None
+            if name not in record.under_way["files"]:
+                record.under_way["files"] = sorted([*record.under_way["files"], name])
+                record.write(self.folder / RECORD)
+
+        self._making = stage
+        try:
+            with watched_writes(note):
+                yield
+        finally:
+            self._making = ""
+
+    def _own(self, path: Path) -> str | None:
+        """Name of a file in the folder, None for one elsewhere and for the record itself."""
+        path, folder = path.absolute(), self.folder.absolute()
+        if not path.is_relative_to(folder):
+            return None
+        name = path.relative_to(folder).as_posix()
+        checkpoints = (one for stage in self.stages.values() for one in stage.checkpoints)
+        return None if name in (RECORD, SUMMARY) or _is_one_of(name, (*checkpoints,)) else name
+
+    def _checkpoints(self, name: str) -> list[str]:
+        """Files by which a stage goes on, as they are there."""
+        found = (path for one in self.stages[name].checkpoints for path in self.folder.glob(one))
+        return sorted(path.name for path in found)
+
+    def _write(self, record: Record) -> None:
+        """Write run.json, and summary.json where it is another."""
+        self.restore_summary(record)
+        record.write(self.folder / RECORD)
+
+    def restore_summary(self, record: Record | None = None) -> None:
+        """Write summary.json as the stages that have ended have it, where it is not so."""
+        record = record or self.record
+        path, sections = self.folder / SUMMARY, self._merged(record)
+        if not sections:
+            path.unlink(missing_ok=True)
+            return
+        content = {"schema": SCHEMA, **self.head(record.facts), **sections}
+        text = json_text(content)
+        if not path.is_file() or path.read_bytes() != text.encode():
+            write_json(path, content)
+
+    # -- removing ---------------------------------------------------------------------------------
+
+    def clear(self, *others: str) -> None:
+        """Remove what the run wrote, and some other files; the record goes last."""
+        record = self.record
+        files = {one for artefact in record.artefacts.values() for one in artefact.files}
+        files |= set((record.under_way or {}).get("files", ()))
+        files |= {one for name in self.stages for one in self._checkpoints(name)}
+        record.artefacts = {}
+        self._remove({*files, *others, SUMMARY}, record)
+        self._remove({RECORD}, record)
+
+    def _remove(self, names: Any, record: Record) -> None:
+        """Remove files that belong to no other artefact, and the folders that they leave empty."""
+        others = {one for artefact in record.artefacts.values() for one in artefact.files}
+        folders = set()
+        for name in set(names) - others:
+            path = self.folder / name
+            path.unlink(missing_ok=True)
+            folders.add(path.parent)
+        for folder in folders - {self.folder}:
+            if folder.is_dir():
+                remove_leftovers(folder)
+                if not any(not is_leftover(one.name) for one in folder.iterdir()):
+                    folder.rmdir()
+
+
+def _reason(known: Artefact | None, parts: Mapping[str, Any], harmed: str) -> str:
+    """Why an artefact is made anew, as the end of a line; '' where it was never made."""
+    if known is None:
+        return ""
+    if harmed:
+        return f" again, as {harmed} is not what it wrote"
+    changed = difference(known.parts, parts)
+    return f" again, as {changed}" if changed else " again"
+
+
+def _is_one_of(name: str, patterns: tuple[str, ...]) -> bool:
+    """Boolean: a file name fits one of some patterns."""
+    return any(fnmatch(name, one) for one in patterns)

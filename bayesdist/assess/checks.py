@@ -1,0 +1,89 @@
+"""Checks of what an evaluation takes for granted: the matching, the catalogue, the dates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.checks import EITHER, LARGER, Check
+from bayesdist.limits import MATCH_RADIUS
+from bayesdist.model.timedep import TimeDependence
+
+__all__ = ["catalogue_checks", "matching_checks", "time_checks", "visits_of"]
+
+Float = NDArray[np.float64]
+
+GROUP = "Assumptions"
+
+
+def matching_checks(
+    match_radius: float | None, sigma: float, *, in_circle: bool
+) -> Iterator[Check]:
+    """Check of residuals that the match circle may have cut off, unknown to the likelihood.
+
+    `match_radius`: in the unit of u and v. `sigma`: usual error of a star. `in_circle`: True if the
+    likelihood knows of the circles.
+    """
+    if in_circle or match_radius is None or MATCH_RADIUS.met_by(match_radius / sigma):
+        return
+    yield Check(
+        GROUP,
+        sentence=f"stars were matched within {match_radius / sigma:.1f} of their errors of nominal "
+        "positions that are not given, which cuts the scatter and draws the fit: match again with "
+        "a wider match radius, or give the columns u_nominal and v_nominal",
+        doubt=LARGER,
+    )
+
+
+def catalogue_checks(catalogue_stated: bool | None) -> Iterator[Check]:
+    """Check that the errors of the reference catalogue are stated; None without a catalogue."""
+    if catalogue_stated is False:
+        yield Check(
+            GROUP,
+            sentence="no error of the reference catalogue is stated: give a [[budget]] row that "
+            "names the catalogue, of size 0 with its source where it has none",
+            doubt=LARGER,
+        )
+
+
+def time_checks(
+    time: TimeDependence | None, dates: Float, motions_stated: bool | None
+) -> Iterator[Check]:
+    """Checks that the data determine a drift, and that the motions' errors are stated.
+
+    `time`: nothing is checked without. `dates`: of the matches, decimal years. `motions_stated`:
+    None without a catalogue.
+    """
+    if time is None:
+        return
+    visits = visits_of(dates)
+    counts, _ = np.histogram(visits, [-np.inf, *time.breaks, np.inf])
+    if visits.size and counts[counts > 0].min() <= 2:
+        yield Check(
+            GROUP,
+            sentence=f"a drift is fitted to {counts[counts > 0].min()} dates, so that neither the "
+            "variation between exposures nor the curvature of the drift is measured",
+            doubt=EITHER,
+        )
+    if motions_stated is False:
+        yield Check(
+            GROUP,
+            sentence="no error of the catalogue's proper motions is stated, and the drift is "
+            "measured against them: give a [[budget]] row that names the motions, of size 0 with "
+            "its source where they have none",
+            doubt=LARGER,
+        )
+
+
+def visits_of(dates: Float) -> Float:
+    """Dates of which none are next to the same, in rising order: exposures of a visit are one.
+
+    Those within a day, or a fiftieth of the whole time.
+    """
+    if not dates.size:
+        return dates
+    apart = max(1 / 365.25, (dates.max() - dates.min()) / 50)
+    ordered = np.sort(dates)
+    return np.asarray(ordered[np.append(True, np.diff(ordered) > apart)])

@@ -1,0 +1,399 @@
+"""The evaluation of a calibration: maps, budget, margins and one verdict, as one value."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.area import AreaMap, area_map
+from bayesdist.assess.budget.budget import ErrorBudget, budget_of
+from bayesdist.assess.budget.surface import BudgetSurface, budget_surface
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.drawn import DrawnErrors
+from bayesdist.assess.error_model import ErrorModel
+from bayesdist.assess.maps import RELATIVE, UncertaintyMap, uncertainty_map, with_local
+from bayesdist.assess.requirements.margins import Margin, judge
+from bayesdist.assess.requirements.requirement import Requirement
+from bayesdist.assess.requirements.rests_on import rests_on
+from bayesdist.assess.requirements.validity import Horizon, horizon_of
+from bayesdist.assess.requirements.verdict import effective_draws
+from bayesdist.assess.terms.centroid import centroids_of
+from bayesdist.assess.terms.correlated import StructureErrors
+from bayesdist.assess.terms.forms import Known
+from bayesdist.assess.terms.given import Centroids
+from bayesdist.assess.units import pixel_scale_of
+from bayesdist.checks import Check, in_order, worst
+from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.errors import InputError
+from bayesdist.infer import LinearFit, Posterior
+from bayesdist.infer.selfcal import gauge_free
+from bayesdist.infer.selfcal.relative import gauge_free_matrix
+from bayesdist.model import Chip
+from bayesdist.model.grid import DEFAULT_GRID
+from bayesdist.streams import restarted
+
+__all__ = [
+    "Evaluation",
+    "EvaluationSettings",
+    "budget_over",
+    "drawn_errors",
+    "evaluate",
+    "judged",
+    "validity_of",
+]
+
+Float = NDArray[np.float64]
+
+VALIDITY_DRAWS = 1000  # for each of its epochs
+VALIDITY_EPOCHS = 40  # of a curve
+YEARS_AHEAD = 10.0  # to which the budget at every position is extrapolated
+
+ERRORS = "Errors"
+VERDICT_LEVELS = {"met": "pass", "undecided": "warn", "missed": "fail"}
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluationSettings:
+    """Epoch, grid and number of draws at which errors are evaluated.
+
+    Parameters
+    ----------
+    grid : tuple of int
+        Points on x and y of a chip.
+    epoch : float or None
+        Decimal years.
+    draws : int
+    years_ahead : float
+        Over which validity periods are looked for; 0 for none.
+    scale_mas : float or None
+        Size of a pixel, where it is given.
+    single : bool
+        Whether errors of a single exposure are asked for.
+    contained : sequence of (name, sigma_u, sigma_v)
+        Errors that the residuals hold beside those of the centroids, in the unit of the solution.
+    given : tuple of str
+        Names of the errors that the user gives.
+    dates : ndarray
+        Of the matches, decimal years.
+    """
+
+    grid: tuple[int, int] = DEFAULT_GRID
+    epoch: float | None = None
+    draws: int = 4000
+    years_ahead: float = 0.0
+    scale_mas: float | None = None
+    single: bool = False
+    contained: Sequence[tuple[str, float, float]] = ()
+    given: tuple[str, ...] = ()
+    dates: Float = field(default_factory=lambda: np.zeros(0))
+
+    def domain(self, errors: ErrorModel) -> EvaluationDomain:
+        """The grid of all chips."""
+        model = errors.solution.solution.model
+        return EvaluationDomain.of_chips(model, self.grid, epoch=self.epoch)
+
+    def pixel_scale(self, errors: ErrorModel) -> float | None:
+        """Size of a pixel in mas, as given or of the solution."""
+        return pixel_scale_of(errors.solution.solution, scale_mas=self.scale_mas)
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Errors of a calibration, and how they stand against requirements.
+
+    Parameters
+    ----------
+    settings : EvaluationSettings
+    formal, maps : tuple of UncertaintyMap
+        Of least squares, and with all errors that all positions near one share, on each chip.
+    relative : tuple of UncertaintyMap
+        Of relative positions, where the gauge is a question.
+    areas : tuple of AreaMap
+    budget : ErrorBudget
+        Over the grid of all chips.
+    surface : BudgetSurface or None
+        At every position and epoch; None where errors contradict each other.
+    margins : tuple of Margin
+    validity : tuple of Horizon
+        Until when requirements are met; empty where nothing depends on time.
+    checks : tuple of Check
+    """
+
+    settings: EvaluationSettings
+    formal: tuple[UncertaintyMap, ...]
+    maps: tuple[UncertaintyMap, ...]
+    relative: tuple[UncertaintyMap, ...]
+    areas: tuple[AreaMap, ...]
+    budget: ErrorBudget
+    surface: BudgetSurface | None
+    margins: tuple[Margin, ...]
+    validity: tuple[Horizon, ...]
+    checks: tuple[Check, ...]
+
+    @property
+    def verdict(self) -> tuple[str, tuple[str, ...]]:
+        """The worst level of all checks and margins, and the reasons for it."""
+        found = (*self.checks, *(_of_margin(one) for one in self.margins))
+        level = worst(found)
+        return level, tuple(one.text or one.name for one in found if one.level == level != "pass")
+
+
+def _of_margin(margin: Margin) -> Check:
+    """A margin as a check."""
+    sentence = f"{margin.requirement.name}: {margin.verdict}: {margin.reason}"
+    return Check("Requirements", level=VERDICT_LEVELS[margin.verdict], sentence=sentence)
+
+
+def evaluate(
+    errors: ErrorModel,
+    diagnostics: Diagnostics,
+    requirements: Sequence[Requirement],
+    settings: EvaluationSettings,
+    rng: np.random.Generator,
+    *,
+    fit: LinearFit,
+    solution: Posterior,
+    checks: Sequence[Check] = (),
+    files: Sequence[Known] = (),
+    null: Float | None = None,
+) -> Evaluation:
+    """Maps, budget, margins and validity periods of a calibration.
+
+    Parameters
+    ----------
+    errors : ErrorModel
+    diagnostics : Diagnostics
+    requirements : sequence of Requirement
+    settings : EvaluationSettings
+    rng : numpy.random.Generator
+        Each result is made from its numbers from their beginning.
+    fit : LinearFit
+    solution : Posterior
+        With all errors of the parameters in its draws.
+    checks : sequence of Check
+        What is known beside: of the matching, the sampling, the fit and the catalogue.
+    files : sequence of Known
+        What files differ by from the solution.
+    null : ndarray, shape (D, d), optional
+        Directions that the gauge decides: relative positions are mapped, too.
+
+    Returns
+    -------
+    Evaluation
+
+    Raises
+    ------
+    InputError
+        For a requirement that cannot be judged.
+    """
+    chips = solution.model.chips
+    on_chip = [
+        {"grid": settings.grid, "epoch": settings.epoch, "chip": chip.number} for chip in chips
+    ]
+    own = _own_checks(errors, diagnostics, settings)
+    every = in_order((*checks, *diagnostics.checks, *own))
+    whole = drawn_errors(errors, diagnostics, settings, rng, files=files)
+    surface = None
+    if _contradiction(diagnostics, settings) is None:
+        years = _years(solution, diagnostics, settings.epoch)
+        surface = budget_surface(whole, settings.grid, epoch=settings.epoch, years=years)
+    maps = []
+    for chip, where in zip(chips, on_chip, strict=True):
+        local = errors.structure_sigma(_domain(solution, chip, settings))
+        maps.append(with_local(uncertainty_map(solution, **where), local))
+    return Evaluation(
+        settings=settings,
+        formal=tuple(uncertainty_map(fit, **where) for where in on_chip),
+        maps=tuple(maps),
+        relative=()
+        if null is None
+        else tuple(_relative(solution, diagnostics, null, chip, settings) for chip in chips),
+        areas=tuple(area_map(solution, **where) for where in on_chip),
+        budget=budget_of(whole, settings.domain(errors)),
+        surface=surface,
+        margins=judged(errors, diagnostics, requirements, settings, rng, checks=every, drawn=whole),
+        validity=validity_of(errors, diagnostics, requirements, settings, rng),
+        checks=every,
+    )
+
+
+def drawn_errors(
+    errors: ErrorModel,
+    diagnostics: Diagnostics,
+    settings: EvaluationSettings,
+    rng: np.random.Generator,
+    *,
+    files: Sequence[Known] = (),
+    n: int | None = None,
+) -> DrawnErrors:
+    """Draws of all errors: those of the centroids, and of files, among them.
+
+    `errors`, `diagnostics`, `settings`, `rng`, `files`: as `evaluate`. `n`: number of draws.
+    """
+    known = _contradiction(diagnostics, settings) is None
+    centroids = centroids_of(diagnostics, settings.contained) if known else None
+    model = errors.with_terms(Centroids(centroids), *files)
+    return model.drawn(n or settings.draws, restarted(rng))
+
+
+def budget_over(
+    errors: ErrorModel, settings: EvaluationSettings, rng: np.random.Generator, n: int | None = None
+) -> ErrorBudget:
+    """The budget over the grid of all chips."""
+    return errors.at(settings.domain(errors), n=n or settings.draws, rng=restarted(rng))
+
+
+def judged(
+    errors: ErrorModel,
+    diagnostics: Diagnostics,
+    requirements: Sequence[Requirement],
+    settings: EvaluationSettings,
+    rng: np.random.Generator,
+    *,
+    checks: Sequence[Check] = (),
+    drawn: DrawnErrors | None = None,
+) -> tuple[Margin, ...]:
+    """Margins of requirements, and what they rest on.
+
+    `errors`, `diagnostics`, `requirements`, `settings`, `rng`: as `evaluate`. `checks`: all of
+    them: their doubts keep verdicts from being given. `drawn`: as of `drawn_errors`. InputError for
+    a requirement that cannot be judged.
+    """
+    if not requirements:
+        return ()
+    contradiction = _contradiction(diagnostics, settings)
+    if contradiction is not None and any(r.magnitude is not None for r in requirements):
+        raise contradiction
+    if drawn is None:
+        drawn = drawn_errors(errors, diagnostics, settings, rng)
+    margins = judge(
+        drawn,
+        requirements,
+        grid=settings.grid,
+        epoch=settings.epoch,
+        pixel_scale=settings.pixel_scale(errors),
+        checks=checks,
+    )
+    return tuple(
+        replace(
+            _where_stars_are(margin, diagnostics, settings.grid),
+            rests_on=rests_on(
+                errors.solution.solution.model,
+                diagnostics,
+                margin.epoch,
+                given=settings.given,
+                aligned=errors.aligned,
+                single=settings.single,
+                dates=settings.dates,
+            ),
+        )
+        for margin in margins
+    )
+
+
+def validity_of(
+    errors: ErrorModel,
+    diagnostics: Diagnostics,
+    requirements: Sequence[Requirement],
+    settings: EvaluationSettings,
+    rng: np.random.Generator,
+) -> tuple[Horizon, ...]:
+    """Until when requirements at one date are met, on fewer draws than their margins.
+
+    `errors`, `diagnostics`, `requirements`, `settings`, `rng`: as `evaluate`. The result is empty
+    where nothing depends on time.
+    """
+    epoch = diagnostics.sample.table.epoch
+    if errors.solution.solution.model.time is None or not requirements or not settings.years_ahead:
+        return ()
+    assert epoch is not None  # the model depends on time
+    last = float(np.max(epoch))
+    n = min(VALIDITY_DRAWS, settings.draws)
+    drawn = drawn_errors(errors, diagnostics, settings, rng, n=n)
+    return tuple(
+        horizon_of(
+            drawn,
+            r,
+            np.linspace(last, last + settings.years_ahead, VALIDITY_EPOCHS),
+            grid=settings.grid,
+            n_effective=effective_draws(drawn.solution, n),
+            pixel_scale=settings.pixel_scale(errors),
+        )
+        for r in requirements
+        if r.epochs is None
+    )
+
+
+def _own_checks(
+    errors: ErrorModel, diagnostics: Diagnostics, settings: EvaluationSettings
+) -> Iterator[Check]:
+    """Checks of requests that cannot be met."""
+    linear = None if diagnostics.correlated is None else diagnostics.correlated.linear
+    measured = errors.aligned or (linear is not None and bool(linear.kinds))
+    if settings.single and not measured:
+        yield Check(
+            ERRORS,
+            level="warn",
+            sentence="assess.exposure is 'single', and how single exposures deviate is not known "
+            "here, so that errors are those in their mean",
+        )
+    error = _contradiction(diagnostics, settings)
+    if error is not None:
+        what = f"{error.where}: {error.cause}, so that no budget of single positions can be made"
+        yield Check(ERRORS, level="warn", sentence=what)
+
+
+def _contradiction(diagnostics: Diagnostics, settings: EvaluationSettings) -> InputError | None:
+    """Error of a term that is larger than the residuals said to hold it; None where none is."""
+    try:
+        centroids_of(diagnostics, settings.contained)
+    except InputError as error:
+        return error
+    return None
+
+
+def _where_stars_are(margin: Margin, diagnostics: Diagnostics, grid: tuple[int, int]) -> Margin:
+    """A margin that is not met where it is judged on pixels that no stars cover."""
+    for one in diagnostics.coverage:
+        if margin.verdict == "met" and margin.requirement.reaches_beyond(one, grid):
+            return replace(margin, verdict="undecided", reason=one.sentence)
+    return margin
+
+
+def _years(
+    solution: Posterior, diagnostics: Diagnostics, epoch: float | None
+) -> tuple[float, float] | None:
+    """First and last epoch of the budget at every date."""
+    epochs = diagnostics.sample.table.epoch
+    if solution.model.time is None or epochs is None:
+        return None
+    seen = [*epochs, epoch]
+    return float(min(seen)), float(max(seen)) + YEARS_AHEAD
+
+
+def _domain(solution: Posterior, chip: Chip, settings: EvaluationSettings) -> EvaluationDomain:
+    return EvaluationDomain.of_chips(
+        solution.model, settings.grid, chips=(chip.number,), epoch=settings.epoch
+    )
+
+
+def _relative(
+    solution: Posterior,
+    diagnostics: Diagnostics,
+    null: Float,
+    chip: Chip,
+    settings: EvaluationSettings,
+) -> UncertaintyMap:
+    """Uncertainty of relative positions on a chip, with what the model leaves out."""
+    local, correlated = None, diagnostics.correlated
+    if correlated is not None and correlated.structure:
+        S = gauge_free_matrix(solution.model, np.asarray(solution.mean, float), null)
+        # of the detector alone: frames are no part of it
+        local = StructureErrors(correlated.moved(S)).sigma(_domain(solution, chip, settings))
+    found = uncertainty_map(
+        gauge_free(solution, null), grid=settings.grid, epoch=settings.epoch, chip=chip.number
+    )
+    return replace(with_local(found, local), kind=RELATIVE)

@@ -1,0 +1,100 @@
+"""Checks: what was found, against what limit, and what it means for whoever uses the numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+__all__ = [
+    "EITHER",
+    "LARGER",
+    "LEVELS",
+    "Check",
+    "doubts_of",
+    "in_order",
+    "level_of",
+    "warnings_of",
+    "worst",
+]
+
+LEVELS = ("note", "pass", "warn", "fail")  # from the least to the worst
+LARGER, EITHER = "larger", "either"
+
+# in which order a reader meets them
+GROUPS = (
+    "Sampling",
+    "Held-out truth",
+    "Campaign",
+    "Gauge",
+    "Score tests",
+    "Fit",
+    "Matching",
+    "Errors",
+    "Assumptions",
+    "Periods",
+    "Requirements",
+    "Products",
+)
+
+
+@dataclass(frozen=True)
+class Check:
+    """One criterion, or one remark.
+
+    Parameters
+    ----------
+    group : str
+        What it concerns: one of `GROUPS`.
+    name : str
+        What was checked, with its unit; empty for a remark, which has a sentence alone.
+    value : float or str
+        What was found.
+    limit : str
+        What is asked, in words; empty where nothing is.
+    level : str
+        'pass', 'warn', 'fail', or 'note' where nothing is asked.
+    sentence : str
+        What a reader of the numbers has to know, as a clause; empty where that is nothing.
+    doubt : str
+        What the sentence does to verdicts: `LARGER` where errors can only be larger for it, so that
+        nothing is met, and what is missed is missed all the same; `EITHER` where errors may be
+        smaller too, so that nothing is decided; empty where verdicts stand.
+    """
+
+    group: str
+    name: str = ""
+    value: float | str = ""
+    limit: str = ""
+    level: str = "note"
+    sentence: str = ""
+    doubt: str = ""
+
+    @property
+    def text(self) -> str:
+        """The sentence with a capital."""
+        return self.sentence[:1].upper() + self.sentence[1:]
+
+
+def in_order(checks: Iterable[Check]) -> tuple[Check, ...]:
+    """Checks by their groups, in each as they come."""
+    return tuple(sorted(checks, key=lambda one: GROUPS.index(one.group)))
+
+
+def level_of(good: bool, bad: str = "fail") -> str:
+    """'pass' for what is good, else another level."""
+    return "pass" if good else bad
+
+
+def worst(checks: Iterable[Check]) -> str:
+    """The worst level of some checks; 'pass' where nothing is wrong."""
+    return max((one.level for one in checks), key=LEVELS.index, default="pass")
+
+
+def warnings_of(checks: Iterable[Check]) -> tuple[str, ...]:
+    """Sentences of the checks that warn or fail."""
+    return tuple(one.text for one in checks if one.sentence and one.level in ("warn", "fail"))
+
+
+def doubts_of(checks: Iterable[Check]) -> tuple[Check, ...]:
+    """Checks that keep verdicts from being given."""
+    return tuple(one for one in checks if one.doubt)

@@ -1,0 +1,7 @@
+"""Discrepancy: structure outside the fitted model, with priors and posteriors of its own."""
+
+from bayesdist.diagnose.correlated.estimate import estimate_discrepancy
+from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
+from bayesdist.diagnose.correlated.result import Discrepancy
+
+__all__ = ["Discrepancy", "DiscrepancyPriors", "estimate_discrepancy"]

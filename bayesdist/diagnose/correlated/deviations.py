@@ -1,0 +1,349 @@
+"""Linear deviations of exposures from one another, and the curvature of drifts.
+
+Both are seen in differences between exposures only, and few of these determine little: two
+exposures do not determine a curvature, and hardly a scatter when a drift is fitted to them.  Then
+the prior decides, as it must in any extrapolation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import reduce
+from itertools import product
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from bayesdist.diagnose.correlated.information import GroupCells, Information
+from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_cauchy, log_widths
+from bayesdist.model import DistortionModel, Groups
+from bayesdist.model.frames import LINEAR_MATRICES
+
+__all__ = [
+    "DeviationColumns",
+    "LinearDeviations",
+    "deviation_columns",
+    "deviation_draws",
+    "linear_deviations",
+]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+# deviations of an exposure that scatter together, and the frames that fit them already
+KINDS = {
+    "shift": ("shift", "shift_rotation", "shift_rotation_scale", "affine"),
+    "rotation": ("shift_rotation", "shift_rotation_scale", "affine"),
+    "scale": ("shift_rotation_scale", "affine"),
+    "shear": ("affine",),
+}
+# and their parameters, but for shifts
+LINEAR = {
+    "rotation": ("rotation",),
+    "scale": ("scale",),
+    "shear": ("shear_plus", "shear_cross"),
+}
+SCATTERS = {"shift": "shift", "rotation": "rotation", "scale": "shape", "shear": "shape"}
+CURVATURE = "curvature"
+MAX_EXPOSURES = 40
+# steps in each amplitude, by the number of scatters: first to find where the density is, then only
+# there
+COARSE, REFINED = (12, 8, 6, 5), (30, 18, 11, 6)
+RANGE = 10.0  # range of amplitudes about the prior's median and the resolution of the data
+NEGLIGIBLE = 1e-3  # of the density, below the largest of an amplitude
+
+
+@dataclass(frozen=True, eq=False)
+class LinearDeviations:
+    """Draws of the deviations of exposures, and of the curvature of the drift."""
+
+    model: DistortionModel
+    # effect (n, D) of the deviations on the parameters of the fit, with the sign of its error
+    theta: Float
+    # chip (by code), axis and basis function that is curved in time
+    terms: tuple[tuple[int, int, int], ...]
+    # (n, terms) in the unit of u, v per squared year; half of it multiplies the squared time
+    curvature: Float
+    epoch: float  # zero of time, decimal years; NaN without curvature
+    scatter: dict[str, Float]  # draws (n,) of each scatter
+    n_exposures: int
+    # deviations of each exposure: of 'shift', 'rotation', 'scale' and 'shear'
+    kinds: tuple[str, ...] = ()
+    size: float = 1.0  # half the longer side of a chip, in the unit of u, v: that of a shift of 1
+
+    def polynomials(self, epoch: float | None, chip: int) -> Float:
+        """Coefficients (n, 2, K) on a chip of the curvature alone, at an epoch."""
+        out = np.zeros((len(self.curvature), 2, self.model.n_terms))
+        code = self.model.chip_code(chip)
+        for k, (c, axis, term) in enumerate(self.terms):
+            if c == code and epoch is not None:
+                out[:, axis, term] += 0.5 * self.curvature[:, k] * (epoch - self.epoch) ** 2
+        return out
+
+    def of_single_exposures(self, mean: Float, chip: int, rng: np.random.Generator) -> Float:
+        """Coefficients (n, 2, K) on a chip (by number) of the deviation of a future exposure.
+
+        The polynomials of the parameters `mean` (D,) are deformed.
+        """
+        code, n = self.model.chip_code(chip), len(self.theta)
+        at = np.array([self.model.time.epoch0[0] if self.model.time else 0.0])
+        P = self.model.polynomials(mean, np.array([code]), at)[0].copy()
+        P[:, 0] = 0.0
+        along = np.zeros((2, *P.shape))
+        along[0, 0, 0] = along[1, 1, 0] = self.size
+        out = np.zeros((n, *P.shape))
+        for kind in self.kinds:
+            fields = along if kind == "shift" else [LINEAR_MATRICES[k] @ P for k in LINEAR[kind]]
+            for field in fields:
+                size = self.scatter[SCATTERS[kind]] * rng.standard_normal(n)
+                out += size[:, None, None] * field
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class DeviationColumns:
+    """Functions whose coefficients scatter: displacements of the stars of some groups."""
+
+    model: DistortionModel
+    theta: Float
+    kinds: tuple[str, ...]  # deviations of each exposure
+    # chip (by code), axis and basis function that is curved in time
+    terms: tuple[tuple[int, int, int], ...]
+    scatter: NDArray[np.str_]  # name (n,) of the scatter that each coefficient has
+    of_group: Int  # exposure (G,) of each group of stars, from 0
+    n_exposures: int
+    middle: float  # zero of time; NaN without terms
+    size: float  # half the longer side of a chip, in the unit of u, v
+
+    def __len__(self) -> int:
+        return len(self.scatter)
+
+    @property
+    def n_of_exposures(self) -> int:
+        """Number of coefficients that are deviations of exposures; they come first."""
+        return len(self) - len(self.terms)
+
+    def positions(self, chip: int, epoch: float, phi: Float) -> Float:
+        """Positions (C, 2) along the axes of the polynomials, given the basis (C, K)."""
+        poly = self.model.polynomials(self.theta, np.array([chip]), np.array([epoch]))
+        return np.asarray(phi @ poly[..., 0, :, :].T)
+
+    def at(self, g: int, chip: int, epoch: float, phi: Float, centre: Float) -> tuple[Int, Float]:
+        """Indices (q,) of the functions that displace stars of a group, and their values (C, 2, q).
+
+        Exposures deviate about `centre` (2,); `phi` (C, K) is the model's basis at the stars.
+        """
+        own = _deviations(self.positions(chip, epoch, phi) - centre, self.kinds, self.size)
+        columns = int(self.of_group[g]) * own.shape[2] + np.arange(own.shape[2])
+        here = [k for k, term in enumerate(self.terms) if term[0] == chip]
+        out = np.zeros((len(phi), 2, len(here)))
+        for k, number in enumerate(here):
+            _, axis, term = self.terms[number]
+            out[:, axis, k] = 0.5 * (epoch - self.middle) ** 2 * self.size * phi[:, term]
+        columns = np.concatenate([columns, self.n_of_exposures + np.array(here, np.int64)])
+        return columns, np.concatenate([own, out], axis=2)
+
+
+def deviation_columns(
+    model: DistortionModel,
+    theta: Float,
+    groups: Groups,
+    counts: Float,
+    *,
+    exposures: bool = True,
+    most: int = MAX_EXPOSURES,
+) -> DeviationColumns | None:
+    """Deviations that the frames of a model do not fit, and curvatures of its drift.
+
+    `counts` (G,) is the number of stars of each group.  Single exposures deviate only if
+    `exposures`; not where a hierarchy of them has been fitted.  None where nothing can deviate:
+    without a drift for a single exposure, and for more than `most`, whose scatter averages out.
+    """
+    keys = np.column_stack([groups.exposure, groups.epoch])
+    distinct, of_group = np.unique(keys, axis=0, return_inverse=True)
+    n_exposures = len(distinct)
+    kinds = tuple(k for k, fitted in KINDS.items() if model.frames not in fitted)
+    if n_exposures < 2 or n_exposures > most or not exposures:
+        kinds = ()
+    per_exposure = [SCATTERS[k] for k in kinds for _ in LINEAR.get(k, "uv")]
+    terms = _bending(model)
+    scatter = np.array([*per_exposure * n_exposures, *[CURVATURE] * len(terms)])
+    if not len(scatter):
+        return None
+    return DeviationColumns(
+        model=model,
+        theta=theta,
+        kinds=kinds,
+        terms=terms,
+        scatter=scatter,
+        of_group=of_group.ravel(),
+        n_exposures=n_exposures,
+        middle=float(np.average(groups.epoch, weights=counts)) if terms else np.nan,
+        size=model.pixel_size(theta) * max(max(c.size) for c in model.chips) / 2,
+    )
+
+
+def linear_deviations(
+    information: Information,
+    working: Information,
+    priors: DiscrepancyPriors,
+    n: int,
+    rng: np.random.Generator,
+    *,
+    exposures: bool = True,
+) -> LinearDeviations | None:
+    """Posterior draws of the deviations of exposures and of the curvature of drifts.
+
+    `information` has the excess of the scores, `working` is that of the likelihood of the solution.
+    None where nothing can deviate.
+    """
+    model = working.model
+    counts = np.array([c.count.sum() for c in working.groups()])
+    groups = working.sums.groups
+    columns = deviation_columns(model, working.theta, groups, counts, exposures=exposures)
+    if columns is None:
+        return None
+    total = len(columns)
+    centre = np.mean(
+        [columns.positions(c.chip, c.epoch, c.phi).mean(axis=0) for c in working.groups()], axis=0
+    )
+
+    def displacement(cells: GroupCells, g: int) -> Float:
+        out = np.zeros((len(cells.X), 2, total))
+        which, values = columns.at(g, cells.chip, cells.epoch, cells.phi, centre)
+        out[:, :, which] = values
+        return np.asarray(np.einsum("ab,cbq->caq", cells.frame, out))
+
+    S, score = np.zeros((total, total)), np.zeros(total)
+    crossed = [np.zeros((model.n_params, total)) for _ in range(2)]
+    for which, source in enumerate((information, working)):
+        for g, cells in enumerate(source.groups()):
+            moved = displacement(cells, g)
+            pulled = np.einsum("cab,cbq->caq", cells.curvature, moved, optimize=True)
+            crossed[which][cells.columns] += cells.onto_parameters(pulled)
+            if which == 0:
+                S += np.einsum("caq,car->qr", moved, pulled, optimize=True)
+                score += np.einsum("caq,ca->q", moved, cells.score, optimize=True)
+    through = information.covariance @ crossed[0]
+    S = S - crossed[0].T @ through
+    score = score - through.T @ information.score
+    return deviation_draws(columns, S, score, working.covariance @ crossed[1], priors, n, rng)
+
+
+def deviation_draws(
+    columns: DeviationColumns,
+    S: Float,
+    score: Float,
+    taken: Float,
+    priors: DiscrepancyPriors,
+    n: int,
+    rng: np.random.Generator,
+) -> LinearDeviations:
+    """Posterior draws of deviations, the sizes of their scatters marginalised.
+
+    S (q, q) and `score` (q,) are information and score of the coefficients, with what the fit
+    absorbs eliminated; `taken` (D, q) is the effect of a unit of each on the fit.
+    """
+    total, scatter = len(columns), columns.scatter
+    S = (S + S.T) / 2
+    medians = {
+        "shift": priors.exposure,
+        "rotation": priors.exposure,
+        "shape": priors.exposure,
+        CURVATURE: priors.curvature,
+    }
+    names = list(dict.fromkeys(scatter.tolist()))
+    index = np.array([names.index(s) for s in scatter])
+    grids = []
+    for k, name in enumerate(names):
+        known = np.diag(S)[index == k]
+        known = known[known > 1e-8 * max(float(known.max()), 1e-300)]
+        resolved = 1 / np.sqrt(np.median(known)) if known.size else medians[name]
+        low = min(medians[name], resolved) / RANGE
+        high = RANGE * max(medians[name], resolved if resolved < 1e-2 else 0.0)
+        grids.append(np.geomspace(low, high, COARSE[len(names) - 1]))
+    values, vectors = np.linalg.eigh(S)
+    S = (vectors * np.maximum(values, 0.0)) @ vectors.T
+
+    def conditional(amplitude: Float) -> tuple[Float, Float, Float]:
+        """Scales of the coefficients, factor of their scaled precision, and the scaled score."""
+        spread = amplitude[index]
+        scaled = S * np.outer(spread, spread) + np.eye(total)
+        factor = scipy.linalg.cholesky(scaled, lower=True, check_finite=False)
+        return spread, factor, scipy.linalg.solve_triangular(factor, spread * score, lower=True)
+
+    def weights(grids: Sequence[Float]) -> Float:
+        """Posterior weights of all combinations, the largest 1."""
+        widths = np.ix_(*(np.exp(log_widths(g)) for g in grids))
+        density = np.empty([len(g) for g in grids])
+        for at, amplitude in zip(np.ndindex(density.shape), product(*grids), strict=True):
+            _, factor, z = conditional(np.array(amplitude))
+            density[at] = 0.5 * z @ z - np.log(np.diag(factor)).sum()
+            density[at] += sum(
+                log_half_cauchy(a, medians[name]) for a, name in zip(amplitude, names, strict=True)
+            )
+        weight = np.exp(density - density.max()) * reduce(np.multiply, widths)
+        return np.asarray(weight / weight.max())
+
+    grids = _where_it_counts(grids, weights(grids))
+    weight = weights(grids)
+    counts = rng.multinomial(n, (weight / weight.sum()).ravel())
+    drawn, sizes = [], []
+    for amplitude, m in zip(product(*grids), counts, strict=True):
+        if m:
+            spread, factor, z = conditional(np.array(amplitude))
+            z = z[:, None] + rng.standard_normal((total, m))
+            z = scipy.linalg.solve_triangular(factor, z, trans=1, lower=True)
+            drawn.append(spread * z.T)
+            sizes.append(np.tile(amplitude, (m, 1)))
+    order = rng.permutation(n)
+    coefficients, amplitudes = np.concatenate(drawn)[order], np.concatenate(sizes)[order]
+    return LinearDeviations(
+        model=columns.model,
+        # the fit absorbs a deviation; the truth lies on the other side
+        theta=-coefficients @ taken.T,
+        terms=columns.terms,
+        curvature=coefficients[:, columns.n_of_exposures :] * columns.size,
+        epoch=columns.middle,
+        scatter={name: amplitudes[:, k] for k, name in enumerate(names)},
+        n_exposures=columns.n_exposures,
+        kinds=columns.kinds,
+        size=columns.size,
+    )
+
+
+def _where_it_counts(grids: Sequence[Float], weight: Float) -> list[Float]:
+    """Finer grids over the amplitudes that are not negligible, and the next ones on both sides."""
+    out = []
+    for k, grid in enumerate(grids):
+        best = weight.max(axis=tuple(a for a in range(weight.ndim) if a != k))
+        kept = np.flatnonzero(best > NEGLIGIBLE)
+        low, high = max(kept[0] - 1, 0), min(kept[-1] + 1, len(grid) - 1)
+        out.append(np.geomspace(grid[low], grid[high], REFINED[len(grids) - 1]))
+    return out
+
+
+def _bending(model: DistortionModel) -> tuple[tuple[int, int, int], ...]:
+    """Functions that may be curved in time: those that drift in the model, on each chip."""
+    if model.time is None:
+        return ()
+    out = []
+    for chip in range(len(model.chips)):
+        powers = model.basis(model.chips[chip].number).terms
+        for axis, i, j in model.time.terms:
+            out.append((chip, "uv".index(axis), powers.index((i, j))))
+    return tuple(out)
+
+
+def _deviations(position: Float, kinds: Sequence[str], size: float) -> Float:
+    """Displacements (C, 2, q) by unit deviations of each kind; shifts in half sizes."""
+    chosen = [np.zeros((len(position), 0, 2))]
+    for kind in kinds:
+        if kind == "shift":
+            chosen.append(np.broadcast_to(size * np.eye(2), (len(position), 2, 2)))
+        else:
+            matrices = np.stack([LINEAR_MATRICES[name] for name in LINEAR[kind]])
+            chosen.append(np.einsum("kab,cb->cka", matrices, position))
+    return np.swapaxes(np.concatenate(chosen, axis=1), 1, 2)

@@ -1,0 +1,228 @@
+"""Discrepancy of a solution from the truth, estimated from its residuals in one pass."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import reduce
+from operator import add
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.diagnose.correlated.cells import CellSums, cell_sums, cells_per_side
+from bayesdist.diagnose.correlated.deviations import MAX_EXPOSURES, linear_deviations
+from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.correlated.information import Information
+from bayesdist.diagnose.correlated.neighbours import SharedVariance, shared_variances
+from bayesdist.diagnose.correlated.noise import not_narrower, score_excess
+from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
+from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy
+from bayesdist.diagnose.correlated.shared_stars import shared_stars
+from bayesdist.diagnose.correlated.structure import chip_structure
+from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.scaled import one_thread
+from bayesdist.infer.exposures.chip_offsets import Settling
+from bayesdist.infer.solution import Solution, likelihood_of
+from bayesdist.infer.stars.likelihood import Likelihood
+from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
+from bayesdist.infer.stars.stars import cell_of, prepare
+from bayesdist.model import DistortionModel
+
+__all__ = ["estimate_discrepancy"]
+
+Float = NDArray[np.float64]
+
+DRAWS = 2000
+
+
+@one_thread
+def estimate_discrepancy(
+    matches: Matches | Shards,
+    solution: Solution,
+    *,
+    rng: np.random.Generator,
+    priors: DiscrepancyPriors | None = None,
+    parameter_priors: GaussianPriors | None = None,
+    sample: MatchTable | None = None,
+    stars: MatchTable | None = None,
+    structure: bool = True,
+    exposures: bool = True,
+    settling: Settling | None = None,
+    n_draws: int = DRAWS,
+    compute: Compute | None = None,
+) -> Discrepancy:
+    """Estimate the structure that a solution leaves out, with priors on its size.
+
+    There is never a decision that it is absent.
+
+    Parameters
+    ----------
+    matches : MatchTable, PartitionedMatches or Shards
+        Data of the solution.
+    solution : Posterior or LinearFit
+        Without extra weight in the corners.
+    rng : numpy.random.Generator
+    priors : DiscrepancyPriors, optional
+    parameter_priors : GaussianPriors, optional
+        Priors of the solution's parameters.
+    sample : MatchTable, optional
+        Some of the matches, or all: structure finer than the functions shows in neighbouring stars.
+    stars : MatchTable, optional
+        The matches in memory.  By the star codes, errors common to a star's matches are estimated,
+        and exposures without frames of their own are separated.
+    structure : bool
+        False for no structure beyond the model, where look-up tables were fitted to it.
+    exposures : bool
+        False for no deviations of single exposures, where a hierarchy of them was fitted.
+    settling : Settling, optional
+        Transformation of the single chips' shifts that was made after sampling.
+    n_draws : int
+    compute : Compute, optional
+
+    Returns
+    -------
+    Discrepancy
+
+    Raises
+    ------
+    InputError
+        For a view of a solution.
+    """
+    model, likelihood = solution.model, likelihood_of(solution)
+    priors = priors or DiscrepancyPriors()
+    if exposures and stars is not None and model.frames == "none" and _several(stars):
+        sums = _by_exposure(stars, likelihood, model)
+    else:
+        with opened(model, matches, compute) as shards:
+            sums = shards.sum(cell_sums, likelihood, cells_per_side(len(shards.groups)))
+    mean = likelihood.theta
+    working = Information(model, mean, sums, parameter_priors or GaussianPriors.none(model))
+    pixel = model.pixel_size(mean)
+    repeated = None
+    if stars is not None and stars.star is not None:
+        repeated = shared_stars(stars, likelihood, model, priors.star * pixel)
+    excess = score_excess(working) * (1.0 if repeated is None else repeated.repetition)
+    information = working.with_excess(excess)
+    chips = range(len(model.chips)) if structure else ()
+    near = {} if sample is None or not structure else shared_variances(sample, likelihood, model)
+    found, theta, facts = _structures(
+        information, working, chips, near, priors, pixel, n_draws, rng
+    )
+    linear = linear_deviations(information, working, priors, n_draws, rng, exposures=exposures)
+    formal, noise = working.covariance, working.sandwich()
+    if repeated is not None:
+        noise = noise + repeated.covariance(model, mean, formal)
+        facts["star_rms"] = repeated.rms
+    noise, ratio = not_narrower(noise, formal)
+    if settling is not None:
+        formal, noise = (settling.mean(settling.mean(c).T).T for c in (formal, noise))
+        theta = settling.mean(theta)
+        if linear is not None:
+            linear = replace(linear, theta=settling.mean(linear.theta))
+    facts |= {"unit": model.unit, "noise_ratio": ratio}
+    if linear is not None:
+        facts["exposures"] = linear.n_exposures
+        facts["scatter"] = {k: float(np.median(v)) for k, v in linear.scatter.items()}
+    return Discrepancy(model, mean, formal, noise, found, theta, linear, facts)
+
+
+def _several(stars: MatchTable) -> bool:
+    """True for matches of several exposures, few enough that each may deviate."""
+    return 1 < len(stars.exposure_names) <= MAX_EXPOSURES
+
+
+def _by_exposure(stars: MatchTable, likelihood: Likelihood, model: DistortionModel) -> CellSums:
+    """Sums with separate groups for exposures that have no frames of their own."""
+    side = cells_per_side(len(stars.exposure_names) * len(model.chips))
+    parts = []
+    for code in range(len(stars.exposure_names)):
+        rows = np.flatnonzero(stars.exposure == code)
+        if rows.size:
+            part = cell_sums(prepare(model, stars.select(rows))[0], likelihood, side)
+            of = np.full(len(part.groups), code)
+            parts.append(replace(part, groups=replace(part.groups, exposure=of)))
+    return reduce(add, parts)
+
+
+def _structures(
+    information: Information,
+    working: Information,
+    chips: Sequence[int],
+    neighbours: Mapping[int, tuple[SharedVariance | None, SharedVariance | None]],
+    priors: DiscrepancyPriors,
+    pixel: float,
+    n: int,
+    rng: np.random.Generator,
+) -> tuple[dict[int, ChipStructure], Float, dict[str, object]]:
+    """Structure of chips (by code), its effect on the parameters, and its sizes for summaries."""
+    model, sums = working.model, working.sums
+    stars = sums.position[:, :, 0].sum(axis=1)
+    shift = information.covariance @ information.score
+    theta, out, rows = np.zeros((n, model.n_params)), {}, []
+    for code in chips:
+        chip = model.chips[code]
+        functions = StructureFunctions.for_stars(model.order, chip.size, int(stars[code]))
+        chip_waves = ChipStructure(functions, functions.finer_waves(rng), np.empty(0))
+        S, crossed, taken, score = _along_axes(information, working, chip_waves, code)
+        left = [S[a] - crossed[a].T @ (information.covariance @ crossed[a]) for a in (0, 1)]
+        pull = [score[a] - crossed[a].T @ shift for a in (0, 1)]
+        posterior = chip_structure(
+            functions,
+            left,
+            pull,
+            noise=_star_error(information, code),
+            higher_order=priors.higher_order * pixel,
+            structure=priors.structure * pixel,
+            pairs=neighbours.get(code, (None, None)),
+        )
+        found = replace(chip_waves, coefficients=posterior.draws(n, rng))
+        for a in (0, 1):
+            # the fit absorbs structure into polynomials; the truth lies on the other side
+            theta -= found.coefficients[:, a] @ (working.covariance @ taken[a]).T
+        rows += found.sizes(chip, posterior.length)
+        out[chip.number] = found
+    return out, theta, {"structure": rows}
+
+
+def _star_error(information: Information, chip: int) -> float:
+    """Error of a typical star on an axis."""
+    rows = information.sums.groups.chip == chip
+    n, uu, vv = information.sums.sums[rows][:, :, [0, 3, 5]].sum(axis=(0, 1))
+    return float(np.sqrt(2 * n / (uu + vv))) if uu + vv > 0 else 1.0
+
+
+def _along_axes(
+    information: Information, working: Information, structure: ChipStructure, chip: int
+) -> tuple[list[Float], list[Float], list[Float], list[Float]]:
+    """Information and score of the functions on u and v, and their products with the parameters.
+
+    The products are those of the flattened likelihood and of the working one, the latter with the
+    finer waves too.
+    """
+    model, side = working.model, working.sums.side
+    m, D = structure.functions.n_known, model.n_params
+    weight, score = np.zeros((2, side * side)), np.zeros((2, side * side))
+    used, X, Y = working.sums.centres(chip)
+    every = structure.evaluate(X, Y)
+    B = every[:, :m]
+    crossed, taken = ([np.zeros((D, n)) for _ in "uv"] for n in (m, every.shape[1]))
+    row = np.full(side * side, -1)
+    row[used] = np.arange(len(used))
+    for source, into, values in ((information, crossed, B), (working, taken, every)):
+        for cells in source.groups():
+            if cells.chip != chip:
+                continue
+            at = row[cell_of(cells.X, cells.Y, side)]
+            here, M = values[at], cells.frame
+            turned = np.einsum("cab,bd->cad", cells.curvature, M)
+            for a in (0, 1):
+                block = np.stack([(cells.phi * turned[:, b, a, None]).T @ here for b in (0, 1)])
+                into[a][cells.columns] += np.einsum("akm,akq->mq", cells.derivative, block)
+                if source is information:
+                    weight[a, at] += np.einsum("b,cb->c", M[:, a], turned[:, :, a])
+                    score[a, at] += cells.score @ M[:, a]
+    n = len(used)
+    S = [B.T @ (weight[a, :n, None] * B) for a in (0, 1)]
+    return S, crossed, taken, [B.T @ score[a, :n] for a in (0, 1)]

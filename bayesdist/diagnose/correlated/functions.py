@@ -1,0 +1,165 @@
+"""Functions over a chip that represent structure outside the polynomial.
+
+Legendre products above the model's order, and sines on a box that is larger than the chip, whose
+coefficients are independent with the spectrum of a Matern field for their variances (Solin and
+Sarkka 2020, Statistics and Computing 30, 419).  The part of the sines that the model's polynomials
+can represent, over the whole chip, is subtracted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+
+from bayesdist.model.basis import polynomial_terms
+
+__all__ = ["StructureFunctions", "legendre_products"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+ORDERS = 3  # Legendre orders above the model's
+FALL = 0.5  # rms of an order relative to the one below it
+MARGIN = 0.3  # fraction of the longer half side by which the box is larger than the chip
+SMOOTHNESS = 1.5  # of the Matern field: its slope exists
+FINE = 48  # waves that represent structure finer than the sines
+MIN_SIDE, MAX_SIDE = 6, 20  # sines along a square chip
+STARS_PER_SINE = 4.0
+
+
+@dataclass(frozen=True)
+class StructureFunctions:
+    """Functions over one chip, all of unit mean square before their coefficients' scales."""
+
+    order: int  # of the fitted polynomial
+    size: tuple[float, float]  # columns and rows of the chip
+    n_side: int  # sines along the longer side of the box, were it a square
+
+    @classmethod
+    def for_stars(cls, order: int, size: tuple[float, float], n: int) -> StructureFunctions:
+        """Functions as fine as n stars on the chip can resolve."""
+        side = int(np.clip(np.sqrt(n / STARS_PER_SINE), MIN_SIDE, MAX_SIDE))
+        return cls(order, size, side)
+
+    @cached_property
+    def _half(self) -> Float:
+        """Half sides of the chip, the longer one 1."""
+        return np.asarray(self.size) / max(self.size)
+
+    @cached_property
+    def terms(self) -> tuple[tuple[int, int], ...]:
+        """Powers of the Legendre products above the model's order."""
+        had = len(polynomial_terms(self.order))
+        return polynomial_terms(self.order + ORDERS)[had:]
+
+    @property
+    def n_terms(self) -> int:
+        """Number of Legendre products."""
+        return len(self.terms)
+
+    @cached_property
+    def _waves(self) -> Int:
+        """Numbers of half waves (m, 2) of each sine along the box."""
+        box = self._half + MARGIN
+        most = np.ceil(self.n_side * box / box.max()).astype(int)
+        i, j = (k.ravel() for k in np.meshgrid(*(np.arange(1, n + 1) for n in most), indexing="ij"))
+        wave = np.column_stack([i, j])
+        return wave[np.hypot(*(np.pi * wave / (2 * box)).T) <= self.cut]
+
+    @property
+    def cut(self) -> float:
+        """Largest angular frequency of the sines, in units of the inverse longer half side."""
+        return float(np.pi * (self.n_side + 0.5) / (2 * (1 + MARGIN)))
+
+    @cached_property
+    def frequency(self) -> Float:
+        """Angular frequency (m,) of each sine, in the unit of `cut`."""
+        return np.hypot(*(np.pi * self._waves / (2 * (self._half + MARGIN))).T)
+
+    @property
+    def n_sines(self) -> int:
+        """Number of sines."""
+        return len(self._waves)
+
+    @property
+    def n_known(self) -> int:
+        """Number of functions that the data can determine: terms and sines."""
+        return self.n_terms + self.n_sines
+
+    def decline(self) -> Float:
+        """Standard deviations (n_terms,) of the terms, relative to the rms of the first order."""
+        degree = np.array([sum(t) for t in self.terms])
+        return np.asarray(FALL ** (degree - self.order - 1) / np.sqrt(degree + 1))
+
+    def spectrum(self, length: float) -> Float:
+        """Variances (n_sines,) for a field of unit variance and a correlation length in half sides.
+
+        The spectral density of the Matern field in two dimensions (Rasmussen and Williams 2006,
+        Equation 4.15).
+        """
+        nu, k2 = SMOOTHNESS, 2 * SMOOTHNESS / length**2
+        return np.asarray(4 * np.pi * nu * k2**nu * (k2 + self.frequency**2) ** (-nu - 1))
+
+    def finer(self, length: float) -> float:
+        """Fraction of the field's variance at frequencies above the sines'."""
+        k2 = 2 * SMOOTHNESS / length**2
+        return float((k2 / (k2 + self.cut**2)) ** SMOOTHNESS)
+
+    def evaluate(self, X: Float, Y: Float) -> Float:
+        """Terms and sines (N, n_known) at scaled positions, -1 to 1 along each side."""
+        return np.concatenate([legendre_products(X, Y, self.terms), self._sines(X, Y)], axis=1)
+
+    def _sines(self, X: Float, Y: Float) -> Float:
+        i, j = self._waves.T - 1
+        by_x, by_y = self._along(0, X), self._along(1, Y)
+        low = polynomial_terms(self.order)
+        out = by_x[:, i] * by_y[:, j]
+        out -= legendre_products(X, Y, low) @ self._in_polynomials
+        return out
+
+    def _along(self, axis: int, Z: Float) -> Float:
+        """Sines (N, n) along one side."""
+        half = float(self._half[axis])
+        box, n = half + MARGIN, int(self._waves[:, axis].max())
+        angle = np.outer(half * Z + box, np.pi * np.arange(1, n + 1) / (2 * box))
+        return np.sin(angle) / np.sqrt(box)
+
+    @cached_property
+    def _in_polynomials(self) -> Float:
+        """Projections (K, n_sines) of the sines on the model's polynomials."""
+        low = polynomial_terms(self.order)
+        nodes, weights = legendre.leggauss(2 * self.n_side + self.order + 8)
+        one = [
+            (self._along(axis, nodes) * weights[:, None] / 2).T @ _orthonormal(nodes, self.order)
+            for axis in (0, 1)
+        ]
+        i, j = self._waves.T - 1
+        return np.stack([one[0][i, a] * one[1][j, b] for a, b in low])
+
+    def finer_waves(self, rng: np.random.Generator) -> Float:
+        """Wave vectors (FINE, 2) of structure finer than the sines, in inverse half sides."""
+        frequency = self.cut * rng.uniform(size=FINE) ** (-1 / (2 * SMOOTHNESS))
+        angle = rng.uniform(0, 2 * np.pi, FINE)
+        return frequency[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+
+    def evaluate_finer(self, waves: Float, X: Float, Y: Float) -> Float:
+        """Cosines and sines (N, 2 FINE) of waves at scaled positions; mean squares add to 1."""
+        phase = np.outer(self._half[0] * X, waves[:, 0]) + np.outer(self._half[1] * Y, waves[:, 1])
+        return np.concatenate([np.cos(phase), np.sin(phase)], axis=1) / np.sqrt(len(waves))
+
+
+def _orthonormal(Z: Float, order: int) -> Float:
+    """Legendre polynomials (N, order + 1) of unit mean square over -1 to 1."""
+    return np.asarray(legendre.legvander(Z, order) * np.sqrt(2 * np.arange(order + 1) + 1))
+
+
+def legendre_products(X: Float, Y: Float, terms: tuple[tuple[int, int], ...]) -> Float:
+    """Products (N, n) of Legendre polynomials of unit mean square, by their powers (i, j)."""
+    order = max(max(t) for t in terms)
+    by_x, by_y = _orthonormal(X, order), _orthonormal(Y, order)
+    i, j = np.array(terms).T
+    return np.asarray(by_x[:, i] * by_y[:, j])

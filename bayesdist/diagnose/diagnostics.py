@@ -1,0 +1,410 @@
+"""Diagnostics of a solution by its residuals: one value, made by a function of its arguments."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.checks import EITHER, Check
+from bayesdist.data import MagnitudeErrors, MatchTable
+from bayesdist.diagnose.checks import holdout_checks, score_checks, structure_checks
+from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors, estimate_discrepancy
+from bayesdist.diagnose.correlated.storage import as_stored
+from bayesdist.diagnose.holdout.predictive import Predictive
+from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_validation
+from bayesdist.diagnose.overlap import OverlapTest
+from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, time_variation
+from bayesdist.diagnose.residuals.binned import BinnedSums
+from bayesdist.diagnose.residuals.centroid import centroid_scatter
+from bayesdist.diagnose.residuals.coverage import Coverage, coverage_of
+from bayesdist.diagnose.residuals.epoch_shift import EpochShift, epoch_shift
+from bayesdist.diagnose.residuals.majority import majority_sentence
+from bayesdist.diagnose.residuals.misfit import (
+    MAX_BINS,
+    STARS_PER_BIN,
+    Misfit,
+    misfit_of,
+    partitions_for,
+    worst_misfit,
+)
+from bayesdist.diagnose.residuals.sample import StarSample, star_sample
+from bayesdist.diagnose.residuals.star_sums import StarSums, flagged_by_exposure, star_sums
+from bayesdist.diagnose.score.result import ScoreTest
+from bayesdist.diagnose.score.tests import score_tests
+from bayesdist.diagnose.selfcal.correlated import selfcal_discrepancy
+from bayesdist.diagnose.selfcal.leverage import taken_by_stars
+from bayesdist.diagnose.selfcal.misfit import dithered_misfit
+from bayesdist.diagnose.selfcal.score import selfcal_score_tests
+from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, Shards
+from bayesdist.infer.catalogue.star_errors import StarCovariance, StarErrors, star_covariance
+from bayesdist.infer.exposures.chip_offsets import Settling
+from bayesdist.infer.selfcal import SelfCalibrationMode
+from bayesdist.streams import restarted
+
+__all__ = [
+    "Diagnostics",
+    "catalogue_covariance",
+    "diagnose",
+    "diagnose_fit",
+    "hold_out",
+    "misfits_of",
+    "residual_sums",
+]
+
+Int = NDArray[np.int64]
+Bins = tuple[int, int]
+
+SHOWN = "shown"  # the partition that diagrams of mean residuals show
+
+log = logging.getLogger("bayesdist")
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnostics:
+    """Misfit, score tests, correlated errors and further results by the residuals of a solution.
+
+    Parameters
+    ----------
+    sums : StarSums
+        Of residuals of the least-squares fit over all stars.
+    partitions : mapping of int to mapping of str to tuple of int
+        Bins of each chip, by its number and the name of the partition.
+    misfits : tuple of Misfit
+        Structure that the fit leaves, of each chip or, where these share stars, of all.
+    coverage : tuple of Coverage
+        The area of each chip that its stars cover.
+    sample : StarSample
+        Some stars, or all of them, and what residuals and probabilities of each.
+    majority : str
+        What it means that most pairs are false; empty where they are not.
+    epoch_shift : EpochShift or None
+        Error of the epochs; None without proper motions.
+    centroid : MagnitudeErrors or None
+        Scatter of residuals by magnitude, where stars have magnitudes.
+    flagged : ndarray of int, shape (E,), or None
+        Stars of each exposure that are more likely false than not; None for one exposure.
+    score_tests : tuple of ScoreTest
+    correlated : Discrepancy or None
+        Correlated errors; None where they have not been estimated.
+    catalogue : StarCovariance or None
+        Covariance of the parameters by errors of the catalogue, where these are known by star.
+    periods : TimeVariation or None
+        Models of several periods compared, where that was asked for.
+    holdout : HoldoutValidation or None
+        Results of stars that were set aside before the fit, where there are any.
+    overlap : OverlapTest or None
+        Two exposures far apart in time laid on each other, of a campaign.
+    """
+
+    sums: StarSums
+    partitions: Mapping[int, Mapping[str, Bins]]
+    misfits: tuple[Misfit, ...]
+    coverage: tuple[Coverage, ...]
+    sample: StarSample
+    majority: str = ""
+    epoch_shift: EpochShift | None = None
+    centroid: MagnitudeErrors | None = None
+    flagged: Int | None = None
+    score_tests: tuple[ScoreTest, ...] = ()
+    correlated: Discrepancy | None = None
+    catalogue: StarCovariance | None = None
+    periods: TimeVariation | None = None
+    holdout: HoldoutValidation | None = None
+    overlap: OverlapTest | None = None
+
+    @property
+    def misfit(self) -> Misfit:
+        """Worst of the misfits, its probability corrected for their number."""
+        return worst_misfit(self.misfits)
+
+    @property
+    def shown(self) -> tuple[BinnedSums, ...]:
+        """Sums of residuals that diagrams of their means show, one for each chip."""
+        return tuple(self.sums.binned[c, bins[SHOWN]] for c, bins in self.partitions.items())
+
+    @property
+    def checks(self) -> tuple[Check, ...]:
+        """Checks that a reader of the numbers has to know."""
+        out = [
+            *holdout_checks(self.holdout),
+            *score_checks(self.score_tests, self.correlated),
+            *structure_checks(self.misfits, self.correlated),
+        ]
+        texts = [one.sentence for one in self.coverage if one.significant]
+        if self.epoch_shift is not None and self.epoch_shift.significant:
+            texts.append(self.epoch_shift.sentence)
+        out += [Check("Fit", level="warn", sentence=text) for text in texts]
+        if self.majority:
+            out.append(Check("Fit", level="warn", sentence=self.majority, doubt=EITHER))
+        if self.periods is not None and self.periods.is_material:
+            verdict = self.periods.verdict.rstrip(".")
+            out.append(Check("Periods", level="warn", sentence=verdict))
+        return tuple(out)
+
+
+def diagnose_fit(
+    fit: LinearFit,
+    posterior: Posterior | None,
+    stars: Matches,
+    shards: Shards,
+    table: MatchTable,
+    *,
+    eliminated: SelfCalibrationMode | None = None,
+    centroid: MagnitudeErrors | Literal["residuals"] | None = "residuals",
+    things: str = "pairs",
+) -> Diagnostics:
+    """Diagnostics of a fit, and of a posterior where there is one; nothing is estimated.
+
+    Parameters
+    ----------
+    fit : LinearFit
+    posterior : Posterior or None
+    stars : MatchTable or PartitionedMatches
+        With errors: those that were fitted.
+    shards : Shards
+        The same, as passes go over them.
+    table : MatchTable
+        Evenly spread ones of them, or all.
+    eliminated : infer.selfcal.SelfCalibrationMode, optional
+        The solution with its stars, where places of stars were fitted too.
+    centroid : MagnitudeErrors, 'residuals' or None
+        Errors of the centroids where the fit has found them; else they are the scatter of the
+        residuals.
+    things : str
+        What is true or false.
+
+    Returns
+    -------
+    Diagnostics
+    """
+    model, survey = fit.model, shards.survey
+    partitions, sums = residual_sums(fit, shards)
+    several = len(model.chips) > 1
+    sample = star_sample(table, len(stars), fit, posterior)
+    if eliminated is not None:
+        sample = replace(sample, taken=_taken(eliminated, sample.table.row))
+    if centroid == "residuals":
+        centroid = centroid_scatter(sample, n_params=model.n_params)
+    return Diagnostics(
+        sums=sums,
+        partitions=partitions,
+        misfits=misfits_of(fit, partitions, sums)
+        if eliminated is None
+        else (dithered_misfit(eliminated),),
+        coverage=tuple(
+            coverage_of(
+                sums.binned[chip.number, bins["cells"]], found.corners, chip, several=several
+            )
+            for chip, bins, found in zip(
+                model.chips, partitions.values(), survey.chips, strict=True
+            )
+        ),
+        sample=sample,
+        majority=majority_sentence(fit, posterior, quoted=survey.reference_sigma, things=things),
+        epoch_shift=epoch_shift(table, fit),
+        centroid=centroid,
+    )
+
+
+def residual_sums(fit: LinearFit, shards: Shards) -> tuple[dict[int, dict[str, Bins]], StarSums]:
+    """Bins of each chip by the name of the partition, and sums of residuals in them.
+
+    `shards` has all stars that were fitted.
+    """
+    partitions = {}
+    for chip, found in zip(fit.model.chips, shards.survey.chips, strict=True):
+        n = round(fit.n_used * found.n / len(shards))
+        side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 4, MAX_BINS))
+        partitions[chip.number] = partitions_for(n) | {SHOWN: (side, side)}
+    wanted = {chip: tuple(dict.fromkeys(bins.values())) for chip, bins in partitions.items()}
+    return partitions, shards.sum(star_sums, fit.mean, fit.clip, wanted)
+
+
+def misfits_of(
+    fit: LinearFit, partitions: Mapping[int, Mapping[str, Bins]], sums: StarSums
+) -> tuple[Misfit, ...]:
+    """Structure in the residuals of each chip.
+
+    `partitions` and `sums` are those of `residual_sums`.
+    """
+    out = []
+    for chip, bins in zip(fit.model.chips, partitions.values(), strict=True):
+        binned = {
+            name: sums.binned[chip.number, size] for name, size in bins.items() if name != SHOWN
+        }
+        found = misfit_of(binned, order=fit.model.order, unit=fit.unit)
+        out.append(replace(found, chip=chip) if len(fit.model.chips) > 1 else found)
+    return tuple(out)
+
+
+def _taken(eliminated: SelfCalibrationMode, rows: Int) -> NDArray[np.float64]:
+    """Fraction (N,) of the variance that places of stars take out of detections."""
+    own = eliminated.problem.rows
+    taken = np.zeros(max(int(own.max(initial=-1)), int(rows.max(initial=-1))) + 1)
+    taken[own] = taken_by_stars(eliminated)
+    return taken[rows]
+
+
+def diagnose(
+    fit: LinearFit,
+    posterior: Posterior,
+    stars: Matches,
+    shards: Shards,
+    table: MatchTable,
+    *,
+    rng: np.random.Generator,
+    tested: MatchTable | None = None,
+    discrepancy: DiscrepancyPriors | None = None,
+    priors: GaussianPriors | None = None,
+    match_radius: float | None = None,
+    structure: bool = True,
+    exposures: bool = True,
+    settling: Settling | None = None,
+    catalogue: StarErrors | None = None,
+    eliminated: SelfCalibrationMode | None = None,
+    centroid: MagnitudeErrors | Literal["residuals"] | None = "residuals",
+    periods: PeriodSettings | None = None,
+    things: str = "pairs",
+) -> Diagnostics:
+    """Diagnostics of a posterior.
+
+    Parameters
+    ----------
+    fit, posterior, stars, shards, table, eliminated, centroid, things
+        As `diagnose_fit`.
+    rng : numpy.random.Generator
+        Each result is made from its numbers from their beginning.
+    tested : MatchTable, optional
+        Those that the score tests look at, where they have more columns than `table`.
+    discrepancy : DiscrepancyPriors, optional
+        Of the size of correlated errors.
+    priors : GaussianPriors, optional
+        Those of the parameters that the posterior has.
+    match_radius : float, optional
+        Within which the stars were matched, in the unit of u and v.
+    structure : bool
+        Whether there is structure beyond the model; not where look-up tables were fitted to it.
+    exposures : bool
+        Whether single exposures deviate; not where a hierarchy of them was fitted.
+    settling : Settling, optional
+        What was done to the shifts of single chips after sampling.
+    catalogue : StarErrors, optional
+        Errors of the catalogue by code of the star.
+    periods : PeriodSettings, optional
+        Periods that are compared.
+
+    Returns
+    -------
+    Diagnostics
+
+    Raises
+    ------
+    InputError
+        Where correlated errors cannot be estimated: no verdict could rest on anything then.
+    DegenerateError
+        For a period with too few pairs.
+    """
+    found = diagnose_fit(
+        fit,
+        posterior,
+        stars,
+        shards,
+        table,
+        eliminated=eliminated,
+        centroid=centroid,
+        things=things,
+    )
+    in_memory = stars if isinstance(stars, MatchTable) else None
+    shared = None
+    if eliminated is not None:
+        estimated = selfcal_discrepancy(eliminated, rng=restarted(rng), priors=discrepancy)
+        tests = selfcal_score_tests(
+            eliminated, mag=_column(stars, "mag"), epoch=_column(stars, "epoch")
+        )
+    else:
+        estimated = estimate_discrepancy(
+            shards,
+            posterior,
+            rng=restarted(rng),
+            priors=discrepancy,
+            parameter_priors=priors,
+            sample=table,
+            stars=in_memory if catalogue is None else None,
+            structure=structure,
+            exposures=exposures,
+            settling=settling,
+        )
+        tests = score_tests(
+            table if tested is None else tested,
+            posterior,
+            priors=priors,
+            match_radius=match_radius,
+        )
+        shared = catalogue_covariance(fit, in_memory, catalogue)
+    return replace(
+        found,
+        flagged=flagged_by_exposure(shards, posterior) if len(fit.model.exposures) > 1 else None,
+        score_tests=tests,
+        correlated=as_stored(estimated),
+        catalogue=shared,
+        periods=None
+        if periods is None
+        else time_variation(fit, stars, periods, rng=restarted(rng)),
+    )
+
+
+def _column(stars: Matches, name: str) -> NDArray[np.float64] | None:
+    """A column of detections that are all in memory."""
+    assert isinstance(stars, MatchTable)
+    values: NDArray[np.float64] | None = getattr(stars, name)
+    return values
+
+
+def catalogue_covariance(
+    fit: LinearFit, stars: MatchTable | None, errors: StarErrors | None
+) -> StarCovariance | None:
+    """Covariance of the parameters by the errors of the catalogue.
+
+    It is computed for the linear fit, whose covariance has no noise of sampling: with hundreds of
+    parameters a few thousand draws leave factors of several in the eigenvalues of theirs.
+    Polynomials and drift are followed exactly, frames as far as they are correlated with these.
+
+    `stars` have errors that contain the catalogue's, and codes. None where the catalogue has no
+    errors, or the matches no codes.
+    """
+    if errors is None or stars is None or stars.star is None:
+        return None
+    log.info("assess: errors of the catalogue, one for each star in all of its exposures")
+    return star_covariance(fit, stars, errors, frames=False)
+
+
+def hold_out(
+    diagnostics: Diagnostics, predictive: Predictive, held: Matches, whole: tuple[str, ...] = ()
+) -> Diagnostics:
+    """Diagnostics with what stars say that were set aside.
+
+    Parameters
+    ----------
+    diagnostics : Diagnostics
+    predictive : Predictive
+        The solution with its correlated errors, as it predicts.
+    held : MatchTable or PartitionedMatches
+        Stars that were set aside, with errors.
+    whole : tuple of str
+        Exposures all of whose stars were.
+
+    Returns
+    -------
+    Diagnostics
+
+    Raises
+    ------
+    InputError
+        For too few stars.
+    """
+    return replace(diagnostics, holdout=holdout_validation(predictive, held, whole=whole))

@@ -1,0 +1,107 @@
+"""Part of a chip that the stars cover; beyond it a polynomial is extrapolated.
+
+The formal and the posterior errors hold beyond it only if the model does, and no star says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linprog
+from scipy.spatial import ConvexHull, QhullError
+
+from bayesdist.diagnose.residuals.binned import BinnedSums
+from bayesdist.limits import UNCOVERED, UNCOVERED_BY_CHANCE
+from bayesdist.model import Chip
+from bayesdist.model.grid import mesh
+
+__all__ = ["Coverage", "coverage_of"]
+
+Float = NDArray[np.float64]
+
+SPARSE = 0.02  # of the density where stars usually are: strays, not coverage
+_FINE = (65, 65)
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """The convex area of a chip that its stars span."""
+
+    chip: Chip
+    several: bool  # whether the detector has other chips beside it
+    sides: Float  # (m, 3) (a, b, c) with a x + b y + c the distance beyond a side of the area
+    gap: float  # fraction of the chip's area beyond it
+    by_chance: float  # the gap that as many stars leave on average when they are scattered evenly
+
+    @property
+    def significant(self) -> bool:
+        """True where so much is missing that the corners or edges are extrapolated."""
+        return self.gap > max(UNCOVERED.value, UNCOVERED_BY_CHANCE.value * self.by_chance)
+
+    @property
+    def sentence(self) -> str:
+        """Meaning of the gap, as a clause."""
+        part = f"chip {self.chip.name}" if self.several else "the detector"
+        (left, right), (bottom, top) = self.extent
+        return (
+            f"{100 * self.gap:.0f} % of {part} lies beyond the area that its stars cover (within "
+            f"x {left:.0f} to {right:.0f}, y {bottom:.0f} to {top:.0f}): there the "
+            "polynomial is extrapolated, and its errors are not known"
+        )
+
+    @property
+    def extent(self) -> Float:
+        """Smallest and largest x, then y, of the area, shape (2, 2)."""
+        on_chip = [(0.5, n + 0.5) for n in self.chip.size]
+        reach = np.eye(2)[:, None] * [[1.0], [-1.0]]  # the least x, the least -x, ...
+        found = [
+            [linprog(way, self.sides[:, :2], -self.sides[:, 2], bounds=on_chip).x for way in axis]
+            for axis in reach
+        ]
+        return np.einsum("aca->ac", np.array(found))
+
+    def beyond(self, x: Float, y: Float) -> Float:
+        """Distance (N,) of pixels beyond the area; negative inside."""
+        return np.asarray((self.sides @ np.stack([x, y, np.ones_like(x)])).max(axis=0))
+
+
+def coverage_of(sums: BinnedSums, corners: Float, chip: Chip, *, several: bool = False) -> Coverage:
+    """The area of a chip that its stars cover.
+
+    It lies within the hull of all stars, and within that of the cells that hold more than strays:
+    a few false matches in the corners cover nothing.
+
+    `sums` are those of the stars used, `corners` (m, 2) the vertices of the convex hull of all
+    stars (`ChipSurvey.corners`); `several` chips make the detector, or one.
+
+    The gap that n even stars leave in a rectangle is (8/3) ln n / n of its area (Renyi & Sulanke
+    1963, Z. Wahrscheinlichkeitstheorie 2, 75).
+    """
+    count, size = sums.count, np.array(chip.size)
+    n = int(count.sum())
+    ny, nx = count.shape
+    # half of the stars have no more neighbours than this in their cells
+    ordered = np.sort(count.ravel())
+    usual = ordered[np.searchsorted(np.cumsum(ordered), n / 2)]
+    iy, ix = np.nonzero(count > max(1.0, SPARSE * usual))
+    cells = (
+        np.concatenate([np.column_stack([ix + a, iy + b]) for a in (0, 1) for b in (0, 1)])
+        * (size / [nx, ny])
+        + 0.5
+    )
+    sides = np.concatenate([_sides(cells), _sides(corners)])
+    step = [(np.arange(k) + 0.5) / k for k in _FINE]
+    x, y = mesh(*(s * length + 0.5 for s, length in zip(step, size, strict=True)))
+    beyond = (sides @ np.stack([x, y, np.ones_like(x)])).max(axis=0) > 0
+    chance = 8 / 3 * np.log(max(n, 2)) / max(n, 2)
+    return Coverage(chip, several, sides, float(beyond.mean()), float(chance))
+
+
+def _sides(points: Float) -> Float:
+    """Sides of the convex hull; none, which bounds nothing, where there is no area."""
+    try:
+        return np.asarray(ConvexHull(points).equations)
+    except (QhullError, ValueError):
+        return np.array([[0.0, 0.0, -1.0]])

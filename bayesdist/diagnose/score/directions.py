@@ -1,0 +1,42 @@
+"""Directions in which a model may lack something: which are left, and how large a finding is."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["independent_directions", "squares_of"]
+
+Float = NDArray[np.float64]
+
+
+def independent_directions(whole: Float, left: Float, least: float) -> Float:
+    """Directions (n, q) of regressors that the parameters have left.
+
+    `whole` and `left` (n, n) are the information of the regressors before and after the parameters
+    are projected out, `least` the fraction of it that a direction must have kept. Directions are in
+    units in which `whole` is the unit matrix.
+    """
+    diagonal = np.diag(whole)
+    scale = np.zeros(len(diagonal))
+    scale[diagonal > 0] = diagonal[diagonal > 0] ** -0.5
+    values, vectors = np.linalg.eigh(whole * np.outer(scale, scale))
+    good = values > 1e-8 * values.max(initial=1e-300)
+    basis = scale[:, None] * vectors[:, good] / np.sqrt(values[good])
+    kept, turn = np.linalg.eigh(basis.T @ left @ basis)
+    return np.asarray(basis @ turn[:, kept > least])
+
+
+def squares_of(
+    score: Float, information: Float, covariance: Float, square: Float
+) -> tuple[float, float]:
+    """Mean squares of the pattern that a score stands for, and of what noise makes of it.
+
+    The first holds the second. `information` and `covariance` (q, q) are those of the directions
+    and of their `score` (q,), `square` (q, q) the mean products of the directions over the
+    detector.
+    """
+    inverse = np.linalg.inv(information)
+    step = inverse @ score
+    noise = np.trace(square @ inverse @ covariance @ inverse)
+    return float(step @ square @ step), float(noise)

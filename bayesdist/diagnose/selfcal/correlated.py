@@ -1,0 +1,159 @@
+"""Discrepancy of a self-calibration, estimated from its residuals with the stars eliminated.
+
+As for matched stars (`diagnose.correlated.estimate`), with this difference: stars follow the common
+part of their detections, which couples axes and chips.  So the structure on all of them has one
+posterior, with amplitudes and a correlation length in common.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.diagnose.correlated.coupled_structure import structure_posterior
+from bayesdist.diagnose.correlated.deviations import deviation_columns, deviation_draws
+from bayesdist.diagnose.correlated.functions import MIN_SIDE, StructureFunctions
+from bayesdist.diagnose.correlated.noise import not_narrower
+from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
+from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy
+from bayesdist.diagnose.selfcal.eliminated import (
+    Columns,
+    eliminated,
+    even_stars,
+    without_parameters,
+)
+from bayesdist.diagnose.selfcal.sandwich import sandwich
+from bayesdist.diagnose.selfcal.scores import DetectionScores, score_excess, scores_of_detections
+from bayesdist.infer.equations.scaled import one_thread
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode
+from bayesdist.infer.selfcal.problem import Problem
+
+__all__ = ["MAX_EXPOSURES", "selfcal_discrepancy"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+DRAWS = 2000
+MAX_DETECTIONS = 60_000  # from which structure is estimated, at most
+MAX_EXPOSURES = 150  # whose single deviations are estimated
+MAX_SINES = 700  # of all axes and chips: their information is decomposed
+
+
+@one_thread
+def selfcal_discrepancy(
+    solution: SelfCalibrationMode,
+    *,
+    rng: np.random.Generator,
+    priors: DiscrepancyPriors | None = None,
+    structure: bool = True,
+    exposures: bool = True,
+    n_draws: int = DRAWS,
+) -> Discrepancy:
+    """Discrepancy of a self-calibration at its mode, with priors on its size.
+
+    In the gauge of the solution: parameters that it fixes have no errors.  `structure` beyond the
+    model and deviations of single `exposures` can be left out.
+    """
+    priors, model = priors or DiscrepancyPriors(), solution.problem.model
+    working = scores_of_detections(solution)
+    flat = working.flattened(score_excess(solution, working))
+    cov = solution.cov
+    noise, ratio = _noise(solution, working)
+    facts: dict[str, object] = {"structure": [], "unit": model.unit, "noise_ratio": ratio}
+
+    some = even_stars(solution.problem, MAX_DETECTIONS)
+    problem, stars = solution.problem.of_stars(some), solution.stars[some]
+    chosen = np.isin(solution.problem.star, some)
+    flat, working = flat.at(chosen), working.at(chosen)
+    functions = _functions(problem) if structure else {}
+    counts = np.bincount(problem.groups.index, minlength=len(problem.groups))
+    deviations = deviation_columns(
+        model,
+        solution.theta,
+        problem.groups,
+        counts.astype(float),
+        exposures=exposures,
+        most=MAX_EXPOSURES,
+    )
+    columns = Columns(problem, solution.theta, functions, deviations)
+    N, score, taken = eliminated(columns, flat, stars, working=working)
+    left = without_parameters(solution, N, score)
+    S, score = left.information, left.score
+    # effect of a unit of each function on the fit of all detections
+    D, all_of_them = model.n_params, len(solution.problem) / len(problem)
+    taken = cov @ taken[:, D:] * all_of_them
+
+    m = 2 * sum(f.n_known for f in functions.values())
+    theta, found = np.zeros((n_draws, D)), dict[int, ChipStructure]()
+    if functions:
+        found, theta, facts["structure"] = _structure(
+            solution, functions, (S[:m, :m], score[:m], taken[:, :m]), priors, n_draws, rng
+        )
+    linear = None
+    if deviations is not None:
+        linear = deviation_draws(
+            deviations, S[m:, m:], score[m:], taken[:, m:], priors, n_draws, rng
+        )
+        facts["exposures"] = linear.n_exposures
+        facts["scatter"] = {k: float(np.median(v)) for k, v in linear.scatter.items()}
+    if exposures and model.frames != "affine" and not (linear and linear.scatter):
+        facts["exposures_measured"] = False
+    return Discrepancy(model, solution.theta, cov, noise, found, theta, linear, facts)
+
+
+def _noise(solution: SelfCalibrationMode, scores: DetectionScores) -> tuple[Float, float]:
+    """Covariance (D, D) by the stars' scatter, and its ratio to the formal one."""
+    inner = np.ix_(solution.free, solution.free)
+    narrow, ratio = not_narrower(sandwich(solution, scores)[inner], solution.cov[inner])
+    out = np.zeros((len(solution.theta),) * 2)
+    out[inner] = narrow
+    return out, ratio
+
+
+def _functions(problem: Problem) -> dict[int, StructureFunctions]:
+    """Functions on each chip (by code) that has detections."""
+    model = problem.model
+    n = np.bincount(problem.groups.chip[problem.groups.index], minlength=len(model.chips))
+    used = np.flatnonzero(n)
+    # sines in a circle of frequencies: a side squared, times pi / 4
+    side = np.sqrt(MAX_SINES / (2 * len(used)) / (np.pi / 4))
+    out = {}
+    for code in used:
+        size = model.chips[code].size
+        wanted = StructureFunctions.for_stars(model.order, size, int(n[code]))
+        out[int(code)] = StructureFunctions(
+            model.order, size, int(max(min(wanted.n_side, side), MIN_SIDE))
+        )
+    return out
+
+
+def _structure(
+    solution: SelfCalibrationMode,
+    functions: dict[int, StructureFunctions],
+    sums: tuple[Float, Float, Float],
+    priors: DiscrepancyPriors,
+    n: int,
+    rng: np.random.Generator,
+) -> tuple[dict[int, ChipStructure], Float, list[dict[str, object]]]:
+    """Structure by chip number, its effect on the parameters (n, D), and its sizes."""
+    problem, model = solution.problem, solution.problem.model
+    pixel = model.pixel_size(solution.theta)
+    S, score, taken = sums
+    posterior = structure_posterior(
+        [one for one in functions.values() for _ in "uv"],
+        S,
+        score,
+        noise=pixel * float(np.sqrt(np.median(problem.var) + solution.mixture.jitter**2)),
+        higher_order=priors.higher_order * pixel,
+        structure=priors.structure * pixel,
+    )
+    drawn = posterior.draws(n, rng)
+    out, rows, known = dict[int, ChipStructure](), list[dict[str, object]](), []
+    for k, (code, one) in enumerate(functions.items()):
+        chip, pair = model.chips[code], drawn[2 * k : 2 * k + 2]
+        found = ChipStructure(one, one.finer_waves(rng), np.stack(pair, axis=1))
+        rows += found.sizes(chip, posterior.length)
+        out[chip.number] = found
+        known += [axis[:, : one.n_known] for axis in pair]
+    # the fit absorbs structure into polynomials; the truth lies on the other side
+    return out, -np.concatenate(known, axis=1) @ taken.T, rows

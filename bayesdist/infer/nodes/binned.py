@@ -1,0 +1,192 @@
+"""Look-up table after ACS ISR 2015-06: bins, iterative sigma clipping, smoothing.
+
+ACS ISR 2015-06, section 4.3.1: residuals are averaged in bins of 64 x 64 pixels with iterative
+sigma clipping, then each grid point is smoothed with a 5 x 5 quadratic kernel: the value of a node
+becomes that of the quadratic surface through the 25 values around it, all of equal weight (Anderson
+and King 2000, PASP 112, 1360).  Away from edges and empty bins this is their fixed kernel, 27/175
+in the middle.  Near an edge or an empty bin the surface is fitted to the values that exist.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from bayesdist.errors import DegenerateError, InputError
+from bayesdist.infer.nodes.field import checked_stars
+from bayesdist.infer.nodes.grid import STEP, NodeGrid
+from bayesdist.model import Chip
+from bayesdist.model.lookup import LookupTable
+
+__all__ = ["binned_table", "quadratic_smoother"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+PASSES = 20  # of the clipping, at most
+OWN_SCATTER = 5  # stars from which on a bin's error is from its own scatter
+HALF_WIDTH = 2  # nodes: the kernel is 5 x 5
+# values for each coefficient of the surface: the 3 x 3 of a corner determine a quadratic
+ENOUGH = 1.5
+
+
+def binned_table(
+    x: ArrayLike,
+    y: ArrayLike,
+    shift: ArrayLike,
+    *,
+    chip: Chip,
+    order: int | None = None,
+    clip: float = 3.0,
+    smooth: bool = True,
+    filter: str = "",
+    step: tuple[float, float] = STEP,
+) -> LookupTable:
+    """Table of clipped means in bins, smoothed.
+
+    Parameters
+    ----------
+    x, y : array_like, shape (N,)
+        Raw pixels.
+    shift : array_like, shape (N, 2)
+        Corrections to be added to them, pixels.
+    chip : Chip
+    order : int, optional
+        Subtract the part that a polynomial of this order describes; left in by default, as in the
+        report.
+    clip : float
+        Stars beyond this many standard deviations of their bin's, on either axis, are left out.
+    smooth : bool
+        True to apply the 5 x 5 kernel: `quadratic_smoother`.
+    filter : str
+    step : tuple of float
+        Size of the bins, pixels.
+
+    Returns
+    -------
+    LookupTable
+        With the standard error of each node, propagated from the errors of the bins' means.  It
+        does not include what smoothing removes of the pattern itself.  A node with no star within
+        the kernel is zero, and the rms of the others is its error.
+
+    Raises
+    ------
+    InputError
+        For arrays of other shapes, or a clip that is not positive.
+    DegenerateError
+        When no bin holds two stars.
+    """
+    if not clip > 0:
+        raise InputError(f"stars are clipped at {clip} sigma", do="give a positive number")
+    ones = np.ones_like(np.asarray(shift, float))
+    px, py, r, _, _ = checked_stars(x, y, shift, ones, None, chip)
+    grid = NodeGrid(chip, 1 if order is None else order, step)
+    ny, nx = grid.shape
+    i = np.clip(((px - 0.5) // step[0]).astype(np.int64), 0, nx - 1)
+    j = np.clip(((py - 0.5) // step[1]).astype(np.int64), 0, ny - 1)
+    bins = j * nx + i
+
+    inlier = _clipped(bins, r, grid.n_nodes, clip)
+    count, mean, scatter = _moments(bins[inlier], r[inlier], grid.n_nodes)
+    several = count > 1
+    if not several.any():
+        raise DegenerateError(
+            "no bin holds two stars",
+            where=f"look-up table of chip {chip.number}",
+            do="give more matches or larger bins",
+        )
+    freedom = (count[several] - 1)[:, None]
+    pooled = (scatter[several] ** 2 * freedom).sum(axis=0) / freedom.sum()
+    square = np.where((count >= OWN_SCATTER)[:, None], scatter**2, pooled)
+    filled = count > 0
+    variance = np.where(filled[:, None], square / np.maximum(count, 1)[:, None], 0.0)
+
+    if smooth:
+        H = quadratic_smoother(filled.reshape(ny, nx))
+        mean, variance = H @ mean, H.power(2) @ variance
+        filled = np.diff(H.indptr) > 0
+    if order is not None:
+        mean = grid.without_polynomials(mean)
+    sigma = np.sqrt(variance)
+    sigma[~filled] = np.sqrt((mean[filled] ** 2).mean(axis=0))
+    return grid.table(mean.T, sigma.T, filter=filter)
+
+
+def _clipped(bins: Int, r: Float, n: int, clip: float) -> NDArray[np.bool_]:
+    """Boolean mask (N,) of the stars left when clipping changes nothing any more."""
+    centre, scale = _robust(bins, r, n)
+    inlier: NDArray[np.bool_] = np.ones(len(r), bool)
+    for _ in range(PASSES):
+        within = np.asarray((np.abs(r - centre[bins]) <= clip * scale[bins]).all(axis=1))
+        if np.array_equal(within, inlier):
+            break
+        inlier = within
+        _, centre, scale = _moments(bins[inlier], r[inlier], n)
+    return inlier
+
+
+def _robust(bins: Int, r: Float, n: int) -> tuple[Float, Float]:
+    """Median and scaled median absolute deviation (n, 2), from which the clipping starts."""
+    centre, scale = np.zeros((n, 2)), np.zeros((n, 2))
+    filled = np.unique(bins)
+    for a in (0, 1):
+        centre[filled, a] = ndimage.median(r[:, a], bins, filled)
+        off = np.abs(r[:, a] - centre[bins, a])
+        scale[filled, a] = 1.4826 * ndimage.median(off, bins, filled)
+    return centre, scale
+
+
+def _moments(bins: Int, r: Float, n: int) -> tuple[Int, Float, Float]:
+    """Number (n,), mean and standard deviation (n, 2) of stars in a bin; zero where undefined."""
+    count = np.bincount(bins, minlength=n)
+    mean, square = np.zeros((n, 2)), np.zeros((n, 2))
+    for a in (0, 1):
+        mean[:, a] = np.bincount(bins, r[:, a], n) / np.maximum(count, 1)
+        square[:, a] = np.bincount(bins, (r[:, a] - mean[bins, a]) ** 2, n)
+    return count, mean, np.sqrt(square / np.maximum(count - 1, 1)[:, None])
+
+
+def quadratic_smoother(filled: NDArray[np.bool_]) -> scipy.sparse.csr_array:
+    """Sparse linear map (n_nodes, n_nodes) from node values to smooth ones.
+
+    `filled` (ny, nx) marks nodes with a value; columns of empty nodes are zero.  A node whose
+    window holds few values gets a plane or their mean; one whose window holds none gets a row of
+    zeros.
+    """
+    ny, nx = filled.shape
+    rows, columns, entries = [], [], []
+    for j in range(ny):
+        for i in range(nx):
+            low_j, low_i = max(j - HALF_WIDTH, 0), max(i - HALF_WIDTH, 0)
+            window = filled[low_j : j + HALF_WIDTH + 1, low_i : i + HALF_WIDTH + 1]
+            dj, di = np.nonzero(window)
+            if not len(dj):
+                continue
+            dj, di = dj + low_j - j, di + low_i - i
+            kernel = _kernel(tuple(di.tolist()), tuple(dj.tolist()))
+            rows.append(np.full(len(dj), j * nx + i))
+            columns.append((dj + j) * nx + di + i)
+            entries.append(kernel)
+    shape = (ny * nx, ny * nx)
+    if not rows:
+        return scipy.sparse.csr_array(shape)
+    where = (np.concatenate(rows), np.concatenate(columns))
+    return scipy.sparse.coo_array((np.concatenate(entries), where), shape).tocsr()
+
+
+@lru_cache(maxsize=4096)
+def _kernel(dx: tuple[int, ...], dy: tuple[int, ...]) -> Float:
+    """Weights of values at offsets (m,) in the surface's value at zero."""
+    x, y = np.array(dx, float), np.array(dy, float)
+    quadratic = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    for n in (6, 3, 1):
+        design = quadratic[:, :n]
+        if len(x) >= ENOUGH * n or n == 1:
+            if np.linalg.matrix_rank(design) == n:
+                break
+    weights: Float = np.linalg.pinv(design)[0]
+    return weights

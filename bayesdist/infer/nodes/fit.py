@@ -1,0 +1,261 @@
+"""Polynomial and look-up tables fitted in turn, until both converge.
+
+Each iteration corrects the pixels by the tables of the last one, fits the polynomial, and makes the
+tables anew from *all* that the polynomial leaves: residuals, with the last tables' own shifts added
+back.  Nothing is smoothed twice, and the iterations end at the joint solution of both.
+
+The detector's tables come from a filter whose own irregularities are the smallest, and are then
+fixed; each other filter has its own polynomial, and tables of the residuals of both (ACS ISR
+2015-06, section 4.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import InputError
+from bayesdist.infer.equations.scaled import one_thread
+from bayesdist.infer.linear import LinearFit, fit_linear
+from bayesdist.infer.nodes.binned import binned_table
+from bayesdist.infer.nodes.corrected import corrected_matches, on_the_chips, with_columns
+from bayesdist.infer.nodes.field import field_table
+from bayesdist.infer.nodes.grid import STEP
+from bayesdist.infer.nodes.hyperparameters import SMOOTHNESS
+from bayesdist.infer.nodes.mixture import ResidualMixture, fit_mixture
+from bayesdist.infer.nodes.pixels import pixel_shifts
+from bayesdist.infer.nodes.posterior import TablePosterior
+from bayesdist.infer.nodes.table_fit import Iteration, TableFit, table_of
+from bayesdist.model import DistortionModel
+from bayesdist.model.lookup import LookupTable
+
+__all__ = ["fit_with_tables"]
+
+Float = NDArray[np.float64]
+Fit = Callable[[MatchTable, DistortionModel], LinearFit]
+
+LIKELY = 0.5  # stars that are less likely true matches are left out
+SEARCHED = 2  # iterations that optimise hyperparameters, which are fixed in later ones
+
+
+# all large matrices are factored here, one at a time: see `field_table`
+@one_thread
+def fit_with_tables(
+    matches: MatchTable,
+    model: DistortionModel,
+    *,
+    filter: str = "",
+    beneath: Sequence[LookupTable | TablePosterior] = (),
+    method: str = "field",
+    max_iterations: int = 8,
+    tolerance: float = 2e-4,
+    step: tuple[float, float] = STEP,
+    smoothness: Sequence[float] = SMOOTHNESS,
+    fit: Fit = fit_linear,
+    report: Callable[[Iteration], None] | None = None,
+) -> TableFit:
+    """Fit the polynomial and the look-up tables of one filter in turn.
+
+    Parameters
+    ----------
+    matches : MatchTable
+        At raw pixels, with errors, of one filter.
+    model : DistortionModel
+        It is cut to the exposures of the matches.
+    filter : str
+        Filter of the new tables; '' makes them the detector's.
+    beneath : sequence of LookupTable or TablePosterior
+        The detector's tables where they are known: they are fixed, and applied first.  The error
+        of a posterior counts as far as the new tables do not absorb it, that of a plain table by
+        its upper bound.
+    method : str
+        'field': a Gaussian random field, with the covariance of its nodes; 'binned': clipped means
+        in bins, smoothed, as ACS ISR 2015-06.  Either is made orthogonal to the polynomial.
+    max_iterations : int
+    tolerance : float
+        Change of every node, pixels, below which the iterations end.
+    step : tuple of float
+        Pixels between nodes.
+    smoothness : sequence of float
+        Matern smoothness to choose from, for 'field'.
+    fit : callable
+        Takes matches and a model, returns a solution with `model`, `mean` and `cov`.
+    report : callable, optional
+        Called with each iteration.
+
+    Returns
+    -------
+    TableFit
+        `converged` is True if the tables converged.
+
+    Raises
+    ------
+    InputError
+        For an unknown method, no iterations, a tolerance that is not positive, matches of several
+        filters, matches without the exposure that holds the gauge, or a table of a filter among
+        the detector's.
+    DegenerateError
+        When the matches do not determine the model.
+
+    Notes
+    -----
+    The detector's tables come from one filter, and each other one lies over them::
+
+        base = fit_with_tables(matches.select(matches.filter == 0), model)
+        other = matches.select(matches.filter == 1)
+        fit_with_tables(other, model, filter="F814W", beneath=base.fitted)
+    """
+    _check(matches, beneath, method, max_iterations, tolerance)
+    matches, model = _with_own_exposures(matches, model)
+    chips = [c for k, c in enumerate(matches.chip_numbers) if (matches.chip == k).any()]
+    numbers = matches.chip_number
+    lower = corrected_matches([table_of(one) for one in beneath], matches)
+    x, y = lower.x, lower.y
+    tables: dict[int, LookupTable] = {}
+    posteriors: dict[int, TablePosterior] = {}
+    mixture: ResidualMixture | None = None
+    progress: list[Iteration] = []
+
+    def solved(moved: MatchTable, pixel: float) -> LinearFit:
+        """Polynomial fit for fixed tables; `pixel` is the size of one in u, v."""
+        if mixture is not None:
+            jitter = np.full(len(x), mixture.jitter)
+            for number, posterior in posteriors.items():
+                jitter[numbers == number] = posterior.jitter
+            moved = _with_memberships(moved, mixture, jitter * pixel)
+        return fit(on_the_chips(moved, model), model)
+
+    def new_table(chip: int, rows: NDArray[np.bool_], shift: Float, variance: Float) -> LookupTable:
+        where = model.chips[model.chip_code(chip)]
+        if method == "binned":
+            return binned_table(
+                x[rows],
+                y[rows],
+                shift[rows],
+                chip=where,
+                order=model.order,
+                filter=filter,
+                step=step,
+            )
+        posteriors[chip] = field_table(
+            x[rows],
+            y[rows],
+            shift[rows],
+            variance[rows],
+            chip=where,
+            order=model.order,
+            weight=weight[rows],
+            filter=filter,
+            step=step,
+            smoothness=smoothness,
+            earlier=posteriors.get(chip),
+            hold=number > SEARCHED,
+        )
+        return posteriors[chip].table
+
+    moved, own, pixel = lower, np.zeros((len(x), 2)), 1.0
+    for number in range(1, max_iterations + 1):
+        solution = solved(moved, pixel)
+        pixel = model.pixel_size(solution.mean)
+        shifts = pixel_shifts(solution, moved)
+        mixture = fit_mixture(shifts.shift, shifts.variance)
+        weight = np.where(mixture.probability >= LIKELY, mixture.probability, 0.0)
+        rms = float(np.sqrt((weight[:, None] * shifts.shift**2).sum() / (2 * weight.sum())))
+        total = shifts.shift + own
+        change = []
+        for c in chips:
+            rows = numbers == c
+            new = new_table(c, rows, total, shifts.variance)
+            old = tables[c].values if c in tables else np.zeros_like(new.values)
+            change.append((new.values - old).ravel())
+            tables[c] = new
+            own[rows] = new.evaluate(x[rows], y[rows])
+        difference = np.concatenate(change)
+        progress.append(
+            Iteration(
+                number=number,
+                moved=float(np.abs(difference).max()),
+                moved_rms=float(np.sqrt((difference**2).mean())),
+                rms=rms,
+                false_fraction=mixture.fraction,
+            )
+        )
+        if report is not None:
+            report(progress[-1])
+        moved = with_columns(matches, x=x + own[:, 0], y=y + own[:, 1])
+        if progress[-1].moved < tolerance:
+            break
+    assert mixture is not None
+    return TableFit(
+        filter=filter,
+        solution=solved(moved, pixel),
+        beneath=tuple(beneath),
+        fitted=tuple(posteriors.get(c, tables[c]) for c in chips),
+        mixture=mixture,
+        progress=tuple(progress),
+        converged=progress[-1].moved < tolerance,
+    )
+
+
+def _check(
+    matches: MatchTable,
+    beneath: Sequence[LookupTable | TablePosterior],
+    method: str,
+    max_iterations: int,
+    tolerance: float,
+) -> None:
+    """Refuse arguments that make no fit, as `fit_with_tables` has them."""
+    if method not in ("field", "binned"):
+        raise InputError(f"there is no method {method!r} for tables", do="choose field or binned")
+    if max_iterations < 1 or not tolerance > 0:
+        raise InputError(
+            f"{max_iterations} iterations to a tolerance of {tolerance} pixels",
+            do="give one iteration or more and a positive tolerance",
+        )
+    for table in map(table_of, beneath):
+        if table.filter:
+            raise InputError(
+                f"the look-up table {table.label} is not the detector's",
+                where="beneath",
+                do="give tables of no filter",
+            )
+    present = [matches.filter_names[k] for k in np.unique(matches.filter)]
+    if len(present) > 1:
+        raise InputError(
+            f"the matches are of filters {', '.join(map(repr, present))}",
+            do="give those of one: matches.select(matches.filter == k)",
+        )
+
+
+def _with_own_exposures(
+    matches: MatchTable, model: DistortionModel
+) -> tuple[MatchTable, DistortionModel]:
+    """Matches with the exposures that have stars only, and the model with these."""
+    names = matches.exposures
+    if model.n_frame and model.gauge != "first" and names[0] != model.exposures[0]:
+        raise InputError(
+            f"no match is of exposure {model.exposures[0]!r}, which holds the gauge",
+            do="give the filter a model of its own",
+        )
+    code = np.array([names.index(n) if n in names else 0 for n in matches.exposure_names])
+    some = with_columns(matches, exposure=code[matches.exposure], exposure_names=names)
+    return some, replace(model, exposures=names)
+
+
+def _with_memberships(matches: MatchTable, mixture: ResidualMixture, jitter: Float) -> MatchTable:
+    """Likely true matches, with errors that give the polynomial the weights of the tables.
+
+    A star of probability p counts p times: its variance is divided by p.
+    """
+    assert matches.sigma_u is not None and matches.sigma_v is not None
+    likely = mixture.probability >= LIKELY
+    p = np.maximum(mixture.probability, LIKELY)
+    wide = matches.with_sigma(
+        np.sqrt((matches.sigma_u**2 + jitter**2) / p),
+        np.sqrt((matches.sigma_v**2 + jitter**2) / p),
+    )
+    return wide.select(likely, reason="false match")

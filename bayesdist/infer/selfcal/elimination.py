@@ -1,0 +1,279 @@
+"""Normal equations of the distortion with the stars eliminated.
+
+For star s, with A_s the curvature of the log density by its own parameters and B_s that by its own
+and the distortion's, elimination leaves
+
+    N = sum_i J_i^T H_i J_i - sum_s B_s^T A_s^-1 B_s
+
+dense in the parameters of the distortion and of the exposures alone.  B_s of some thousand stars at
+a time is one matrix, so that the second sum is a product of matrices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer import kernel
+from bayesdist.infer.selfcal.problem import Problem
+
+__all__ = [
+    "Expansion",
+    "Mixture",
+    "PlaceDerivatives",
+    "StarModes",
+    "eliminated_rows",
+    "expand",
+    "log_marginal",
+    "memberships",
+]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+STARS = 4096  # eliminated at a time
+SURE, NEVER = 0.99, 1e-6  # memberships beyond which no other choice is considered
+SCRATCH = 2_000_000  # bytes of coefficients of draws at a time: the cache of a core
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Distribution of detections about their stars."""
+
+    jitter: float = 0.0  # pixels, in addition to the quoted errors
+    fraction: float = 0.01  # of false detections
+
+    def constants(self, log_outlier: float) -> tuple[float, float, float]:
+        """Squared jitter, log of the core's fraction, log density of false detections."""
+        with np.errstate(divide="ignore"):
+            core, false = np.log([1.0 - self.fraction, self.fraction])
+        return self.jitter**2, float(core), float(max(false + log_outlier, -1e300))
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceDerivatives:
+    """Dependence of sky positions on the parameters, linearised at a solution.
+
+    By the coefficients of a chip's polynomials, M (kron) phi; by everything else, `extra` phi.
+    """
+
+    coef: Float  # effective coefficients (G, 2, K)
+    linear: Float  # M (G, 2, 2)
+    # derivatives (G, m, 2, K) by drift and frames; zero where a group has fewer than m of them
+    extra: Float
+    columns: Int  # indices (G, m) of these parameters; -1 for none
+
+    @classmethod
+    def at(cls, problem: Problem, theta: Float) -> PlaceDerivatives:
+        """PlaceDerivatives of a problem at theta (D,)."""
+        groups, K = problem.groups, problem.model.n_terms
+        found = problem.effective_jacobian(theta)
+        m = max(len(columns) for columns, _ in found) - 2 * K
+        extra, columns = np.zeros((len(groups), m, 2, K)), np.full((len(groups), m), -1)
+        linear = np.empty((len(groups), 2, 2))
+        for g, (which, derivative) in enumerate(found):
+            linear[g] = derivative[:, 0, [0, K]]
+            n = len(which) - 2 * K
+            columns[g, :n] = which[2 * K :]
+            extra[g, :n] = np.moveaxis(derivative[..., 2 * K :], 2, 0)
+        return cls(problem.effective(theta), linear, extra, columns)
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """Second-order expansion of the log density at a solution, the stars eliminated."""
+
+    value: float  # log density with the stars integrated out (Laplace), up to a constant
+    gradient: Float  # (D,) at the stars' modes
+    curvature: Float  # minus the Hessian (D, D)
+    stars: Float  # modes (S, q)
+    n_members: float  # expected number of true detections
+    n_doubtful: float  # sum of w (1 - w) over the detections
+    chi2: float  # sum of w times the squared normalised residual
+
+
+def expand(
+    problem: Problem, theta: Float, mixture: Mixture, stars: Float, *, observed: bool = True
+) -> Expansion:
+    """Expansion at theta (D,) by one pass over the detections.
+
+    The search for the stars' modes starts at `stars` (S, q).  If `observed` the curvature is that
+    of the mixture itself; otherwise that with EM weights, which is never indefinite.
+    """
+    structure, D = PlaceDerivatives.at(problem, theta), problem.model.n_params
+    curvature, gradient = np.zeros((D, D)), np.zeros(D)
+    found, scalars = stars.copy(), np.zeros(4)
+    chips = problem.groups.chip
+    for sums in _passes(problem, structure, mixture, found, observed):
+        direct, edge, own, pull_direct, pull_own, some, rows, _ = sums
+        _assemble(curvature, structure, chips, direct, edge, own)
+        curvature -= rows.T @ rows
+        K = structure.coef.shape[2]
+        for c in range(pull_direct.shape[1]):
+            gradient[2 * K * c : 2 * K * (c + 1)] += pull_direct[:, c].sum(axis=0).ravel()
+        used = structure.columns >= 0
+        np.add.at(gradient, structure.columns[used], pull_own.sum(axis=0)[used])
+        scalars += some.sum(axis=0)
+    curvature = (curvature + curvature.T) / 2
+    value, members, doubtful, chi2 = scalars
+    return Expansion(float(value), gradient, curvature, found, members, doubtful, chi2)
+
+
+def eliminated_rows(
+    problem: Problem, theta: Float, mixture: Mixture, stars: Float
+) -> Iterator[tuple[slice, Float, Float]]:
+    """Coupling of stars to the distortion, some stars at a time.
+
+    Yields the stars, L^-1 B (n, q, D) of each, A = L L^T, and L (n, q, q).
+    """
+    structure, D, q = PlaceDerivatives.at(problem, theta), problem.model.n_params, problem.n_star
+    first = 0
+    for *_, rows, factors in _passes(problem, structure, mixture, stars.copy(), True):
+        n = len(factors)
+        yield slice(first, first + n), rows.reshape(n, q, D), factors
+        first += n
+
+
+def _passes(
+    problem: Problem, structure: PlaceDerivatives, mixture: Mixture, stars: Float, observed: bool
+) -> Iterator[tuple[Float, ...]]:
+    p = problem
+    j2, log_core, log_out = mixture.constants(p.log_outlier)
+    for first in range(0, p.n_stars, STARS):
+        yield kernel.eliminate_stars(
+            first,
+            min(first + STARS, p.n_stars),
+            *p.columns,
+            stars,
+            structure.coef,
+            p.groups.chip,
+            structure.linear,
+            structure.extra,
+            structure.columns,
+            p.model.n_params,
+            p.model.order,
+            j2,
+            log_core,
+            log_out,
+            p.least_root,
+            observed,
+        )
+
+
+def _assemble(
+    N: Float, structure: PlaceDerivatives, chips: Int, direct: Float, edge: Float, own: Float
+) -> None:
+    """Add the sums of J^T H J to N (D, D)."""
+    K = structure.coef.shape[2]
+    for c, low in enumerate(direct.sum(axis=0)):
+        uu, uv, vv = (one + np.tril(one, -1).T for one in np.tril(low))
+        at = 2 * K * c
+        N[at : at + 2 * K, at : at + 2 * K] += np.block([[uu, uv], [uv, vv]])
+    edges, owns = edge.sum(axis=0), own.sum(axis=0)
+    for g, columns in enumerate(structure.columns):
+        used = columns >= 0
+        which, at = columns[used], 2 * K * chips[g]
+        block = edges[g].reshape(-1, 2 * K)[used].T
+        N[at : at + 2 * K, which] += block
+        N[which, at : at + 2 * K] += block.T
+        N[np.ix_(which, which)] += owns[g][np.ix_(used, used)]
+
+
+def memberships(problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> Float:
+    """Probability (N,) that a detection belongs to its star."""
+    p = problem
+    j2, log_core, log_out = mixture.constants(p.log_outlier)
+    return np.asarray(
+        kernel.weighted_stars(
+            p.starts,
+            p.places(theta),
+            p.W,
+            p.var,
+            j2,
+            log_core,
+            log_out,
+            p.time,
+            p.factor,
+            p.priors.centre,
+            p.priors.precision,
+            p.least_root,
+            stars.copy(),
+        )
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class StarModes:
+    """Modes of the stars at a solution, and their response to their detections from there."""
+
+    stars: Float
+    weight: Float  # (N,) of each detection in the position of its star; they add to 1
+    middles: Float  # weighted mean positions (S, 2) of the detections at the solution
+    state: NDArray[np.int8]  # of each detection (N,): `kernel.MEMBER`, `DOUBTFUL` or `FALSE`
+
+    @classmethod
+    def at(cls, problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> StarModes:
+        """Modes of a problem at theta (D,), where `stars` are the modes."""
+        p, z = problem, problem.places(theta)
+        member = memberships(problem, theta, mixture, stars)
+        weight = member / (p.var + mixture.jitter**2) * (p.W[:, 0] + p.W[:, 2])
+        total = np.bincount(p.star, weight)
+        lost = total[p.star] <= 0  # a star without members stays in the middle
+        weight = np.where(lost, 1.0 / p.counts[p.star], weight / np.where(lost, 1.0, total[p.star]))
+        middles = [np.bincount(p.star, weight * z[:, axis]) for axis in (0, 1)]
+        return cls(stars, weight, np.stack(middles, axis=1), _states(p, member))
+
+
+def _states(problem: Problem, member: Float) -> NDArray[np.int8]:
+    """States (N,) of detections; doubtful memberships are summed over, for stars without motion.
+
+    All detections of a star with few are doubtful if one is: another one may have the right
+    members.
+    """
+    out = np.where(member > 0.5, kernel.MEMBER, kernel.FALSE).astype(np.int8)
+    if problem.n_star > 2:
+        return out
+    doubtful = member < SURE
+    few = problem.counts <= kernel.MOST_DOUBTFUL
+    open_stars = np.bincount(problem.star, doubtful) > 0
+    out[(few & open_stars)[problem.star]] = kernel.DOUBTFUL
+    # of many detections the most doubtful ones
+    rest = np.flatnonzero(doubtful & (member > NEVER) & ~few[problem.star])
+    rest = rest[np.lexsort((np.abs(member[rest] - 0.5), problem.star[rest]))]
+    star = problem.star[rest]
+    rank = np.arange(len(rest)) - np.searchsorted(star, star)
+    out[rest[rank < kernel.MOST_DOUBTFUL]] = kernel.DOUBTFUL
+    return out
+
+
+def log_marginal(problem: Problem, theta: Float, mixtures: Float, modes: StarModes) -> Float:
+    """Log densities (n,) of theta (n, D), the stars integrated out (Laplace), up to a constant.
+
+    `mixtures` (n, 2) are jitter in pixels and fraction of false detections; the search for the
+    stars' modes starts from `modes`, of a solution near by.
+    """
+    p = problem
+    rows = np.array([Mixture(j, f).constants(p.log_outlier) for j, f in mixtures])
+    out = np.empty(len(theta))
+    # a multiple of eight, as in a vector instruction
+    step = max(8, SCRATCH // (16 * p.model.n_terms * len(p.groups)) // 8 * 8)
+    for a in range(0, len(theta), step):
+        some = slice(a, a + step)
+        sums = kernel.log_marginals(
+            0,
+            p.n_stars,
+            *p.columns,
+            modes.stars,
+            modes.middles,
+            modes.weight,
+            modes.state,
+            np.ascontiguousarray(np.moveaxis(p.effective(theta[some]), 0, -1)),
+            p.model.order,
+            rows[some],
+            p.least_root,
+        )
+        out[some] = sums.sum(axis=0)
+    return out

@@ -1,0 +1,371 @@
+"""Posterior of a self-calibration, the stars integrated out: density, proposal and draws.
+
+The proposal is Laplace approximations at several jitters, as for matched stars (`GridProposal`),
+but with nodes that are found in few passes: with the stars eliminated a pass is expensive, and many
+detections leave the jitter little room.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import DegenerateError, InputError
+from bayesdist.infer.convergence import Limits
+from bayesdist.infer.density.coordinates import Split
+from bayesdist.infer.density.laplace import Node
+from bayesdist.infer.density.proposal import GridProposal
+from bayesdist.infer.equations.arrow import Arrow
+from bayesdist.infer.equations.priors import Prior
+from bayesdist.infer.equations.scaled import one_thread
+from bayesdist.infer.posterior import Posterior, SamplerInfo
+from bayesdist.infer.sampler.chains import Settings, run_chains
+from bayesdist.infer.selfcal.elimination import (
+    Mixture,
+    StarModes,
+    expand,
+    log_marginal,
+    memberships,
+)
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode
+from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.infer.stars.mixture import Hyper, OutlierMixture
+
+__all__ = ["SelfTarget", "propose", "sample_selfcal"]
+
+Float = NDArray[np.float64]
+
+DROP = 18.0  # distance (in log density) below the top to which the nodes extend
+MAX_NODES, MIN_NODES = 25, 9
+MAX_DECREMENT = 1e-4  # decrement at which a node is found
+MAX_STEPS = 12
+MAX_ITERATIONS = 10  # in each of which the mesh of log j is narrowed by seven: to 1e-8
+MIN_EFFECT = 0.02  # change of the log density beyond which the jitter has an effect
+MIN_JITTER = 1e-3  # of the median error: no jitter
+# cost of a detection in a pass, in matched stars: its star's mode is found anew each time
+RELATIVE_COST = 60
+
+
+@dataclass(frozen=True, eq=False)
+class SelfTarget:
+    """Density of psi = (free parameters, log j, logit f); j in pixels."""
+
+    solution: SelfCalibrationMode  # the mode; parameters that it fixes stay there
+    jitter: float | None = None  # fixed value; sampled by default
+    # (a, b) of the Beta prior of the fraction of false detections
+    fraction_prior: tuple[float, float] = (1.0, 9.0)
+    # of the prior of the jitter, in pixels; by default the typical error of a detection
+    jitter_scale: float | None = None
+
+    @property
+    def problem(self) -> Problem:
+        """Detections, linearised about the mode."""
+        return self.solution.problem
+
+    @property
+    def prior(self) -> Prior:
+        """Prior from other sources than the detections."""
+        return self.solution.prior
+
+    @cached_property
+    def mixture(self) -> OutlierMixture:
+        """Mixture with uniform false detections, in pixels."""
+        radius = self.problem.match_radius
+        return OutlierMixture(
+            "uniform", radius, self.jitter, self.fraction_prior, self.jitter_scale
+        )
+
+    @cached_property
+    def hyper(self) -> Hyper:
+        """Priors of jitter and fraction of false detections."""
+        return self.mixture.bind(self.problem.sigma)
+
+    @property
+    def n_theta(self) -> int:
+        """Number of free parameters."""
+        return len(self.solution.free)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of psi."""
+        all_names = self.problem.model.names
+        return (*(all_names[k] for k in self.solution.free), *self.hyper.names)
+
+    @cached_property
+    def _modes(self) -> StarModes:
+        s = self.solution
+        return StarModes.at(s.problem, s.theta, s.mixture, s.stars)
+
+    def theta(self, free: Float) -> Float:
+        """Parameters (..., D) from free ones (..., F)."""
+        out = np.tile(self.solution.theta, (*free.shape[:-1], 1))
+        out[..., self.solution.free] = free
+        return out
+
+    def mixtures(self, hyper: Float) -> Float:
+        """Jitter and fraction of false detections (n, 2) of sampled coordinates."""
+        values = self.hyper.values(hyper)
+        j = values.get("j", np.full(len(hyper), self.jitter or 0.0))
+        return np.stack([j, values["f"]], axis=1)
+
+    def log_density(self, psi: Float) -> Float:
+        """Log posterior (n,) of points (n, F + h); minus infinity outside the support."""
+        ok = np.isfinite(psi).all(axis=1)
+        out = np.full(len(psi), -np.inf)
+        if not ok.any():
+            return out
+        theta, h = self.theta(psi[ok, : self.n_theta]), psi[ok, self.n_theta :]
+        value = self.prior.log_density(theta) + self.hyper.log_prior(h)
+        value += log_marginal(self.problem, theta, self.mixtures(h), self._modes)
+        out[ok] = np.where(np.isnan(value), -np.inf, value)
+        return out
+
+
+@one_thread
+def sample_selfcal(
+    solution: SelfCalibrationMode,
+    *,
+    jitter: float | None = None,
+    fraction_prior: tuple[float, float] = (1.0, 9.0),
+    jitter_scale: float | None = None,
+    seed: int = 1,
+    ensembles: int = 4,
+    target_ess: float = 400.0,
+    target_rhat: float = 1.01,
+    max_steps: int = 20_000,
+    checkpoint_every: int = 200,
+    folder: str | Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Posterior:
+    """Sample distortion, frames, jitter and fraction of false detections.
+
+    Parameters
+    ----------
+    solution : SelfCalibrationMode
+    jitter : float, optional
+        Fixed value, in pixels; sampled by default.
+    fraction_prior : tuple of float
+        As `OutlierMixture`.
+    jitter_scale : float, optional
+        As `OutlierMixture`, in pixels.
+    seed, ensembles, target_ess, target_rhat, max_steps, checkpoint_every, folder, progress
+        As `sample`.
+
+    Returns
+    -------
+    Posterior
+        With errors in the unit of u, v.  Parameters that the gauge fixes have one value in all
+        draws and are not judged.
+
+    Raises
+    ------
+    DegenerateError, InputError
+        As `sample`.
+    """
+    if ensembles < 2:
+        raise InputError(
+            f"{ensembles} ensemble cannot show convergence", where="sampler.ensembles", do="use 4"
+        )
+    started = time.monotonic()
+    target = SelfTarget(solution, jitter, fraction_prior, jitter_scale)
+    proposal = propose(target)
+    seeds = np.random.SeedSequence(seed).generate_state(ensembles + 1)
+    settings = Settings(
+        seeds=tuple(int(s) for s in seeds[:-1]),
+        n_stars=RELATIVE_COST * len(solution.problem),
+        limits=Limits(target_ess, target_rhat),
+        max_steps=max_steps,
+        checkpoint_every=checkpoint_every,
+        folder=None if folder is None else Path(folder),
+        fingerprint=_fingerprint(
+            solution,
+            jitter,
+            fraction_prior,
+            jitter_scale,
+            seed,
+            ensembles,
+            checkpoint_every,
+        ),
+        progress=progress,
+    )
+    chains = run_chains(target, proposal, settings)  # type: ignore[arg-type]
+    E, T, W, D = chains.psi.shape
+    draws = np.swapaxes(chains.psi, 1, 2).reshape(E, W * T, D)
+    n, expansion = target.n_theta, solution.expansion
+    member = memberships(solution.problem, solution.theta, solution.mixture, solution.stars)
+    posterior = Posterior(
+        model=solution.problem.model,
+        mixture=target.mixture,
+        theta=target.theta(draws[..., :n]),
+        hyper=target.hyper.values(draws[..., n:]),
+        log_prob=np.swapaxes(chains.log_prob, 1, 2).reshape(E, W * T),
+        n_stars=len(solution.problem),
+        n_flagged=int((member < 0.5).sum()),
+        n_false=len(solution.problem) - expansion.n_members,
+        reference_sigma=target.hyper.scale,
+        convergence=chains.verdict.among((*solution.problem.model.names, *target.hyper.names)),
+        sampler=SamplerInfo(
+            method=f"emcee {chains.plan.method}",
+            ensembles=ensembles,
+            walkers=chains.plan.walkers,
+            steps=chains.steps,
+            warmup=chains.warmup,
+            passes=chains.passes,
+            acceptance=chains.acceptance,
+            wall_s=time.monotonic() - started,
+            seed=seed,
+        ),
+        own_places=True,
+    )
+    return _in_unit(posterior, solution.problem.model.pixel_size(solution.theta))
+
+
+def _in_unit(posterior: Posterior, pixel: float) -> Posterior:
+    """Posterior whose errors are pixels, with errors in the unit of u, v like all others."""
+    m, hyper = posterior.mixture, dict(posterior.hyper)
+    if "j" in hyper:
+        hyper["j"] = pixel * hyper["j"]
+
+    def scaled(length: float | None) -> float | None:
+        return None if length is None else pixel * length
+
+    mixture = replace(
+        m,
+        match_radius=scaled(m.match_radius),
+        jitter=scaled(m.jitter),
+        jitter_scale=scaled(m.jitter_scale),
+    )
+    sigma = pixel * posterior.reference_sigma
+    return replace(posterior, mixture=mixture, hyper=hyper, reference_sigma=sigma)
+
+
+def _fingerprint(solution: SelfCalibrationMode, *settings: object) -> str:
+    """Fingerprint of everything that must not change between a run and its resumption."""
+    p, digest = solution.problem, hashlib.sha256()
+    for column in (p.seen, p.var, p.starts, p.groups.index, solution.theta):
+        digest.update(np.ascontiguousarray(column).data)
+    digest.update(repr((p.model.to_dict(), settings)).encode())
+    return digest.hexdigest()
+
+
+def propose(target: SelfTarget) -> GridProposal:
+    """Proposal with nodes over all but 1e-8 of the posterior of the jitter.
+
+    DegenerateError when a node has no mode.
+    """
+    split = Split(
+        target.n_theta, target.mixture.hyper, tuple(k for k in target.mixture.hyper if k == "j")
+    )
+    if not split.held:
+        z, bend = _fraction(target, split, np.zeros(0))
+        return GridProposal(split, (_node(target, split, np.zeros(0), z, bend),))
+    at, top = _nodes_at(target)
+    z, bend = _fraction(target, split, np.array([top]))
+    return GridProposal(split, tuple(_node(target, split, np.array([x]), z, bend) for x in at))
+
+
+def _fraction(target: SelfTarget, split: Split, at: Float) -> tuple[float, float]:
+    """Cube root of the most probable fraction of false detections, and its curvature.
+
+    From the density with the stars integrated out: at their modes the fraction would be biased low,
+    for a detection that may be false leaves its star more room.  It hardly depends on the jitter.
+    """
+    solution = target.solution
+    n = len(target.problem)
+    z = float(np.cbrt(max(solution.mixture.fraction, 0.3 / n)))
+    step = z / (3 * max(np.sqrt(n * z**3), 1.0))  # about a standard deviation
+    for _ in range(4):
+        mesh = np.clip(z + step * np.linspace(-2.0, 2.0, 5), z / 5, 0.98)
+        y = np.column_stack([np.tile(solution.theta[solution.free], (5, 1)), mesh])
+        psi = split.to_psi(y, np.tile(at, (5, 1)))
+        value = target.log_density(psi) + split.log_jacobian(y)
+        a, b, _ = np.polyfit(mesh - z, value - value[2], 2)
+        if a >= 0:  # still on the slope
+            z = float(mesh[int(np.argmax(value))])
+            continue
+        move = float(np.clip(-b / (2 * a), -2 * step, 2 * step))
+        z, step = float(np.clip(z + move, z / 5, 0.98)), float(1 / np.sqrt(-2 * a))
+        if abs(move) < 0.2 * step:
+            break
+    return z, step**-2
+
+
+def _nodes_at(target: SelfTarget) -> tuple[Float, float]:
+    """Nodes in log j, and the most probable one, from the density along it, all else fixed."""
+    solution = target.solution
+    rest = solution.theta[solution.free]
+    f = solution.mixture.fraction
+    logit = np.log(f) - np.log1p(-f)
+
+    def along(log_j: Float) -> Float:
+        psi = np.column_stack([np.tile(rest, (len(log_j), 1)), log_j, np.full(len(log_j), logit)])
+        return target.log_density(psi)
+
+    sigma = target.problem.sigma
+    low, high = np.log(MIN_JITTER * sigma), np.log(30 * max(sigma, solution.mixture.jitter))
+    mesh = np.linspace(low, high, 16)
+    for turn in range(MAX_ITERATIONS):
+        value = along(mesh)
+        top = int(np.argmax(value))
+        inside = np.flatnonzero(value > value[top] - DROP)
+        begin, end = max(inside[0] - 1, 0), min(inside[-1] + 1, len(mesh) - 1)
+        if inside[-1] - inside[0] > 6 or turn == MAX_ITERATIONS - 1:
+            break
+        mesh = np.linspace(mesh[begin], mesh[end], 16)
+    fine = np.linspace(mesh[begin], mesh[end], 400)
+    open_end = begin == 0 and mesh[0] <= low + 1e-9
+    if open_end:
+        # at the left end is only the prior's tail: one node in it is enough
+        likelihood = value - value[0] - (mesh - mesh[0])
+        felt = np.flatnonzero(np.abs(likelihood) > MIN_EFFECT)
+        if len(felt):
+            fine = fine[fine >= mesh[max(felt[0] - 2, 0)]]
+    # a peak is nearly Gaussian; a shoulder that falls off from a plateau is not
+    count = MAX_NODES if open_end else MIN_NODES
+    return np.linspace(fine[0], fine[-1], count), float(mesh[np.argmax(value)])
+
+
+def _node(target: SelfTarget, split: Split, at: Float, z: float, bend: float) -> Node:
+    """Node with mode and curvature of everything else at one jitter, for a given fraction."""
+    solution, problem, free = target.solution, target.problem, target.solution.free
+    theta, stars = solution.theta.copy(), solution.stars
+    held = float(np.exp(at[0])) if len(at) else float(target.jitter or 0.0)
+    middles = problem.middles(theta)
+    observed = True
+    for _ in range(MAX_STEPS):
+        found = expand(problem, theta, Mixture(held, z**3), stars, observed=observed)
+        gradient = (found.gradient + target.prior.pull(theta))[free]
+        H = np.zeros((len(free) + 1,) * 2)
+        H[:-1, :-1] = (found.curvature + target.prior.precision)[np.ix_(free, free)]
+        H[-1, -1] = bend
+        try:
+            factor = Arrow(H, np.zeros((0, len(H), 0)), np.zeros((0, 0, 0)), n_tail=1).factor()
+        except np.linalg.LinAlgError as error:
+            if observed:  # a star between two modes: with EM weights the curvature is positive
+                observed = False
+                continue
+            raise DegenerateError(
+                "the detections do not determine the parameters that are free",
+                where="self-calibration",
+                do="look at the gauge: dither more, add roll angles, or give priors",
+            ) from error
+        step = factor.solve(np.append(gradient, 0.0))[:-1]
+        if gradient @ step < MAX_DECREMENT:
+            break
+        theta[free] += step
+        after = problem.middles(theta)
+        stars = found.stars.copy()
+        stars[:, :2] += after - middles
+        middles = after
+    y = np.append(theta[free], z)
+    # of the density itself: that of the expansion has one choice of members
+    value = float(target.log_density(split.to_psi(y, at)[None])[0])
+    log_marginal = value + float(split.log_jacobian(y)) - 0.5 * factor.logdet
+    return Node(at, y, factor, log_marginal)

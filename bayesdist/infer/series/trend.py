@@ -1,0 +1,135 @@
+"""Trends of a coefficient with time: constant, lines, steps, kinks, smooth or irregular drift.
+
+A trend is linear in its parameters once the dates of its breaks are known; its columns are the
+same for every coefficient of a series.  R is the reference date of a segment, as RDATE in Equation
+3 of ACS ISR 2015-06.
+
+    constant    a
+    line        a + b (t - R)
+    step        a_s in segment s
+    line+step   a_s + b (t - R_s)
+    piecewise   continuous, of slope b_s in segment s
+    lines       a_s + b_s (t - R_s)
+    spline      a line, and a smooth deviation: a Wiener process integrated once, seen at few knots
+    random_walk      a constant, and an irregular deviation: a Wiener process, seen at many knots
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayesdist.errors import InputError
+
+__all__ = ["KINDS", "MIN_EXPOSURES", "MIN_EXPOSURES_FOUND", "TrendModel"]
+
+PLAIN = ("constant", "line", "spline", "random_walk")
+BROKEN = ("step", "line+step", "piecewise", "lines")
+KINDS = ("constant", "line", "step", "line+step", "piecewise", "lines", "spline", "random_walk")
+SLOPED = ("line", "line+step", "piecewise", "lines", "spline")
+# fewest exposures of a segment: with given breaks, and where the breaks are to be found
+MIN_EXPOSURES = {"step": 1, "line+step": 1, "piecewise": 2, "lines": 3}
+MIN_EXPOSURES_FOUND = 5
+
+
+@dataclass(frozen=True)
+class TrendModel:
+    """One form of dependence on time.
+
+    Parameters
+    ----------
+    kind : str
+        One of `KINDS`.
+    breaks : tuple of float
+        Dates at which a new segment begins, ascending, decimal years.
+    find : int
+        Number of breaks to be found, where none are given.
+    reference : tuple of float
+        Reference date of each segment; one date serves all.  By default the mean date of the
+        segment's exposures, or of all where the breaks are to be found.
+    groups : str
+        'offsets': each group but the first has its own offset; 'slopes': and its own slope.
+
+    Raises
+    ------
+    InputError
+        For an unknown kind, breaks that do not ascend, or breaks where the kind has none or needs
+        some, and a wrong number of reference dates.
+    """
+
+    kind: str
+    breaks: tuple[float, ...] = ()
+    find: int = 0
+    reference: tuple[float, ...] = ()
+    groups: str = "offsets"
+
+    def __post_init__(self) -> None:
+        where = f"trend {self.kind!r}"
+        if self.kind not in KINDS:
+            raise InputError("unknown trend", where=where, do=f"choose among {', '.join(KINDS)}")
+        if self.groups not in ("offsets", "slopes"):
+            raise InputError(
+                f"groups is {self.groups!r}", where=where, do="choose offsets or slopes"
+            )
+        if not np.isfinite((*self.breaks, *self.reference)).all():
+            raise InputError("a date is not finite", where=where, do="give decimal years")
+        if list(self.breaks) != sorted(set(self.breaks)):
+            raise InputError(
+                f"breaks {list(self.breaks)} do not rise",
+                where=where,
+                do="sort them and name each once",
+            )
+        if self.kind in PLAIN and (self.breaks or self.find):
+            raise InputError("has no breaks", where=where, do=f"choose among {', '.join(BROKEN)}")
+        if self.kind in BROKEN and bool(self.breaks) == bool(self.find):
+            raise InputError(
+                "needs the dates of its breaks, or how many are to be found",
+                where=where,
+                do="give one of breaks and find",
+            )
+        if self.find < 0:
+            raise InputError(f"find is {self.find}", where=where, do="give 1 or more")
+        if len(self.reference) not in (0, 1, self.n_segments):
+            raise InputError(
+                f"{len(self.reference)} reference dates for {self.n_segments} segments",
+                where=where,
+                do="give one date, or one for each segment",
+            )
+
+    @property
+    def n_breaks(self) -> int:
+        """Number of breaks, given or to be found."""
+        return self.find or len(self.breaks)
+
+    @property
+    def n_segments(self) -> int:
+        """Number of segments: one more than the breaks."""
+        return self.n_breaks + 1
+
+    @property
+    def n_columns(self) -> int:
+        """Number of columns, without groups and random part."""
+        s = self.n_segments
+        sizes = {"constant": 1, "line": 2, "spline": 2, "random_walk": 1, "step": s}
+        return {**sizes, "line+step": s + 1, "piecewise": s + 1, "lines": 2 * s}[self.kind]
+
+    @property
+    def name(self) -> str:
+        """Kind, with the breaks: 'lines, break at 2009.4'."""
+        if self.breaks:
+            dates = ", ".join(f"{b:g}" for b in self.breaks)
+            return f"{self.kind}, break{'s' * (len(self.breaks) > 1)} at {dates}"
+        if self.find:
+            return f"{self.kind}, {self.find} break{'s' * (self.find > 1)} found"
+        return self.kind
+
+    @property
+    def drifts(self) -> bool:
+        """True if it has a random part that can follow any drift."""
+        return self.kind in ("spline", "random_walk")
+
+    @property
+    def has_slope(self) -> bool:
+        """True if it claims a drift that goes on."""
+        return self.kind in SLOPED

@@ -1,0 +1,132 @@
+"""How a star counts at a solution: after rejection in least squares, or in a mixture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.infer import kernel
+from bayesdist.infer.kernel import GAUSSIAN, Constants
+from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
+from bayesdist.model import DistortionModel
+
+__all__ = ["Clip", "ClippedGaussian", "Likelihood", "MixtureAt", "star_averages"]
+
+Float = NDArray[np.float64]
+
+
+class Likelihood(Protocol):
+    """Likelihood of a star by its position in the model, at one parameter vector."""
+
+    @property
+    def theta(self) -> Float:
+        """The parameter vector (D,)."""
+
+    def scores(self, stars: Stars) -> Float:
+        """Gradient by the model's u and v, and minus the second derivatives uu, uv, vv: (5, N)."""
+
+    def inliers(self, stars: Stars) -> Float:
+        """Probability (N,) of each star to be a true match."""
+
+    def variances(self, stars: Stars) -> Float:
+        """Variances (2, N) of true matches along u and v."""
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """Limits on the residuals of the first pass, beyond which stars are left out of the second."""
+
+    theta: Float  # of the first pass
+    chi2_limit: float
+    abs_limit: float  # in the unit of u, v
+
+    def keeps(self, model: DistortionModel, matches: MatchTable) -> NDArray[np.bool_]:
+        """Boolean mask (N,) of a table's stars within both limits."""
+        stars, order = prepare(model, matches)
+        return in_table_order(self.keeps_of(stars), order).astype(bool)
+
+    def keeps_of(self, stars: Stars) -> NDArray[np.bool_]:
+        """Boolean mask (N,) of prepared stars within both limits, in their own order."""
+        residual = stars.residuals(self.theta)
+        chi2 = residual[:, 0] ** 2 / stars.var_u + residual[:, 1] ** 2 / stars.var_v
+        r2 = (residual**2).sum(axis=1)
+        return np.asarray((chi2 <= self.chi2_limit) & (r2 <= self.abs_limit**2))
+
+
+@dataclass(frozen=True, eq=False)
+class ClippedGaussian:
+    """Normal errors of the stars within the limits of a two-pass fit."""
+
+    theta: Float
+    clip: Clip
+
+    def scores(self, stars: Stars) -> Float:
+        """As `Likelihood.scores`; zero for stars that are left out."""
+        r = stars.residuals(self.theta).T
+        used = self.clip.keeps_of(stars)
+        w_u, w_v = used / stars.var_u, used / stars.var_v
+        return np.stack([w_u * r[0], w_v * r[1], w_u, np.zeros(len(stars)), w_v])
+
+    def inliers(self, stars: Stars) -> Float:
+        """1 for stars within the limits, else 0."""
+        return self.clip.keeps_of(stars).astype(float)
+
+    def variances(self, stars: Stars) -> Float:
+        """Quoted variances (2, N)."""
+        return np.stack([stars.var_u, stars.var_v])
+
+
+@dataclass(frozen=True, eq=False)
+class MixtureAt:
+    """Mixture of true and false matches, with one set of hyperparameters."""
+
+    theta: Float
+    constants: Constants
+
+    def scores(self, stars: Stars) -> Float:
+        """As `Likelihood.scores`."""
+        if circle := stars.circle(self.constants):
+            return kernel.truncated_scores(
+                stars.blocks,
+                stars.columns,
+                circle,
+                stars.powers(self.theta),
+                stars.model.order,
+                self.constants,
+            )
+        r = stars.residuals(self.theta).T
+        p = star_averages(stars, self.theta[None], self.constants)[0]
+        j2, out = self.constants.j2[0], self.constants.out[0]
+        outlier = 1 / out if self.constants.kind == GAUSSIAN else 0.0
+        w = np.stack([1 / (stars.var_u + j2), 1 / (stars.var_v + j2)])
+        mean = (1 - p) * w + p * outlier
+        # derivative of the membership by position
+        turn = (outlier - w) * r
+        uu, vv = mean - p * (1 - p) * turn**2
+        return np.stack([*(mean * r), uu, -p * (1 - p) * turn[0] * turn[1], vv])
+
+    def inliers(self, stars: Stars) -> Float:
+        """Membership (N,) of each star in the core of the mixture."""
+        return 1.0 - star_averages(stars, self.theta[None], self.constants)[0]
+
+    def variances(self, stars: Stars) -> Float:
+        """Quoted variances with the jitter (2, N)."""
+        return np.stack([stars.var_u, stars.var_v]) + self.constants.j2[0]
+
+
+def star_averages(stars: Stars, theta: Float, constants: Constants) -> Float:
+    """Outlier probability, log-likelihood and its square (3, N), averaged over draws.
+
+    `theta` is (n, D), and `constants` are those of the n draws.  With a sum over the stars it makes
+    a task for `Shards.sum`.
+    """
+    powers, order = stars.powers(theta), stars.model.order
+    if circle := stars.circle(constants):
+        return kernel.truncated_memberships(
+            stars.blocks, stars.columns, circle, powers, order, constants
+        )
+    return kernel.memberships(stars.blocks, stars.columns, powers, order, constants)

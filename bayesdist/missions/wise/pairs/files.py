@@ -1,0 +1,127 @@
+"""The files of RvB pairs: IPAC tables, other tables and Parquet, by their columns and bands."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.table import Table
+from numpy.typing import NDArray
+
+from bayesdist.data.pieces import PIECE
+from bayesdist.data.reading.formats import input_files
+from bayesdist.data.tables.column import Place, SourceColumn, row_number
+from bayesdist.data.tables.files import read_table
+from bayesdist.data.tables.names import BASIC, find_columns
+from bayesdist.data.tables.parquet import ParquetPart, describe_part
+from bayesdist.data.tables.quantities import Columns
+from bayesdist.errors import InputError
+from bayesdist.missions.wise.published import WISE_BANDS
+
+__all__ = [
+    "IPAC",
+    "MAGNITUDES",
+    "RVB_ALIASES",
+    "RvbFile",
+    "band_name",
+    "open_rvb_files",
+]
+
+PathLike = str | os.PathLike[str]
+
+MAGNITUDES = tuple(f"mag_{band.lower()}" for band in WISE_BANDS)
+
+# lower case; the first that the file has is taken
+RVB_ALIASES: dict[str, tuple[str, ...]] = {
+    **{key: BASIC[key] for key in ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag")},
+    "exposure": ("frame", "frame_id", "frameset", *BASIC["exposure"]),
+    "star": BASIC["star"],
+    "band": ("band", "filter", "channel"),
+    "mjd": ("mjd", "mjd_obs"),
+    "colour": ("colour", "color"),
+    **{
+        key: (key, f"w{k}mag", f"w{k}_mag", f"w{k}mpro", f"w{k}")
+        for k, key in enumerate(MAGNITUDES, 1)
+    },
+}
+
+IPAC = (".tbl", ".ipac")
+
+
+def band_name(label: object) -> str:
+    """'W1' to 'W4' of what a file or a user calls a band: W1, w1, 1.
+
+    InputError for anything else.
+    """
+    text = str(label).strip().upper()
+    name = text if text.startswith("W") else f"W{text.removesuffix('.0')}"
+    if name not in WISE_BANDS:
+        raise InputError(f"{label!r} is no band", do=f"give one of {', '.join(WISE_BANDS)}")
+    return name
+
+
+@dataclass(frozen=True, eq=False)
+class RvbFile:
+    """A file and which of its columns is what."""
+
+    source: str
+    contents: Table | ParquetPart
+    found: Mapping[str, str]
+
+    def blocks(self, keys: Sequence[str]) -> Iterator[tuple[Columns, int, Place]]:
+        """Rows of some quantities with the number of the first, counted from 0, and their names."""
+        if isinstance(self.contents, Table):
+            if len(self.contents):
+                yield self.contents, 0, row_number
+            return
+        part = self.contents
+        columns = list(dict.fromkeys(self.found[key] for key in keys if key in self.found))
+        labels = {self.found[key] for key in ("band", "exposure") if key in self.found}
+        labels |= {self.found["epoch"]} & part.texts if "epoch" in self.found else set()
+        for block in part.blocks(columns, encoded=labels & set(columns), size=PIECE):
+            yield block, block.first, part.place(block.first)
+
+    def column(self, table: Columns, key: str, place: Place) -> SourceColumn:
+        """One quantity of some rows."""
+        name = self.found[key]
+        return SourceColumn(table[name], self.source, name, place)
+
+    def bands(self, table: Columns, place: Place) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+        """Code of each row's band, and the bands."""
+        column = self.column(table, "band", place)
+        codes, labels = column.labels()
+        names: list[str] = []
+        for k, label in enumerate(labels):
+            try:
+                names.append(band_name(label))
+            except InputError as error:
+                raise column.fail(int(np.argmax(codes == k)), error.cause, error.do) from None
+        unique = tuple(dict.fromkeys(names))
+        return np.array([unique.index(name) for name in names])[codes], unique
+
+
+def open_rvb_files(
+    path: PathLike | Sequence[PathLike], columns: Mapping[str, str] | None
+) -> list[RvbFile]:
+    columns = {{"color": "colour"}.get(key, key): name for key, name in (columns or {}).items()}
+    out = []
+    for file in input_files(path):
+        name = file.name.lower()
+        contents: Table | ParquetPart
+        if name.endswith(".parquet"):
+            contents = describe_part(file)
+        else:
+            contents = read_table(file)
+        names = list(contents.colnames)
+        found = find_columns(names, columns, RVB_ALIASES, source=str(file))
+        for key in ("x", "y", "u", "v"):
+            if key not in found:
+                raise InputError(
+                    f"no column for {key!r} among {', '.join(names) or 'none'}",
+                    where=str(file),
+                    do="name it in the option 'columns'",
+                )
+        out.append(RvbFile(str(file), contents, found))
+    return out

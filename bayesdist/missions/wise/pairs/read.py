@@ -1,0 +1,259 @@
+"""RvB files: pairs of WISE detections and 2MASS stars, of one band at a time.
+
+WSDC D-T033, section 1: the detections are raw band-frame pixels; the reference stars are brought to
+the same pixels by the frame's solution without any distortion.  Files are IPAC tables, any table
+that `read_matches` knows, or Parquet, which is gone through piece by piece.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from astropy.table import Column
+from numpy.typing import NDArray
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.data.reading.columns import match_columns
+from bayesdist.data.reading.options import ReadOptions, check_sigma, refuse_missing_errors
+from bayesdist.data.tables.column import Place, SourceColumn
+from bayesdist.data.tables.quantities import Columns, Quantities
+from bayesdist.errors import InputError
+from bayesdist.missions.wise.pairs.array_check import ArrayCheck
+from bayesdist.missions.wise.pairs.files import (
+    MAGNITUDES,
+    RVB_ALIASES,
+    RvbFile,
+    band_name,
+    open_rvb_files,
+)
+from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs, colour_of
+from bayesdist.missions.wise.published import WISE_ARRAYS, WISE_BANDS
+
+__all__ = ["chosen_band", "read_rvb", "rvb_bands", "stream_rvb"]
+
+Float = NDArray[np.float64]
+PathLike = str | os.PathLike[str]
+
+
+def rvb_bands(
+    path: PathLike | Sequence[PathLike], *, columns: Mapping[str, str] | None = None
+) -> dict[str, int]:
+    """Number of pairs of each band in some files.
+
+    `path`, `columns`: as `stream_rvb`. Returns bands in the order of their wavelength. InputError
+    without a column of bands, and for what is no band.
+    """
+    return _bands_of(open_rvb_files(path, columns))
+
+
+def _bands_of(files: Sequence[RvbFile]) -> dict[str, int]:
+    counts = dict.fromkeys(WISE_BANDS, 0)
+    for file in files:
+        if "band" not in file.found:
+            raise InputError(
+                "has no column of bands",
+                where=file.source,
+                do="name it in the option 'columns', or say which band all pairs are of",
+            )
+        for table, _, place in file.blocks(["band"]):
+            codes, names = file.bands(table, place)
+            for k, name in enumerate(names):
+                counts[name] += int((codes == k).sum())
+    return {band: n for band, n in counts.items() if n}
+
+
+def stream_rvb(
+    path: PathLike | Sequence[PathLike],
+    *,
+    band: str | None = None,
+    columns: Mapping[str, str] | None = None,
+    unit: str = "pix",
+    sigma: str | float = "columns",
+    pixel_origin: int = 1,
+    size: tuple[float, float] | None = None,
+) -> Iterator[RvbPairs]:
+    """RvB pairs of one band, piece by piece.
+
+    What a piece needs is done to it, and `write_partitioned` puts the pieces where `open_matches`
+    finds them: memory is that of a piece.
+
+    Parameters
+    ----------
+    path : path-like or sequence of path-like
+        .tbl or .ipac (IPAC tables), .parquet, other tables as of `read_matches`; patterns and
+        folders of Parquet as there.
+    band : str, optional
+        'W1' to 'W4'; not needed where the files hold one band.
+    columns : mapping of str to str, optional
+        Column of each quantity: x y u v sigma_u sigma_v epoch mjd exposure mag star band, colour,
+        and mag_w1 to mag_w4, the magnitudes that make colours where there is no column of them.
+        What is not named is looked for under its usual names (`RVB_ALIASES`); an empty name leaves
+        a quantity out.  The frame is the exposure.  `mjd` is a Modified Julian Date whether or not
+        the file says so.
+    unit : str, optional
+        Unit of u and v.
+    sigma : {'columns', 'by_magnitude'} or float, optional
+        As `read_matches`.
+    pixel_origin : {0, 1}, optional
+        Coordinate of the centre of the first pixel in the file.
+    size : tuple of float, optional
+        Columns and rows of the array; those of the band by default.
+
+    Yields
+    ------
+    RvbPairs
+        Not more than `PIECE` pairs, of which no two are equal.  The magnitude is the band's own
+        where the file has no other and each pair of the piece has one.
+
+    Raises
+    ------
+    InputError
+        For missing columns, several bands of which none is chosen, a band that is not there,
+        positions outside the array, pairs that all lie in the array's first quarter (those of
+        another array), u, v in pixels that are mostly far from x, y, and for all that
+        `read_matches` refuses in a row.
+    """
+    check_sigma(sigma)
+    files = open_rvb_files(path, columns)
+    band = chosen_band(files, band)
+    size = size or WISE_ARRAYS[band].size
+    check = ArrayCheck(band, size)
+    for file in files:
+        for table, first, place in file.blocks(list(RVB_ALIASES)):
+            which = np.ones(len(table), bool)
+            if "band" in file.found:
+                codes, names = file.bands(table, place)
+                which = codes == (names.index(band) if band in names else -1)
+            if not which.any():
+                continue
+            pairs = _pairs(file, table, first, place, which, band, unit, sigma, pixel_origin)
+            matches = pairs.matches
+            check.see(
+                matches.x,
+                matches.y,
+                partial(_row_name, matches),
+                reference=(matches.u, matches.v) if matches.unit == "pix" else None,
+            )
+            yield pairs
+    sources = ", ".join(file.source for file in files)
+    if not check.n:
+        raise InputError("holds no rows", where=sources, do="give a table with matched stars")
+    check.end(sources)
+
+
+def _row_name(matches: MatchTable, k: int) -> str:
+    return f"{matches.sources[matches.source[k]]}, row {matches.row[k] + 1}"
+
+
+def read_rvb(
+    path: PathLike | Sequence[PathLike],
+    **options: Any,
+) -> RvbPairs:
+    """RvB pairs of one band in memory.
+
+    Parameters
+    ----------
+    path, **options
+        As `stream_rvb`.
+
+    Returns
+    -------
+    RvbPairs
+
+    Raises
+    ------
+    InputError
+        As `stream_rvb`.
+    """
+    return RvbPairs.concatenate(list(stream_rvb(path, **options)))
+
+
+def chosen_band(files: Sequence[RvbFile], band: str | None) -> str:
+    """The band to be read."""
+    sources = ", ".join(file.source for file in files)
+    if band is not None:
+        band = band_name(band)
+        if not any("band" in file.found for file in files):
+            return band
+    counts = _bands_of(files)
+    found = ", ".join(f"{name} ({n} pairs)" for name, n in counts.items())
+    if not counts:
+        raise InputError("holds no rows", where=sources, do="give a table with matched stars")
+    if band is None:
+        if len(counts) > 1:
+            raise InputError(
+                f"holds several bands: {found}", where=sources, do="choose one of them"
+            )
+        return next(iter(counts))
+    if band not in counts:
+        raise InputError(f"holds no {band}, but {found}", where=sources, do="choose another band")
+    return band
+
+
+def _pairs(
+    file: RvbFile,
+    table: Columns,
+    first: int,
+    place: Place,
+    which: NDArray[np.bool_],
+    band: str,
+    unit: str,
+    sigma: str | float,
+    pixel_origin: int,
+) -> RvbPairs:
+    """The chosen rows of one block."""
+    unread = {"band", "mjd", "colour", *MAGNITUDES}
+    if sigma != "columns":
+        unread |= {"sigma_u", "sigma_v"}
+    plain = {key: name for key, name in file.found.items() if key not in unread}
+    quantities = Quantities(table, plain, file.source, place)
+    out = match_columns(quantities, ReadOptions(unit=unit, pixel_origin=pixel_origin))
+    if "mjd" in file.found and "epoch" not in file.found:
+        column = file.column(table, "mjd", place)
+        out["epoch"] = SourceColumn(
+            Column(column.numbers(), unit="d"), file.source, column.name, place
+        ).years()
+    magnitudes = {
+        key: _magnitudes(file.column(table, key, place))[which]
+        for key in MAGNITUDES
+        if key in file.found
+    }
+    out = {name: v[which] if isinstance(v, np.ndarray) else v for name, v in out.items()}
+    own = magnitudes.get(f"mag_{band.lower()}")
+    if "mag" not in out and own is not None and np.isfinite(own).all():
+        out["mag"] = own
+    if "exposure" in out:  # frames of other bands need no names here
+        used, out["exposure"] = np.unique(out["exposure"], return_inverse=True)
+        out["exposure_names"] = tuple(out["exposure_names"][k] for k in used)
+    matches = MatchTable(
+        **out, filter_names=(band,), row=first + np.flatnonzero(which), sources=(file.source,)
+    )
+    refuse_missing_errors(sigma, matches.has_sigma, matches.has_mag, where=file.source)
+    if not isinstance(sigma, str):
+        matches = matches.with_sigma(sigma, sigma)
+    colour = colour_of(list(magnitudes.values())) if len(magnitudes) > 1 else None
+    if "colour" in file.found:
+        colour = _magnitudes(file.column(table, "colour", place))[which]
+    return RvbPairs(matches, colour)
+
+
+def _magnitudes(column: SourceColumn) -> Float:
+    """Magnitudes; NaN where the source is not detected."""
+    values = column.values
+    mask = np.broadcast_to(getattr(values, "mask", False), np.shape(values))
+    plain = np.asarray(getattr(values, "unmasked", values))
+    known = ~mask
+    if plain.dtype.kind == "f":
+        known = known & ~np.isnan(plain)
+    rows = np.flatnonzero(known)
+    out = np.full(len(plain), np.nan)
+    named = SourceColumn(
+        Column(plain[rows]), column.source, column.name, lambda index: column.place(rows[index])
+    )
+    if len(rows):  # a column of nulls alone has no type
+        out[rows] = named.numbers()
+    return out

@@ -1,0 +1,181 @@
+"""RvB pairs of a run: in memory, left on disk where they are, or selected into its folder."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from bayesdist.app.config import Data
+from bayesdist.app.matches import is_large
+from bayesdist.app.named_files import named_files
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.star_files import PAIRS, part_files
+from bayesdist.data import MatchTable, open_matches, write_partitioned
+from bayesdist.errors import InputError
+from bayesdist.files import made_folder
+from bayesdist.infer import Matches
+from bayesdist.missions.wise.pairs.files import band_name
+from bayesdist.missions.wise.pairs.read import stream_rvb
+from bayesdist.missions.wise.pairs.section import RvbData
+from bayesdist.missions.wise.pairs.selection import SelectedPairs
+from bayesdist.missions.wise.pairs.stored import open_rvb
+from bayesdist.missions.wise.published import WISE_ARRAYS
+
+__all__ = ["RvbInput", "load_rvb"]
+
+
+@dataclass
+class RvbInput:
+    """The RvB pairs that a configuration names.
+
+    What is too large for memory and has to be selected or converted is written once, as a table of
+    matches: beside the run's folder as long as nothing may be written into it, then moved there
+    whole.  The record of the run says that it is there.
+    """
+
+    run: RunDirectory
+    _scratch: TemporaryDirectory[str] | None = None
+    _counts: Mapping[str, Any] | None = None
+
+    def load(self) -> Matches:
+        """The selected pairs.
+
+        InputError for all that is wrong with files and selection, and a detector that is not the
+        band's.
+        """
+        data, size = self._settings
+        path = named_files(self.run.config, Path(self.run.record["base"]))
+        options = _options(data, size)
+        if not is_large(path):
+            return load_rvb(path, data, size)
+        if data.band is not None:
+            _require_array(data.band, size)
+        if "pairs" in self.run.record and part_files(self.run / PAIRS):
+            return self._opened(self.run / PAIRS, self.run.record["pairs"])
+        selection = data.rvb.selection()
+        if selection.takes_all:
+            opened = open_rvb(path, **options)
+            if opened is not None:
+                for band in opened.filter_names:
+                    _require_array(band or data.band, size)
+                return opened
+        return self._written(SelectedPairs(lambda: stream_rvb(path, **options), selection, size))
+
+    @property
+    def _settings(self) -> tuple[RvbData, tuple[float, float]]:
+        """Section [data], and columns and rows of the detector."""
+        config = self.run.config
+        assert isinstance(config.data, RvbData) and config.detector.size is not None
+        return config.data, config.detector.size
+
+    def _written(self, selected: SelectedPairs) -> Matches:
+        """The pairs as a table of matches, in the run's folder if it may be."""
+        self.close()
+        place = self.run.path.resolve().parent
+        while not place.is_dir():
+            place = place.parent
+        try:
+            self._scratch = TemporaryDirectory(
+                prefix=".bayesdist-", dir=place, ignore_cleanup_errors=True
+            )
+        except OSError as error:
+            raise InputError(
+                f"the selected pairs cannot be written beside the run ({error.strerror})",
+                where=str(place),
+                do="choose a folder that you may write to",
+            ) from error
+        folder = Path(self._scratch.name) / PAIRS
+        _, size = self._settings
+
+        def tables() -> Iterator[MatchTable]:
+            for pairs in selected:
+                _require_array(pairs.band, size)
+                yield pairs.matches
+
+        write_partitioned(tables(), folder)
+        self._counts = {"n_rows": selected.n_rows, "rejected": selected.rejected}
+        if not self.run.is_planned:
+            self.move_into_run()
+            return self._opened(self.run / PAIRS, self.run.record["pairs"])
+        return self._opened(folder, self._counts)
+
+    def _opened(self, folder: Path, counts: Mapping[str, Any]) -> Matches:
+        options = _options(*self._settings)
+        # a number has been written into the columns
+        sigma = options["sigma"] if options["sigma"] == "by_magnitude" else "columns"
+        opened = open_matches(folder, unit=options["unit"], sigma=sigma)
+        return replace(opened, dropped=counts["rejected"])
+
+    def move_into_run(self) -> bool:
+        """Move what was written into the folder of the run, which has begun.
+
+        Returns True for pairs that were moved, and have to be opened anew. InputError when the
+        system refuses.
+        """
+        if self._scratch is None or self._counts is None:
+            return False
+        target = made_folder(self.run / PAIRS)
+        for stale in part_files(target):
+            stale.unlink()
+        try:
+            os.replace(Path(self._scratch.name) / PAIRS, target)
+        except OSError as error:
+            raise InputError(
+                f"the selected pairs cannot be moved there ({error.strerror})",
+                where=str(target),
+                do="remove this folder, or choose another for the run",
+            ) from error
+        self.run.note(pairs=self._counts)
+        self.close()
+        return True
+
+    def close(self) -> None:
+        """Remove what was not moved."""
+        if self._scratch is not None:
+            self._scratch.cleanup()
+        self._scratch = self._counts = None
+
+
+def load_rvb(
+    path: str | Path | Sequence[str | Path], data: Data, size: tuple[float, float]
+) -> MatchTable:
+    """RvB pairs in memory, as a configuration reads and selects them.
+
+    `size`: columns and rows of the detector. InputError for all that is wrong with files and
+    selection, and a detector that is not the band's.
+    """
+    assert isinstance(data, RvbData)
+    if data.band is not None:
+        _require_array(data.band, size)
+    pieces = list(stream_rvb(path, **_options(data, size)))
+    _require_array(pieces[0].band, size)
+    return SelectedPairs(lambda: pieces, data.rvb.selection(), size).table()
+
+
+def _options(data: RvbData, size: tuple[float, float]) -> dict[str, Any]:
+    """Options of `stream_rvb` and `open_rvb`."""
+    return {
+        "band": data.band,
+        "columns": data.columns,
+        "unit": data.unit or "pix",
+        "sigma": data.sigma,
+        "pixel_origin": 1 if data.pixel_origin is None else data.pixel_origin,
+        "size": size,
+    }
+
+
+def _require_array(label: str | None, size: tuple[float, float]) -> None:
+    """Refuse a detector that has not the size of the band's array."""
+    band = band_name(label)
+    if tuple(size) != WISE_ARRAYS[band].size:
+        columns, rows = WISE_ARRAYS[band].size
+        raise InputError(
+            f"the array of {band} has {columns:g} x {rows:g} pixels, but the detector "
+            f"{size[0]:g} x {size[1]:g}",
+            where="detector.size",
+            do="give the size of the band's array, or choose the band that it belongs to",
+        )

@@ -1,0 +1,86 @@
+"""The section [data] of RvB pairs: their band, and which of them are taken."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import PositiveFloat, PositiveInt, model_validator
+
+from bayesdist.app.config.data import Data
+from bayesdist.app.config.section import Section
+from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
+from bayesdist.missions.wise.pairs.selection import RvbSelection
+
+__all__ = ["RvbBlock", "RvbData"]
+
+
+class RvbBlock(Section):
+    """Limits on colour, and on offset and chi-square at the array's centre and in its corners."""
+
+    colour: tuple[float, float] | None = None
+    bluest: PositiveInt | None = None
+    accept_centre: PositiveFloat | None = None
+    accept_corner: PositiveFloat | None = None
+    accept_chi2_centre: PositiveFloat | None = None
+    accept_chi2_corner: PositiveFloat | None = None
+    accept_power: PositiveFloat = 2.0
+
+    @model_validator(mode="after")
+    def _ranges(self) -> RvbBlock:
+        if self.colour is not None and not self.colour[0] <= self.colour[1]:
+            raise ValueError(
+                f"data.rvb.colour goes from {self.colour[0]:g} to {self.colour[1]:g}; "
+                "give the lower limit first"
+            )
+        for name in ("accept", "accept_chi2"):
+            given = [f"{name}_{end}" for end in ("centre", "corner") if self._at(name, end)]
+            if len(given) == 1:
+                raise ValueError(
+                    f"data.rvb.{given[0]} stands alone; give {name}_centre and {name}_corner, "
+                    "equal ones for a limit that is the same everywhere"
+                )
+        return self
+
+    def selection(self) -> RvbSelection:
+        """Limits that decide which pairs are taken."""
+        return RvbSelection(
+            colour=self.colour,
+            bluest=self.bluest,
+            offset=self._limit("accept"),
+            chi2=self._limit("accept_chi2"),
+        )
+
+    def _limit(self, name: str) -> RadialLimit | None:
+        centre, corner = (self._at(name, end) for end in ("centre", "corner"))
+        if centre is None or corner is None:
+            return None
+        return RadialLimit(centre, corner, self.accept_power)
+
+    def _at(self, name: str, end: str) -> float | None:
+        """Limit at one end of the radius, the array's centre or its corners."""
+        value: float | None = getattr(self, f"{name}_{end}")
+        return value
+
+
+class RvbData(Data):
+    """RvB pairs of one band."""
+
+    format: Literal["rvb"] = "rvb"
+    band: str | None = None
+    rvb: RvbBlock = RvbBlock()
+
+    one_array: ClassVar[bool] = True
+
+    @model_validator(mode="after")
+    def _in_the_band_frame(self) -> RvbData:
+        if self.tangent_point is not None:
+            raise ValueError(
+                "data.tangent_point is given, but RvB pairs lie in pixels of the band frame; "
+                "leave it out"
+            )
+        for key in ("epoch", "catalogue_epoch"):
+            if getattr(self, key) is not None:
+                raise ValueError(
+                    f"data.{key} is given, and RvB pairs have no proper motions; leave it out"
+                )
+        return self

@@ -1,0 +1,164 @@
+"""Selection of RvB pairs, piece by piece; those that it drops are counted by reason.
+
+In memory or streamed, the same pairs pass: by the range of colours, then the bluest of each frame,
+then the radial limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import InputError
+from bayesdist.missions.wise.pairs.radial_limit import CHI2, OFFSET, RadialLimit, radial_rows
+from bayesdist.missions.wise.pairs.rvb_pairs import (
+    COLOUR,
+    NO_COLOUR,
+    RvbPairs,
+    bluest_rows,
+    colours_of,
+)
+
+__all__ = ["RvbSelection", "SelectedPairs"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Rows = NDArray[np.bool_]
+
+MOST_COLOURS = 100_000_000  # rows whose colours are compared with each other, 1.6 GB of them
+
+
+@dataclass(frozen=True)
+class RvbSelection:
+    """Limits that pairs have to meet, all of those that are given.
+
+    InputError for colours that are no range, and less than one pair.
+    """
+
+    colour: tuple[float, float] | None = None  # lowest and highest colour, both included
+    bluest: int | None = None  # of each frame at most so many, those of the smallest colour
+    # on the distance of the reference position from the detection, in pixels, and on its chi-square
+    # with the quoted errors; a pair beyond both counts under the first
+    offset: RadialLimit | None = None
+    chi2: RadialLimit | None = None
+
+    def __post_init__(self) -> None:
+        if self.colour is not None and not self.colour[0] <= self.colour[1]:
+            low, high = self.colour
+            raise InputError(f"colours from {low:g} to {high:g} are asked for", do="give a range")
+        if self.bluest is not None and self.bluest < 1:
+            raise InputError(
+                f"the {self.bluest} bluest of each frame are asked for", do="ask for one or more"
+            )
+
+    @property
+    def takes_all(self) -> bool:
+        """True if no limit is given."""
+        return self == RvbSelection()
+
+    @property
+    def by_colour(self) -> bool:
+        """True if a pair needs a colour."""
+        return self.colour is not None or self.bluest is not None
+
+    def right_colour(self, pairs: RvbPairs) -> Rows:
+        """Boolean mask (N,) of the pairs with a colour within the limits."""
+        colour = colours_of(pairs)
+        low, high = self.colour or (-np.inf, np.inf)
+        return np.asarray((colour >= low) & (colour <= high))
+
+
+@dataclass
+class SelectedPairs:
+    """The pairs that a selection takes, to be gone through once."""
+
+    # gives the pairs of one band piece by piece: once more where the bluest of each frame are asked
+    # for, which takes the colours of all
+    pieces: Callable[[], Iterable[RvbPairs]]
+    selection: RvbSelection
+    size: tuple[float, float]  # columns and rows of the array
+    n_rows: int = 0  # pairs so far
+    # those of them that were dropped, by reason
+    rejected: dict[str, int] = field(default_factory=dict)
+
+    def __iter__(self) -> Iterator[RvbPairs]:
+        """Pieces of which something is left.
+
+        InputError without colours where they are needed, for u, v in another unit where offsets are
+        judged, and when no pair at all is left.
+        """
+        bluest = self._bluest()
+        sources: dict[str, None] = {}
+        for pairs in self.pieces():
+            sources |= dict.fromkeys(pairs.matches.sources)
+            left = np.ones(len(pairs), bool)
+            for reason, good in self._rules(pairs, bluest).items():
+                dropped = int((left & ~good).sum())
+                if dropped:
+                    self.rejected[reason] = self.rejected.get(reason, 0) + dropped
+                left &= good
+            self.n_rows += len(pairs)
+            if left.any():
+                yield pairs if left.all() else pairs.select(left)
+        if self.n_rows == sum(self.rejected.values()):
+            why = ", ".join(f"{reason} ({n})" for reason, n in self.rejected.items())
+            raise InputError(
+                f"no pair of {self.n_rows} is left by the selection: {why}",
+                where=", ".join(sources),
+                do="widen its limits",
+            )
+
+    def table(self) -> MatchTable:
+        """All of them in memory, with the counts.
+
+        InputError as going through them, and as `MatchTable.concatenate`.
+        """
+        found = MatchTable.concatenate([pairs.matches for pairs in self])
+        columns = {one.name: getattr(found, one.name) for one in fields(found)}
+        columns |= {"n_rows": self.n_rows, "rejected": self.rejected}
+        return MatchTable.of_distinct_rows(**columns)
+
+    def _rules(self, pairs: RvbPairs, bluest: Rows | None) -> Mapping[str, Rows]:
+        """Boolean masks of the pairs that pass, by the reason to drop the others."""
+        rules = {}
+        if self.selection.by_colour:
+            right = self.selection.right_colour(pairs)
+            if bluest is not None:
+                right = right & bluest[self.n_rows : self.n_rows + len(pairs)]
+            rules = {NO_COLOUR: ~np.isnan(colours_of(pairs)), COLOUR: right}
+        offset, chi2 = self.selection.offset, self.selection.chi2
+        if offset is not None or chi2 is not None:
+            near, likely = radial_rows(pairs.matches, self.size, offset=offset, chi2=chi2)
+            rules |= {OFFSET: near, CHI2: likely}
+        return rules
+
+    def _bluest(self) -> Rows | None:
+        """Boolean mask of the rows among the bluest of their frames; None without that rule."""
+        if self.selection.bluest is None:
+            return None
+        colours: list[Float] = []
+        frames: list[Int] = []
+        codes: dict[str, int] = {}
+        for pairs in self.pieces():
+            colour = np.where(self.selection.right_colour(pairs), colours_of(pairs), np.nan)
+            names = pairs.matches.exposure_names
+            code = np.array([codes.setdefault(name, len(codes)) for name in names])
+            colours.append(colour)
+            frames.append(code[pairs.matches.exposure])
+            if sum(map(len, colours)) > MOST_COLOURS:
+                raise InputError(
+                    f"the bluest of each frame are asked for among more than {MOST_COLOURS} pairs",
+                    where=", ".join(pairs.matches.sources),
+                    do="select by a range of colours instead",
+                )
+        if set(codes) == {"1"}:
+            raise InputError(
+                "has no column of frames, of each of which the bluest are asked for",
+                where=", ".join(pairs.matches.sources),
+                do="name it as 'exposure' in the option 'columns'",
+            )
+        return bluest_rows(np.concatenate(colours), np.concatenate(frames), self.selection.bluest)

@@ -1,0 +1,119 @@
+"""A made-up optical model, as the one that the WISE report compares its bands with.
+
+Like the Code V model, turned by 270 degrees it resembles the truth (WSDC D-T033, section 4: longest
+vector 3.513 px, longest difference to W2 1.658 px); as delivered it is worse than none (section 2).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import InputError
+from bayesdist.missions.wise.published import WISE_ARRAYS
+from bayesdist.missions.wise.simulate import wise_solution
+from bayesdist.model import DistortionModel
+from bayesdist.products import SipHeader, write_sip
+from bayesdist.products.formats.common.cards import text_card
+
+__all__ = ["DELIVERED_TURN", "optical_model", "write_optical_model"]
+
+Float = NDArray[np.float64]
+
+BAND = "W2"  # whose longest differences from the optical model the made-up one has
+DELIVERED_TURN = 270
+QUARTERS = {0: 0, 90: 1, 180: 2, 270: 3}
+
+# A field that grows as the cube of the radius, and its direction against the radius: with W2 these
+# give the two longest vectors that the report prints.
+DIFFERENCE = 1.658  # px in the corners
+DIRECTION = -1.12  # radians
+
+HISTORY = (
+    "A made-up optical model: a stand-in, not the Code V model of WISE, whose",
+    "coefficients are not published. It is the distortion of W2 plus a cubic",
+    "field, so that its longest vector, and its longest difference from W2,",
+    "are those of WSDC D-T033. It must be turned by 270 degrees to fit.",
+)
+
+
+def optical_model(band: str = "W2", turn: int = 270) -> tuple[DistortionModel, Float]:
+    """Optical model that resembles the true distortion once it is turned.
+
+    Parameters
+    ----------
+    band : str
+    turn : int
+        Degrees, from x towards y, by which it must be turned to fit: 0, 90, 180 or 270.  270 is the
+        model as it was delivered, 0 the model already turned.
+
+    Returns
+    -------
+    model : DistortionModel
+    theta : ndarray, shape (D,)
+        Its parameters, without constant terms.
+
+    Raises
+    ------
+    InputError
+        For another angle or an unknown band.
+    """
+    if turn not in QUARTERS:
+        raise InputError(
+            f"the optical model is turned by {turn} degrees",
+            where="turn",
+            do="choose 0, 90, 180 or 270",
+        )
+    model, truth = wise_solution(band)
+    basis = model.basis()
+    half = basis.half_size
+    none = np.zeros((2, basis.n_terms))
+    cubic = np.zeros((2, basis.n_terms))
+    for axis, terms in enumerate((((3, 0), (1, 2)), ((2, 1), (0, 3)))):
+        linear = basis.terms.index((1, 0) if axis == 0 else (0, 1))
+        none[axis, [0, linear]] = model.chips[0].reference_pixel[axis], 1.0
+        for i, j in terms:
+            cubic[axis, basis.terms.index((i, j))] = half[0] ** -i * half[1] ** -j
+    none, cubic = basis.from_monomials(none), basis.from_monomials(cubic)
+    c, s = np.cos(DIRECTION), np.sin(DIRECTION)
+    # in the corners x (x^2 + y^2) and y (x^2 + y^2) are 2, in units of the half size
+    field = truth.reshape(2, -1) - none
+    field[:, 0] -= field @ basis.monomial_matrix[0]
+    field += DIFFERENCE / np.sqrt(8) * (np.array([[c, -s], [s, c]]) @ cubic)
+    for _ in range(QUARTERS[turn]):
+        field = _turned_back(field, basis.terms)
+    return model, (none + field).ravel()
+
+
+def _turned_back(field: Float, terms: tuple[tuple[int, int], ...]) -> Float:
+    """Field (2, K) of Legendre products over a square, turned by -90 degrees."""
+    there = np.empty_like(field)  # at the position (-y, x)
+    for k, (i, j) in enumerate(terms):
+        there[:, terms.index((j, i))] = (-1) ** i * field[:, k]
+    return np.stack([there[1], -there[0]])
+
+
+def write_optical_model(path: Path) -> None:
+    """Write the model as it was delivered: turned by 270 degrees it resembles all bands."""
+    model, theta = optical_model(BAND, DELIVERED_TURN)
+    array, basis = WISE_ARRAYS[BAND], model.basis()
+    forward = basis.to_monomials(theta.reshape(2, -1))
+    for axis, term in enumerate(((1, 0), (0, 1))):
+        forward[axis, basis.terms.index(term)] -= 1.0
+    forward[:, 0] = 0.0  # the rest at the reference pixel is rounding
+    a, b = (dict(zip(basis.terms, map(float, one), strict=True)) for one in forward)
+    nx, ny = array.size
+    sip = SipHeader(
+        crpix=array.centre,
+        crval=(0.0, 0.0),
+        cd=np.diag([-1.0, 1.0]) * array.scale / 3600,
+        ctype=("RA---TAN-SIP", "DEC--TAN-SIP"),
+        order=(model.order, model.order),
+        a=a,
+        b=b,
+        size=(int(nx), int(ny)),
+        cards=tuple(text_card("HISTORY", line) for line in HISTORY),
+    )
+    write_sip(sip, path)

@@ -1,0 +1,28 @@
+"""Random numbers that several results share."""
+
+from __future__ import annotations
+
+import numpy as np
+
+__all__ = ["restarted"]
+
+
+def restarted(rng: np.random.Generator) -> np.random.Generator:
+    """A generator of the same numbers from their beginning.
+
+    Results that are compared are made from the same numbers, in whatever order they are made.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        As `numpy.random.default_rng` makes it.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(3)
+    >>> rng.normal() == restarted(rng).normal()
+    True
+    """
+    seeds = rng.bit_generator.seed_seq
+    assert isinstance(seeds, np.random.SeedSequence)
+    return np.random.default_rng(np.random.SeedSequence(seeds.entropy, spawn_key=seeds.spawn_key))

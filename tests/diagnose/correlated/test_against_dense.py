@@ -1,0 +1,112 @@
+"""Information, sandwich and conditional posteriors against algebra with all stars explicit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bayesdist.diagnose.correlated.cells import cell_sums
+from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.correlated.information import Information
+from bayesdist.diagnose.correlated.structure import chip_structure
+from bayesdist.infer import GaussianPriors
+from bayesdist.infer.solution import likelihood_of
+from bayesdist.infer.stars.stars import prepare
+from tests.diagnose.correlated.skies import SIGMA, matched
+
+SIDE = 64
+
+
+@pytest.fixture(scope="module")
+def lone():
+    """Stars of which no two are in one cell, so that sums over cells are exact."""
+    rng = np.random.default_rng(4)
+    fit, table, _ = matched(1200, rng)
+    cell = (np.minimum((table.x - 0.5) / 2048 * SIDE, SIDE - 1)).astype(int)
+    cell = cell + SIDE * np.minimum((table.y - 0.5) / 2048 * SIDE, SIDE - 1).astype(int)
+    rows = np.sort(np.unique(cell, return_index=True)[1])[:150]
+    table = table.select(rows)
+    stars, _ = prepare(fit.model, table)
+    sums = cell_sums(stars, likelihood_of(fit), SIDE)
+    information = Information(fit.model, np.asarray(fit.mean), sums, GaussianPriors.none(fit.model))
+    J = fit.model.jacobian(fit.mean, table.x, table.y).reshape(-1, fit.model.n_params)
+    r = np.column_stack([table.u, table.v]) - fit.model.predict(fit.mean, table.x, table.y)
+    return information, J, r.ravel()
+
+
+def test_the_information_is_that_of_all_stars(lone):
+    information, J, r = lone
+    np.testing.assert_allclose(information.precision, J.T @ J / SIGMA**2, rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(information.score, J.T @ r / SIGMA**2, rtol=1e-7, atol=1e-5)
+
+
+def test_the_sandwich_is_hc3(lone):
+    """MacKinnon and White (1985), with the hat matrix written out."""
+    information, J, r = lone
+    inverse = np.linalg.inv(J.T @ J)
+    hat = np.einsum("nd,de,ne->n", J, inverse, J)
+    meat = J.T @ ((r / (1 - hat)) ** 2 * J.T).T
+    # both axes of a star have one membership: products of its two scores are in as well
+    pairs, own = (r / (1 - hat)).reshape(-1, 2), J.reshape(-1, 2, J.shape[1])
+    cross = np.einsum("nd,n,ne->de", own[:, 0], pairs[:, 0] * pairs[:, 1], own[:, 1])
+    meat = meat + cross + cross.T
+    expected = inverse @ meat @ inverse
+    scale = np.sqrt(np.diag(expected))
+    found = information.sandwich()
+    np.testing.assert_allclose(
+        found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-8
+    )
+
+
+def test_sines_are_orthogonal_to_the_polynomials_over_the_chip():
+    functions = StructureFunctions(3, (2048.0, 1024.0), 10)
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    X, Y = (z.ravel() for z in np.meshgrid(nodes, nodes))
+    w = np.outer(weights, weights).ravel() / 4
+    B = functions.evaluate(X, Y)
+    for i in range(4):
+        for j in range(4 - i):
+            p = np.polynomial.legendre.Legendre.basis(i)(X)
+            p = p * np.polynomial.legendre.Legendre.basis(j)(Y)
+            assert np.abs(B.T @ (w * p)).max() < 1e-12
+
+
+def test_the_sines_have_the_covariance_of_a_matern_field():
+    """In the middle of a large chip, at lengths that the sines resolve."""
+    functions = StructureFunctions(1, (2048.0, 2048.0), 20)
+    length, lag = 0.35, np.array([0.0, 0.1, 0.25, 0.5])
+    # the sines themselves: what polynomials take is no part of a stationary field
+    raw = functions._along(0, lag - 0.25), functions._along(1, np.zeros(4))
+    i, j = functions._waves.T - 1
+    whole = raw[0][:, i] * raw[1][:, j]
+    covariance = whole @ np.diag(functions.spectrum(length)) @ whole[0]
+    t = np.sqrt(3) * lag / length
+    np.testing.assert_allclose(covariance, (1 + t) * np.exp(-t), atol=0.06)
+
+
+def test_conditional_means_are_those_of_dense_algebra():
+    rng = np.random.default_rng(0)
+    functions = StructureFunctions(2, (512.0, 512.0), 6)
+    m = functions.n_known
+    roots = rng.normal(0, 30, (2, m, m + 5))
+    S = [root @ root.T for root in roots]
+    s = [rng.normal(0, 40, m) @ np.linalg.cholesky(one).T * 0.02 for one in S]
+    posterior = chip_structure(functions, S, s, noise=0.02, higher_order=1e-3, structure=1e-3)
+    point = posterior.points[len(posterior.points) // 2]
+    amplitude = 3e-3
+    T, decline = functions.n_terms, functions.decline()
+    for a, axis in enumerate(point.axes):
+        variance = np.concatenate(
+            [
+                (amplitude * decline) ** 2,
+                point.amplitudes[a] ** 2 * functions.spectrum(point.length),
+            ]
+        )
+        precision = S[a] + np.diag(1 / variance)
+        mean, cov = np.linalg.solve(precision, s[a]), np.linalg.inv(precision)
+        terms, sines = axis.draws(np.full(40_000, amplitude), rng)
+        drawn = np.concatenate([terms * decline, sines], axis=1)
+        pull = (drawn.mean(axis=0) - mean) / np.sqrt(np.diag(cov) / len(drawn))
+        assert np.abs(pull).max() < 5.0
+        ratio = drawn[:, :T].var(axis=0) / np.diag(cov)[:T]
+        np.testing.assert_allclose(ratio, 1.0, atol=0.05)

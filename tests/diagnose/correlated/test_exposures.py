@@ -1,0 +1,66 @@
+"""Deviations of single exposures, with and without frames of their own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bayesdist.diagnose.correlated import estimate_discrepancy
+from bayesdist.infer import Rejection, build_model, fit_linear
+from tests.diagnose.correlated.skies import SIZE, matched
+
+EXPOSURES, SCATTER = 8, 3e-5
+
+
+def breathing(frames: str, scatter: float = SCATTER, seed: int = 2):
+    """A discrepancy of exposures whose scales scatter."""
+    rng = np.random.default_rng(seed)
+    _, table, _ = matched(2400, rng)
+    code = np.arange(2400) % EXPOSURES
+    factor = 1 + (scatter * rng.standard_normal(EXPOSURES))[code]
+    names = tuple(f"e{k}" for k in range(EXPOSURES))
+    middle_u, middle_v = table.u.mean(), table.v.mean()
+    table = replace(
+        table,
+        u=middle_u + factor * (table.u - middle_u),
+        v=middle_v + factor * (table.v - middle_v),
+        exposure=code,
+        exposure_names=names,
+    )
+    model = build_model(table, order=3, size=(SIZE, SIZE), frames=frames)
+    fit = fit_linear(table, model, rejection=Rejection(1e9, 1e9))
+    return estimate_discrepancy(table, fit, rng=rng, stars=table)
+
+
+@pytest.mark.parametrize("frames", ["none", "shift_rotation"])
+def test_the_scatter_of_the_scales_is_found(frames):
+    found = breathing(frames).linear
+    assert found is not None and found.n_exposures == EXPOSURES
+    # of scale and two shears, of which the scale alone scatters
+    assert SCATTER / 3 < np.median(found.scatter["shape"]) < 1.5 * SCATTER
+
+
+@pytest.mark.parametrize(
+    ("frames", "kinds"),
+    [
+        ("none", ("shift", "rotation", "scale", "shear")),
+        ("shift", ("rotation", "scale", "shear")),
+        ("shift_rotation_scale", ("shear",)),
+    ],
+)
+def test_a_single_exposure_deviates_in_what_its_frame_does_not_fit(frames, kinds):
+    found = breathing(frames)
+    linear, rng = found.linear, np.random.default_rng(1)
+    assert linear.kinds == kinds
+    P = linear.of_single_exposures(found.mean, 1, rng)
+    basis = found.model.basis(1)
+    terms = list(basis.terms)
+    x, y, constant = (terms.index(t) for t in ((1, 0), (0, 1), (0, 0)))
+    # of u = a x + b y + ..., v = c x + d y + ...: a + d changes by scale, b - c by rotation
+    a, b, c, d = P[:, 0, x], P[:, 0, y], P[:, 1, x], P[:, 1, y]
+    size = SIZE / 2
+    assert (np.std(a + d) > 1e-7 * size) == ("scale" in kinds)
+    assert (np.abs(P[:, :, constant]).max() > 0) == ("shift" in kinds)
+    assert np.std(a - d) > 1e-7 * size and np.std(b + c) > 1e-7 * size

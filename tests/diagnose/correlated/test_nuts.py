@@ -1,0 +1,199 @@
+"""Marginalised posteriors against NumPyro's NUTS, with every coefficient explicit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import arviz
+import numpy as np
+import pytest
+from numpy.polynomial.legendre import legvander2d
+from scipy.stats import kurtosis
+
+from bayesdist.diagnose.correlated import DiscrepancyPriors
+from bayesdist.diagnose.correlated.deviations import DeviationColumns, deviation_draws
+from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.correlated.structure import LENGTHS, chip_structure
+from tests.infer.by_nuts import nuts_draws
+
+pytestmark = pytest.mark.slow
+numpyro = pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
+
+ORDER, SIGMA = 2, 0.02
+POWERS = [(i, j) for i in range(ORDER + 1) for j in range(ORDER + 1 - i)]
+
+
+def polynomials(X: np.ndarray, Y: np.ndarray) -> np.ndarray:
+    every = legvander2d(X, Y, [ORDER] * 2)
+    return np.stack([every[:, i * (ORDER + 1) + j] for i, j in POWERS], axis=1)
+
+
+def nuts(density: Callable[[], None], start: dict[str, object], draws: int, seed: int):
+    """Draws (4, n, ...) of what the density samples and names."""
+    settings = {"warmup": 1000, "target_accept": 0.9, "by_chain": True}
+    return nuts_draws(density, start, draws, seed, **settings)
+
+
+def _effective(chains: np.ndarray) -> np.ndarray:
+    return np.array([float(arviz.ess(chains[..., k])) for k in range(chains.shape[-1])])
+
+
+def agree(ours: np.ndarray, got: dict[str, np.ndarray], name: str, what: str, capsys) -> None:
+    """Means and standard deviations within four Monte-Carlo errors of the chains (4, n, ...).
+
+    A mean hangs on the amplitudes, which mix ten times more slowly than what they are amplitudes
+    of: the slowest of all that was sampled says how many draws of a mean are independent.
+    """
+    theirs = got[name].reshape(*got[name].shape[:2], -1)
+    sizes = _effective(theirs)
+    slowest = min(_effective(v.reshape(*v.shape[:2], -1)).min() for v in got.values())
+    flat = theirs.reshape(-1, theirs.shape[-1])
+    sd = flat.std(axis=0)
+    shift = np.abs(ours.mean(axis=0) - flat.mean(axis=0)) / sd
+    ratio = ours.std(axis=0) / sd
+    with capsys.disabled():
+        print(
+            f"\n{what}: {sd.size} quantities, at least {slowest:.0f} independent draws; "
+            f"means differ by at most {shift.max():.3f} sd, sd ratio {ratio.min():.4f} to "
+            f"{ratio.max():.4f}"
+        )
+    assert slowest > 400
+    assert (shift < 4 / np.sqrt(slowest)).all()
+    # tails are heavier than a normal distribution's
+    assert (np.abs(ratio - 1) < 4 * np.sqrt(kurtosis(flat, axis=0, fisher=False) / 4 / sizes)).all()
+
+
+@pytest.mark.parametrize("found", [True, False], ids=["a field", "nothing"])
+def test_structure(found, full, capsys):
+    """Polynomial, higher orders and sines of both axes; three amplitudes; length and likeness."""
+    import jax
+    import jax.numpy as jnp
+    import numpyro.distributions as dist
+
+    jax.config.update("jax_enable_x64", True)
+    rng = np.random.default_rng(8)
+    n, amplitude = 250, 0.012 if found else 0.0
+    functions = StructureFunctions(ORDER, (1024.0, 1024.0), 6)
+    X, Y = rng.uniform(-1, 1, (2, n))
+    P = polynomials(X, Y)
+    B = functions.evaluate(X, Y)
+    T, m = functions.n_terms, functions.n_known
+    truth = amplitude * np.sqrt(functions.spectrum(0.35))[:, None] * rng.standard_normal((m - T, 2))
+    data = B[:, T:] @ truth + SIGMA * rng.standard_normal((n, 2))
+
+    # the fit's share eliminated, as the estimate from cells does it
+    hat = P @ np.linalg.solve(P.T @ P, P.T)
+    left = B - hat @ B
+    S = [left.T @ left / SIGMA**2] * 2
+    score = [left.T @ data[:, a] / SIGMA**2 for a in (0, 1)]
+    medians = {"higher_order": 2e-3, "structure": 2e-3}
+    posterior = chip_structure(functions, S, score, noise=SIGMA, **medians)
+    drawn = posterior.draws(40_000, rng)[..., :m]
+    places = np.array([[-0.9, 0.9, 0.0, 0.5], [-0.9, -0.9, 0.1, 0.8]])
+    at, low_at = functions.evaluate(*places), polynomials(*places)
+    root = np.linalg.cholesky(np.linalg.inv(P.T @ P)) * SIGMA
+    theirs_given = [
+        np.linalg.lstsq(P, data[:, [a]] - B @ drawn[:, a].T, rcond=None)[0] for a in (0, 1)
+    ]
+    of_fit = [t.T + rng.standard_normal((len(drawn), len(POWERS))) @ root.T for t in theirs_given]
+    parts = [drawn[:, a] @ at.T for a in (0, 1)]
+    totals = [part + t @ low_at.T for part, t in zip(parts, of_fit, strict=True)]
+    ours = np.concatenate([*parts, *totals], axis=1)
+
+    grid = posterior.terms_amplitude
+    low = 0.01 * float(grid[0])
+    high = max(3 * SIGMA, 10 * medians["structure"])
+    decline = jnp.array(functions.decline())
+    spectra = jnp.array(np.stack([np.sqrt(functions.spectrum(s)) for s in LENGTHS]))
+    stars, poly, every, points = (jnp.array(z) for z in (data, P, B, at))
+    centre, spread = (jnp.array(z) for z in (np.linalg.lstsq(P, data, rcond=None)[0].T, root))
+
+    def half_cauchy(t, median):
+        z = jnp.exp(t) / median
+        return jnp.log(z) - jnp.log1p(z**2)
+
+    def density():
+        flat = dist.ImproperUniform(dist.constraints.real, (), (2, len(POWERS)))
+        theta = centre + numpyro.sample("theta", flat) @ spread.T
+        terms = numpyro.sample("terms", dist.Normal(0, 1).expand((2, T)))
+        sines = numpyro.sample("sines", dist.Normal(0, 1).expand((2, m - T)))
+        within = dist.Uniform(np.log(low), np.log(high))
+        of_terms = numpyro.sample("of_terms", dist.Uniform(np.log(low), np.log(3 * high)))
+        a = jnp.stack([numpyro.sample(f"of_field_{k}", within) for k in "uv"])
+        z_terms = jnp.exp(of_terms) * decline * terms
+        base = stars.T - theta @ poly.T - z_terms @ every[:, :T].T
+        inside = 1 - 0.5 * (jnp.exp(np.log(low) - a[0]) + jnp.exp(a[0] - np.log(high)))
+        apart = jnp.log(0.5) - jnp.abs(a[0] - a[1])
+        rms = 0.5 * jnp.log(0.5 * jnp.exp(2 * a).sum())
+        alike = jnp.log(0.8) + half_cauchy(a[0], medians["structure"]) + apart - jnp.log(inside)
+        unlike = jnp.log(0.2) + half_cauchy(rms, medians["structure"]) + apart
+        logs, fields = [], []
+        for prior, sizes in ((alike, a[jnp.array([0, 0])]), (unlike, a)):
+            for spectrum in spectra:
+                z = jnp.exp(sizes)[:, None] * spectrum * sines
+                logs.append(prior - 0.5 * ((base - z @ every[:, T:].T) ** 2).sum() / SIGMA**2)
+                fields.append(jnp.concatenate([z_terms, z], axis=1) @ points.T)
+        logs = jnp.stack(logs)
+        numpyro.factor("posterior", half_cauchy(of_terms, medians["higher_order"]))
+        numpyro.factor("mixture", jax.scipy.special.logsumexp(logs))
+        pick = numpyro.sample("pick", dist.Uniform())
+        which = jnp.searchsorted(jnp.cumsum(jax.nn.softmax(logs)), pick)
+        field = jnp.stack(fields)[which]
+        numpyro.deterministic("at", jnp.stack([field, field + theta @ low_at.T]))
+
+    start = {
+        "theta": np.zeros((2, len(POWERS))),
+        "terms": np.zeros((2, T)),
+        "sines": np.zeros((2, m - T)),
+        "of_terms": np.log(1e-3),
+        "of_field_u": np.log(5e-3),
+        "of_field_v": np.log(5e-3),
+        "pick": 0.5,
+    }
+    got = nuts(density, start, 10_000 if full else 2500, 5)
+    agree(ours, got, "at", "structure" + (" of a field" if found else " of nothing"), capsys)
+
+
+def test_deviations_of_exposures(full, capsys):
+    """Scale and shears of six exposures and the curvature of a drift, two scatters."""
+    import jax
+    import jax.numpy as jnp
+    import numpyro.distributions as dist
+
+    jax.config.update("jax_enable_x64", True)
+    rng = np.random.default_rng(3)
+    scatter = np.array(["shape"] * 18 + ["rotation"] * 6 + ["curvature"] * 2)
+    priors = DiscrepancyPriors(exposure=1e-5, curvature=3e-7)
+    sizes = {"shape": 2e-5, "rotation": 5e-6, "curvature": 2e-7}
+    q, n = len(scatter), 80
+    d = np.array([sizes[s] for s in scatter]) * rng.standard_normal(q)
+    A = rng.standard_normal((n, q))
+    A[:, -2:] *= 40.0
+    noise = 1e-4
+    data = A @ d + noise * rng.standard_normal(n)
+    S, score = A.T @ A / noise**2, A.T @ data / noise**2
+    columns = DeviationColumns(
+        None, np.zeros(1), (), ((0, 0, 1), (0, 1, 2)), scatter, np.zeros(1, int), 6, 2010.0, 1.0
+    )
+    found = deviation_draws(columns, S, score, -np.eye(q), priors, 60_000, rng)
+    medians = {"shape": 1e-5, "rotation": 1e-5, "curvature": 3e-7}
+    index = np.array([list(medians).index(s) for s in scatter])
+    matrix, seen = jnp.array(A / noise), jnp.array(data / noise)
+
+    def density():
+        logs = jnp.stack(
+            [
+                numpyro.sample(name, dist.Uniform(np.log(m) - 7, np.log(m) + 7))
+                for name, m in medians.items()
+            ]
+        )
+        z = jnp.exp(logs) / jnp.array(list(medians.values()))
+        numpyro.factor("prior", (jnp.log(z) - jnp.log1p(z**2)).sum())
+        own = numpyro.sample("own", dist.Normal(0, 1).expand((q,)))
+        each = jnp.exp(logs)[index] * own
+        numpyro.factor("seen", -0.5 * ((seen - matrix @ each) ** 2).sum())
+        numpyro.deterministic("each", each)
+
+    start = {"own": np.zeros(q)} | {name: np.log(m) for name, m in medians.items()}
+    got = nuts(density, start, 10_000 if full else 2500, 4)
+    agree(found.theta, got, "each", "deviations", capsys)
