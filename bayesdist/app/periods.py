@@ -9,7 +9,6 @@ from astropy.table import Table, vstack
 from astropy.time import Time
 
 from bayesdist.assess import SAMPLE, convert, pixel_scale_of
-from bayesdist.data import MatchTable
 from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, bins_for
 from bayesdist.errors import InputError
 
@@ -47,7 +46,7 @@ def check_pairs(session: Session) -> dict[str, int]:
         raise InputError(
             "[periods] needs an epoch for every pair", where=where, do="map column 'epoch'"
         )
-    some = raw if isinstance(raw, MatchTable) else raw.sample(SAMPLE)
+    some = raw if raw.in_memory else raw.sample(SAMPLE)
     epoch = some.epoch
     assert epoch is not None
     share = len(raw) / len(some)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -114,7 +114,8 @@ class RvbInput:
         # a number has been written into the columns
         sigma = options["sigma"] if options["sigma"] == "by_magnitude" else "columns"
         opened = open_matches(folder, unit=options["unit"], sigma=sigma)
-        return replace(opened, dropped=counts["rejected"])
+        rejected = counts["rejected"]
+        return opened.with_counts(len(opened) + sum(rejected.values()), rejected)
 
     def settle(self) -> bool:
         """Move what was written into the folder of the run, which has begun.

@@ -420,7 +420,7 @@ class Session:
     def dates(self) -> Float:
         """Distinct dates of the matches, in decimal years; none where they have none."""
         raw = self.raw_matches
-        table = raw if isinstance(raw, MatchTable) else self._sample
+        table = raw if raw.in_memory else self._sample
         return np.zeros(0) if table.epoch is None else np.unique(table.epoch)
 
     @property
@@ -467,6 +467,6 @@ class Session:
     @cached_property
     def _median_epoch(self) -> float:
         raw = self.raw_matches
-        table = raw if isinstance(raw, MatchTable) else raw.sample(SAMPLE)
+        table = raw if raw.in_memory else raw.sample(SAMPLE)
         assert table.epoch is not None
         return float(np.median(table.epoch))

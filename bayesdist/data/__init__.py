@@ -1,10 +1,9 @@
 """Input: matched positions, reference catalogues, and the matching of star lists with catalogues.
 
 `read_matches` reads any known kind of file, `read_rvb` WISE's pairs.  Each kind of file has a
-module of its own, and all of them end in a `MatchTable`, where units, errors and row numbers have
+module of its own, and all of them end in `Matches`, where units, errors and row numbers have
 been checked.  Tables that are larger than the memory are Parquet: `open_matches` leaves them on
-disk and gives `PartitionedMatches`, whose pieces are MatchTables; `write_partitioned` makes such
-files.
+disk, to be read in batches; `write_partitioned` makes such files.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ _HOMES = {
     "bayesdist.data.exposures": ("read_exposures", "write_exposures"),
     "bayesdist.data.hst1pass": ("Hst1passList", "read_hst1pass", "read_matchup"),
     "bayesdist.data.magnitude_errors": ("MagnitudeErrors",),
-    "bayesdist.data.matches": ("MatchTable",),
+    "bayesdist.data.matches": ("Matches", "MatchTable"),
     "bayesdist.data.matching.campaign": ("CampaignMatches", "match_campaign"),
     "bayesdist.data.matching.linear_map": ("LinearMap",),
     "bayesdist.data.matching.reports": ("ExposureReport",),
@@ -32,12 +31,10 @@ _HOMES = {
         "motion_error_line",
         "select_motions",
     ),
-    "bayesdist.data.partitioned": ("PartitionedMatches", "open_matches"),
-    "bayesdist.data.pieces": ("PIECE", "Piece"),
+    "bayesdist.data.on_disk": ("open_matches",),
     "bayesdist.data.preparing": (
         "centroid_errors",
         "neutralise_aberration",
-        "with_centroid_errors",
     ),
     "bayesdist.data.reading.formats": ("FORMATS", "input_files"),
     "bayesdist.data.reading.mission_formats": ("MatchFormat",),

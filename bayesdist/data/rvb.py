@@ -16,7 +16,7 @@ import numpy as np
 from astropy.table import Column
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.data.reading.columns import match_columns
 from bayesdist.data.reading.options import ReadOptions, check_sigma, refuse_missing_errors
 from bayesdist.data.rvb_array import ArrayCheck
@@ -118,7 +118,7 @@ def stream_rvb(
     Yields
     ------
     RvbPairs
-        Not more than `PIECE` pairs, of which no two are equal.  The magnitude is the band's own
+        Not more than `BATCH` pairs, of which no two are equal.  The magnitude is the band's own
         where the file has no other and each pair of the piece has one.
 
     Raises
@@ -157,7 +157,7 @@ def stream_rvb(
     check.end(sources)
 
 
-def _row_name(matches: MatchTable, k: int) -> str:
+def _row_name(matches: Matches, k: int) -> str:
     return f"{matches.sources[matches.source[k]]}, row {matches.row[k] + 1}"
 
 
@@ -241,12 +241,12 @@ def _pairs(
     if "exposure" in out:  # frames of other bands need no names here
         used, out["exposure"] = np.unique(out["exposure"], return_inverse=True)
         out["exposure_names"] = tuple(out["exposure_names"][k] for k in used)
-    matches = MatchTable(
+    matches = Matches(
         **out, filter_names=(band,), row=first + np.flatnonzero(which), sources=(file.source,)
     )
     refuse_missing_errors(sigma, matches.has_sigma, matches.has_mag, where=file.source)
     if not isinstance(sigma, str):
-        matches = matches.with_sigma(sigma, sigma)
+        matches = matches.with_errors(sigma)
     colour = colour_of(list(magnitudes.values())) if len(magnitudes) > 1 else None
     if "colour" in file.found:
         colour = _magnitudes(file.column(table, "colour", place))[which]

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-from bayesdist.data.partitioned import PartitionedMatches, open_matches
+from bayesdist.data.on_disk import Matches, open_matches
 from bayesdist.data.rvb import chosen_band
 from bayesdist.data.rvb_array import ArrayCheck
 from bayesdist.data.rvb_files import MAGNITUDES, RvbFile, open_rvb_files
@@ -28,7 +28,7 @@ def open_rvb(
     sigma: str | float,
     pixel_origin: int,
     size: tuple[float, float],
-) -> PartitionedMatches | None:
+) -> Matches | None:
     """RvB pairs of one band, left on disk.
 
     Parameters
@@ -38,7 +38,7 @@ def open_rvb(
 
     Returns
     -------
-    PartitionedMatches or None
+    Matches or None
         The pairs that `stream_rvb` gives.  None where the files are no Parquet, hold other bands
         beside this one, or have to be converted: dates in MJD, magnitudes by band.
 

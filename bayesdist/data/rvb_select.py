@@ -7,12 +7,12 @@ then the radial limits.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.data.rvb_accept import CHI2, OFFSET, RadialLimit, radial_rows
 from bayesdist.data.rvb_pairs import COLOUR, NO_COLOUR, RvbPairs, bluest_rows, colours_of
 from bayesdist.errors import InputError
@@ -134,18 +134,16 @@ class SelectedPairs:
                 do="widen its limits",
             )
 
-    def table(self) -> MatchTable:
+    def table(self) -> Matches:
         """All of them in memory, with the counts.
 
         Raises
         ------
         InputError
-            As going through them, and as `MatchTable.concatenate`.
+            As going through them, and as `Matches.concatenate`.
         """
-        found = MatchTable.concatenate([pairs.matches for pairs in self])
-        columns = {one.name: getattr(found, one.name) for one in fields(found)}
-        columns |= {"n_rows": self.n_rows, "rejected": self.rejected}
-        return MatchTable.of_distinct_rows(**columns)
+        found = Matches.concatenate([pairs.matches for pairs in self])
+        return found.with_counts(self.n_rows, self.rejected)
 
     def _rules(self, pairs: RvbPairs, bluest: Rows | None) -> Mapping[str, Rows]:
         """Which pairs are good by each reason to drop one."""

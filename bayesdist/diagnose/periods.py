@@ -249,7 +249,7 @@ def time_variation(
     ----------
     fit : LinearFit
         Of all data, without frames and time dependence.
-    matches : MatchTable or PartitionedMatches
+    matches : Matches
         With errors and epochs.
     settings : PeriodSettings
     rng : numpy.random.Generator

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from bayesdist.data.batches import even_edges
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.pieces import even_edges
 from bayesdist.data.write import write_partitioned
 from bayesdist.simulate.matches import Truth
 

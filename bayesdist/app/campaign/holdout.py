@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bayesdist.assess.error_model import solution_with_errors
-from bayesdist.data import MatchTable
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
 from bayesdist.infer.catalogue.star_influence import star_influence
@@ -28,7 +27,6 @@ def predictive_of_campaign(session: CampaignSession, found: Diagnostics) -> Pred
     errors in the catalogue did there is known and no part of their residuals.
     """
     fitted, held = session.matches, session.held_pairs
-    assert isinstance(fitted, MatchTable)
     errors, stars = session.catalogue_errors, None
     if errors is not None and held is not None and held.star is not None:
         whole = np.isin(held.exposure_names, session.matched.whole)

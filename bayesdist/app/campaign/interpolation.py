@@ -17,7 +17,6 @@ from bayesdist.diagnose.tables.mean_square import MeanSquare
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import LinearFit
 from bayesdist.infer.nodes import TablePosterior, pixel_shifts
-from bayesdist.infer.nodes.alternation import with_columns
 from bayesdist.infer.nodes.table_fit import held_sigma
 from bayesdist.infer.nodes.trust import Trust, fitted_trust
 from bayesdist.model import Chip, LookupTable, corrected
@@ -71,7 +70,7 @@ def measured_between(
         return ()
     numbers = pairs.chip_number
     px, py = corrected(tables, pairs.x, pairs.y, chip=numbers, filter=filter)
-    left = pixel_shifts(fit, with_columns(pairs, x=px, y=py))
+    left = pixel_shifts(fit, pairs.with_columns(x=px, y=py))
     trust = trust or fitted_trust(left.shift, left.variance)
     jitter = np.full(len(pairs), trust.jitter)
     for one in posteriors:

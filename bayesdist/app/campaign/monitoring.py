@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +12,13 @@ from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.kinds.errors import read_magnitude_errors
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.star_files import PAIRS, part_files
-from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
+from bayesdist.data import MagnitudeErrors, MatchTable, read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_influence import StarErrors
 from bayesdist.infer.compare.monitoring import NewFit, fit_new, with_star_errors_of
 from bayesdist.infer.linear import Rejection
-from bayesdist.infer.nodes.alternation import on_the_chips, with_columns
+from bayesdist.infer.nodes.alternation import on_the_chips
 from bayesdist.model import corrected
 
 __all__ = ["NewExposures", "fit_exposures_of", "read_new_exposures"]
@@ -89,10 +89,7 @@ def read_new_exposures(session: CampaignSession, new: Path) -> NewExposures:
             do="give pairs of other exposures",
         )
     pairs = pairs.select(fresh)
-    names = pairs.exposures
-    code = {name: k for k, name in enumerate(names)}
-    codes = np.array([code.get(name, -1) for name in pairs.exposure_names])[pairs.exposure]
-    pairs = replace(pairs, exposure=codes, exposure_names=names)
+    pairs = pairs.with_exposure_names(pairs.exposures)
     own = None if run is None else read_magnitude_errors(run.path)
     return NewExposures(
         released,
@@ -117,10 +114,10 @@ def prepared(
             chip=pairs.chip_number,
             filter=np.where(names == "", own, names),
         )
-        pairs = on_the_chips(with_columns(pairs, x=x, y=y), session.fit.model)
+        pairs = on_the_chips(pairs.with_columns(x=x, y=y), session.fit.model)
     if pairs.mag is None or errors is None:
         return pairs
-    return with_centroid_errors(pairs, errors)
+    return pairs.with_errors(errors, in_quadrature=True)
 
 
 def fit_exposures_of(session: CampaignSession, new: NewExposures) -> NewFit:
@@ -143,7 +140,6 @@ def fit_exposures_of(session: CampaignSession, new: NewExposures) -> NewFit:
     released = None
     if new.same_catalogue:
         old = session.matches
-        assert isinstance(old, MatchTable)
         released = (session.fit, old)
     return with_star_errors_of(new.errors, found, new.matches, released)
 

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from bayesdist.app.campaign.inputs import cuts_of, read_campaign_catalog
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.rundir import as_json
-from bayesdist.data import MatchTable, with_centroid_errors
+from bayesdist.data import MatchTable
 from bayesdist.data.motions import motion_error_line
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
 from bayesdist.infer import GaussianPriors, LinearFit, fit_linear
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import Rejection
 from bayesdist.infer.nodes import pixel_shifts
-from bayesdist.infer.nodes.alternation import inside_chips, with_columns
+from bayesdist.infer.nodes.alternation import inside_chips
 from bayesdist.model import corrected
 from bayesdist.model.grid import outline_pixels
 from bayesdist.report.campaign import (
@@ -168,13 +168,12 @@ def _footprints(session: CampaignSession) -> Footprints:
 def _residuals(session: CampaignSession) -> tuple[ChipResiduals, ...]:
     """Pairs of each chip without the tables and with them, along the detector's axes."""
     pairs, moved, model = session.pairs, session.matches, session.plain_model
-    assert isinstance(moved, MatchTable)
     errors, farthest = session.magnitude_errors, session.config.fit.clip_abs
-    plain = pairs if errors is None else with_centroid_errors(pairs, errors)
+    plain = pairs if errors is None else pairs.with_errors(errors, in_quadrature=True)
     if any(table.filter for table in session.tables):  # those of the detector are not of this run
         detector = [table for table in session.tables if not table.filter]
         x, y = corrected(detector, pairs.x, pairs.y, chip=pairs.chip_number)
-        plain = with_columns(plain, x=x, y=y)
+        plain = plain.with_columns(x=x, y=y)
     # the stars that neither has moved off their chip
     kept = session.inside_with_tables
     both = kept & inside_chips(plain, model)

@@ -44,7 +44,6 @@ from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.infer import LinearFit, Matches
 from bayesdist.infer.catalogue.star_influence import StarErrors
 from bayesdist.infer.exposures.chip_offsets import Settling
-from bayesdist.infer.nodes.alternation import with_columns
 from bayesdist.infer.series import Series
 from bayesdist.model import DistortionModel, LookupTable
 
@@ -274,7 +273,7 @@ class CampaignSession(Session):
             by_code = np.zeros(int(catalog.star.max()) + 1)
             by_code[catalog.star] = getattr(catalog, name)
             columns[name] = by_code[table.star]
-        return with_columns(table, **columns)
+        return table.with_columns(**columns)
 
     @property
     def catalogue_stated(self) -> bool:

@@ -19,7 +19,7 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, LinearFit, save_fit
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
-from bayesdist.infer.nodes.alternation import inside_chips, on_the_chips, with_columns
+from bayesdist.infer.nodes.alternation import inside_chips, on_the_chips
 from bayesdist.infer.series import Series
 from bayesdist.infer.stars.shards import Matches
 from bayesdist.model import LookupTable, corrected
@@ -74,7 +74,7 @@ class Fitted:
 
     def placed(self, stars: Matches) -> Matches:
         """Stars at the pixels that the tables move them to, on their chips, with quoted errors."""
-        if not self.tables.tables or not isinstance(stars, MatchTable):
+        if not self.tables.tables or not stars.in_memory:
             return stars
         return on_the_chips(moved_by(self.tables.tables, stars), self.linear.model)
 
@@ -114,4 +114,4 @@ def moved_by(tables: Sequence[LookupTable], stars: MatchTable) -> MatchTable:
     """Stars at the pixels that tables of the detector and of one filter move them to."""
     filter = next((table.filter for table in tables if table.filter), "")
     x, y = corrected(tables, stars.x, stars.y, chip=stars.chip_number, filter=filter)
-    return with_columns(stars, x=x, y=y)
+    return stars.with_columns(x=x, y=y)

@@ -23,9 +23,9 @@ class Matched:
 
     Parameters
     ----------
-    stars : MatchTable or PartitionedMatches
+    stars : Matches
         Those that are fitted.
-    held : MatchTable or PartitionedMatches or None
+    held : Matches or None
         Those that are held out; None where none are.
     whole : tuple of str
         Exposures that are held out whole.
@@ -58,9 +58,9 @@ class Prepared:
 
     Parameters
     ----------
-    stars : MatchTable or PartitionedMatches
+    stars : Matches
         Those that are fitted.
-    held : MatchTable or PartitionedMatches or None
+    held : Matches or None
         Those that are held out, in the same way.
     """
 

@@ -61,7 +61,7 @@ def match_stars(config: Config, base: Path, *, stars: Matches | None = None) -> 
         With a section [data].
     base : Path
         Folder that its files are relative to.
-    stars : MatchTable or PartitionedMatches, optional
+    stars : Matches, optional
         What the configuration names, where that has been read already.
 
     Returns
@@ -245,7 +245,7 @@ def sample_stars(
     Parameters
     ----------
     fitted : Fitted
-    stars : MatchTable, PartitionedMatches or Shards
+    stars : Matches or Shards
         As `Fitted.prepared` gives them.
     config : Config
     folder : Path, optional

@@ -8,7 +8,6 @@ from bayesdist.app.kinds.stars import sample_stars
 from bayesdist.app.kinds.summary import sample_sections
 from bayesdist.app.session import Session
 from bayesdist.app.star_files import FOLDER, write_star_files
-from bayesdist.data import MatchTable
 from bayesdist.infer import Posterior, save_posterior
 
 __all__ = ["run_sample", "save_sampled"]
@@ -36,7 +35,7 @@ def save_sampled(session: Session, posterior: Posterior) -> None:
     provenance = {k: record[k] for k in ("inputs", "seed", "versions", "created")}
     provenance |= {"gauge": session.gauge_words} if session.gauge_words else {}
     matches = session.matches
-    table = matches if isinstance(matches, MatchTable) else None
+    table = matches if matches.in_memory else None
     save_posterior(posterior, table, run / "posterior.nc", provenance=provenance)
     write_star_files(matches, session.fit, posterior, run / FOLDER)
     run.summarise(**sample_sections(posterior, in_circle=session.in_circle))

@@ -80,7 +80,7 @@ def partitions_of(
     Parameters
     ----------
     model : DistortionModel
-    held : MatchTable or PartitionedMatches
+    held : Matches
     sample : MatchTable
         Some of them, evenly spread: they say where bins end.
     whole : sequence of str

@@ -15,8 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
-from bayesdist.data.pieces import Piece
+from bayesdist.data.matches import Matches, MatchTable
 from bayesdist.diagnose.holdout.predictive import Predictive, scores_of
 from bayesdist.infer.stars.stars import errors_of
 from bayesdist.model import DistortionModel, Groups
@@ -152,16 +151,14 @@ def _groups(
     )
 
 
-def frames_for(
-    predictive: Predictive, pieces: Sequence[Piece], names: Sequence[str]
-) -> dict[str, Frame]:
+def frames_for(predictive: Predictive, held: Matches, names: Sequence[str]) -> dict[str, Frame]:
     """Frames of exposures that the solution does not know, fitted to their own stars.
 
     Parameters
     ----------
     predictive : Predictive
-    pieces : sequence of Piece
-        Of the held-out stars; they are gone through once for every step.
+    held : Matches
+        Held-out stars; they are read once for every step.
     names : sequence of str
 
     Returns
@@ -177,13 +174,13 @@ def frames_for(
     precision = np.zeros(len(kinds))
     if predictive.deviations is not None:
         precision = predictive.deviations.precision(kinds)
-    values = _first_guess(predictive, pieces, unknown, precision)
+    values = _first_guess(predictive, held, unknown, precision)
     for step in range(SOFT + EXACT):
-        sums = _frame_sums(predictive, pieces, values, soft=step < SOFT)
+        sums = _frame_sums(predictive, held, values, soft=step < SOFT)
         for name, (gradient, curvature, *_) in sums.items():
             pull = gradient - precision * values[name]
             values[name] = values[name] + _solved(curvature + np.diag(precision), pull)
-    final = _frame_sums(predictive, pieces, values, soft=False)
+    final = _frame_sums(predictive, held, values, soft=False)
     return {
         name: Frame(
             kinds,
@@ -213,12 +210,9 @@ def _inverse(matrix: Float) -> Float:
     return np.asarray(s[:, None] * np.linalg.pinv(s[:, None] * matrix * s) * s)
 
 
-def _of_exposures(
-    pieces: Sequence[Piece], names: Sequence[str]
-) -> Iterator[tuple[str, MatchTable, Int]]:
+def _of_exposures(held: Matches, names: Sequence[str]) -> Iterator[tuple[str, MatchTable, Int]]:
     """Name, table and rows of some exposures."""
-    for piece in pieces:
-        table = piece.read()
+    for table in held.batches():
         for k, name in enumerate(table.exposure_names):
             if name in names:
                 rows = np.flatnonzero(table.exposure == k)
@@ -227,14 +221,14 @@ def _of_exposures(
 
 
 def _first_guess(
-    predictive: Predictive, pieces: Sequence[Piece], names: Sequence[str], precision: Float
+    predictive: Predictive, held: Matches, names: Sequence[str], precision: Float
 ) -> dict[str, Float]:
     """Frames nearest to the linear maps that least squares finds."""
     model = predictive.model
     kind, o = model.frames, np.asarray(model.origin)
     normal = {name: np.zeros((3, 3)) for name in names}
     right = {name: np.zeros((3, 2)) for name in names}
-    for name, table, rows in _of_exposures(pieces, names):
+    for name, table, rows in _of_exposures(held, names):
         groups = _groups(model, table, rows, exposure=None)
         effective = model.effective(predictive.mean, groups)
         for g, members in enumerate(groups.members()):
@@ -261,14 +255,14 @@ def _first_guess(
 
 
 def _frame_sums(
-    predictive: Predictive, pieces: Sequence[Piece], values: Mapping[str, Float], *, soft: bool
+    predictive: Predictive, held: Matches, values: Mapping[str, Float], *, soft: bool
 ) -> dict[str, tuple[Float, Float, Float, Float, int]]:
     """Gradient, curvature, information, what is shared with the solution, stars, by exposure."""
     q, D = _alone(predictive.model).n_frame, predictive.model.n_distortion
     shapes = ((q,), (q, q), (q, q), (q, D))
     out = {name: [np.zeros(shape) for shape in shapes] for name in values}
     count = dict.fromkeys(values, 0)
-    for name, table, index in _of_exposures(pieces, list(values)):
+    for name, table, index in _of_exposures(held, list(values)):
         for rows in framed(predictive, table, index, values[name]):
             var = noise_of(predictive, table, rows.index)[:, :2]
             if soft:

@@ -11,8 +11,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_matrix
 from scipy.special import erf
 
-from bayesdist.data.matches import MatchTable
-from bayesdist.data.pieces import Piece
+from bayesdist.data.matches import Matches, MatchTable
 from bayesdist.diagnose.holdout.bins import ALL, Partition
 from bayesdist.diagnose.holdout.frames import Frame
 from bayesdist.diagnose.holdout.predictive import (
@@ -170,7 +169,7 @@ class HeldSums:
 
 def held_sums(
     predictive: Predictive,
-    pieces: Sequence[Piece],
+    held: Matches,
     partitions: Sequence[Partition],
     frames: Mapping[str, Frame],
 ) -> HeldSums:
@@ -179,7 +178,7 @@ def held_sums(
     Parameters
     ----------
     predictive : Predictive
-    pieces : sequence of Piece
+    held : Matches
     partitions : sequence of Partition
     frames : mapping of str to Frame
 
@@ -202,8 +201,7 @@ def held_sums(
         out.shared = ClusterSums(predictive, PIT_BINS, TAILS)
     moments = SpreadMoments(predictive)
     around = [predictive, *_around(predictive)]
-    for piece in pieces:
-        table = piece.read()
+    for table in held.batches():
         seen = 0
         for rows in predicted_rows(predictive, table, frames):
             seen += len(rows.index)

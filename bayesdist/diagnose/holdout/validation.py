@@ -153,7 +153,7 @@ def held_out_truth(
     Parameters
     ----------
     solution : Posterior or Predictive
-    held : MatchTable or PartitionedMatches
+    held : Matches
         Held-out stars, with errors.
     whole : sequence of str
         Exposures all of whose stars were held out.
@@ -175,10 +175,9 @@ def held_out_truth(
             where=where,
             do="give a Predictive with deviations",
         )
-    pieces = held.pieces()
     partitions = partitions_of(predictive.model, held, held.sample(SAMPLE), whole)
-    frames = frames_for(predictive, pieces, held.exposure_names)
-    sums = held_sums(predictive, pieces, partitions, frames)
+    frames = frames_for(predictive, held, held.exposure_names)
+    sums = held_sums(predictive, held, partitions, frames)
     if not HELD_OUT.met_by(sums.n):
         raise InputError(
             f"{sums.n} held-out stars say too little of the solution",

@@ -8,8 +8,7 @@ back.  Nothing is smoothed twice, and the rounds end at the joint solution of bo
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +34,6 @@ __all__ = [
     "alternate",
     "inside_chips",
     "on_the_chips",
-    "with_columns",
 ]
 
 Float = NDArray[np.float64]
@@ -140,7 +138,7 @@ def alternate(
             out[rows] = table.evaluate(x[rows], y[rows])
         return out
 
-    moved, pixel = with_columns(matches, x=x, y=y), 1.0
+    moved, pixel = matches.with_columns(x=x, y=y), 1.0
     for number in range(1, rounds + 1):
         solution = solved(pixel)
         pixel = model.pixel_size(solution.mean)
@@ -196,7 +194,7 @@ def alternate(
         if report is not None:
             report(progress[-1])
         own = shifts_of_tables()
-        moved = with_columns(matches, x=x + own[:, 0], y=y + own[:, 1])
+        moved = matches.with_columns(x=x + own[:, 0], y=y + own[:, 1])
         if progress[-1].moved < tolerance:
             break
     assert trust is not None
@@ -209,12 +207,6 @@ def alternate(
         progress=tuple(progress),
         converged=progress[-1].moved < tolerance,
     )
-
-
-def with_columns(matches: MatchTable, **changes: Any) -> MatchTable:
-    """Matches with some columns replaced."""
-    columns = {one.name: getattr(matches, one.name) for one in fields(matches)}
-    return MatchTable.of_distinct_rows(**(columns | changes))
 
 
 def on_the_chips(matches: MatchTable, model: DistortionModel) -> MatchTable:
@@ -242,8 +234,10 @@ def _trusted(matches: MatchTable, trust: Trust, jitter: Float) -> MatchTable:
     assert matches.sigma_u is not None and matches.sigma_v is not None
     likely = trust.probability >= LIKELY
     p = np.maximum(trust.probability, LIKELY)
-    wide = matches.with_sigma(
-        np.sqrt((matches.sigma_u**2 + jitter**2) / p),
-        np.sqrt((matches.sigma_v**2 + jitter**2) / p),
+    wide = matches.with_errors(
+        (
+            np.sqrt((matches.sigma_u**2 + jitter**2) / p),
+            np.sqrt((matches.sigma_v**2 + jitter**2) / p),
+        )
     )
     return wide.select(likely, reason="false match")

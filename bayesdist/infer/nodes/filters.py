@@ -9,7 +9,6 @@ import numpy as np
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.infer.nodes.alternation import with_columns
 from bayesdist.model import DistortionModel
 
 __all__ = ["matches_of_filter"]
@@ -49,4 +48,4 @@ def matches_of_filter(
             do="name it among the model's exposures",
         )
     code = np.array([names.index(n) if n in names else 0 for n in matches.exposure_names])
-    return with_columns(some, exposure=code[some.exposure], exposure_names=names), one
+    return some.with_columns(exposure=code[some.exposure], exposure_names=names), one

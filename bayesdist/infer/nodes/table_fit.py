@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.infer.nodes.alternation import Alternated, Round, on_the_chips, with_columns
+from bayesdist.infer.nodes.alternation import Alternated, Round, on_the_chips
 from bayesdist.infer.nodes.pixels import pixel_jacobian
 from bayesdist.infer.nodes.posterior import TablePosterior
 from bayesdist.model.lookup import LookupTable, corrected
@@ -89,7 +89,7 @@ class TableFit:
         """
         names = np.asarray(matches.filter_names)[matches.filter]
         x, y = corrected(self.tables, matches.x, matches.y, chip=matches.chip_number, filter=names)
-        return on_the_chips(with_columns(matches, x=x, y=y), self.part().fit.model)
+        return on_the_chips(matches.with_columns(x=x, y=y), self.part().fit.model)
 
     def predict(
         self,

@@ -37,8 +37,8 @@ def some(seed=1, n_stars=70):
         "epoch0": rng.uniform(2003.0, 2006.0, n_stars),
     }
     dt = matches.epoch - catalogue["epoch0"][code]
-    matches = matches.with_sigma(
-        *(
+    matches = matches.with_errors(
+        tuple(
             np.sqrt(
                 rng.uniform(0.01, 0.05, n) ** 2
                 + catalogue[f"sigma_{a}"][code] ** 2
@@ -145,7 +145,7 @@ def test_memberships_weigh_the_matches():
 
 def test_the_column_of_the_table_is_used():
     _, matches, fit, code, catalogue = some(3)
-    a = star_covariance(fit, matches._with(star=code), **catalogue)
+    a = star_covariance(fit, matches.with_columns(star=code), **catalogue)
     b = star_covariance(fit, matches, star=code, **catalogue)
     np.testing.assert_array_equal(a.extra, b.extra)
 

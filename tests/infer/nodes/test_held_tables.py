@@ -10,7 +10,6 @@ import pytest
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer.nodes import fit_with_tables
-from bayesdist.infer.nodes.alternation import with_columns
 from bayesdist.infer.nodes.table_fit import held_sigma
 from bayesdist.model import DistortionModel
 from bayesdist.model.lookup import LookupTable, corrected
@@ -87,7 +86,7 @@ def test_a_held_table_is_a_correction_made_beforehand(matches, model, alone):
     some = matches.select(matches.filter == 1)
     x, y = corrected(alone.held, some.x, some.y, chip=1)
     inside = (x > 0.5) & (x < SIZE[0] + 0.5) & (y > 0.5) & (y < SIZE[1] + 0.5)
-    moved = with_columns(some.select(inside), x=x[inside], y=y[inside])
+    moved = some.select(inside).with_columns(x=x[inside], y=y[inside])
     found = fit_with_tables(moved, model, base=FILTER, **OPTIONS)
     sigma = alone.part().tables[0].sigma
     # the few stars at the rim are left out here
