@@ -25,12 +25,7 @@ _HOMES = {
     "bayesdist.data.matching.search_radius": ("SearchRadius", "search_radius"),
     "bayesdist.data.matching.similarity": ("find_similarity", "pattern_index"),
     "bayesdist.data.matching.table": ("Matching", "match_table", "match_to_catalog"),
-    "bayesdist.data.motions": (
-        "MotionErrorLine",
-        "derive_motions",
-        "motion_error_line",
-        "select_motions",
-    ),
+    "bayesdist.data.motions": ("motion_error_line", "select_motions"),
     "bayesdist.data.on_disk": ("open_matches",),
     "bayesdist.data.preparing": (
         "centroid_errors",
