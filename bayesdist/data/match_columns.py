@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.labels import LABELS_OF_CODES, Labels, merged_counts
-from bayesdist.data.tables.checks import absent, check_values, counted, one_length, refuse_half
+from bayesdist.data.tables.checks import absent, check_values, columns_of, counted, one_length, refuse_half
 from bayesdist.data.tables.repeated import first_duplicate
 from bayesdist.data.tables.units import check_unit, conversion, unit_of, without_unit
 from bayesdist.errors import InputError
@@ -90,8 +90,7 @@ class MatchColumns:
     @property
     def _columns(self) -> dict[str, Any]:
         """Columns that the stars have."""
-        values = {name: getattr(self, name) for name in COLUMNS}
-        return {name: value for name, value in values.items() if value is not None}
+        return columns_of(self, COLUMNS)
 
     @property
     def labels(self) -> Labels:

@@ -8,7 +8,7 @@ from astropy.table import Table
 from scipy import stats
 
 from bayesdist.data import read_rvb
-from bayesdist.data.frame_stars import FrameStars
+from bayesdist.missions.wise.bring_up.frame_stars import FrameStars
 from bayesdist.data.matching.pairs import mutual_pairs
 from bayesdist.data.rvb_accept import RadialLimit
 from bayesdist.errors import InputError

@@ -13,7 +13,7 @@ from bayesdist.app.folder import atomic_directory
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import write_table
 from bayesdist.data import RadialLimit, RvbPairs
-from bayesdist.data.frame_stars import FrameStars
+from bayesdist.missions.wise.bring_up.frame_stars import FrameStars
 from bayesdist.data.rvb_files import ARRAY_SIZE, RVB_ALIASES, band_name
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.files import read_table

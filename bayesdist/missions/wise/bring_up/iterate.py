@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.frame_stars import FrameStars
+from bayesdist.missions.wise.bring_up.frame_stars import FrameStars
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.rvb_accept import RadialLimit
 from bayesdist.errors import InputError

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import poisson
 
-from bayesdist.data.frame_stars import FrameStars
+from bayesdist.missions.wise.bring_up.frame_stars import FrameStars
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.matching.pairs import mutual_pairs
 from bayesdist.data.rvb_accept import RadialLimit
