@@ -6,7 +6,7 @@ delivered, and from the same model turned by 270 degrees.  Every start should en
 
 import numpy as np
 
-from bayesdist.data.rvb_accept import RadialLimit
+from bayesdist.data.rvb.limits import RadialLimit
 from bayesdist.missions.wise.bring_up.iterate import bring_up
 from bayesdist.missions.wise.simulate.bringup import optical_model, simulate_unpaired
 

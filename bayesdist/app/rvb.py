@@ -15,10 +15,10 @@ from bayesdist.app.matches import is_large
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.star_files import PAIRS, part_files
 from bayesdist.data import MatchTable, open_matches, write_partitioned
-from bayesdist.data.rvb import stream_rvb
-from bayesdist.data.rvb_files import ARRAY_SIZE, band_name
-from bayesdist.data.rvb_open import open_rvb
-from bayesdist.data.rvb_select import RvbSelection, SelectedPairs
+from bayesdist.data.rvb.files import ARRAY_SIZE, band_name
+from bayesdist.data.rvb.on_disk import open_rvb
+from bayesdist.data.rvb.read import stream_rvb
+from bayesdist.data.rvb.select import RvbSelection, SelectedPairs
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
 from bayesdist.infer import Matches

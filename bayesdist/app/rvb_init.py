@@ -6,8 +6,8 @@ from pathlib import Path
 
 from bayesdist.app.init_columns import column_lines
 from bayesdist.data import input_files
-from bayesdist.data.rvb import rvb_bands, stream_rvb
-from bayesdist.data.rvb_files import ARRAY_SIZE, IPAC, MAGNITUDES, RvbFile, open_rvb_files
+from bayesdist.data.rvb.files import ARRAY_SIZE, IPAC, MAGNITUDES, RvbFile, open_rvb_files
+from bayesdist.data.rvb.read import rvb_bands, stream_rvb
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import InputError

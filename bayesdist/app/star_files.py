@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from bayesdist.data import MatchTable
-from bayesdist.data.write import write_columns
+from bayesdist.data.storage.write import write_columns
 from bayesdist.files import made_folder, remove_leftovers
 from bayesdist.infer import LinearFit, Matches, Posterior
 from bayesdist.infer.posterior.memberships import memberships_of

@@ -16,7 +16,7 @@ _HOMES = {
     "bayesdist.data.catalog": ("ReferenceCatalog", "catalog_from_table", "read_catalog"),
     "bayesdist.data.exposure_log": ("Exposure", "ExposureLog"),
     "bayesdist.data.exposures": ("read_exposures", "write_exposures"),
-    "bayesdist.data.hst1pass": ("Hst1passList", "read_hst1pass", "read_matchup"),
+    "bayesdist.data.formats.hst1pass": ("Hst1passList", "read_hst1pass", "read_matchup"),
     "bayesdist.data.magnitude_errors": ("MagnitudeErrors",),
     "bayesdist.data.matches": ("Matches", "MatchTable"),
     "bayesdist.data.matching.campaign": ("CampaignMatches", "match_campaign"),
@@ -26,7 +26,7 @@ _HOMES = {
     "bayesdist.data.matching.similarity": ("find_similarity", "pattern_index"),
     "bayesdist.data.matching.table": ("Matching", "match_table", "match_to_catalog"),
     "bayesdist.data.motions": ("motion_error_line", "select_motions"),
-    "bayesdist.data.on_disk": ("open_matches",),
+    "bayesdist.data.storage.on_disk": ("open_matches",),
     "bayesdist.data.preparing": (
         "centroid_errors",
         "neutralise_aberration",
@@ -36,10 +36,10 @@ _HOMES = {
     "bayesdist.data.reading.options": ("ReadOptions",),
     "bayesdist.data.reading.read": ("read_matches",),
     "bayesdist.data.reading.table": ("matches_from_table",),
-    "bayesdist.data.rvb": ("read_rvb", "rvb_bands", "stream_rvb"),
-    "bayesdist.data.rvb_accept": ("RadialLimit",),
-    "bayesdist.data.rvb_pairs": ("RvbPairs",),
-    "bayesdist.data.rvb_select": ("RvbSelection", "SelectedPairs"),
+    "bayesdist.data.rvb.read": ("read_rvb", "rvb_bands", "stream_rvb"),
+    "bayesdist.data.rvb.limits": ("RadialLimit",),
+    "bayesdist.data.rvb.pairs": ("RvbPairs",),
+    "bayesdist.data.rvb.select": ("RvbSelection", "SelectedPairs"),
     "bayesdist.data.sky.earth": ("velocity_aberration",),
     "bayesdist.data.sky.tangent": ("mean_direction", "tangent_plane"),
     "bayesdist.data.starlists": (
@@ -49,7 +49,7 @@ _HOMES = {
         "star_list_of_hst1pass",
     ),
     "bayesdist.data.tables.units": ("UNITS",),
-    "bayesdist.data.write": ("write_partitioned",),
+    "bayesdist.data.storage.write": ("write_partitioned",),
 }
 
 __all__ = sorted(name for names in _HOMES.values() for name in names)

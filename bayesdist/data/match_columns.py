@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.labels import LABELS_OF_CODES, Labels, merged_counts
-from bayesdist.data.tables.checks import absent, check_values, columns_of, counted, one_length, refuse_half
+from bayesdist.data.tables.checks import (
+    absent,
+    check_values,
+    columns_of,
+    counted,
+    one_length,
+    refuse_half,
+)
 from bayesdist.data.tables.repeated import first_duplicate
 from bayesdist.data.tables.units import check_unit, conversion, unit_of, without_unit
 from bayesdist.errors import InputError

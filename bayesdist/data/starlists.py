@@ -11,7 +11,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.hst1pass import Hst1passList, is_hst1pass, read_hst1pass
+from bayesdist.data.formats.hst1pass import Hst1passList, is_hst1pass, read_hst1pass
 from bayesdist.data.reading.formats import exposure_names, input_files
 from bayesdist.data.tables.checks import check_columns, columns_of, counted
 from bayesdist.data.tables.column import SourceColumn

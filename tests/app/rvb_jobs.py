@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from astropy.table import Table
 
-from bayesdist.data.rvb_files import ARRAY_SIZE
+from bayesdist.data.rvb.files import ARRAY_SIZE
 from bayesdist.missions.wise.simulate import wise_solution
 from tests.app.support import write_config
 

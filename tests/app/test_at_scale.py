@@ -13,7 +13,7 @@ from bayesdist.app.matches import load_matches
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
 from bayesdist.data import Matches, read_matches, write_partitioned
-from bayesdist.data.on_disk import StoredRows
+from bayesdist.data.storage.on_disk import StoredRows
 from bayesdist.infer import load_fit, load_posterior
 from bayesdist.model import TimeDependence
 from bayesdist.simulate import simulate_matches

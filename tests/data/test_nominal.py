@@ -8,7 +8,7 @@ from astropy.table import Table
 
 from bayesdist.data import MatchTable, open_matches, read_matches
 from bayesdist.data.holdout import SetAside, split_matches
-from bayesdist.data.write import write_partitioned
+from bayesdist.data.storage.write import write_partitioned
 from bayesdist.errors import InputError
 
 NOMINAL = ("u_nominal", "v_nominal")

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 
 from bayesdist.data import MagnitudeErrors, MatchTable, batches, open_matches, read_matches
 from bayesdist.data.added_errors import AddedErrors
+from bayesdist.data.storage.write import write_partitioned
 from bayesdist.data.tables import repeated as duplicates_module
-from bayesdist.data.write import write_partitioned
 from bayesdist.errors import FormatError, InputError
 
 ARRAYS = ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour")
@@ -276,7 +276,7 @@ def test_any_sizes_of_row_groups_pieces_and_batches(tmp_path_factory, groups, pi
         writer.close()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bayesdist.data.tables.parquet._BATCH", batch)
-        patch.setattr("bayesdist.data.stored._BLOCK", piece + 3)
+        patch.setattr("bayesdist.data.storage.stored._BLOCK", piece + 3)
         assert_same(folder, monkeypatch=patch, piece=piece, unit="pix")
 
 
@@ -581,7 +581,8 @@ def test_nothing_half_written_stays(rng, tmp_path):
 MEASURE = """
 import json, sys
 import numpy as np, pyarrow as pa
-from bayesdist.data import batches, open_matches, stored
+from bayesdist.data import batches, open_matches
+from bayesdist.data.storage import stored
 from bayesdist.data.tables import repeated
 
 def peak():

@@ -11,11 +11,12 @@ import pytest
 from astropy.table import MaskedColumn, Table
 from astropy.time import Time
 
-from bayesdist.data import MatchTable, open_matches, rvb_files, write_partitioned
-from bayesdist.data.rvb import read_rvb, rvb_bands, stream_rvb
-from bayesdist.data.rvb_accept import RadialLimit, radial_rows
-from bayesdist.data.rvb_pairs import RvbPairs, colour_of
-from bayesdist.data.rvb_select import RvbSelection, SelectedPairs
+from bayesdist.data import MatchTable, open_matches, write_partitioned
+from bayesdist.data.rvb import files as rvb_files
+from bayesdist.data.rvb.limits import RadialLimit, radial_rows
+from bayesdist.data.rvb.pairs import RvbPairs, colour_of
+from bayesdist.data.rvb.read import read_rvb, rvb_bands, stream_rvb
+from bayesdist.data.rvb.select import RvbSelection, SelectedPairs
 from bayesdist.errors import InputError
 
 SIZE = (1016.0, 1016.0)

@@ -13,11 +13,11 @@ from bayesdist.data import (
     RvbSelection,
     SelectedPairs,
     read_rvb,
-    rvb_files,
     rvb_open,
     stream_rvb,
 )
-from bayesdist.data.rvb_open import open_rvb
+from bayesdist.data.rvb import files as rvb_files
+from bayesdist.data.rvb.on_disk import open_rvb
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.rvb.write import write_rvb
 from tests.data.test_rvb import assert_same, rvb_table, write

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pydantic import PositiveFloat, PositiveInt, model_validator
 
 from bayesdist.app.config.section import Section
-from bayesdist.data.rvb_accept import RadialLimit
-from bayesdist.data.rvb_select import RvbSelection
+from bayesdist.data.rvb.limits import RadialLimit
+from bayesdist.data.rvb.select import RvbSelection
 
 __all__ = ["RvbBlock"]
 

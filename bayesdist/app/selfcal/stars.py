@@ -12,7 +12,7 @@ from astropy.units import Unit
 from bayesdist.app.checks import provenance_notes
 from bayesdist.app.selfcal.session import SelfcalSession
 from bayesdist.app.session import write_table
-from bayesdist.data.write import write_columns
+from bayesdist.data.storage.write import write_columns
 from bayesdist.infer.selfcal import StarCatalogue, star_catalogue
 
 __all__ = ["FLAGS", "star_table", "write_stars"]

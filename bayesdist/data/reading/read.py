@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.data.astrometrynet import COLUMNS as CORR_COLUMNS
-from bayesdist.data.astrometrynet import matches_from_corr
-from bayesdist.data.hst1pass import is_matchup, read_hst1pass, read_matchup
+from bayesdist.data.formats.astrometrynet import COLUMNS as CORR_COLUMNS
+from bayesdist.data.formats.astrometrynet import matches_from_corr
+from bayesdist.data.formats.hst1pass import is_matchup, read_hst1pass, read_matchup
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.table import match_table
 from bayesdist.data.reading.chips import numbered, text_labels

@@ -13,13 +13,13 @@ from bayesdist.app.folder import atomic_directory
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import write_table
 from bayesdist.data import RadialLimit, RvbPairs
-from bayesdist.missions.wise.bring_up.frame_stars import FrameStars
-from bayesdist.data.rvb_files import ARRAY_SIZE, RVB_ALIASES, band_name
+from bayesdist.data.rvb.files import ARRAY_SIZE, RVB_ALIASES, band_name
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bands.optical import optical_models
+from bayesdist.missions.wise.bring_up.frame_stars import FrameStars
 from bayesdist.missions.wise.bring_up.iterate import BringUp, bring_up
 from bayesdist.missions.wise.rvb.write import write_rvb
 from bayesdist.model import Chip, DistortionModel

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.missions.wise.bring_up.frame_stars import FrameStars
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.rvb_accept import RadialLimit
+from bayesdist.data.rvb.limits import RadialLimit
 from bayesdist.errors import InputError
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
+from bayesdist.missions.wise.bring_up.frame_stars import FrameStars
 from bayesdist.missions.wise.bring_up.pairs import Field
 from bayesdist.model import Chip, DistortionModel
 

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import poisson
 
-from bayesdist.missions.wise.bring_up.frame_stars import FrameStars
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.matching.pairs import mutual_pairs
-from bayesdist.data.rvb_accept import RadialLimit
+from bayesdist.data.rvb.limits import RadialLimit
 from bayesdist.errors import InputError
+from bayesdist.missions.wise.bring_up.frame_stars import FrameStars
 from bayesdist.model import DistortionModel
 
 __all__ = ["Believed", "Field"]

@@ -10,8 +10,8 @@ from operator import add
 from pathlib import Path
 
 from bayesdist.data import MatchTable, RvbPairs, stream_rvb
-from bayesdist.data.rvb import chosen_band
-from bayesdist.data.rvb_files import ARRAY_SIZE, open_rvb_files
+from bayesdist.data.rvb.files import ARRAY_SIZE, open_rvb_files
+from bayesdist.data.rvb.read import chosen_band
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.rvb.linear import fit_transform, linear_moments
 from bayesdist.missions.wise.rvb.solutions import read_solutions

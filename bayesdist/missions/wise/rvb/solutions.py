@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.data.rvb_files import RVB_ALIASES
+from bayesdist.data.rvb.files import RVB_ALIASES
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import find_columns

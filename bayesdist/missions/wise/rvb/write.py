@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.data.rvb_pairs import RvbPairs
-from bayesdist.data.write import write_columns
+from bayesdist.data.rvb.pairs import RvbPairs
+from bayesdist.data.storage.write import write_columns
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
 

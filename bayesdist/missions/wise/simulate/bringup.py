@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.missions.wise.bring_up.frame_stars import FrameStars
 from bayesdist.errors import InputError
+from bayesdist.missions.wise.bring_up.frame_stars import FrameStars
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import DistortionModel
 

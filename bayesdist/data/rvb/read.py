@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from bayesdist.data.matches import Matches
 from bayesdist.data.reading.columns import match_columns
 from bayesdist.data.reading.options import ReadOptions, check_sigma, refuse_missing_errors
-from bayesdist.data.rvb_array import ArrayCheck
-from bayesdist.data.rvb_files import (
+from bayesdist.data.rvb.array import ArrayCheck
+from bayesdist.data.rvb.files import (
     ARRAY_SIZE,
     MAGNITUDES,
     RVB_ALIASES,
@@ -28,7 +28,7 @@ from bayesdist.data.rvb_files import (
     band_name,
     open_rvb_files,
 )
-from bayesdist.data.rvb_pairs import RvbPairs, colour_of
+from bayesdist.data.rvb.pairs import RvbPairs, colour_of
 from bayesdist.data.tables.column import Place, SourceColumn
 from bayesdist.data.tables.quantities import Columns, Quantities
 from bayesdist.errors import InputError

@@ -23,7 +23,7 @@ from bayesdist.data.match_columns import COLUMNS, POSITIONS, SIGMAS
 from bayesdist.data.matches import Matches
 from bayesdist.data.reading.formats import exposure_names, input_files
 from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
-from bayesdist.data.stored import StoredFile, scan, stored_file, tangent_point_of
+from bayesdist.data.storage.stored import StoredFile, scan, stored_file, tangent_point_of
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import FormatError, InputError
 

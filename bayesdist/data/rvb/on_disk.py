@@ -6,10 +6,10 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-from bayesdist.data.on_disk import Matches, open_matches
-from bayesdist.data.rvb import chosen_band
-from bayesdist.data.rvb_array import ArrayCheck
-from bayesdist.data.rvb_files import MAGNITUDES, RvbFile, open_rvb_files
+from bayesdist.data.rvb.array import ArrayCheck
+from bayesdist.data.rvb.files import MAGNITUDES, RvbFile, open_rvb_files
+from bayesdist.data.rvb.read import chosen_band
+from bayesdist.data.storage.on_disk import Matches, open_matches
 from bayesdist.data.tables.column import Place
 from bayesdist.data.tables.names import ALIASES
 from bayesdist.data.tables.parquet import ParquetPart

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import Matches
-from bayesdist.data.rvb_accept import CHI2, OFFSET, RadialLimit, radial_rows
-from bayesdist.data.rvb_pairs import COLOUR, NO_COLOUR, RvbPairs, bluest_rows, colours_of
+from bayesdist.data.rvb.limits import CHI2, OFFSET, RadialLimit, radial_rows
+from bayesdist.data.rvb.pairs import COLOUR, NO_COLOUR, RvbPairs, bluest_rows, colours_of
 from bayesdist.errors import InputError
 
 __all__ = ["RvbSelection", "SelectedPairs"]

@@ -1,0 +1,1 @@
+"""Pairs of WISE detections and 2MASS stars (RvB)."""
