@@ -13,10 +13,10 @@ from bayesdist.data import (
     RvbSelection,
     SelectedPairs,
     read_rvb,
-    rvb_open,
     stream_rvb,
 )
 from bayesdist.data.rvb import files as rvb_files
+from bayesdist.data.rvb import on_disk as rvb_open
 from bayesdist.data.rvb.on_disk import open_rvb
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.rvb.write import write_rvb
