@@ -25,7 +25,7 @@ LABELS_OF_CODES = {
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """What all batches of matches have in common; the fields are those of `Matches`."""
+    """Attributes that all batches of matches share; the fields are those of `Matches`."""
 
     unit: str
     exposure_names: tuple[str, ...]

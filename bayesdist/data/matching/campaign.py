@@ -191,9 +191,9 @@ def match_campaign(
             continue
         found.append(pairs)
     refuse_astray([one.report for one in found], catalog)
-    kept = [one for one in lists if one.exposure not in failed]
+    matched = [one for one in lists if one.exposure not in failed]
     shown = catalog.mirrored() if views[0].mirrored else catalog
-    table = _table(kept, log, shown, found)
+    table = _table(matched, log, shown, found)
     if failed:
         n = sum(len(one) for one in lists) - table.n_rows
         table = table.with_counts(table.n_rows + n, {**table.rejected, _LEFT_OUT: n})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -223,9 +223,8 @@ def match_table(
         u[pairs], v[pairs] = then.u[found.catalog_index], then.v[found.catalog_index]
         star[pairs] = then.star[found.catalog_index]
         matched[pairs] = True
-    kept = table.select(matched, reason="no counterpart in the catalogue")
-    return replace(
-        kept,
+    selected = table.select(matched, reason="no counterpart in the catalogue")
+    return selected.with_columns(
         u=u[matched],
         v=v[matched],
         star=star[matched],

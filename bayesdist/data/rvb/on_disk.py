@@ -40,7 +40,7 @@ def open_rvb(
     -------
     Matches or None
         The pairs that `stream_rvb` gives.  None where the files are no Parquet, hold other bands
-        beside this one, or have to be converted: dates in MJD, magnitudes by band.
+        than this one, or have to be converted: dates in MJD, magnitudes by band.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def _row_name(file: RvbFile, place: Place, k: int) -> str:
 
 
 def _fit(files: Sequence[RvbFile]) -> bool:
-    """Whether the files read as one table of matches."""
+    """True where the files read as one table of matches."""
     found = files[0].found
     return (
         all(isinstance(file.contents, ParquetPart) and file.found == found for file in files)
@@ -84,7 +84,7 @@ def _fit(files: Sequence[RvbFile]) -> bool:
 
 
 def _only(file: RvbFile, band: str) -> bool:
-    """Whether a file holds no other band."""
+    """True where a file holds no other band."""
     if "band" not in file.found:
         return True
     return all(file.bands(table, place)[1] == (band,) for table, _, place in file.blocks(["band"]))

@@ -100,7 +100,7 @@ def colour_of(magnitudes: ArrayLike) -> Float:
     -------
     ndarray, shape (N,)
         NaN where fewer than two bands have a magnitude.  Colours of sources that are detected in
-        different bands are different colours: W1 - W2 of one stands beside W1 - W4 of another.
+        different bands are different colours: W1 - W2 of one, W1 - W4 of another.
     """
     magnitudes = np.asarray(magnitudes, float)
     detected = np.isfinite(magnitudes)
@@ -112,7 +112,7 @@ def colour_of(magnitudes: ArrayLike) -> Float:
 
 
 def bluest_rows(colour: Float, frame: NDArray[np.int64], n: int) -> NDArray[np.bool_]:
-    """Which rows (N,) are among the n of smallest colour of their frame; never one without."""
+    """Boolean mask (N,) of the n rows of smallest colour of each frame; never one without."""
     order = np.lexsort((colour, frame))  # stable, NaN last within a frame
     first = np.searchsorted(frame[order], frame[order])
     rank = np.empty(len(colour), np.int64)

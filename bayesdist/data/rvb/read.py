@@ -2,14 +2,13 @@
 
 WSDC D-T033, section 1: the detections are raw band-frame pixels; the reference stars are brought to
 the same pixels by the frame's solution without any distortion.  Files are IPAC tables, any table
-that `read_matches` knows, or Parquet, which is gone through piece by piece.
+that `read_matches` knows, or Parquet, which is read batch by batch.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -42,7 +41,7 @@ PathLike = str | os.PathLike[str]
 def rvb_bands(
     path: PathLike | Sequence[PathLike], *, columns: Mapping[str, str] | None = None
 ) -> dict[str, int]:
-    """How many pairs of each band some files hold.
+    """Numbers of pairs of each band that some files hold.
 
     Parameters
     ----------
@@ -88,10 +87,9 @@ def stream_rvb(
     pixel_origin: int = 1,
     size: tuple[float, float] | None = None,
 ) -> Iterator[RvbPairs]:
-    """RvB pairs of one band, piece by piece.
+    """RvB pairs of one band, batch by batch.
 
-    What a piece needs is done to it, and `write_partitioned` puts the pieces where `open_matches`
-    finds them: memory is that of a piece.
+    Memory is that of a batch; `write_partitioned` puts them where `open_matches` finds them.
 
     Parameters
     ----------
@@ -119,7 +117,7 @@ def stream_rvb(
     ------
     RvbPairs
         Not more than `BATCH` pairs, of which no two are equal.  The magnitude is the band's own
-        where the file has no other and each pair of the piece has one.
+        where the file has no other and each pair of the batch has one.
 
     Raises
     ------
@@ -147,7 +145,7 @@ def stream_rvb(
             check.see(
                 matches.x,
                 matches.y,
-                partial(_row_name, matches),
+                matches.place,
                 reference=(matches.u, matches.v) if matches.unit == "pix" else None,
             )
             yield pairs
@@ -155,10 +153,6 @@ def stream_rvb(
     if not check.n:
         raise InputError("holds no rows", where=sources, do="give a table with matched stars")
     check.end(sources)
-
-
-def _row_name(matches: Matches, k: int) -> str:
-    return f"{matches.sources[matches.source[k]]}, row {matches.row[k] + 1}"
 
 
 def read_rvb(

@@ -1,4 +1,4 @@
-"""Which RvB pairs are taken, piece by piece: what the selection drops is counted by reason.
+"""Selection of RvB pairs, batch by batch; what it drops is counted by reason.
 
 In memory or streamed, the same pairs pass: by the range of colours, then the bluest of each frame,
 then the radial limits.
@@ -28,7 +28,7 @@ MOST_COLOURS = 100_000_000  # rows whose colours are compared with each other, 1
 
 @dataclass(frozen=True)
 class RvbSelection:
-    """Which pairs are taken: all limits that are given.
+    """Limits on the pairs that are taken; a pair is within all that are given.
 
     Parameters
     ----------
@@ -62,16 +62,16 @@ class RvbSelection:
 
     @property
     def takes_all(self) -> bool:
-        """Whether no limit is given."""
+        """True where no limit is given."""
         return self == RvbSelection()
 
     @property
     def by_colour(self) -> bool:
-        """Whether a pair needs a colour."""
+        """True where a pair needs a colour."""
         return self.colour is not None or self.bluest is not None
 
     def right_colour(self, pairs: RvbPairs) -> Rows:
-        """Which pairs (N,) have a colour within the limits."""
+        """Boolean mask (N,) of the pairs with a colour within the limits."""
         colour = colours_of(pairs)
         low, high = self.colour or (-np.inf, np.inf)
         return np.asarray((colour >= low) & (colour <= high))
@@ -83,8 +83,8 @@ class SelectedPairs:
 
     Parameters
     ----------
-    pieces : callable
-        Gives the pairs of one band piece by piece: once more where the bluest of each frame are
+    batches : callable
+        Gives the pairs of one band batch by batch: once more where the bluest of each frame are
         asked for, which takes the colours of all.
     selection : RvbSelection
     size : tuple of float
@@ -98,14 +98,14 @@ class SelectedPairs:
         Those of them that were dropped, by reason.
     """
 
-    pieces: Callable[[], Iterable[RvbPairs]]
+    batches: Callable[[], Iterable[RvbPairs]]
     selection: RvbSelection
     size: tuple[float, float]
     n_rows: int = 0
     rejected: dict[str, int] = field(default_factory=dict)
 
     def __iter__(self) -> Iterator[RvbPairs]:
-        """Pieces of which something is left.
+        """Batches of which something is left.
 
         Raises
         ------
@@ -115,7 +115,7 @@ class SelectedPairs:
         """
         bluest = self._bluest()
         sources: dict[str, None] = {}
-        for pairs in self.pieces():
+        for pairs in self.batches():
             sources |= dict.fromkeys(pairs.matches.sources)
             left = np.ones(len(pairs), bool)
             for reason, good in self._rules(pairs, bluest).items():
@@ -146,7 +146,7 @@ class SelectedPairs:
         return found.with_counts(self.n_rows, self.rejected)
 
     def _rules(self, pairs: RvbPairs, bluest: Rows | None) -> Mapping[str, Rows]:
-        """Which pairs are good by each reason to drop one."""
+        """Boolean masks (N,) of the good pairs, by each reason to drop one."""
         rules = {}
         if self.selection.by_colour:
             right = self.selection.right_colour(pairs)
@@ -160,13 +160,13 @@ class SelectedPairs:
         return rules
 
     def _bluest(self) -> Rows | None:
-        """Which of all rows are among the bluest of their frames."""
+        """Boolean mask of all rows that are among the bluest of their frames."""
         if self.selection.bluest is None:
             return None
         colours: list[Float] = []
         frames: list[Int] = []
         codes: dict[str, int] = {}
-        for pairs in self.pieces():
+        for pairs in self.batches():
             colour = np.where(self.selection.right_colour(pairs), colours_of(pairs), np.nan)
             names = pairs.matches.exposure_names
             code = np.array([codes.setdefault(name, len(codes)) for name in names])
