@@ -17,7 +17,7 @@ _HOMES = {
     "bayesdist.errors": ("BayesdistError", "InputError"),
     "bayesdist.data": (
         "MatchTable",
-        "PartitionedMatches",
+        "Matches",
         "ReferenceCatalog",
         "match_table",
         "open_matches",

@@ -31,7 +31,7 @@ def load_matches(
 
     Returns
     -------
-    MatchTable or PartitionedMatches
+    Matches
 
     Raises
     ------

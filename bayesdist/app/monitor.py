@@ -164,7 +164,7 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
             where=str(new),
             do="give data.sigma another value",
         )
-    return matches.with_errors_by_magnitude(errors)
+    return matches.with_errors(errors)
 
 
 def _refuse_the_same(run: RunDirectory, path: Any) -> None:

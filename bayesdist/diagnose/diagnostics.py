@@ -164,7 +164,7 @@ def diagnose_fit(
     ----------
     fit : LinearFit
     posterior : Posterior or None
-    stars : MatchTable or PartitionedMatches
+    stars : Matches
         With errors: those that were fitted.
     shards : Shards
         The same, as passes go over them.
@@ -319,7 +319,7 @@ def diagnose(
         centroid=centroid,
         things=things,
     )
-    in_memory = stars if isinstance(stars, MatchTable) else None
+    in_memory = stars if stars.in_memory else None
     shared = None
     if eliminated is not None:
         estimated = selfcal_discrepancy(eliminated, rng=restarted(rng), priors=discrepancy)
@@ -360,7 +360,6 @@ def diagnose(
 
 def _column(stars: Matches, name: str) -> NDArray[np.float64] | None:
     """A column of detections that are all in memory."""
-    assert isinstance(stars, MatchTable)
     values: NDArray[np.float64] | None = getattr(stars, name)
     return values
 
@@ -393,7 +392,7 @@ def hold_out(
     diagnostics : Diagnostics
     predictive : Predictive
         The solution with its correlated errors, as it predicts.
-    held : MatchTable or PartitionedMatches
+    held : Matches
         Stars that were set aside, with errors.
     whole : tuple of str
         Exposures all of whose stars were.

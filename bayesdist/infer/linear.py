@@ -163,7 +163,7 @@ def build_model(
 
     Parameters
     ----------
-    matches : MatchTable or PartitionedMatches
+    matches : Matches
     order : int
         Polynomial order, 1 to 9.
     size : tuple of float, optional
@@ -231,7 +231,7 @@ def fit_linear(
 
     Parameters
     ----------
-    matches : MatchTable, PartitionedMatches or Shards
+    matches : Matches or Shards
         With errors.
     model : DistortionModel
     rejection : Rejection

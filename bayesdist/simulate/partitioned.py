@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from bayesdist.data.batches import even_edges
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.pieces import even_edges
-from bayesdist.data.write import write_partitioned
+from bayesdist.data.storage.write import write_partitioned
 from bayesdist.simulate.matches import Truth
 
 __all__ = ["simulate_partitioned"]

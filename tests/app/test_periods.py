@@ -254,7 +254,7 @@ def test_a_pattern_that_no_polynomial_follows_is_found(tmp_path):
 def test_pairs_on_disk_give_the_same(quiet, tmp_path, monkeypatch):
     run, matches, _ = quiet
     monkeypatch.setattr(app_matches, "IN_MEMORY", 1000)
-    monkeypatch.setattr("bayesdist.data.partitioned.PIECE", 1700)
+    monkeypatch.setattr("bayesdist.data.batches.BATCH", 1700)
     write_partitioned([matches], tmp_path / "stars")
     sections = {"detector": {"name": "A", "size": SIZE, "scale_mas": 50.0}, "periods": PERIODS}
     config = write_config(

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 import bayesdist as bd
-from bayesdist.data import PartitionedMatches, open_matches
+from bayesdist.data import open_matches
 from bayesdist.infer import GaussianPriors, kernel, load
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.stars.stars import prepare
@@ -80,11 +80,11 @@ class Problem:
 
     Parameters
     ----------
-    matches : MatchTable or PartitionedMatches
+    matches : Matches
     model : DistortionModel
     """
 
-    matches: bd.MatchTable | PartitionedMatches
+    matches: bd.Matches
     model: bd.DistortionModel
 
     def __len__(self) -> int:

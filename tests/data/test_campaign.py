@@ -17,7 +17,7 @@ from bayesdist.data.exposures import Exposure, ExposureLog
 from bayesdist.data.matching.campaign import match_campaign
 from bayesdist.data.matching.search_radius import search_radius
 from bayesdist.data.matching.similarity import mismatch_reason, pattern_index
-from bayesdist.data.preparing import neutralise_aberration, with_centroid_errors
+from bayesdist.data.preparing import neutralise_aberration
 from bayesdist.data.starlists import StarCuts, StarList, read_star_lists
 from bayesdist.errors import InputError
 from tests.data.sky import ZERO_POINT, campaign, positions, start
@@ -296,13 +296,14 @@ def test_errors_of_centroids_add_in_quadrature():
     )  # fmt: skip
     k = np.arange(3.0)
     table = MatchTable(x=k, y=k, u=k, v=k, mag=k, sigma_u=[0.04] * 3, sigma_v=[0.12] * 3)
-    both = with_centroid_errors(table, errors)
+    both = table.with_errors(errors, in_quadrature=True)
     np.testing.assert_allclose(both.sigma_u, 0.05)
     np.testing.assert_allclose(both.sigma_v, 0.13)
-    alone = with_centroid_errors(MatchTable(x=k, y=k, u=k, v=k, mag=k), errors)
+    bare = MatchTable(x=k, y=k, u=k, v=k, mag=k)
+    alone = bare.with_errors(errors, in_quadrature=True)
     np.testing.assert_allclose(alone.sigma_u, 0.03)
     with pytest.raises(InputError, match="no magnitudes"):
-        with_centroid_errors(MatchTable(x=k, y=k, u=k, v=k), errors)
+        MatchTable(x=k, y=k, u=k, v=k).with_errors(errors, in_quadrature=True)
 
 
 def test_without_aberration_a_detector_has_one_scale(rng):

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest, kstest
 
-from bayesdist.data import MatchTable, open_matches, write_partitioned
-from bayesdist.data import partitioned as on_disk
+from bayesdist.data import MatchTable, batches, open_matches, write_partitioned
 from bayesdist.data.holdout import HELD_OUT, SetAside, exposures_drawn, split_matches
 from bayesdist.errors import InputError
 
@@ -25,8 +24,7 @@ def table_of(n: int = 4000, seed: int = 1, **columns) -> MatchTable:
 
 def places(matches) -> set[tuple[float, float, str]]:
     out = set()
-    for piece in matches.pieces():
-        t = piece.read()
+    for t in matches.batches():
         names = np.array(t.exposure_names)[t.exposure]
         out |= set(zip(t.x.tolist(), t.y.tolist(), names.tolist(), strict=True))
     return out
@@ -73,15 +71,15 @@ def test_data_on_disk_split_alike_whatever_their_pieces(tmp_path, monkeypatch):
         [table.select(np.arange(1500)), table.select(np.arange(1500, 4000))], tmp_path / "m"
     )
     for size in (2**20, 700):
-        monkeypatch.setattr(on_disk, "PIECE", size)
+        monkeypatch.setattr(batches, "BATCH", size)
         there = split_matches(open_matches(tmp_path / "m"), aside)
         for part in ("kept", "held"):
             mine, theirs = getattr(here, part), getattr(there, part)
-            assert len(mine) == len(theirs) == sum(len(p) for p in theirs.pieces())
+            assert len(mine) == len(theirs) == sum(len(p) for p in theirs.readers())
             # errors multiplied before and after
-            scaled = open_matches(tmp_path / "m").with_errors_times(2.0)
-            twice = getattr(split_matches(scaled, aside), part).with_errors_times(3.0)
-            assert all((p.read().sigma_u == 6.0).all() for p in twice.pieces())
+            scaled = open_matches(tmp_path / "m").with_scaled_errors(2.0)
+            twice = getattr(split_matches(scaled, aside), part).with_scaled_errors(3.0)
+            assert all((p.load().sigma_u == 6.0).all() for p in twice.readers())
             assert places(mine) == places(theirs)
             assert mine.exposure_names == theirs.exposure_names
             assert places(pickle.loads(pickle.dumps(theirs))) == places(mine)

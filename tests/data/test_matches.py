@@ -127,8 +127,8 @@ def test_numbers_of_the_chips():
     assert t.select([2, 4]).chip_number.tolist() == [7, 2]
 
 
-def test_with_sigma_takes_one_number_or_one_for_each():
-    t = table().with_sigma(0.1, np.arange(1.0, 6.0))
+def test_errors_are_one_number_or_one_for_each():
+    t = table().with_errors((0.1, np.arange(1.0, 6.0)))
     assert t.sigma_u.tolist() == [0.1] * 5 and t.sigma_v.tolist() == [1, 2, 3, 4, 5]
 
 
@@ -156,4 +156,4 @@ def test_concatenate_refuses_what_does_not_fit():
 def test_an_error_in_a_joined_table_names_the_right_file():
     t = MatchTable.concatenate([table(), table(x=np.arange(5.0), sources=("b.csv",))])
     with pytest.raises(InputError, match=r"b\.csv, row 2, column 'sigma_u'"):
-        t.with_sigma(np.where(np.arange(10) == 6, -1.0, 1.0), 1.0)
+        t.with_errors((np.where(np.arange(10) == 6, -1.0, 1.0), 1.0))

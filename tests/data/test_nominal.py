@@ -8,7 +8,7 @@ from astropy.table import Table
 
 from bayesdist.data import MatchTable, open_matches, read_matches
 from bayesdist.data.holdout import SetAside, split_matches
-from bayesdist.data.write import write_partitioned
+from bayesdist.data.storage.write import write_partitioned
 from bayesdist.errors import InputError
 
 NOMINAL = ("u_nominal", "v_nominal")
@@ -60,10 +60,12 @@ def test_on_disk_as_in_memory(stars, tmp_path):
     for name in NOMINAL:
         expected = getattr(table, name)
         assert np.array_equal(
-            np.concatenate([getattr(p.read(), name) for p in found.pieces()]), expected
+            np.concatenate([getattr(p.load(), name) for p in found.readers()]), expected
         )
         assert np.array_equal(getattr(found.sample(10), name), expected[::6])
-        assert np.array_equal(getattr(found.with_sigma(0.1, 0.1).sample(10), name), expected[::6])
+        assert np.array_equal(
+            getattr(found.with_errors((0.1, 0.1)).sample(10), name), expected[::6]
+        )
         assert np.array_equal(getattr(read_matches(folder), name), expected)
 
 
@@ -72,8 +74,8 @@ def test_kept_by_all_that_makes_tables(stars):
     both = MatchTable.concatenate([table.select([0, 1]), table.select([5])])
     assert np.array_equal(both.u_nominal, table.u_nominal[[0, 1, 5]])
     assert np.array_equal(table.sample(20).v_nominal, table.v_nominal[::3])
-    assert np.array_equal(table.with_sigma(0.1, 0.1).u_nominal, table.u_nominal)
-    assert np.array_equal(table.pieces()[0].read().v_nominal, table.v_nominal)
+    assert np.array_equal(table.with_errors((0.1, 0.1)).u_nominal, table.u_nominal)
+    assert np.array_equal(table.readers()[0].load().v_nominal, table.v_nominal)
     split = split_matches(table, SetAside(0.3))
     held = SetAside(0.3).which(table)
     assert np.array_equal(split.held.u_nominal, table.u_nominal[held])

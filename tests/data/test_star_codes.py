@@ -28,8 +28,8 @@ def table(n=6, **changes):
 def test_codes_follow_their_stars():
     t = table()
     assert t.select([4, 1]).star.tolist() == [BIG + 4, BIG + 1]
-    assert t.with_sigma(1.0, 1.0).star.tolist() == t.star.tolist()
-    assert t.pieces()[0].read().star.tolist() == t.star.tolist()
+    assert t.with_errors(1.0).star.tolist() == t.star.tolist()
+    assert t.readers()[0].load().star.tolist() == t.star.tolist()
     assert replace(t, star=None).star is None and table(star=None).select([0]).star is None
 
 
@@ -72,7 +72,7 @@ def test_parts_on_disk_carry_codes(tmp_path):
     tables = [table(exposure_names=(name,)) for name in "abc"]
     write_partitioned(tables, tmp_path / "parts", rows_per_group=4)
     opened = open_matches(tmp_path / "parts", sigma=1.0)
-    read = [piece.read() for piece in opened.pieces()]
+    read = [piece.load() for piece in opened.readers()]
     assert np.concatenate([one.star for one in read]).tolist() == 3 * tables[0].star.tolist()
     assert opened.sample(6).star is not None
     with pytest.raises(InputError, match="other columns"):

@@ -104,7 +104,7 @@ class Dated:
             zero = np.zeros(E * S)
             added |= {"pm_u": zero, "pm_v": zero}
             added |= {f"sigma_pm_{a}": np.full(E * S, self.motion) for a in "uv"}
-        return model, matches.with_sigma(quoted, quoted)._with(**added)
+        return model, matches.with_errors((quoted, quoted)).with_columns(**added)
 
     def _second(self, rng, theta, model, matches, uv, years) -> np.ndarray:
         """What the second chip's own motion does to positions (N, 2)."""

@@ -123,7 +123,7 @@ def solved(
 ) -> tuple[HierarchicalFit, Predictive]:
     """The joint fit of what is kept, and what it predicts."""
     kept, held = split.kept, split.held
-    assert isinstance(kept, MatchTable) and isinstance(held, MatchTable)
+    assert held is not None
     model = replace(one.model, exposures=kept.exposure_names)
     joint = fit_hierarchical(
         kept, model, rejection=Rejection(25.0 if mixture else np.inf, None), n_tau=64

@@ -79,10 +79,10 @@ class Scene:
         uv += SIGMA * self.noise(rng, self.n)
         false = rng.uniform(size=self.n) < self.fraction
         uv[false] += 0.5 * gaussian(rng, int(false.sum()))
-        table = table._with(u=uv[:, 0], v=uv[:, 1], colour=rng.normal(1, 0.3, self.n))
+        table = table.with_columns(u=uv[:, 0], v=uv[:, 1], colour=rng.normal(1, 0.3, self.n))
         if self.misquoted:
             factors = np.exp(self.misquoted * rng.standard_normal((2, self.n)))
-            table = table.with_sigma(*(SIGMA * factors))
+            table = table.with_errors(tuple(SIGMA * factors))
         return model, table
 
     def solve(self, model: DistortionModel, table: MatchTable) -> LinearFit | Posterior:

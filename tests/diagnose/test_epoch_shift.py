@@ -63,7 +63,7 @@ def test_errors_of_motions_do_not_draw_the_shift_to_zero():
         quoted = np.array([table.pm_u, table.pm_v]) + rng.normal(0, error, (2, 800))
         quoted[:, rng.uniform(size=800) < 0.4] = 0.0
         sigma = np.where(quoted == 0, 0.0, error)
-        one = found(table._with(pm_u=quoted[0], pm_v=quoted[1], sigma_pm_u=sigma[0],
+        one = found(table.with_columns(pm_u=quoted[0], pm_v=quoted[1], sigma_pm_u=sigma[0],
                                 sigma_pm_v=sigma[1]))  # fmt: skip
         assert one.significant
         pulls.append((one.years + 9.9) / one.sigma)
@@ -104,6 +104,6 @@ def test_right_epochs_are_left_alone():
 def test_without_motions_there_is_nothing_to_find():
     table = stars(-9.9, 1)
     no = dict.fromkeys(("pm_u", "pm_v"))
-    assert found(table._with(**no)) is None
-    still = table._with(pm_u=np.zeros(400), pm_v=np.zeros(400))
+    assert found(table.with_columns(**no)) is None
+    still = table.with_columns(pm_u=np.zeros(400), pm_v=np.zeros(400))
     assert found(still) is None

@@ -63,7 +63,7 @@ def stars(seed: int, n: int, model: DistortionModel | None = None, change=None, 
         exposure = matches.exposure if model.n_frame else None
         true = model.predict(theta, matches.x, matches.y, exposure=exposure)
         offset = change(matches, np.stack([matches.u, matches.v], axis=1) - true)
-        matches = matches._with(u=true[:, 0] + offset[:, 0], v=true[:, 1] + offset[:, 1])
+        matches = matches.with_columns(u=true[:, 0] + offset[:, 0], v=true[:, 1] + offset[:, 1])
     return model, matches
 
 

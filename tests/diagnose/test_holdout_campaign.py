@@ -167,7 +167,7 @@ def test_frames_of_whole_exposures_are_the_true_ones() -> None:
     one = field(8)
     split = split_matches(one.matches, SetAside(0.0, WHOLE))
     _, predictive = solved(one, split, WHOLE)
-    frames = frames_for(predictive, split.held.pieces(), split.held.exposure_names)
+    frames = frames_for(predictive, split.held, split.held.exposure_names)
     assert set(frames) == set(WHOLE)
     pulls = []
     for name, frame in frames.items():

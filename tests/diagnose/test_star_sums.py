@@ -123,7 +123,7 @@ def test_one_pass_gives_what_arrays_give(several, monkeypatch):
     assert used.sum() == fit.n_used < len(table)
     numbers = table.chip_number
     for piece in (10_000, 700):
-        monkeypatch.setattr("bayesdist.data.matches.PIECE", piece)
+        monkeypatch.setattr("bayesdist.data.batches.BATCH", piece)
         sums = load(fit.model, table).sum(star_sums, fit.mean, fit.clip, BINS)
         assert set(sums.binned) == {
             (chip, bins) for chip, several in BINS.items() for bins in several
@@ -170,7 +170,7 @@ def test_stars_flagged_are_those_that_are_flagged_one_by_one(several, monkeypatc
     posterior = sample(fit, table, outliers=OutlierMixture(), target_ess=50, target_rhat=1.1)
     flagged = memberships(posterior, table).outlier_probability > 0.5
     expected = [(flagged & (table.exposure == k)).sum() for k in range(3)]
-    monkeypatch.setattr("bayesdist.data.matches.PIECE", 700)
+    monkeypatch.setattr("bayesdist.data.batches.BATCH", 700)
     found = flagged_by_exposure(load(fit.model, table), posterior)
     np.testing.assert_array_equal(found, expected)
     assert found.sum() == posterior.n_flagged > 50

@@ -35,7 +35,7 @@ def blocks(rng: np.random.Generator, side: float, rms: float, size: float = SIDE
 
 
 def moved(matches: MatchTable, by: np.ndarray) -> MatchTable:
-    return matches._with(u=matches.u + by[:, 0], v=matches.v + by[:, 1])
+    return matches.with_columns(u=matches.u + by[:, 0], v=matches.v + by[:, 1])
 
 
 @dataclass(frozen=True)

@@ -176,7 +176,7 @@ class SharedStars:
     def with_errors(self, error: np.ndarray) -> MatchTable:
         """The matches with errors (N, 2)."""
         m = self.matches
-        return m._with(u=m.u + error[:, 0], v=m.v + error[:, 1])
+        return m.with_columns(u=m.u + error[:, 0], v=m.v + error[:, 1])
 
     def covariance(self, fit: LinearFit) -> StarCovariance:
         """What the catalogue's errors make of a fit to the matches."""
@@ -211,7 +211,7 @@ def shared_stars(
     quoted = np.sqrt(centroid**2 + position**2 + (motion * (epoch - 2004.0)) ** 2)
     u, v = model.predict(theta, x, y, exposure=exposure, chip=np.array([1, 2])[chip]).T
     measured = {"x": x, "y": y, "u": u, "v": v, "sigma_u": quoted, "sigma_v": quoted}
-    matches = matches._with(**measured, exposure=exposure, chip=chip, epoch=epoch, star=star)
+    matches = matches.with_columns(**measured, exposure=exposure, chip=chip, epoch=epoch, star=star)
     return SharedStars(model, theta, matches, position, motion)
 
 

@@ -188,7 +188,7 @@ def test_the_absolute_limit_counts_in_pixels_whatever_the_unit():
 
 def test_errors_that_are_too_small_as_a_whole_do_not_reject_everything():
     model, matches, _ = simulated(7, 500, order=2, sigma=0.05)
-    small = matches.with_sigma(0.002, 0.002)
+    small = matches.with_errors((0.002, 0.002))
     fit = fit_linear(small, model)
     # a chi-square above 25 with two degrees of freedom has probability 4e-6
     assert fit.uses(small).all() and fit.n_rejected == 0

@@ -12,7 +12,7 @@ from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.table_file import StoredLookupTables
 from bayesdist.data import MatchTable
 from bayesdist.diagnose.overlap import _aligned, _at_first_epoch, chosen_exposures
-from bayesdist.infer.nodes.corrected import inside_chips, with_columns
+from bayesdist.infer.nodes.corrected import inside_chips
 from bayesdist.model import Chip, DistortionModel, LookupTable, corrected
 
 SIZE = (1024.0, 512.0)
@@ -53,7 +53,7 @@ def test_residuals_show_the_pattern_of_the_detector_whatever_the_roll(margin):
     x, y = corrected([table], pairs.x, pairs.y, chip=1)
     chip = Chip(1, "CCD", SIZE, (512.0, 256.0))
     model = DistortionModel(2, (chip,), frames="affine", exposures=pairs.exposure_names)
-    moved = with_columns(pairs, x=x, y=y)
+    moved = pairs.with_columns(x=x, y=y)
     kept = inside_chips(moved, model)
     assert kept.all() == (margin > 0)
     data = SimpleNamespace(

@@ -34,8 +34,8 @@ def test_chunks_follow_one_generator(tmp_path, monkeypatch):
     chunks, truths = zip(*(simulate_wise(n, rng=rng) for n in (833, 833, 834)), strict=True)
     expected = MatchTable.concatenate(chunks)
     opened = open_matches(tmp_path)
-    (piece,) = opened.pieces()
-    back = piece.read()
+    (piece,) = opened.readers()
+    back = piece.load()
     for name in NAMES:
         assert getattr(back, name).tobytes() == getattr(expected, name).tobytes()
     assert (truth.false == np.concatenate([t.false for t in truths])).all()

@@ -26,7 +26,6 @@ from bayesdist.diagnose.overlap import OverlapTest, overlap_test
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_influence import StarErrors
-from bayesdist.infer.nodes.corrected import with_columns
 from bayesdist.model import DistortionModel, LookupTable
 
 __all__ = ["CampaignMatched", "campaign_matches", "load_matched_campaign", "matched_campaign"]
@@ -111,7 +110,7 @@ class CampaignMatched(Matched):
             by_code = np.zeros(int(catalog.star.max()) + 1)
             by_code[catalog.star] = getattr(catalog, name)
             columns[name] = by_code[table.star]
-        return with_columns(table, **columns)
+        return table.with_columns(**columns)
 
     def overlap(
         self, posterior: Posterior, tables: tuple[LookupTable, ...], config: Config, base: Path

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +15,13 @@ from bayesdist.app.kinds.fitted import Fitted, required
 from bayesdist.app.results import Results
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.star_files import PAIRS, part_files
-from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
+from bayesdist.data import MagnitudeErrors, MatchTable, read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.compare.monitoring import NewFit, fit_new, with_star_errors_of
 from bayesdist.infer.linear import Rejection
-from bayesdist.infer.nodes.corrected import on_the_chips, with_columns
+from bayesdist.infer.nodes.corrected import on_the_chips
 from bayesdist.model import corrected
 
 __all__ = ["NewExposures", "fit_exposures_of", "read_new_exposures"]
@@ -92,10 +92,7 @@ def read_new_exposures(release: Results, new: Path) -> NewExposures:
             do="give pairs of other exposures",
         )
     pairs = pairs.select(fresh)
-    names = pairs.exposures
-    code = {name: k for k, name in enumerate(names)}
-    codes = np.array([code.get(name, -1) for name in pairs.exposure_names])[pairs.exposure]
-    pairs = replace(pairs, exposure=codes, exposure_names=names)
+    pairs = pairs.with_exposure_names(pairs.exposures)
     own = None if run is None else read_magnitude_errors(run.path)
     return NewExposures(
         released,
@@ -119,10 +116,10 @@ def prepared(release: Fitted, pairs: MatchTable, errors: MagnitudeErrors | None)
             chip=pairs.chip_number,
             filter=np.where(names == "", own, names),
         )
-        pairs = on_the_chips(with_columns(pairs, x=x, y=y), release.linear.model)
+        pairs = on_the_chips(pairs.with_columns(x=x, y=y), release.linear.model)
     if pairs.mag is None or errors is None:
         return pairs
-    return with_centroid_errors(pairs, errors)
+    return pairs.with_errors(errors, in_quadrature=True)
 
 
 def fit_exposures_of(release: Results, new: NewExposures) -> NewFit:
@@ -144,9 +141,7 @@ def fit_exposures_of(release: Results, new: NewExposures) -> NewFit:
         return found
     released = None
     if new.same_catalogue:
-        old = release.data.stars
-        assert isinstance(old, MatchTable)
-        released = (release.fit, old)
+        released = (release.fit, release.data.stars)
     return with_star_errors_of(new.errors, found, new.matches, released)
 
 

@@ -82,7 +82,7 @@ def fit_tables(
             return FittedTables(StoredLookupTables())
         placed = on_the_chips(corrected_matches(held, matched.stars), model)
         fit, _, errors = scatter_by_magnitude(placed, model, matched.inputs)
-        pairs = matched.stars.with_errors_by_magnitude(errors)
+        pairs = matched.stars.with_errors(errors)
         between = measured_between(pairs, fit, held, filter=filter, fitted=False)
         of_nodes = _on_the_grid(model, grid, _errors_of(held, fit))
         return FittedTables(_stored(held, of_nodes, between))
@@ -125,7 +125,7 @@ def scatter_by_magnitude(
         Where stars have outrun a catalogue without proper motions.
     """
     fit, _, errors = fit_by_magnitude(pairs, model)
-    scattered = pairs.with_errors_by_magnitude(errors)
+    scattered = pairs.with_errors(errors)
     refuse_outrun_stars(inputs, fit, scattered)
     return fit, scattered, errors
 
@@ -153,7 +153,7 @@ def _with_errors(
         max_iterations=ROUGH,
     )
     _, _, errors = scatter_by_magnitude(rough.corrected(pairs), model, inputs)
-    return pairs.with_errors_by_magnitude(errors)
+    return pairs.with_errors(errors)
 
 
 def _stored(

@@ -85,13 +85,13 @@ class FitData:
     @cached_property
     def dates(self) -> Float:
         """Distinct dates of the stars, decimal years; none where they have none."""
-        table = self.placed if isinstance(self.placed, MatchTable) else self.sample
+        table = self.placed if self.placed.in_memory else self.sample
         return np.zeros(0) if table.epoch is None else np.unique(table.epoch)
 
     @cached_property
     def median_epoch(self) -> float:
         """Median date of the stars, decimal years; they have dates where the model drifts."""
-        table = self.placed if isinstance(self.placed, MatchTable) else self.placed.sample(SAMPLE)
+        table = self.placed if self.placed.in_memory else self.placed.sample(SAMPLE)
         assert table.epoch is not None
         return float(np.median(table.epoch))
 

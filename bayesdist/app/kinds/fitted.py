@@ -70,7 +70,7 @@ class Fitted:
         """
         if self.solved is not None:
             return self.solved.matches
-        if not self.tables.tables or not isinstance(stars, MatchTable):
+        if not self.tables.tables or not stars.in_memory:
             return stars
         return on_the_chips(corrected_matches(self.tables.tables, stars), self.linear.model)
 

@@ -29,9 +29,9 @@ class Matched:
 
     Parameters
     ----------
-    stars : MatchTable or PartitionedMatches
+    stars : Matches
         Those that are fitted.
-    held : MatchTable or PartitionedMatches or None
+    held : Matches or None
         Those that are held out; None where none are.
     whole : tuple of str
         Exposures that are held out whole.

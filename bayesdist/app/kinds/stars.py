@@ -57,7 +57,7 @@ def match_stars(stars: Matches, config: Config, base: Path) -> Matched:
 
     Parameters
     ----------
-    stars : MatchTable or PartitionedMatches
+    stars : Matches
         As `read_stars` reads them.
     config : Config
         With a section [data].

@@ -24,7 +24,7 @@ def fit_sections(fitted: Fitted, stars: Matches, *, skew: bool = False) -> dict[
     Parameters
     ----------
     fitted : Fitted
-    stars : MatchTable or PartitionedMatches
+    stars : Matches
         As `Fitted.placed` gives them.
     skew : bool
         The skew of the axes is asked for.

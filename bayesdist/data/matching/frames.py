@@ -57,9 +57,9 @@ def mutual_frames(
     """
     groups = _groups(planes, mags)
     if len(groups) > 1:
-        told = "; ".join(_listed([names[e] for e in group]) for group in groups)
+        listed = "; ".join(_listed([names[e] for e in group]) for group in groups)
         raise InputError(
-            f"the exposures fall into {len(groups)} groups without stars in common: {told}",
+            f"the exposures fall into {len(groups)} groups without stars in common: {listed}",
             where=source,
             do="add exposures between them, calibrate each group by itself, or give a start by "
             "which their stars agree",

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, iterated_map
 from bayesdist.data.matching.pairs import beats_chance, mutual_pairs, overlap
 from bayesdist.data.matching.voting import mean_spacing, vote_offset
@@ -159,17 +159,17 @@ def match_to_catalog(
 
 
 def match_table(
-    table: MatchTable,
+    table: Matches,
     catalog: ReferenceCatalog,
     *,
     radius: float | None = None,
     max_offset: float | None = None,
-) -> MatchTable:
+) -> Matches:
     """Matches with a catalogue's positions in place of approximate ones, exposure by exposure.
 
     Parameters
     ----------
-    table : MatchTable
+    table : Matches
         u, v are approximate corrected positions in the catalogue's unit, as hst1pass gives them.
     catalog : ReferenceCatalog
         Brought to the mean epoch of each exposure, where it has proper motions.
@@ -178,7 +178,7 @@ def match_table(
 
     Returns
     -------
-    MatchTable
+    Matches
         The matched stars, with u, v and star codes of the catalogue; the others are counted as
         rejected.  Errors stay as they are: those of a catalogue are only a part of the error of a
         match.
@@ -223,9 +223,8 @@ def match_table(
         u[pairs], v[pairs] = then.u[found.catalog_index], then.v[found.catalog_index]
         star[pairs] = then.star[found.catalog_index]
         matched[pairs] = True
-    kept = table.select(matched, reason="no counterpart in the catalogue")
-    return replace(
-        kept,
+    selected = table.select(matched, reason="no counterpart in the catalogue")
+    return selected.with_columns(
         u=u[matched],
         v=v[matched],
         star=star[matched],

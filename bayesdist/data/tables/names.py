@@ -218,7 +218,7 @@ def origin_of(column: str, names: Iterable[str], header: Mapping[str, Any]) -> t
     if column.lower() in _FROM_ZERO:
         return 0, f"{column} is a name of {_FROM_ZERO[column.lower()]}, which counts from 0"
     if column in ("x", "xcenter"):
-        for program, beside in _COUNTS_FROM_ZERO:
-            if beside <= lower:
-                return 0, f"{', '.join(sorted(beside))} are of {program}, which counts from 0"
+        for program, others in _COUNTS_FROM_ZERO:
+            if others <= lower:
+                return 0, f"{', '.join(sorted(others))} are of {program}, which counts from 0"
     return 1, ""

@@ -59,7 +59,7 @@ def estimate_discrepancy(
 
     Parameters
     ----------
-    matches : MatchTable, PartitionedMatches or Shards
+    matches : Matches or Shards
         Data of the solution.
     solution : Posterior or LinearFit
         Without extra weight in the corners.

@@ -139,10 +139,9 @@ def holdout_validation(
             where=where,
             do="give a Predictive with deviations",
         )
-    pieces = held.pieces()
     partitions = partitions_of(predictive.model, held, held.sample(SAMPLE), whole)
-    frames = frames_for(predictive, pieces, held.exposure_names)
-    sums = held_sums(predictive, pieces, partitions, frames)
+    frames = frames_for(predictive, held, held.exposure_names)
+    sums = held_sums(predictive, held, partitions, frames)
     if not HELD_OUT.met_by(sums.n):
         raise InputError(
             f"{sums.n} held-out stars say too little of the solution",

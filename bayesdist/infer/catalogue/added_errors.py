@@ -30,7 +30,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.added_errors import AddedErrors, group_codes
+from bayesdist.data.added_errors import AddedErrors
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.by_magnitude import (
@@ -145,7 +145,7 @@ def grouped_errors(
     model = fit.model
     count = max(STARS, PER_EXPOSURE * len(model.exposures) * len(model.chips))
     table = matches.sample(count)
-    names, label = group_codes(table, by)
+    names, label = table.grouped(by)
     present, label = np.unique(label, return_inverse=True)
     labels = tuple(names[k] for k in present)
     if by and len(labels) < 2:
@@ -219,7 +219,8 @@ def _maximised(
             wide = max(least, float((bad * square).sum() / max(2.0 * bad.sum(), 1e-300)))
         before, variance = variance, _maxima(quoted, square, good, code, n_groups)
         var = quoted + variance[code]
-        weighted = table.with_sigma(*(np.sqrt(var / np.maximum(good, LEAST_WEIGHT))))
+        sigma_u, sigma_v = np.sqrt(var / np.maximum(good, LEAST_WEIGHT))
+        weighted = table.with_errors((sigma_u, sigma_v))
         fit = fit_linear(weighted, model, rejection=NO_REJECTION, priors=priors)
         residual = residuals_of(fit, table) ** 2
         square = residual + variances_of(fit, table)

@@ -81,8 +81,7 @@ def period_scores(
     edges = _edges(matches, most)
     held: dict[int, tuple[NormalEquations, float, float, int]] = {}
     constants = new.target.hyper.constants(new.psi[None, new.target.n_theta :])
-    for piece in matches.pieces():
-        table = piece.read()
+    for table in matches.batches():
         assert table.epoch is not None
         of_period = np.searchsorted(edges, table.epoch, side="right")
         for b in np.unique(of_period):

@@ -153,7 +153,7 @@ def fit_new(
     ----------
     released : Solution
         A fit or a posterior; only the kind of its frames matters, not the frames of its exposures.
-    matches : MatchTable or PartitionedMatches
+    matches : Matches
         With errors.
     mixture : OutlierMixture, optional
         That of a released posterior by default, else Gaussian outliers.

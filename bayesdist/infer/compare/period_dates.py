@@ -84,8 +84,7 @@ def sum_by_period(matches: Matches, periods: Periods, task: Callable[[MatchTable
         )
     check_periods(periods)
     sums: dict[str, Any] = {}
-    for piece in matches.pieces():
-        table = piece.read()
+    for table in matches.batches():
         assert table.epoch is not None
         for name, (start, stop) in periods.items():
             inside = (table.epoch >= start) & (table.epoch < stop)

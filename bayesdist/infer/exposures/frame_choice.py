@@ -77,7 +77,7 @@ def _scatter(matches: MatchTable, model: DistortionModel) -> float:
     median = 1.0
     for _ in range(FITS):
         sigma = np.full(len(matches), max(median / MEDIAN_LENGTH, np.finfo(float).tiny))
-        table = replace(matches, sigma_u=sigma, sigma_v=sigma)
+        table = matches.with_errors((sigma, sigma))
         fit = fit_linear(table, model, rejection=Rejection(clip_abs=None))
         median = float(np.median(np.hypot(*residuals(fit, table).T)))
     return median * float(np.sqrt(2 * len(matches) / (2 * len(matches) - model.n_params)))

@@ -193,7 +193,7 @@ def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -
 
     Parameters
     ----------
-    matches : MatchTable or PartitionedMatches
+    matches : Matches
     model : DistortionModel
         Of all exposures; its gauge is replaced.
     chip : int
@@ -211,8 +211,7 @@ def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -
     first = model.exposures[0]
     number = model.chips[model.chip_code(chip)].number
     parts = []
-    for piece in matches.pieces():
-        table = piece.read()
+    for table in matches.batches():
         rows = np.asarray(table.exposure_names)[table.exposure] == first
         rows &= table.chip_number == number
         if rows.any():
@@ -248,7 +247,7 @@ def fit_hierarchical(
 
     Parameters
     ----------
-    matches : MatchTable, PartitionedMatches or Shards
+    matches : Matches or Shards
         With errors.
     model : DistortionModel
         Frames 'shift_rotation_scale' or 'affine', or deviations of single chips, in gauge 'held':

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,20 +11,14 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.model import DistortionModel
 from bayesdist.model.lookup import LookupTable, corrected
 
-__all__ = ["corrected_matches", "inside_chips", "on_the_chips", "with_columns"]
-
-
-def with_columns(matches: MatchTable, **changes: Any) -> MatchTable:
-    """Matches with some columns replaced."""
-    columns = {one.name: getattr(matches, one.name) for one in fields(matches)}
-    return MatchTable.of_distinct_rows(**(columns | changes))
+__all__ = ["corrected_matches", "inside_chips", "on_the_chips"]
 
 
 def corrected_matches(tables: Sequence[LookupTable], matches: MatchTable) -> MatchTable:
     """Matches at the pixels to which tables of the detector and of one filter move them."""
     filter = next((table.filter for table in tables if table.filter), "")
     x, y = corrected(tables, matches.x, matches.y, chip=matches.chip_number, filter=filter)
-    return with_columns(matches, x=x, y=y)
+    return matches.with_columns(x=x, y=y)
 
 
 def on_the_chips(matches: MatchTable, model: DistortionModel) -> MatchTable:

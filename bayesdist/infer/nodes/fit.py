@@ -22,7 +22,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import LinearFit, fit_linear
 from bayesdist.infer.nodes.binned import binned_table
-from bayesdist.infer.nodes.corrected import corrected_matches, on_the_chips, with_columns
+from bayesdist.infer.nodes.corrected import corrected_matches, on_the_chips
 from bayesdist.infer.nodes.field import field_table
 from bayesdist.infer.nodes.grid import STEP
 from bayesdist.infer.nodes.hyperparameters import SMOOTHNESS
@@ -186,7 +186,7 @@ def fit_with_tables(
         )
         if report is not None:
             report(progress[-1])
-        moved = with_columns(matches, x=x + own[:, 0], y=y + own[:, 1])
+        moved = matches.with_columns(x=x + own[:, 0], y=y + own[:, 1])
         if progress[-1].moved < tolerance:
             break
     assert mixture is not None
@@ -241,9 +241,7 @@ def _with_own_exposures(
             f"no match is of exposure {model.exposures[0]!r}, which holds the gauge",
             do="give the filter a model of its own",
         )
-    code = np.array([names.index(n) if n in names else 0 for n in matches.exposure_names])
-    some = with_columns(matches, exposure=code[matches.exposure], exposure_names=names)
-    return some, replace(model, exposures=names)
+    return matches.with_exposure_names(names), replace(model, exposures=names)
 
 
 def _with_memberships(matches: MatchTable, mixture: ResidualMixture, jitter: Float) -> MatchTable:
@@ -254,8 +252,10 @@ def _with_memberships(matches: MatchTable, mixture: ResidualMixture, jitter: Flo
     assert matches.sigma_u is not None and matches.sigma_v is not None
     likely = mixture.probability >= LIKELY
     p = np.maximum(mixture.probability, LIKELY)
-    wide = matches.with_sigma(
-        np.sqrt((matches.sigma_u**2 + jitter**2) / p),
-        np.sqrt((matches.sigma_v**2 + jitter**2) / p),
+    wide = matches.with_errors(
+        (
+            np.sqrt((matches.sigma_u**2 + jitter**2) / p),
+            np.sqrt((matches.sigma_v**2 + jitter**2) / p),
+        )
     )
     return wide.select(likely, reason="false match")

@@ -63,7 +63,7 @@ def sample(
     ----------
     fit : LinearFit
         Of the same matches; the search for the mode starts there.
-    matches : MatchTable, PartitionedMatches or Shards
+    matches : Matches or Shards
         All stars: none is clipped.
     outliers : OutlierMixture, optional
         Gaussian outliers by default.

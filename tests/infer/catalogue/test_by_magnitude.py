@@ -28,7 +28,7 @@ def lists():
 
 def test_errors_come_out_as_they_went_in(lists):
     model, matches, truth = lists
-    bare = matches.with_sigma(1.0, 1.0)
+    bare = matches.with_errors(1.0)
     fit, table, errors = fit_by_magnitude(bare, model)
     for found, true in zip(errors.at(matches.mag), true_sigma(matches.mag), strict=True):
         ratio = found / true
@@ -44,7 +44,7 @@ def test_errors_come_out_as_they_went_in(lists):
 
 def test_the_fit_is_that_of_the_table_it_returns(lists):
     model, matches, _ = lists
-    fit, table, _ = fit_by_magnitude(matches.with_sigma(1.0, 1.0), model)
+    fit, table, _ = fit_by_magnitude(matches.with_errors(1.0), model)
     np.testing.assert_array_equal(fit_linear(table, model).mean, fit.mean)
 
 
@@ -115,7 +115,7 @@ def test_errors_predict_what_was_held_out(data_dir):
         sigma = np.stack(errors.at(held.mag), axis=1)
         jacobian = model.jacobian(fit.mean, held.x, held.y)
         var = sigma**2 + np.einsum("nam,mk,nak->na", jacobian, fit.cov, jacobian)
-        pulls.append(residuals(fit, held.with_sigma(1.0, 1.0)) / np.sqrt(var))
+        pulls.append(residuals(fit, held.with_errors(1.0)) / np.sqrt(var))
         bright.append(held.mag < np.median(table.mag))
     pull, bright = np.abs(np.concatenate(pulls)), np.concatenate(bright)
     for half in (pull[bright], pull[~bright]):

@@ -7,7 +7,7 @@ import pytest
 from astropy.time import Time
 from scipy.stats import kstest, ncx2
 
-from bayesdist.data import MatchTable, matches
+from bayesdist.data import MatchTable, batches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import Rejection, fit_linear
 from bayesdist.infer.compare.period_dates import mjd_periods, sum_by_period
@@ -297,8 +297,8 @@ def test_pieces_and_parts_of_a_period_add_up(rng, monkeypatch):
     table = dated(rng, 1000)
     fit = fit_linear(table, MODEL)
     whole = period_sums(fit, table, PERIODS)
-    monkeypatch.setattr(matches, "PIECE", 130)
-    assert len(table.pieces()) > 5
+    monkeypatch.setattr(batches, "BATCH", 130)
+    assert len(table.readers()) > 5
     pieces = period_sums(fit, table, PERIODS)
     for name in PERIODS:
         assert pieces[name].n == whole[name].n

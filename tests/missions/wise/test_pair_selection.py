@@ -91,7 +91,7 @@ def test_what_leaves_nothing_or_cannot_be_done_is_refused(rng):
 def test_written_pairs_are_read_again(rng, tmp_path, monkeypatch):
     path = write(rvb_table(rng), tmp_path / "a.parquet")
     expected = read_rvb(path, band="W2")
-    monkeypatch.setattr(rvb_files, "PIECE", 41)
+    monkeypatch.setattr(rvb_files, "BATCH", 41)
     assert write_rvb(stream_rvb(path, band="W2"), tmp_path / "out") == len(expected)
     found = read_rvb(tmp_path / "out")
     assert len(list((tmp_path / "out").iterdir())) > 3
@@ -127,7 +127,7 @@ def test_pairs_that_stay_on_disk_are_the_same(rng, tmp_path):
     path = write(table, tmp_path / "a.parquet")
     options = OPTIONS | {"columns": {"color": ""}}
     opened = open_rvb(path, band="W1", **options)
-    (piece,) = [piece.read() for piece in opened.pieces()]
+    (piece,) = [piece.load() for piece in opened.readers()]
     expected = read_rvb(path, band="W1").matches
     for name in (*ARRAYS, "row"):
         np.testing.assert_array_equal(getattr(piece, name), getattr(expected, name))

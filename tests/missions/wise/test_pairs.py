@@ -92,14 +92,14 @@ def test_parquet_in_small_pieces_is_the_ipac_table(rng, tmp_path, monkeypatch):
     table = rvb_table(rng)
     whole = read_rvb(write(table, tmp_path / "a.tbl"), band="w2")
     path = write(table, tmp_path / "a.parquet")
-    monkeypatch.setattr(rvb_files, "PIECE", 41)
+    monkeypatch.setattr(rvb_files, "BATCH", 41)
     pieces = list(stream_rvb(path, band="2"))
     assert len(pieces) == 8 and sum(len(p) for p in pieces) == len(whole)
     assert_same(RvbPairs.concatenate(pieces), whole)
     # what is written from the pieces is what a fit opens
     write_partitioned((p.matches for p in pieces), tmp_path / "W2")
     opened = open_matches(tmp_path / "W2")
-    joined = MatchTable.concatenate([piece.read() for piece in opened.pieces()])
+    joined = MatchTable.concatenate([piece.load() for piece in opened.readers()])
     for name in ("x", "y", "u", "v", "sigma_u", "epoch", "mag"):
         np.testing.assert_array_equal(getattr(joined, name), getattr(whole.matches, name))
     assert opened.filter_names == ("W2",)

@@ -228,7 +228,7 @@ def _partial_fit(
         (float(high[0] - low[0]), float(high[1] - low[1])),
         (chip.reference_pixel[0] - low[0], chip.reference_pixel[1] - low[1]),
     )
-    moved = replace(matches, x=matches.x - low[0], y=matches.y - low[1])
+    moved = matches.with_columns(x=matches.x - low[0], y=matches.y - low[1])
     return fit_linear(moved, replace(model, order=order, chips=(part,)), rejection=rejection)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -108,7 +108,8 @@ class RvbInput:
         # a number has been written into the columns
         sigma = options["sigma"] if options["sigma"] == "by_magnitude" else "columns"
         opened = open_matches(folder, unit=options["unit"], sigma=sigma)
-        return replace(opened, dropped=counts["rejected"])
+        rejected = counts["rejected"]
+        return opened.with_counts(len(opened) + sum(rejected.values()), rejected)
 
     def move_into_run(self) -> bool:
         """Move what was written into the folder of the run, which has begun.
@@ -151,9 +152,9 @@ def load_rvb(
     assert isinstance(data, RvbData)
     if data.band is not None:
         _require_array(data.band, size)
-    pieces = list(stream_rvb(path, **_options(data, size)))
-    _require_array(pieces[0].band, size)
-    return SelectedPairs(lambda: pieces, data.rvb.selection(), size).table()
+    batches = list(stream_rvb(path, **_options(data, size)))
+    _require_array(batches[0].band, size)
+    return SelectedPairs(lambda: batches, data.rvb.selection(), size).table()
 
 
 def _options(data: RvbData, size: tuple[float, float]) -> dict[str, Any]:

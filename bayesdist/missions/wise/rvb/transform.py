@@ -9,7 +9,7 @@ what two of them do one after the other is one of them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -221,5 +221,4 @@ def _moved(
                 do="give both axes the same errors before, or transform the detections instead",
             )
         columns |= {"sigma_u": out[:, 0], "sigma_v": out[:, 1]}
-    same = {one.name: getattr(matches, one.name) for one in fields(matches)}
-    return MatchTable.of_distinct_rows(**(same | columns))
+    return matches.with_columns(**columns)
