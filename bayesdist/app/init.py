@@ -15,10 +15,10 @@ from bayesdist.app.init_sigma import guessed_sigma
 from bayesdist.app.matches import load_matches
 from bayesdist.app.output import refuse_existing
 from bayesdist.app.rvb_init import is_rvb, rvb_template
+from bayesdist.data import Matches
 from bayesdist.data.reading.layout import TableLayout, table_layout
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
-from bayesdist.infer import Matches
 
 __all__ = ["init"]
 

@@ -14,14 +14,13 @@ from bayesdist.app.config.rvb import RvbBlock
 from bayesdist.app.matches import is_large
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.star_files import PAIRS, part_files
-from bayesdist.data import MatchTable, open_matches, write_partitioned
+from bayesdist.data import Matches, open_matches, write_partitioned
 from bayesdist.data.rvb.files import ARRAY_SIZE, band_name
 from bayesdist.data.rvb.on_disk import open_rvb
 from bayesdist.data.rvb.read import stream_rvb
 from bayesdist.data.rvb.select import RvbSelection, SelectedPairs
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
-from bayesdist.infer import Matches
 
 __all__ = ["RvbInput", "load_rvb"]
 
@@ -97,7 +96,7 @@ class RvbInput:
         folder = Path(self._scratch.name) / PAIRS
         size = self._options["size"]
 
-        def tables() -> Iterator[MatchTable]:
+        def tables() -> Iterator[Matches]:
             for pairs in selected:
                 _refuse_other_array(pairs.band, size)
                 yield pairs.matches
@@ -156,7 +155,7 @@ class RvbInput:
 
 def load_rvb(
     path: str | Path | Sequence[str | Path], data: Data, size: tuple[float, float]
-) -> MatchTable:
+) -> Matches:
     """RvB pairs in memory, as a configuration reads and selects them.
 
     Parameters
@@ -169,7 +168,7 @@ def load_rvb(
 
     Returns
     -------
-    MatchTable
+    Matches
 
     Raises
     ------

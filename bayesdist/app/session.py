@@ -32,11 +32,11 @@ from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.checks import Check
-from bayesdist.data import MagnitudeErrors, MatchTable
+from bayesdist.data import MagnitudeErrors, Matches
 from bayesdist.diagnose.diagnostics import Diagnostics, diagnose, diagnose_fit, hold_out
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.residuals.quoted import error_scale_sentence
-from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, Shards, load_posterior
+from bayesdist.infer import GaussianPriors, LinearFit, Posterior, Shards, load_posterior
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.exposures.frame_choice import FrameChoice, frames_that_help
 from bayesdist.model import DistortionModel
@@ -193,7 +193,7 @@ class Session:
         return self.reader.shards(self.model, *self._read)
 
     @property
-    def _sample(self) -> MatchTable:
+    def _sample(self) -> Matches:
         """Some of the matches, or all."""
         return self.reader.sample(*self._read)
 
@@ -404,7 +404,7 @@ class Session:
         return self.config.held_in_residuals(self.model.unit)
 
     @property
-    def tested_matches(self) -> MatchTable:
+    def tested_matches(self) -> Matches:
         """Matches that the score tests look at: all, or every k-th."""
         return self._sample
 
@@ -449,7 +449,7 @@ class Session:
         return None if scale is None else scale / 1000
 
     @property
-    def sampled_matches(self) -> MatchTable:
+    def sampled_matches(self) -> Matches:
         """Some of the matches, or all: for what is estimated from single residuals."""
         return self._sample
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.checks import EITHER, Check
-from bayesdist.data import MagnitudeErrors, MatchTable
+from bayesdist.data import MagnitudeErrors, Matches
 from bayesdist.diagnose.checks import holdout_checks, score_checks, structure_checks
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.validation import HeldOutTruth, held_out_truth
@@ -36,7 +36,7 @@ from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.diagnose.score.tests import score_tests
 from bayesdist.diagnose.selfcal.misfit import dithered_misfit
 from bayesdist.diagnose.selfcal.score import selfcal_score_tests
-from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, Shards
+from bayesdist.infer import GaussianPriors, LinearFit, Posterior, Shards
 from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance
 from bayesdist.infer.catalogue.star_influence import StarErrors
 from bayesdist.infer.discrepancy import Discrepancy, DiscrepancyPriors, estimate_discrepancy
@@ -153,7 +153,7 @@ def diagnose_fit(
     posterior: Posterior | None,
     stars: Matches,
     shards: Shards,
-    table: MatchTable,
+    table: Matches,
     *,
     eliminated: Eliminated | None = None,
     centroid: MagnitudeErrors | Literal["residuals"] | None = "residuals",
@@ -169,7 +169,7 @@ def diagnose_fit(
         With errors: those that were fitted.
     shards : Shards
         The same, as passes go over them.
-    table : MatchTable
+    table : Matches
         Evenly spread ones of them, or all.
     eliminated : infer.selfcal.Solution, optional
         The solution with its stars, where places of stars were fitted too.
@@ -264,10 +264,10 @@ def diagnose(
     posterior: Posterior,
     stars: Matches,
     shards: Shards,
-    table: MatchTable,
+    table: Matches,
     *,
     rng: np.random.Generator,
-    tested: MatchTable | None = None,
+    tested: Matches | None = None,
     discrepancy: DiscrepancyPriors | None = None,
     priors: GaussianPriors | None = None,
     match_radius: float | None = None,
@@ -288,7 +288,7 @@ def diagnose(
         As `diagnose_fit`.
     rng : numpy.random.Generator
         Each result is made from its numbers from their beginning.
-    tested : MatchTable, optional
+    tested : Matches, optional
         Those that the score tests look at, where they have more columns than `table`.
     discrepancy : DiscrepancyPriors, optional
         Of the size of correlated errors.
@@ -374,7 +374,7 @@ def _column(stars: Matches, name: str) -> NDArray[np.float64] | None:
 
 
 def catalogue_covariance(
-    fit: LinearFit, stars: MatchTable | None, errors: StarErrors | None
+    fit: LinearFit, stars: Matches | None, errors: StarErrors | None
 ) -> StarCovariance | None:
     """What the errors of the catalogue do to the parameters.
 
@@ -385,7 +385,7 @@ def catalogue_covariance(
     Parameters
     ----------
     fit : LinearFit
-    stars : MatchTable or None
+    stars : Matches or None
         With errors that contain the catalogue's, and codes of the stars.
     errors : StarErrors or None
 

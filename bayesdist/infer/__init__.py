@@ -30,7 +30,7 @@ _HOMES = {
     "bayesdist.infer.convergence": ("Convergence", "Limits"),
     "bayesdist.infer.sampler.sample": ("sample",),
     "bayesdist.infer.stars.mixture": ("OutlierMixture",),
-    "bayesdist.infer.stars.shards": ("Compute", "Matches", "Shards", "load"),
+    "bayesdist.infer.stars.shards": ("Compute", "Shards", "load"),
     "bayesdist.infer.transforms": (
         "LinearTerms",
         "ReferenceGauge",

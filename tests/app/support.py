@@ -18,7 +18,7 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.cli import main
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import Truth, simulate_matches
 
@@ -120,7 +120,7 @@ def truth_of(model: DistortionModel, scale: float = 1.0, offset: bool = True) ->
     return theta
 
 
-def simulated(n: int = 400, seed: int = 1, **options: Any) -> tuple[MatchTable, Truth]:
+def simulated(n: int = 400, seed: int = 1, **options: Any) -> tuple[Matches, Truth]:
     """Stars on one chip, 5 % of them false, errors 0.022 px where 0.02 is quoted."""
     model = model_of()
     options = {"fraction": 0.05, "outlier_scale": 0.5, "jitter": 0.01, "sigma": SIGMA} | options
@@ -128,7 +128,7 @@ def simulated(n: int = 400, seed: int = 1, **options: Any) -> tuple[MatchTable, 
     return simulate_matches(model, truth_of(model), n, rng=rng, **options)
 
 
-def as_table(matches: MatchTable, unit: str | None = "same") -> Table:
+def as_table(matches: Matches, unit: str | None = "same") -> Table:
     """Matches as a file holds them."""
     table = Table({k: getattr(matches, k).copy() for k in ("x", "y", "u", "v")})
     if matches.sigma_u is not None:

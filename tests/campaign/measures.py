@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.infer import fit_by_magnitude
 from bayesdist.infer.nodes import TableFit, TablePosterior, fit_with_tables, pixel_jacobian
 from bayesdist.infer.series import Course, Series, fit_series
@@ -114,9 +114,9 @@ def node_errors(found: Calibrated, tables: TableFit, step: float) -> Outcome:
     }
     session = found.session
     pairs = session.pairs
-    assert isinstance(pairs, MatchTable)
+    assert isinstance(pairs, Matches)
     _, with_errors, _ = fit_by_magnitude(pairs, session.plain_model)
-    assert isinstance(with_errors, MatchTable)
+    assert isinstance(with_errors, Matches)
     binned = fit_with_tables(with_errors, session.plain_model, method="binned", step=(step, step))
     others = {table.chip: table for table in binned.tables}
     for posterior in tables.part().posteriors:
@@ -138,7 +138,7 @@ def node_errors(found: Calibrated, tables: TableFit, step: float) -> Outcome:
 def _noise(found: Calibrated) -> float:
     """Rms of the errors of centroids and catalogue, as they were drawn, of all pairs."""
     pairs = found.session.pairs
-    assert isinstance(pairs, MatchTable) and pairs.star is not None
+    assert isinstance(pairs, Matches) and pairs.star is not None
     assert pairs.sigma_u is not None and pairs.sigma_v is not None
     single = centroid_error(found.campaign.truth.stars.mag[pairs.star])
     return float(np.sqrt((single**2 + (pairs.sigma_u**2 + pairs.sigma_v**2) / 2).mean()))

@@ -17,7 +17,7 @@ from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.campaign.stages import CAMPAIGN_STAGES
 from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.infer.catalogue.star_errors import star_covariance
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit
 from bayesdist.infer.nodes import Matern, NodeGrid, TableFit
@@ -204,7 +204,7 @@ def _results_of(*names: str) -> Iterator[dict[str, Any]]:
 def _with_catalogue(bare: HierarchicalFit, session: CampaignSession) -> Recoloured:
     """The joint fit with the errors that a star of the catalogue has in all exposures."""
     catalog, matches = session.inputs.catalog, session.matches
-    assert isinstance(matches, MatchTable)
+    assert isinstance(matches, Matches)
 
     def by_code(values: Any) -> np.ndarray:
         out = np.zeros(int(catalog.star.max()) + 1)

@@ -7,7 +7,7 @@ import pytest
 
 from bayesdist.data import (
     LinearMap,
-    MatchTable,
+    Matches,
     ReferenceCatalog,
     match_table,
     match_to_catalog,
@@ -119,9 +119,9 @@ def test_a_table_takes_the_catalogue_at_the_epoch_of_each_exposure(rng):
         now = uv + pm * (epoch - 2010.0)
         seen = now + rng.normal(0, 0.01, now.shape) + 3.0
         tables.append(
-            MatchTable(*(seen / 0.05), *seen, epoch=np.full(n, epoch), exposure_names=(name,))
+            Matches(*(seen / 0.05), *seen, epoch=np.full(n, epoch), exposure_names=(name,))
         )
-    t = match_table(MatchTable.concatenate(tables), catalog)
+    t = match_table(Matches.concatenate(tables), catalog)
     for code, epoch in enumerate((2004.0, 2014.0)):
         now = t.exposure == code
         rows = t.row[now]

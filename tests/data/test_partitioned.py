@@ -16,7 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from bayesdist.data import MagnitudeErrors, MatchTable, batches, open_matches, read_matches
+from bayesdist.data import MagnitudeErrors, Matches, batches, open_matches, read_matches
 from bayesdist.data.added_errors import AddedErrors
 from bayesdist.data.storage.write import write_partitioned
 from bayesdist.data.tables import repeated as duplicates_module
@@ -516,7 +516,7 @@ def test_more_repetitions_than_are_compared_at_a_time(rng, monkeypatch):
 
 def some_tables(rng):
     for n in (700, 1, 300):
-        yield MatchTable(
+        yield Matches(
             **{name: rng.uniform(1, 1000, n) for name in "xyuv"},
             sigma_u=rng.uniform(0.1, 1, n), sigma_v=rng.uniform(0.1, 1, n), unit="mas",
             epoch=rng.uniform(2002, 2014, n), mag=rng.uniform(10, 20, n),
@@ -535,7 +535,7 @@ def test_what_is_written_is_read_back_to_the_last_bit(rng, tmp_path, monkeypatch
     assert sorted(os.listdir(tmp_path / "a" / "b")) == [p.name for p in paths]
     assert_same(tmp_path / "a" / "b", monkeypatch=monkeypatch)
     back = read_matches(tmp_path / "a" / "b")
-    whole = MatchTable.concatenate(tables)
+    whole = Matches.concatenate(tables)
     assert back.unit == "mas"
     for name in ARRAYS:
         assert_bitwise(getattr(back, name), getattr(whole, name), where=name)
@@ -561,7 +561,7 @@ def test_nothing_half_written_stays(rng, tmp_path):
     with pytest.raises(RuntimeError):
         write_partitioned(broken(), tmp_path / "a")
     first, *_ = some_tables(rng)
-    bare = MatchTable(x=first.x, y=first.y, u=first.u, v=first.v)
+    bare = Matches(x=first.x, y=first.y, u=first.u, v=first.v)
     with pytest.raises(InputError, match="table 2 has another unit or other columns"):
         write_partitioned([first, bare], tmp_path / "a")
     with pytest.raises(InputError, match="no tables to write"):

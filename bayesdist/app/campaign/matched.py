@@ -13,7 +13,7 @@ from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.split import set_aside
 from bayesdist.app.star_files import PAIRS, part_files
 from bayesdist.data import read_matches, write_partitioned
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.model import DistortionModel
 
 __all__ = ["CampaignMatched", "load_matched_campaign", "matched_campaign"]
@@ -29,14 +29,14 @@ class CampaignMatched(Matched):
     ----------
     inputs : Inputs
         Catalogue, exposures and star lists.
-    pairs : MatchTable
+    pairs : Matches
         All matches, fitted or held out.
     """
 
-    stars: MatchTable
-    held: MatchTable | None = None
+    stars: Matches
+    held: Matches | None = None
     inputs: Inputs = field(kw_only=True)
-    pairs: MatchTable = field(kw_only=True)
+    pairs: Matches = field(kw_only=True)
 
     @property
     def mirrored(self) -> bool:
@@ -65,7 +65,7 @@ class CampaignMatched(Matched):
 
 
 def matched_campaign(
-    pairs: MatchTable, config: Config, inputs: Inputs, **more: Any
+    pairs: Matches, config: Config, inputs: Inputs, **more: Any
 ) -> CampaignMatched:
     """Matches of a campaign, with what the configuration holds out set aside.
 

@@ -12,7 +12,7 @@ from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.kinds.errors import read_magnitude_errors
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.star_files import PAIRS, part_files
-from bayesdist.data import MagnitudeErrors, MatchTable, read_matches
+from bayesdist.data import MagnitudeErrors, Matches, read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_influence import StarErrors
@@ -34,7 +34,7 @@ class NewExposures:
     ----------
     released : Posterior
         With the errors of the catalogue, and those that its stars share.
-    matches : MatchTable
+    matches : Matches
         At the pixels that the release's tables have corrected, with errors.
     errors : StarErrors or None
         Of the catalogue; None where stars have no codes, or pairs no errors of it.
@@ -45,7 +45,7 @@ class NewExposures:
     """
 
     released: Posterior
-    matches: MatchTable
+    matches: Matches
     errors: StarErrors | None
     same_catalogue: bool
     left_out: tuple[str, ...]
@@ -100,9 +100,7 @@ def read_new_exposures(session: CampaignSession, new: Path) -> NewExposures:
     )
 
 
-def prepared(
-    session: CampaignSession, pairs: MatchTable, errors: MagnitudeErrors | None
-) -> MatchTable:
+def prepared(session: CampaignSession, pairs: Matches, errors: MagnitudeErrors | None) -> Matches:
     """Pairs at the pixels that the release's tables have corrected, with errors of centroids."""
     if session.tables:
         names = np.asarray(pairs.filter_names)[pairs.filter]
@@ -144,7 +142,7 @@ def fit_exposures_of(session: CampaignSession, new: NewExposures) -> NewFit:
     return with_star_errors_of(new.errors, found, new.matches, released)
 
 
-def _pairs(run: RunDirectory | None, new: Path, unit: str) -> MatchTable:
+def _pairs(run: RunDirectory | None, new: Path, unit: str) -> Matches:
     """Pairs as another run keeps them, or of a table."""
     if run is None:
         if new.suffix == ".toml":
@@ -167,7 +165,7 @@ def _pairs(run: RunDirectory | None, new: Path, unit: str) -> MatchTable:
     return found
 
 
-def _refuse_other_filters(session: CampaignSession, pairs: MatchTable, where: str) -> None:
+def _refuse_other_filters(session: CampaignSession, pairs: Matches, where: str) -> None:
     mine = session.config.campaign.filter if session.config.campaign is not None else None
     others = sorted({name for name in pairs.filter_names if name} - {mine})
     if mine is not None and others:
@@ -178,7 +176,7 @@ def _refuse_other_filters(session: CampaignSession, pairs: MatchTable, where: st
         )
 
 
-def _catalogue_errors(pairs: MatchTable) -> StarErrors | None:
+def _catalogue_errors(pairs: Matches) -> StarErrors | None:
     """The least error that each star of the catalogue has in its pairs, by code of the star."""
     if pairs.star is None or pairs.sigma_u is None or pairs.sigma_v is None or pairs.mag is None:
         return None

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from bayesdist.app.campaign.inputs import cuts_of, read_campaign_catalog
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.rundir import as_json
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.data.motions import motion_error_line
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
 from bayesdist.infer import GaussianPriors, LinearFit, fit_linear
@@ -209,7 +209,7 @@ def _cells(size: tuple[float, float], n: int) -> tuple[int, int]:
 
 
 def _binned(
-    pairs: MatchTable,
+    pairs: Matches,
     residual: Float,
     rows: NDArray[np.bool_],
     bins: tuple[int, int],

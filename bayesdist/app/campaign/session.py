@@ -36,12 +36,12 @@ from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorTerm
 from bayesdist.assess.terms.parameters import ExposureVariation
 from bayesdist.checks import Check
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.overlap import overlap_test
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
-from bayesdist.infer import LinearFit, Matches
+from bayesdist.infer import LinearFit
 from bayesdist.infer.catalogue.star_influence import StarErrors
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.series import Series
@@ -102,12 +102,12 @@ class CampaignSession(Session):
         return self.matched.mirrored
 
     @property
-    def pairs(self) -> MatchTable:
+    def pairs(self) -> Matches:
         """Raw pixels beside aberration-neutral catalogue positions, with the catalogue's errors."""
         return self.matched.stars
 
     @property
-    def held_pairs(self) -> MatchTable | None:
+    def held_pairs(self) -> Matches | None:
         """What is held out, in the same way; None where nothing is."""
         return self.matched.held
 
@@ -263,7 +263,7 @@ class CampaignSession(Session):
         )
 
     @property
-    def tested_matches(self) -> MatchTable:
+    def tested_matches(self) -> Matches:
         """Matches with what the catalogue states of the motions of their stars."""
         table, catalog = super().tested_matches, self.inputs.catalog
         if table.star is None or catalog.pm_u is None or catalog.sigma_pm_u is None:

@@ -15,13 +15,12 @@ from bayesdist.app.kinds.exposures import FIT_AGAIN, ExposureScatter, write_hier
 from bayesdist.app.kinds.matched import Matched, Prepared
 from bayesdist.app.kinds.table_file import StoredLookupTables, write_tables
 from bayesdist.app.selfcal.solved import SelfCalibrated
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, LinearFit, save_fit
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.nodes.alternation import inside_chips, on_the_chips
 from bayesdist.infer.series import Series
-from bayesdist.infer.stars.shards import Matches
 from bayesdist.model import LookupTable, corrected
 
 __all__ = ["FIT", "TABLES", "Fitted", "moved_by", "required"]
@@ -78,7 +77,7 @@ class Fitted:
             return stars
         return on_the_chips(moved_by(self.tables.tables, stars), self.linear.model)
 
-    def inside(self, stars: MatchTable) -> NDArray[np.bool_]:
+    def inside(self, stars: Matches) -> NDArray[np.bool_]:
         """Boolean mask (N,) of the stars that the tables do not move off their chip."""
         if not self.tables.tables:
             return np.ones(len(stars), bool)
@@ -110,7 +109,7 @@ def required(part: T | None, what: str) -> T:
     return part
 
 
-def moved_by(tables: Sequence[LookupTable], stars: MatchTable) -> MatchTable:
+def moved_by(tables: Sequence[LookupTable], stars: Matches) -> Matches:
     """Stars at the pixels that tables of the detector and of one filter move them to."""
     filter = next((table.filter for table in tables if table.filter), "")
     x, y = corrected(tables, stars.x, stars.y, chip=stars.chip_number, filter=filter)

@@ -10,7 +10,7 @@ from typing import Any
 from astropy.table import Table
 
 from bayesdist.app.output import write_table
-from bayesdist.infer.stars.shards import Matches
+from bayesdist.data import Matches
 
 __all__ = ["Matched", "Prepared"]
 

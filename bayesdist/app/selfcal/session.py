@@ -20,9 +20,8 @@ from bayesdist.app.selfcal.matched import SelfcalMatched, load_matched_selfcal
 from bayesdist.app.selfcal.solved import SelfCalibrated
 from bayesdist.app.session import Session
 from bayesdist.checks import Check
-from bayesdist.data import MatchTable, ReferenceCatalog
+from bayesdist.data import Matches, ReferenceCatalog
 from bayesdist.data.detections import Detections
-from bayesdist.infer import Matches
 from bayesdist.infer.selfcal import Gauge, Solution
 
 Float = NDArray[np.float64]
@@ -101,7 +100,7 @@ class SelfcalSession(Session):
         return self._solved.fixed
 
     @property
-    def raw_matches(self) -> MatchTable:
+    def raw_matches(self) -> Matches:
         """Detections beside their stars, with their errors."""
         return self._solved.matches
 

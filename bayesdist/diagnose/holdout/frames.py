@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import Matches, MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.predictive import Predictive, scores_of
 from bayesdist.infer.stars.stars import errors_of
 from bayesdist.model import DistortionModel, Groups
@@ -83,7 +83,7 @@ class Bare:
     matrix: Float
 
 
-def noise_of(predictive: Predictive, table: MatchTable, index: Int) -> Float:
+def noise_of(predictive: Predictive, table: Matches, index: Int) -> Float:
     """uu, vv and uv (n, 3) of the errors of stars without those of the solution's parameters."""
     var = np.stack(errors_of(table), axis=1)[index] ** 2 + predictive.jitter2
     if predictive.local and not predictive.local_in_noise:
@@ -97,13 +97,13 @@ def _alone(model: DistortionModel) -> DistortionModel:
     return replace(model, exposures=("(release)", "(held out)"))
 
 
-def framed(predictive: Predictive, table: MatchTable, index: Int, values: Float) -> Iterator[Bare]:
+def framed(predictive: Predictive, table: Matches, index: Int, values: Float) -> Iterator[Bare]:
     """Rows of an exposure under a frame, chip by chip and date by date.
 
     Parameters
     ----------
     predictive : Predictive
-    table : MatchTable
+    table : Matches
     index : ndarray of int, shape (n,)
         Rows of one exposure.
     values : ndarray, shape (q,)
@@ -140,9 +140,7 @@ def framed(predictive: Predictive, table: MatchTable, index: Int, values: Float)
             )
 
 
-def _groups(
-    model: DistortionModel, table: MatchTable, index: Int, *, exposure: int | None
-) -> Groups:
+def _groups(model: DistortionModel, table: Matches, index: Int, *, exposure: int | None) -> Groups:
     return model.groups(
         len(index),
         epoch=None if table.epoch is None else table.epoch[index],
@@ -210,7 +208,7 @@ def _inverse(matrix: Float) -> Float:
     return np.asarray(s[:, None] * np.linalg.pinv(s[:, None] * matrix * s) * s)
 
 
-def _of_exposures(held: Matches, names: Sequence[str]) -> Iterator[tuple[str, MatchTable, Int]]:
+def _of_exposures(held: Matches, names: Sequence[str]) -> Iterator[tuple[str, Matches, Int]]:
     """Name, table and rows of some exposures."""
     for table in held.batches():
         for k, name in enumerate(table.exposure_names):

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.frames import AT_ONCE, Frame, framed, noise_of
 from bayesdist.diagnose.holdout.predictive import Predictive
 
@@ -60,14 +60,14 @@ class Rows:
 
 
 def predicted_rows(
-    predictive: Predictive, table: MatchTable, frames: Mapping[str, Frame]
+    predictive: Predictive, table: Matches, frames: Mapping[str, Frame]
 ) -> Iterator[Rows]:
     """The stars of a table that can be predicted.
 
     Parameters
     ----------
     predictive : Predictive
-    table : MatchTable
+    table : Matches
         With errors.
     frames : mapping of str to Frame
         Of the exposures that the solution does not know; stars of others are left out.
@@ -92,7 +92,7 @@ def predicted_rows(
 
 
 def _known(
-    predictive: Predictive, table: MatchTable, rows: Int, exposure: Int | None
+    predictive: Predictive, table: Matches, rows: Int, exposure: Int | None
 ) -> Iterator[Rows]:
     """Rows whose frame, if there is one, belongs to the solution."""
     model = predictive.model
@@ -125,7 +125,7 @@ def _known(
             yield found
 
 
-def _framed(predictive: Predictive, table: MatchTable, index: Int, frame: Frame) -> Iterator[Rows]:
+def _framed(predictive: Predictive, table: Matches, index: Int, frame: Frame) -> Iterator[Rows]:
     """Rows of an exposure with a frame of its own."""
     n = predictive.model.n_distortion
     C = predictive.cov[:n, :n]

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.diagnose.clusters import joint_clusters, products_over, sums_over
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.rows import Rows
@@ -57,7 +57,7 @@ class ClusterSums:
 
     def add(
         self,
-        table: MatchTable,
+        table: Matches,
         rows: Rows,
         place: Float,
         uniforms: Float,

@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_matrix
 from scipy.special import erf
 
-from bayesdist.data.matches import Matches, MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.bins import ALL, Partition
 from bayesdist.diagnose.holdout.frames import Frame
 from bayesdist.diagnose.holdout.predictive import (
@@ -242,7 +242,7 @@ def _add(
     moments: SpreadMoments,
     around: Sequence[Predictive],
     partitions: Sequence[Partition],
-    table: MatchTable,
+    table: Matches,
     rows: Rows,
 ) -> None:
     scores = scores_of(predictive, rows.residual, rows.cov)
@@ -329,7 +329,7 @@ class _Lost:
     along: Float
 
     @classmethod
-    def of(cls, table: MatchTable, rows: Rows, place: Float) -> _Lost | None:
+    def of(cls, table: Matches, rows: Rows, place: Float) -> _Lost | None:
         if rows.by_frame is None:
             return None
         name = table.exposure_names[table.exposure[rows.index[0]]]

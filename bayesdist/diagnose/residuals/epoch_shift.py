@@ -20,7 +20,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.sample import ScoredSample, scored_sample
 from bayesdist.infer.transforms import Solution
@@ -81,12 +81,12 @@ class EpochShift:
         )
 
 
-def epoch_shift(table: MatchTable, solution: Solution) -> EpochShift | None:
+def epoch_shift(table: Matches, solution: Solution) -> EpochShift | None:
     """The error of the epochs that the residuals show.
 
     Parameters
     ----------
-    table : MatchTable
+    table : Matches
         With proper motions; of more than `SAMPLE` rows, every k-th is taken.
     solution : Posterior or LinearFit
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer.posterior.likelihood import scores_of
 from bayesdist.infer.posterior.memberships import star_averages
 from bayesdist.infer.stars.stars import Stars, prepare
@@ -122,12 +122,12 @@ class ScoredSample:
         return replace(self, curvature=np.stack([good[:, 0, 0], good[:, 0, 1], good[:, 1, 1]]))
 
 
-def scored_sample(table: MatchTable, solution: Solution) -> ScoredSample:
+def scored_sample(table: Matches, solution: Solution) -> ScoredSample:
     """Detections of a table with what a solution says of each.
 
     Parameters
     ----------
-    table : MatchTable
+    table : Matches
         With errors; of more than `SAMPLE` rows, every k-th is taken.
     solution : Posterior or LinearFit
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
 from bayesdist.infer.equations.scaled import one_thread
@@ -59,7 +59,7 @@ class StarCovariance:
 @one_thread
 def star_covariance(
     solution: Solution,
-    matches: MatchTable,
+    matches: Matches,
     sigma_u: ArrayLike,
     sigma_v: ArrayLike,
     *,
@@ -78,7 +78,7 @@ def star_covariance(
     solution : Solution
         A fit or a posterior of these matches: its covariance stands for the inverse of the normal
         matrix, so that it must not come from a fit with extra weight in the corners.
-    matches : MatchTable
+    matches : Matches
         All stars at once.
     sigma_u, sigma_v : array_like, shape () or (n_stars,)
         Errors of the catalogue's positions at `epoch0`, in the unit of u, v; by star code.
@@ -149,7 +149,7 @@ def star_covariance(
 
 
 def _require_contained(
-    matches: MatchTable, code: Int, variances: list[Float], levers: list[Float]
+    matches: Matches, code: Int, variances: list[Float], levers: list[Float]
 ) -> None:
     """Raise InputError for quoted errors that are smaller than the catalogue's part of them."""
     for axis, quoted in enumerate((matches.sigma_u, matches.sigma_v)):
@@ -166,7 +166,7 @@ def _require_contained(
             )
 
 
-def _codes(matches: MatchTable, star: ArrayLike | None) -> Int:
+def _codes(matches: Matches, star: ArrayLike | None) -> Int:
     given = matches.star if star is None else star
     if given is None:
         raise InputError(

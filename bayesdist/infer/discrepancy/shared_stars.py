@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
 from bayesdist.infer.discrepancy.priors import log_half_cauchy
 from bayesdist.infer.posterior.likelihood import Scores
@@ -53,7 +53,7 @@ class SharedStars:
 
 
 def shared_stars(
-    table: MatchTable, scores: Scores, model: DistortionModel, median: float
+    table: Matches, scores: Scores, model: DistortionModel, median: float
 ) -> SharedStars | None:
     """Size of the errors that stars have in all of their matches; None where none is repeated.
 

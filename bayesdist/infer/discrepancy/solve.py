@@ -10,7 +10,7 @@ from operator import add
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer.discrepancy.cells import CellSums, cell_sums, cells_per_side
 from bayesdist.infer.discrepancy.functions import StructureFunctions
 from bayesdist.infer.discrepancy.information import Information
@@ -25,7 +25,7 @@ from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.posterior.likelihood import Scores, scores_of
-from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
+from bayesdist.infer.stars.shards import Compute, Shards, opened
 from bayesdist.infer.stars.stars import cell_of, prepare
 from bayesdist.infer.transforms import Solution
 from bayesdist.model import DistortionModel
@@ -46,8 +46,8 @@ def estimate_discrepancy(
     rng: np.random.Generator,
     priors: DiscrepancyPriors | None = None,
     parameter_priors: GaussianPriors | None = None,
-    sample: MatchTable | None = None,
-    stars: MatchTable | None = None,
+    sample: Matches | None = None,
+    stars: Matches | None = None,
     structure: bool = True,
     exposures: bool = True,
     settling: Settling | None = None,
@@ -68,9 +68,9 @@ def estimate_discrepancy(
     priors : DiscrepancyPriors, optional
     parameter_priors : GaussianPriors, optional
         Priors of the solution's parameters.
-    sample : MatchTable, optional
+    sample : Matches, optional
         Some of the matches, or all: structure finer than the functions shows in neighbouring stars.
-    stars : MatchTable, optional
+    stars : Matches, optional
         The matches in memory.  By the star codes, errors common to a star's matches are estimated,
         and exposures without frames of their own are separated.
     structure : bool
@@ -128,12 +128,12 @@ def estimate_discrepancy(
     return Discrepancy(model, np.asarray(scores.theta), formal, noise, found, theta, linear, facts)
 
 
-def _several(stars: MatchTable) -> bool:
+def _several(stars: Matches) -> bool:
     """True for matches of several exposures, few enough that each may deviate."""
     return 1 < len(stars.exposure_names) <= MOST_EXPOSURES
 
 
-def _by_exposure(stars: MatchTable, scores: Scores, model: DistortionModel) -> CellSums:
+def _by_exposure(stars: Matches, scores: Scores, model: DistortionModel) -> CellSums:
     """Sums with separate groups for exposures that have no frames of their own."""
     side = cells_per_side(len(stars.exposure_names) * len(model.chips))
     parts = []

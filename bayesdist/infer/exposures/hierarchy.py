@@ -26,7 +26,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.normal import least_squares
 from bayesdist.infer.equations.priors import GaussianPriors
@@ -34,7 +34,7 @@ from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.exposures.scatter import Scatter
 from bayesdist.infer.linear import DEFAULT_REJECTION, Clip, LinearFit, Rejection, fit_linear
-from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
+from bayesdist.infer.stars.shards import Compute, Shards, opened
 from bayesdist.infer.transforms import reference_gauge
 from bayesdist.model import DistortionModel
 
@@ -105,7 +105,7 @@ class HierarchicalFit:
         """Rule by which stars were left out of the second pass."""
         return self.fit.clip
 
-    def uses(self, matches: MatchTable) -> NDArray[np.bool_]:
+    def uses(self, matches: Matches) -> NDArray[np.bool_]:
         """Boolean mask (N,) of a table's stars that were used."""
         return self.fit.uses(matches)
 
@@ -239,7 +239,7 @@ def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -
         gauge="first",
         held=(0.0, 0.0, 0.0),
     )
-    table = MatchTable.concatenate(parts)
+    table = Matches.concatenate(parts)
     gauge = reference_gauge(fit_linear(table, alone), chip).gauge
     assert gauge is not None
     return replace(model, gauge="held", held=(*gauge.shift, -gauge.rotation), origin=(0.0, 0.0))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.linear import LinearFit, fit_linear
 from bayesdist.infer.nodes.binning import binned_table
@@ -38,7 +38,7 @@ __all__ = [
 
 Float = NDArray[np.float64]
 
-Fit = Callable[[MatchTable, DistortionModel], LinearFit]
+Fit = Callable[[Matches, DistortionModel], LinearFit]
 
 LIKELY = 0.5  # stars that are less likely true matches are left out
 SEARCHED = 2  # rounds that optimise hyperparameters; later ones fix them, so that rounds converge
@@ -87,7 +87,7 @@ class Alternated:
 # all large matrices are factored here, one at a time: see `field_table`
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def alternate(
-    matches: MatchTable,
+    matches: Matches,
     model: DistortionModel,
     *,
     beneath: Sequence[LookupTable] = (),
@@ -209,7 +209,7 @@ def alternate(
     )
 
 
-def on_the_chips(matches: MatchTable, model: DistortionModel) -> MatchTable:
+def on_the_chips(matches: Matches, model: DistortionModel) -> Matches:
     """Matches without the few at the edge that a table has moved off the chip.
 
     There the polynomial is not defined.  They count in the tables all the same.
@@ -218,7 +218,7 @@ def on_the_chips(matches: MatchTable, model: DistortionModel) -> MatchTable:
     return matches if inside.all() else matches.select(inside, reason="moved off the chip")
 
 
-def inside_chips(matches: MatchTable, model: DistortionModel) -> NDArray[np.bool_]:
+def inside_chips(matches: Matches, model: DistortionModel) -> NDArray[np.bool_]:
     """Boolean mask (N,) of the matches whose pixels lie on their chip."""
     size = np.array([model.chips[model.chip_code(c)].size for c in matches.chip_numbers])
     nx, ny = size[matches.chip].T
@@ -226,7 +226,7 @@ def inside_chips(matches: MatchTable, model: DistortionModel) -> NDArray[np.bool
     return np.asarray((x >= 0.5) & (x <= nx + 0.5) & (y >= 0.5) & (y <= ny + 0.5))
 
 
-def _trusted(matches: MatchTable, trust: Trust, jitter: Float) -> MatchTable:
+def _trusted(matches: Matches, trust: Trust, jitter: Float) -> Matches:
     """Likely true matches, with errors that give the polynomial the weights of the tables.
 
     A star of probability p counts p times: its variance is divided by p.

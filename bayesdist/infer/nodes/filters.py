@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 
@@ -15,8 +15,8 @@ __all__ = ["matches_of_filter"]
 
 
 def matches_of_filter(
-    matches: MatchTable, model: DistortionModel | Mapping[str, DistortionModel], filter: str
-) -> tuple[MatchTable, DistortionModel]:
+    matches: Matches, model: DistortionModel | Mapping[str, DistortionModel], filter: str
+) -> tuple[Matches, DistortionModel]:
     """Matches of one filter, and a model with their exposures.
 
     A model for all filters is cut to the exposures of this one.  InputError when a dict of models

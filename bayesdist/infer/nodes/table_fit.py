@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.nodes.alternation import Alternated, Round, on_the_chips
 from bayesdist.infer.nodes.pixels import pixel_jacobian
@@ -74,17 +74,17 @@ class TableFit:
             )
         return self.parts[name]
 
-    def corrected(self, matches: MatchTable) -> MatchTable:
+    def corrected(self, matches: Matches) -> Matches:
         """Matches at the pixels that the tables have corrected.
 
         Parameters
         ----------
-        matches : MatchTable
+        matches : Matches
             At raw pixels.
 
         Returns
         -------
-        MatchTable
+        Matches
             The few that are moved off their chip are left out, and counted in `rejected`.
         """
         names = np.asarray(matches.filter_names)[matches.filter]

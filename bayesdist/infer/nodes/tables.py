@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.linear import fit_linear
 from bayesdist.infer.nodes.alternation import Alternated, Fit, Round, alternate
@@ -26,7 +26,7 @@ __all__ = ["TableFit", "fit_with_tables"]
 
 
 def fit_with_tables(
-    matches: MatchTable,
+    matches: Matches,
     model: DistortionModel | Mapping[str, DistortionModel],
     *,
     base: str | None = None,
@@ -44,7 +44,7 @@ def fit_with_tables(
 
     Parameters
     ----------
-    matches : MatchTable
+    matches : Matches
         At raw pixels, with errors, of one filter or several.
     model : DistortionModel or dict of str to DistortionModel
         One for all filters, or one for each by name.  A model for all is cut to the exposures of

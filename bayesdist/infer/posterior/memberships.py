@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel import Constants
 from bayesdist.infer.posterior.posterior import Posterior
@@ -78,13 +78,13 @@ def some_draws(theta: Float, h: Float, n_stars: int) -> tuple[Float, Float]:
     return theta[rows], h[rows]
 
 
-def memberships(posterior: Posterior, matches: MatchTable) -> Memberships:
+def memberships(posterior: Posterior, matches: Matches) -> Memberships:
     """Probability that each star is a false match, and its log-likelihood.
 
     Parameters
     ----------
     posterior : Posterior
-    matches : MatchTable
+    matches : Matches
         The stars that the posterior was made from, or some of them.
 
     Returns
@@ -115,7 +115,7 @@ def averaged_draws(posterior: Posterior) -> tuple[Float, Constants]:
     return theta, posterior.mixture.bind(posterior.reference_sigma).constants(h)
 
 
-def star_log_likelihood(posterior: Posterior, matches: MatchTable) -> Float:
+def star_log_likelihood(posterior: Posterior, matches: Matches) -> Float:
     """Log-likelihood (chains, draws, N) of each star at every draw."""
     stars, order = prepare(posterior.model, matches)
     theta, h = sampled_points(posterior)

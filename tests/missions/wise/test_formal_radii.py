@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import uncertainty_map
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import Rejection, fit_linear
 from bayesdist.missions.wise.assess.formal_radii import (
@@ -56,7 +56,7 @@ def pairs():
     x, y = 508.5 + 508 * X, 508.5 + 508 * Y
     n = x.size
     u, v = x + 0.1 * rng.standard_normal(n), y + 0.2 * rng.standard_normal(n)
-    return MatchTable(x, y, u, v, np.full(n, 0.1), np.full(n, 0.2))
+    return Matches(x, y, u, v, np.full(n, 0.1), np.full(n, 0.2))
 
 
 def thinning(X, Y):

@@ -9,7 +9,7 @@ from math import radians
 from operator import add
 from pathlib import Path
 
-from bayesdist.data import MatchTable, RvbPairs, stream_rvb
+from bayesdist.data import Matches, RvbPairs, stream_rvb
 from bayesdist.data.rvb.files import ARRAY_SIZE, open_rvb_files
 from bayesdist.data.rvb.read import chosen_band
 from bayesdist.errors import InputError
@@ -143,7 +143,7 @@ def _written(
     output: str | Path,
     band: str,
     columns: Mapping[str, str],
-    move: Callable[[MatchTable], MatchTable],
+    move: Callable[[Matches], Matches],
 ) -> str:
     for path in map(Path, files):
         if path.is_dir() and Path(output).resolve().is_relative_to(path.resolve()):

@@ -6,7 +6,7 @@ import os
 
 import numpy as np
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.missions.wise.simulate.published import SAMPLE_SIZES
 from bayesdist.missions.wise.simulate.solution import simulate_wise
 from bayesdist.simulate.matches import Truth
@@ -48,7 +48,7 @@ def simulate_wise_partitioned(
         As `simulate_wise` and `write_partitioned`.
     """
 
-    def simulate(size: int) -> tuple[MatchTable, Truth]:
+    def simulate(size: int) -> tuple[Matches, Truth]:
         return simulate_wise(
             size,
             band=band,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.simulate.published import WISE_ARRAYS, WISE_COEFFICIENTS
 from bayesdist.model import Chip, DistortionModel
@@ -68,7 +68,7 @@ def simulate_wise(
     fraction: float = 0.03,
     jitter: float = 0.03,
     outlier_scale: float = 1.0,
-) -> tuple[MatchTable, Truth]:
+) -> tuple[Matches, Truth]:
     """Pairs of WISE detections and 2MASS stars, in memory.
 
     All bands have the magnitudes and errors of W2; sets of full size with those of each band are
@@ -89,7 +89,7 @@ def simulate_wise(
 
     Returns
     -------
-    matches : MatchTable
+    matches : Matches
     truth : Truth
     """
     model, theta = wise_solution(band)
