@@ -213,6 +213,53 @@ def test_errors_in_the_file_do_not_matter_once_others_are_given(rng, tmp_path):
     assert (piece.load().sigma_u == 0.1).all() and (piece.load().sigma_v == 0.2).all()
 
 
+def mirrored(matches):
+    """A step that acts on each row by itself."""
+    return matches.with_columns(x=2049.0 - matches.x)
+
+
+def test_what_is_done_to_stars_on_disk_is_done_when_they_are_read(rng, tmp_path, monkeypatch):
+    exposure = np.array(["a", "b", "c"])[rng.integers(3, size=500)]
+    path = write(tmp_path / "a.parquet", stars(rng, exp=exposure, mag=rng.uniform(8, 15, 500)))
+    monkeypatch.setattr(batches, "BATCH", 60)
+    whole, opened = read_matches(path), open_matches(path)
+    some = rng.uniform(size=500) < 0.3
+    late = np.arange(500) >= 250  # nothing is left of the first batches
+    for step in (
+        lambda m: m.select(some, reason="faint"),
+        lambda m: m.select(late).with_scaled_errors(3.0),
+        lambda m: m.with_scaled_errors(3.0).select(late).mapped(mirrored),
+        lambda m: m.mapped(mirrored).with_errors(0.1, in_quadrature=True),
+        lambda m: m.with_exposure_names(("c", "none", "b", "a")).select(some).select(late[some]),
+        lambda m: m.with_counts(600, {"early": 100}),
+    ):
+        ours, theirs = step(opened), step(whole)
+        assert not ours.in_memory and theirs.in_memory and theirs.load() is theirs
+        assert sum(len(pickle.loads(pickle.dumps(p)).load()) for p in ours.readers()) == len(ours)
+        loaded = ours.load()
+        assert loaded.in_memory and len(ours) == len(theirs)
+        for name in (*ARRAYS, *CODES):
+            assert_bitwise(getattr(loaded, name), getattr(theirs, name), where=name)
+        for name in SHARED:
+            assert getattr(ours, name) == getattr(loaded, name) == getattr(theirs, name), name
+
+
+def test_what_takes_stars_in_memory_says_so(rng, tmp_path):
+    opened = open_matches(write(tmp_path / "a.parquet", stars(rng)))
+    one = np.full(500, 0.1)
+    for call, message in (
+        (lambda: opened.x, "the stars are on disk, and no column 'x' of them is in memory"),
+        (lambda: opened.epoch, "no column 'epoch'"),
+        (lambda: opened.with_columns(x=one), "are on disk"),
+        (lambda: opened.select([1, 2]), "are selected by a mask"),
+        (lambda: opened.select(one > 1), "holds no rows"),
+        (lambda: opened.with_errors((one, one)), "errors of single stars are given"),
+    ):
+        with pytest.raises(InputError, match=message):
+            call()
+    assert "500 matches on disk" in repr(opened) and "in memory" in repr(opened.load())
+
+
 def test_the_origin_and_units(rng, tmp_path, monkeypatch):
     units = {"u": "arcsec", "v": "arcsec", "su": "mas", "sv": "mas"}
     path = write(tmp_path / "a.parquet", stars(rng), units=units)
