@@ -11,8 +11,8 @@ from bayesdist.data import read_rvb
 from bayesdist.data.matching.pairs import mutual_pairs
 from bayesdist.data.rvb.limits import RadialLimit
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.bring_up.frame_stars import FrameStars
 from bayesdist.missions.wise.bring_up.iterate import bring_up
+from bayesdist.missions.wise.frame_stars import FrameStars
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.missions.wise.simulate.bringup import optical_model, simulate_unpaired
 from bayesdist.missions.wise.simulate.stand_in import write_stand_in

@@ -19,8 +19,8 @@ from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bands.optical import optical_models
-from bayesdist.missions.wise.bring_up.frame_stars import FrameStars
 from bayesdist.missions.wise.bring_up.iterate import BringUp, bring_up
+from bayesdist.missions.wise.frame_stars import FrameStars
 from bayesdist.missions.wise.rvb.write import write_rvb
 from bayesdist.model import Chip, DistortionModel
 

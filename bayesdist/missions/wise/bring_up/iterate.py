@@ -17,8 +17,8 @@ from bayesdist.data.matches import Matches
 from bayesdist.data.rvb.limits import RadialLimit
 from bayesdist.errors import InputError
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
-from bayesdist.missions.wise.bring_up.frame_stars import FrameStars
 from bayesdist.missions.wise.bring_up.pairs import Field
+from bayesdist.missions.wise.frame_stars import FrameStars
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["BringUp", "Round", "bring_up"]

@@ -12,7 +12,7 @@ from bayesdist.data.matches import Matches
 from bayesdist.data.matching.pairs import mutual_pairs
 from bayesdist.data.rvb.limits import RadialLimit
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.bring_up.frame_stars import FrameStars
+from bayesdist.missions.wise.frame_stars import FrameStars
 from bayesdist.model import DistortionModel
 
 __all__ = ["Believed", "Field"]

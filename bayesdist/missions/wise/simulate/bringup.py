@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.bring_up.frame_stars import FrameStars
+from bayesdist.missions.wise.frame_stars import FrameStars
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import DistortionModel
 
