@@ -16,7 +16,6 @@ from bayesdist.version import __version__
 _HOMES = {
     "bayesdist.errors": ("BayesdistError", "InputError"),
     "bayesdist.data": (
-        "MatchTable",
         "Matches",
         "ReferenceCatalog",
         "match_table",

@@ -16,11 +16,10 @@ from bayesdist.app.init_sigma import guessed_sigma
 from bayesdist.app.match_sources import mission_template
 from bayesdist.app.matches import load_matches
 from bayesdist.app.output import refuse_existing
-from bayesdist.data import FORMATS
+from bayesdist.data import FORMATS, Matches
 from bayesdist.data.reading.layout import TableLayout, table_layout
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
-from bayesdist.infer import Matches
 
 __all__ = ["init"]
 

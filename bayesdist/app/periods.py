@@ -11,9 +11,9 @@ from astropy.time import Time
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.assess import SAMPLE, convert, pixel_scale_of
+from bayesdist.data import Matches
 from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, bins_for
 from bayesdist.errors import InputError
-from bayesdist.infer.stars.shards import Matches
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals import PatternChange, StatisticsTable

@@ -18,7 +18,7 @@ _HOMES = {
     "bayesdist.data.exposures": ("read_exposures", "write_exposures"),
     "bayesdist.data.formats.hst1pass": ("Hst1passList", "read_hst1pass", "read_matchup"),
     "bayesdist.data.magnitude_errors": ("MagnitudeErrors",),
-    "bayesdist.data.matches": ("Matches", "MatchTable"),
+    "bayesdist.data.matches": ("Matches",),
     "bayesdist.data.matching.campaign": ("CampaignMatches", "match_campaign"),
     "bayesdist.data.matching.linear_map": ("LinearMap",),
     "bayesdist.data.matching.reports": ("ExposureReport",),

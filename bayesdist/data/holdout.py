@@ -18,7 +18,7 @@ from bayesdist.errors import InputError
 
 __all__ = [
     "HELD_OUT",
-    "SetAside",
+    "HoldoutSpec",
     "Split",
     "exposures_drawn",
     "refuse_strangers",
@@ -31,7 +31,7 @@ HELD_OUT = "held out"  # reason under which they are counted
 
 
 @dataclass(frozen=True)
-class SetAside:
+class HoldoutSpec:
     """Selection of the matches that are set aside: a fraction of the stars, and whole exposures."""
 
     fraction: float  # of the stars, in [0, 1)
@@ -74,7 +74,7 @@ def exposures_drawn(names: Sequence[str], n: int, seed: int) -> tuple[str, ...]:
     return tuple(name for name in names if name in chosen)
 
 
-def split_matches(matches: Matches, aside: SetAside) -> Split:
+def split_matches(matches: Matches, aside: HoldoutSpec) -> Split:
     """Matches in two parts; those on disk are read once.
 
     Refused are an unknown exposure, nothing left to fit, and nothing set aside.

@@ -19,7 +19,7 @@ from bayesdist.data.magnitude_errors import MagnitudeErrors, no_magnitudes
 from bayesdist.data.match_columns import SIGMAS, MatchColumns, refuse_repeated
 from bayesdist.errors import InputError
 
-__all__ = ["BatchReader", "MatchTable", "Matches"]
+__all__ = ["BatchReader", "Matches"]
 
 Float = NDArray[np.float64]
 Errors = MagnitudeErrors | AddedErrors | float | tuple[ArrayLike, ArrayLike]
@@ -570,6 +570,3 @@ def _checked_numbers(errors: float | tuple[ArrayLike, ArrayLike]) -> tuple[float
                 f"{name} is {sigma:g}, and must be finite and positive", do="give another"
             )
     return float(pair[0]), float(pair[1])  # type: ignore[arg-type]
-
-
-MatchTable = Matches  # until all call sites have the name

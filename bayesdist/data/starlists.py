@@ -234,14 +234,7 @@ def _of_table(
     table: Table, columns: Mapping[str, str] | None, source: str, name: str, chip: int | None
 ) -> list[StarList]:
     """Star lists of the exposures of a table."""
-    found = find_columns(table.colnames, columns, _LIST_ALIASES, source=source)
-    for key in ("x", "y"):
-        if key not in found:
-            raise InputError(
-                f"no column for {key!r} among {', '.join(table.colnames) or 'none'}",
-                where=source,
-                do="rename the column, or name it in the option 'columns'",
-            )
+    found = find_columns(table.colnames, columns, _LIST_ALIASES, source=source, needed="xy")
     if not len(table):
         raise InputError("holds no detections", where=source, do="give a list with stars")
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.convergence import Convergence
 from bayesdist.model import DistortionModel
@@ -111,7 +111,7 @@ class Solution(ABC):
         """Likelihood of a star by its position, at the mean; None for a transformed solution."""
         return None
 
-    def uses(self, matches: MatchTable) -> NDArray[np.bool_]:
+    def uses(self, matches: Matches) -> NDArray[np.bool_]:
         """Boolean mask (N,) of a table's stars that were not left out; all by default."""
         return np.ones(len(matches), bool)
 

@@ -79,6 +79,7 @@ def test_a_run_on_disk_is_the_run_in_memory(job, tmp_path, on_disk, monkeypatch)
     stages = ("fit", "sample", "assess")
     disk = begin_stagewise(tmp_path / "disk", job, *stages)
     monkeypatch.setattr(app_matches, "IN_MEMORY", 10 * N)
+    monkeypatch.setattr("bayesdist.data.batches.BATCH", 2**20)
     memory = begin_stagewise(tmp_path / "memory", job, *stages)
 
     one, other = load_fit(disk / "fit.nc"), load_fit(memory / "fit.nc")

@@ -58,7 +58,7 @@ def _truth(model: bd.DistortionModel) -> Float:
     return theta
 
 
-def _matches(n: int, order: int, rng: np.random.Generator) -> bd.MatchTable:
+def _matches(n: int, order: int, rng: np.random.Generator) -> bd.Matches:
     model = _model(order)
     quoted = SIGMA * np.exp(0.3 * rng.standard_normal((2, n)))
     matches, _ = bd.simulate_matches(

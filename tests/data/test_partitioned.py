@@ -16,7 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from bayesdist.data import MagnitudeErrors, MatchTable, batches, open_matches, read_matches
+from bayesdist.data import MagnitudeErrors, Matches, batches, open_matches, read_matches
 from bayesdist.data.added_errors import AddedErrors
 from bayesdist.data.storage.write import write_partitioned
 from bayesdist.data.tables import repeated as duplicates_module
@@ -211,6 +211,53 @@ def test_errors_in_the_file_do_not_matter_once_others_are_given(rng, tmp_path):
     opened = open_matches(path).with_errors((0.1, 0.2))
     (piece,) = opened.readers()
     assert (piece.load().sigma_u == 0.1).all() and (piece.load().sigma_v == 0.2).all()
+
+
+def mirrored(matches):
+    """A step that acts on each row by itself."""
+    return matches.with_columns(x=2049.0 - matches.x)
+
+
+def test_what_is_done_to_stars_on_disk_is_done_when_they_are_read(rng, tmp_path, monkeypatch):
+    exposure = np.array(["a", "b", "c"])[rng.integers(3, size=500)]
+    path = write(tmp_path / "a.parquet", stars(rng, exp=exposure, mag=rng.uniform(8, 15, 500)))
+    monkeypatch.setattr(batches, "BATCH", 60)
+    whole, opened = read_matches(path), open_matches(path)
+    some = rng.uniform(size=500) < 0.3
+    late = np.arange(500) >= 250  # nothing is left of the first batches
+    for step in (
+        lambda m: m.select(some, reason="faint"),
+        lambda m: m.select(late).with_scaled_errors(3.0),
+        lambda m: m.with_scaled_errors(3.0).select(late).mapped(mirrored),
+        lambda m: m.mapped(mirrored).with_errors(0.1, in_quadrature=True),
+        lambda m: m.with_exposure_names(("c", "none", "b", "a")).select(some).select(late[some]),
+        lambda m: m.with_counts(600, {"early": 100}),
+    ):
+        ours, theirs = step(opened), step(whole)
+        assert not ours.in_memory and theirs.in_memory and theirs.load() is theirs
+        assert sum(len(pickle.loads(pickle.dumps(p)).load()) for p in ours.readers()) == len(ours)
+        loaded = ours.load()
+        assert loaded.in_memory and len(ours) == len(theirs)
+        for name in (*ARRAYS, *CODES):
+            assert_bitwise(getattr(loaded, name), getattr(theirs, name), where=name)
+        for name in SHARED:
+            assert getattr(ours, name) == getattr(loaded, name) == getattr(theirs, name), name
+
+
+def test_what_takes_stars_in_memory_says_so(rng, tmp_path):
+    opened = open_matches(write(tmp_path / "a.parquet", stars(rng)))
+    one = np.full(500, 0.1)
+    for call, message in (
+        (lambda: opened.x, "the stars are on disk, and no column 'x' of them is in memory"),
+        (lambda: opened.epoch, "no column 'epoch'"),
+        (lambda: opened.with_columns(x=one), "are on disk"),
+        (lambda: opened.select([1, 2]), "are selected by a mask"),
+        (lambda: opened.select(one > 1), "holds no rows"),
+        (lambda: opened.with_errors((one, one)), "errors of single stars are given"),
+    ):
+        with pytest.raises(InputError, match=message):
+            call()
+    assert "500 matches on disk" in repr(opened) and "in memory" in repr(opened.load())
 
 
 def test_the_origin_and_units(rng, tmp_path, monkeypatch):
@@ -516,7 +563,7 @@ def test_more_repetitions_than_are_compared_at_a_time(rng, monkeypatch):
 
 def some_tables(rng):
     for n in (700, 1, 300):
-        yield MatchTable(
+        yield Matches(
             **{name: rng.uniform(1, 1000, n) for name in "xyuv"},
             sigma_u=rng.uniform(0.1, 1, n), sigma_v=rng.uniform(0.1, 1, n), unit="mas",
             epoch=rng.uniform(2002, 2014, n), mag=rng.uniform(10, 20, n),
@@ -535,7 +582,7 @@ def test_what_is_written_is_read_back_to_the_last_bit(rng, tmp_path, monkeypatch
     assert sorted(os.listdir(tmp_path / "a" / "b")) == [p.name for p in paths]
     assert_same(tmp_path / "a" / "b", monkeypatch=monkeypatch)
     back = read_matches(tmp_path / "a" / "b")
-    whole = MatchTable.concatenate(tables)
+    whole = Matches.concatenate(tables)
     assert back.unit == "mas"
     for name in ARRAYS:
         assert_bitwise(getattr(back, name), getattr(whole, name), where=name)
@@ -561,7 +608,7 @@ def test_nothing_half_written_stays(rng, tmp_path):
     with pytest.raises(RuntimeError):
         write_partitioned(broken(), tmp_path / "a")
     first, *_ = some_tables(rng)
-    bare = MatchTable(x=first.x, y=first.y, u=first.u, v=first.v)
+    bare = Matches(x=first.x, y=first.y, u=first.u, v=first.v)
     with pytest.raises(InputError, match="table 2 has another unit or other columns"):
         write_partitioned([first, bare], tmp_path / "a")
     with pytest.raises(InputError, match="no tables to write"):

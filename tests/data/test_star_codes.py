@@ -7,7 +7,7 @@ import pytest
 from astropy.table import Table
 
 from bayesdist.data import (
-    MatchTable,
+    Matches,
     ReferenceCatalog,
     match_table,
     open_matches,
@@ -22,7 +22,7 @@ BIG = 6_123_456_789_012_345_679  # beyond the whole numbers of float64
 def table(n=6, **changes):
     k = np.arange(n, dtype=float)
     columns = {"x": 10 + k, "y": 20 + k, "u": 0.5 * k, "v": -k, "star": BIG + np.arange(n)}
-    return MatchTable(**{**columns, **changes})
+    return Matches(**{**columns, **changes})
 
 
 def test_codes_follow_their_stars():
@@ -35,8 +35,8 @@ def test_codes_follow_their_stars():
 
 def test_joined_tables_have_codes_when_all_have_them():
     a, b = table(exposure_names=("a",)), table(exposure_names=("b",))
-    assert MatchTable.concatenate([a, b]).star.tolist() == [*a.star, *b.star]
-    assert MatchTable.concatenate([a, replace(b, star=None)]).star is None
+    assert Matches.concatenate([a, b]).star.tolist() == [*a.star, *b.star]
+    assert Matches.concatenate([a, replace(b, star=None)]).star is None
 
 
 def test_codes_are_not_negative():
@@ -83,5 +83,5 @@ def test_matching_names_the_star(rng):
     uv = rng.uniform(0, 400, (2, 200))
     catalog = ReferenceCatalog(u=uv[0], v=uv[1], star=BIG + rng.permutation(200))
     seen = uv[:, ::-1] + 3.0
-    t = match_table(MatchTable(*seen, *seen), catalog)
+    t = match_table(Matches(*seen, *seen), catalog)
     np.testing.assert_array_equal(t.star, catalog.star[199 - t.row])

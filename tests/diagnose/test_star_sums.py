@@ -14,7 +14,7 @@ from bayesdist.assess import (
     star_sample,
     star_sums,
 )
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.infer import (
     OutlierMixture,
     fit_linear,
@@ -97,7 +97,7 @@ def several():
     uv = model.predict(theta, x, y, exposure=exposure, chip=numbers)
     spread = np.where(rng.random(n) < 0.05, 0.6, 0.05)
     u, v = (uv + rng.normal(size=(n, 2)) * spread[:, None]).T
-    table = MatchTable(
+    table = Matches(
         x, y, u, v, sigma_u=np.full(n, 0.05), sigma_v=np.full(n, 0.06), exposure=exposure,
         exposure_names=names, chip=chip, chip_numbers=(1, 2),
     )  # fmt: skip
@@ -201,7 +201,7 @@ def test_what_belongs_to_the_detector_is_seen_in_turned_exposures(rng):
     exposure = np.arange(n) % 4
     pattern = np.where(x // 127 % 2 == 0, 0.05, -0.05)
     u, v = model.predict(theta, x, y, exposure=exposure).T
-    table = MatchTable(
+    table = Matches(
         x, y,
         u + pattern * np.cos(rolls[exposure]) + 0.01 * rng.standard_normal(n),
         v + pattern * np.sin(rolls[exposure]) + 0.01 * rng.standard_normal(n),

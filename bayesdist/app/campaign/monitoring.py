@@ -15,7 +15,7 @@ from bayesdist.app.kinds.fitted import Fitted, required
 from bayesdist.app.results import Results
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.star_files import PAIRS, part_files
-from bayesdist.data import MagnitudeErrors, MatchTable, read_matches
+from bayesdist.data import MagnitudeErrors, Matches, read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_errors import StarErrors
@@ -37,7 +37,7 @@ class NewExposures:
     ----------
     released : Posterior
         With the errors of the catalogue, and those that its stars share.
-    matches : MatchTable
+    matches : Matches
         At the pixels that the release's tables have corrected, with errors.
     errors : StarErrors or None
         Of the catalogue; None where stars have no codes, or pairs no errors of it.
@@ -48,7 +48,7 @@ class NewExposures:
     """
 
     released: Posterior
-    matches: MatchTable
+    matches: Matches
     errors: StarErrors | None
     same_catalogue: bool
     left_out: tuple[str, ...]
@@ -103,7 +103,7 @@ def read_new_exposures(release: Results, new: Path) -> NewExposures:
     )
 
 
-def prepared(release: Fitted, pairs: MatchTable, errors: MagnitudeErrors | None) -> MatchTable:
+def prepared(release: Fitted, pairs: Matches, errors: MagnitudeErrors | None) -> Matches:
     """Pairs at the pixels that the release's tables have corrected, with errors of centroids."""
     tables = release.tables.tables
     if tables:
@@ -145,7 +145,7 @@ def fit_exposures_of(release: Results, new: NewExposures) -> NewFit:
     return with_star_errors_of(new.errors, found, new.matches, released)
 
 
-def _pairs(run: RunDirectory | None, new: Path, unit: str) -> MatchTable:
+def _pairs(run: RunDirectory | None, new: Path, unit: str) -> Matches:
     """Pairs as another run keeps them, or of a table."""
     if run is None:
         if new.suffix == ".toml":
@@ -168,7 +168,7 @@ def _pairs(run: RunDirectory | None, new: Path, unit: str) -> MatchTable:
     return found
 
 
-def _refuse_other_filters(config: Config, pairs: MatchTable, where: str) -> None:
+def _refuse_other_filters(config: Config, pairs: Matches, where: str) -> None:
     mine = campaign_block(config).filter
     others = sorted({name for name in pairs.filter_names if name} - {mine})
     if mine is not None and others:
@@ -179,7 +179,7 @@ def _refuse_other_filters(config: Config, pairs: MatchTable, where: str) -> None
         )
 
 
-def _catalogue_errors(pairs: MatchTable) -> StarErrors | None:
+def _catalogue_errors(pairs: Matches) -> StarErrors | None:
     """The least error that each star of the catalogue has in its pairs, by code of the star."""
     if pairs.star is None or pairs.sigma_u is None or pairs.sigma_v is None or pairs.mag is None:
         return None

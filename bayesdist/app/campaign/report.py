@@ -21,7 +21,7 @@ from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.results import Results
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.store import as_json
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.data.motions import motion_error_line
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
 from bayesdist.infer import GaussianPriors, LinearFit, Posterior, fit_linear
@@ -224,7 +224,7 @@ def _cells(size: tuple[float, float], n: int) -> tuple[int, int]:
 
 
 def _binned(
-    pairs: MatchTable,
+    pairs: Matches,
     residual: Float,
     rows: NDArray[np.bool_],
     bins: tuple[int, int],

@@ -19,7 +19,7 @@ from bayesdist.app.config import Config
 from bayesdist.app.config.campaign import TablesBlock
 from bayesdist.app.kinds.table_file import StoredLookupTables
 from bayesdist.data.magnitude_errors import MagnitudeErrors
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.infer import LinearFit, fit_by_magnitude
 from bayesdist.infer.nodes import (
@@ -115,8 +115,8 @@ def fit_tables(
 
 
 def scatter_by_magnitude(
-    pairs: MatchTable, model: DistortionModel, inputs: Inputs
-) -> tuple[LinearFit, MatchTable, MagnitudeErrors]:
+    pairs: Matches, model: DistortionModel, inputs: Inputs
+) -> tuple[LinearFit, Matches, MagnitudeErrors]:
     """Fit of every exposure by itself and scatter by magnitude, as `fit_by_magnitude`.
 
     Raises
@@ -135,7 +135,7 @@ def _with_errors(
     model: DistortionModel,
     held: tuple[LookupTable, ...],
     block: TablesBlock,
-) -> MatchTable:
+) -> Matches:
     """Pairs with errors by magnitude, free of the pattern that the tables are to describe.
 
     The scatter of the residuals before any table is twice that of the stars: with errors from

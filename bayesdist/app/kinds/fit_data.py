@@ -13,11 +13,10 @@ from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.assess import SAMPLE
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.residuals.quoted import error_scale_sentence
 from bayesdist.infer import LinearFit, Shards
 from bayesdist.infer.exposures.frame_choice import FrameChoice, frames_that_help
-from bayesdist.infer.stars.shards import Matches
 from bayesdist.model import DistortionModel
 
 __all__ = ["FitData"]
@@ -78,7 +77,7 @@ class FitData:
         return self.reader.shards(self.model, self.placed, self._law)
 
     @property
-    def sample(self) -> MatchTable:
+    def sample(self) -> Matches:
         """Evenly spread ones of them, or all."""
         return self.reader.sample(self.placed, self._law)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bayesdist.app.config import Config
 from bayesdist.app.config.holdout import HoldoutBlock
-from bayesdist.data.holdout import SetAside, exposures_drawn, split_matches
+from bayesdist.data.holdout import HoldoutSpec, exposures_drawn, split_matches
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.limits import HELD_OUT
@@ -41,7 +41,7 @@ def set_aside(
     if block is None:
         return matches, None, ()
     whole = _whole_exposures(block, config.sampler.seed, matches.exposure_names, needed)
-    split = split_matches(matches, SetAside(block.fraction, whole, config.sampler.seed))
+    split = split_matches(matches, HoldoutSpec(block.fraction, whole, config.sampler.seed))
     if not HELD_OUT.met_by(len(split.held)):
         raise InputError(
             f"{len(split.held)} of {len(matches)} stars are held out, which say too little",

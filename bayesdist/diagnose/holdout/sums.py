@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_matrix
 from scipy.special import erf
 
-from bayesdist.data.matches import Matches, MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.bins import ALL, Partition
 from bayesdist.diagnose.holdout.frames import Frame
 from bayesdist.diagnose.holdout.grouped import GroupedScores, ScaleSums, StarScores, membership
@@ -163,7 +163,7 @@ def _add(
     moments: SpreadMoments,
     around: Sequence[Predictive],
     partitions: Iterable[Partition],
-    table: MatchTable,
+    table: Matches,
     rows: HeldRows,
 ) -> None:
     """Add some stars to all sums."""

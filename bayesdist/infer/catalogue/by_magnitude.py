@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.magnitude_law import MagnitudeLaw
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.linear import DEFAULT_REJECTION, NO_REJECTION, LinearFit, Rejection, fit_linear
-from bayesdist.infer.stars.shards import Compute, Matches
+from bayesdist.infer.stars.shards import Compute
 from bayesdist.infer.stars.stars import groups_of, in_table_order, prepare
 from bayesdist.model import DistortionModel
 
@@ -84,7 +84,7 @@ def fit_by_magnitude(
 
 
 def _law(
-    stars: MatchTable,
+    stars: Matches,
     model: DistortionModel,
     rejection: Rejection,
     priors: GaussianPriors | None,
@@ -133,13 +133,13 @@ def _scatter(bins: MagnitudeErrors, mag: Float, good: Float, square: Float) -> F
     return np.sqrt(np.array(sums) / np.maximum(n, 1e-300))
 
 
-def residuals_of(fit: LinearFit, stars: MatchTable) -> Float:
+def residuals_of(fit: LinearFit, stars: Matches) -> Float:
     """Data minus model (2, N)."""
     some, order = prepare(fit.model, stars.with_errors(1.0))
     return in_table_order(some.residuals(fit.mean), order).T
 
 
-def variances_of(fit: LinearFit, stars: MatchTable) -> Float:
+def variances_of(fit: LinearFit, stars: Matches) -> Float:
     """Variances (2, N) of the fitted positions of stars."""
     model = fit.model
     groups = groups_of(model, stars)

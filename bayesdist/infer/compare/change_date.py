@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 from scipy.stats import chi2 as chi_square
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer.compare.frame_fields import mean_squares, without
 from bayesdist.infer.compare.monitoring import Change, NewFit
 from bayesdist.infer.equations.normal import NormalEquations, mixture
 from bayesdist.infer.equations.scaled import FieldTest, determined
-from bayesdist.infer.stars.shards import Matches
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import nearest_frame
@@ -105,7 +104,7 @@ def _edges(matches: Matches, most: int) -> Float:
     return dates[np.flatnonzero(np.diff(period)) + 1]
 
 
-def _sums(new: NewFit, table: MatchTable, constants) -> tuple[NormalEquations, float, float, int]:  # type: ignore[no-untyped-def]
+def _sums(new: NewFit, table: Matches, constants) -> tuple[NormalEquations, float, float, int]:  # type: ignore[no-untyped-def]
     stars, _ = prepare(new.model, table)
     assert table.epoch is not None
     equations = mixture(stars, new.theta, constants, True)

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import LinearFit, fit_linear
@@ -36,7 +36,7 @@ from bayesdist.model.lookup import LookupTable
 __all__ = ["fit_with_tables"]
 
 Float = NDArray[np.float64]
-Fit = Callable[[MatchTable, DistortionModel], LinearFit]
+Fit = Callable[[Matches, DistortionModel], LinearFit]
 
 LIKELY = 0.5  # stars that are less likely true matches are left out
 SEARCHED = 2  # iterations that optimise hyperparameters, which are fixed in later ones
@@ -45,7 +45,7 @@ SEARCHED = 2  # iterations that optimise hyperparameters, which are fixed in lat
 # all large matrices are factored here, one at a time: see `field_table`
 @one_thread
 def fit_with_tables(
-    matches: MatchTable,
+    matches: Matches,
     model: DistortionModel,
     *,
     filter: str = "",
@@ -62,7 +62,7 @@ def fit_with_tables(
 
     Parameters
     ----------
-    matches : MatchTable
+    matches : Matches
         At raw pixels, with errors, of one filter.
     model : DistortionModel
         It is cut to the exposures of the matches.
@@ -120,7 +120,7 @@ def fit_with_tables(
     mixture: ResidualMixture | None = None
     progress: list[Iteration] = []
 
-    def solved(moved: MatchTable, pixel: float) -> LinearFit:
+    def solved(moved: Matches, pixel: float) -> LinearFit:
         """Polynomial fit for fixed tables; `pixel` is the size of one in u, v."""
         if mixture is not None:
             jitter = np.full(len(x), mixture.jitter)
@@ -202,7 +202,7 @@ def fit_with_tables(
 
 
 def _check(
-    matches: MatchTable,
+    matches: Matches,
     beneath: Sequence[LookupTable | TablePosterior],
     method: str,
     max_iterations: int,
@@ -232,8 +232,8 @@ def _check(
 
 
 def _with_own_exposures(
-    matches: MatchTable, model: DistortionModel
-) -> tuple[MatchTable, DistortionModel]:
+    matches: Matches, model: DistortionModel
+) -> tuple[Matches, DistortionModel]:
     """Matches with the exposures that have stars only, and the model with these."""
     names = matches.exposures
     if model.n_frame and model.gauge != "first" and names[0] != model.exposures[0]:
@@ -244,7 +244,7 @@ def _with_own_exposures(
     return matches.with_exposure_names(names), replace(model, exposures=names)
 
 
-def _with_memberships(matches: MatchTable, mixture: ResidualMixture, jitter: Float) -> MatchTable:
+def _with_memberships(matches: Matches, mixture: ResidualMixture, jitter: Float) -> Matches:
     """Likely true matches, with errors that give the polynomial the weights of the tables.
 
     A star of probability p counts p times: its variance is divided by p.

@@ -23,10 +23,10 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
-from bayesdist.data.matches import BatchReader
+from bayesdist.data.matches import BatchReader, Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import kernel
-from bayesdist.infer.stars.shards import Compute, Matches, Shards, Task, shard_of, total
+from bayesdist.infer.stars.shards import Compute, Shards, Task, shard_of, total
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.survey import Survey
 from bayesdist.model import DistortionModel

@@ -19,7 +19,7 @@ from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.infer.stars.survey import Survey, survey
 from bayesdist.model import DistortionModel, Groups
 
-__all__ = ["Compute", "LocalShards", "Matches", "Shards", "load", "opened", "shard_of"]
+__all__ = ["Compute", "LocalShards", "Shards", "load", "opened", "shard_of"]
 
 Task = Callable[..., Any]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.data.added_errors import AddedErrors
 from bayesdist.errors import InputError
 from bayesdist.infer import build_model, fit_linear
@@ -41,7 +41,7 @@ def stars(seed, n, sigma=(0.05, 0.05), *, false=0.04, labels=1, by="chip", dof=N
             "filter": {"filter": label, "filter_names": names},
         }[by]
     quoted = np.broadcast_to(np.asarray(quoted, float), (n,))
-    return MatchTable(
+    return Matches(
         x=x,
         y=y,
         u=x + 0.4 * X**2 * Y + noise[:, 0],

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.polynomial import legendre
 
-from bayesdist.data import MatchTable, read_matches
+from bayesdist.data import Matches, read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Rejection, build_model, fit_by_magnitude, fit_linear, residuals
 from bayesdist.infer.catalogue import by_magnitude
@@ -69,7 +69,7 @@ def test_one_error_for_all_is_that_of_the_residuals_and_their_freedom():
         n, order = 60, 3
         x, y = rng.uniform(1, 1000, (2, n))
         u, v = x + rng.normal(0, 0.1, n), y + rng.normal(0, 0.2, n)
-        table = MatchTable(x=x, y=y, u=u, v=v, mag=rng.uniform(15.0, 15.001, n), unit="pix")
+        table = Matches(x=x, y=y, u=u, v=v, mag=rng.uniform(15.0, 15.001, n), unit="pix")
         model = build_model(table, order=order, size=(1000, 1000))
         *_, errors = fit_by_magnitude(table, model)
         A = legendre.legvander2d(x / 500 - 1, y / 500 - 1, [order, order])

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from threadpoolctl import threadpool_limits
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Rejection, fit_linear
 from bayesdist.infer.catalogue import star_sums as module
@@ -167,7 +167,7 @@ def repeated(n_stars=60, n_exposures=9, order=2):
     x, y = rng.uniform(1, SIZE[0], n_stars), rng.uniform(1, SIZE[1], n_stars)
     # a table does not hold a star twice: not quite the same pixel
     x, y = (np.tile(p, n_exposures) + 1e-9 * np.arange(n_stars * n_exposures) for p in (x, y))
-    table = MatchTable(
+    table = Matches(
         x,
         y,
         x,

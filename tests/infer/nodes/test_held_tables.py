@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.nodes import fit_with_tables, held_sigma
 from bayesdist.model import DistortionModel
@@ -39,7 +39,7 @@ def matches(model):
         parts[name] = (x, y, u, v, np.full(len(x), k))
     x, y, u, v, code = (np.concatenate(column) for column in zip(*parts.values(), strict=True))
     sigma = np.full(len(x), NOISE)
-    return MatchTable(
+    return Matches(
         x=x,
         y=y,
         u=u,

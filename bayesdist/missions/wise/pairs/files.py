@@ -115,13 +115,6 @@ def open_rvb_files(
         else:
             contents = read_table(file)
         names = list(contents.colnames)
-        found = find_columns(names, columns, RVB_ALIASES, source=str(file))
-        for key in ("x", "y", "u", "v"):
-            if key not in found:
-                raise InputError(
-                    f"no column for {key!r} among {', '.join(names) or 'none'}",
-                    where=str(file),
-                    do="name it in the option 'columns'",
-                )
+        found = find_columns(names, columns, RVB_ALIASES, source=str(file), needed="xyuv")
         out.append(RvbFile(str(file), contents, found))
     return out

@@ -212,7 +212,7 @@ def _pairs(
             Column(column.numbers(), unit="d"), file.source, column.name, place
         ).years()
     magnitudes = {
-        key: _magnitudes(file.column(table, key, place))[which]
+        key: file.column(table, key, place).known_numbers()[which]
         for key in MAGNITUDES
         if key in file.found
     }
@@ -231,23 +231,5 @@ def _pairs(
         matches = matches.with_errors(sigma)
     colour = colour_of(list(magnitudes.values())) if len(magnitudes) > 1 else None
     if "colour" in file.found:
-        colour = _magnitudes(file.column(table, "colour", place))[which]
+        colour = file.column(table, "colour", place).known_numbers()[which]
     return RvbPairs(matches, colour)
-
-
-def _magnitudes(column: SourceColumn) -> Float:
-    """Magnitudes; NaN where the source is not detected."""
-    values = column.values
-    mask = np.broadcast_to(getattr(values, "mask", False), np.shape(values))
-    plain = np.asarray(getattr(values, "unmasked", values))
-    known = ~mask
-    if plain.dtype.kind == "f":
-        known = known & ~np.isnan(plain)
-    rows = np.flatnonzero(known)
-    out = np.full(len(plain), np.nan)
-    named = SourceColumn(
-        Column(plain[rows]), column.source, column.name, lambda index: column.place(rows[index])
-    )
-    if len(rows):  # a column of nulls alone has no type
-        out[rows] = named.numbers()
-    return out

@@ -14,10 +14,9 @@ from bayesdist.app.matches import is_large
 from bayesdist.app.named_files import named_files
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.star_files import PAIRS, part_files
-from bayesdist.data import MatchTable, open_matches, write_partitioned
+from bayesdist.data import Matches, open_matches, write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
-from bayesdist.infer import Matches
 from bayesdist.missions.wise.pairs.files import band_name
 from bayesdist.missions.wise.pairs.read import stream_rvb
 from bayesdist.missions.wise.pairs.section import RvbData
@@ -91,7 +90,7 @@ class RvbInput:
         folder = Path(self._scratch.name) / PAIRS
         _, size = self._settings
 
-        def tables() -> Iterator[MatchTable]:
+        def tables() -> Iterator[Matches]:
             for pairs in selected:
                 _require_array(pairs.band, size)
                 yield pairs.matches
@@ -143,7 +142,7 @@ class RvbInput:
 
 def load_rvb(
     path: str | Path | Sequence[str | Path], data: Data, size: tuple[float, float]
-) -> MatchTable:
+) -> Matches:
     """RvB pairs in memory, as a configuration reads and selects them.
 
     `size`: columns and rows of the detector. InputError for all that is wrong with files and

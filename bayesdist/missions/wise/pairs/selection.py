@@ -12,7 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.data.labels import merged_counts
 from bayesdist.data.matches import Matches
+from bayesdist.data.tables.checks import counted
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs.radial_limit import CHI2, OFFSET, RadialLimit, radial_rows
 from bayesdist.missions.wise.pairs.rvb_pairs import (
@@ -95,12 +97,9 @@ class SelectedPairs:
         sources: dict[str, None] = {}
         for pairs in self.batches():
             sources |= dict.fromkeys(pairs.matches.sources)
-            left = np.ones(len(pairs), bool)
-            for reason, good in self._rules(pairs, bluest).items():
-                dropped = int((left & ~good).sum())
-                if dropped:
-                    self.rejected[reason] = self.rejected.get(reason, 0) + dropped
-                left &= good
+            rules = self._rules(pairs, bluest).items()
+            left, counts = counted([(reason, ~good) for reason, good in rules], len(pairs))
+            self.rejected |= merged_counts([self.rejected, counts])
             self.n_rows += len(pairs)
             if left.any():
                 yield pairs if left.all() else pairs.select(left)
