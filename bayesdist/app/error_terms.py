@@ -17,12 +17,12 @@ from bayesdist.app.kinds.fitted import required
 from bayesdist.app.kinds.table_file import StoredLookupTables
 from bayesdist.assess import pixel_scale_of
 from bayesdist.assess.error_model import ErrorModel, error_model
-from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorTerm
 from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.assess.terms.parameters import ExposureVariation
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
+from bayesdist.infer.solution import Solution
 from bayesdist.model import LookupTable
 
 __all__ = ["errors_of_run", "published_tables"]

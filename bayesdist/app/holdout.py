@@ -102,8 +102,7 @@ def holdout_table(found: HoldoutValidation) -> Table:
         "p_corrected",
         "limit",
     )
-    columns = {name: name for name in names} | {"is_omnibus": "together"}
-    table = Table({name: [getattr(t, columns[name]) for t in found.tests] for name in names})
+    table = Table({name: [getattr(t, name) for t in found.tests] for name in names})
     table["lo95"], table["hi95"] = np.array([t.interval for t in found.tests]).T
     table["limit"].description = "of tails, in sigma; scatter of deviations"
     table["value"].description = (

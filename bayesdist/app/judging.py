@@ -29,11 +29,11 @@ from bayesdist.assess.evaluation import (
 )
 from bayesdist.assess.requirements.margins import judge
 from bayesdist.assess.requirements.validity import Horizon
-from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms.forms import Known
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import BayesdistError, InputError
 from bayesdist.infer import Posterior
+from bayesdist.infer.solution import Solution
 
 __all__ = [
     "errors_of",

@@ -13,9 +13,9 @@ from bayesdist.app.results import Results, open_results
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.assess.planning.exposures import Schedule, exposures_needed
 from bayesdist.assess.requirements.requirement import Requirement
-from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.planning import ExposureContent, exposure_content, exposure_information
+from bayesdist.infer.solution import Solution
 
 __all__ = ["plan"]
 

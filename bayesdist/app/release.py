@@ -19,9 +19,9 @@ from bayesdist.app.output import write_table
 from bayesdist.app.results import Results, results_of
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import table_text
-from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError
 from bayesdist.infer.exposures.shared_drift import with_drift_of
+from bayesdist.infer.solution import Solution
 from bayesdist.model import LookupTable
 
 __all__ = ["release_runs"]

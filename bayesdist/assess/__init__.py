@@ -16,7 +16,6 @@ _HOMES = {
     "bayesdist.assess.maps": ("UncertaintyMap", "uncertainty_map"),
     "bayesdist.assess.mosaic": ("chip_places",),
     "bayesdist.assess.requirements.margins": ("Margin", "Requirement", "check_requirements"),
-    "bayesdist.assess.solution": ("Solution",),
     "bayesdist.assess.statistics": ("STATISTICS", "field_statistic"),
     "bayesdist.assess.terms.given": ("TERM_KINDS", "UserTerm"),
     "bayesdist.assess.terms.local": ("LocalErrors",),

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.domain import EvaluationDomain, WorstPosition
-from bayesdist.assess.solution import Solution
 from bayesdist.assess.statistics import ErrorsOf, drawn_statistics
 from bayesdist.assess.terms.forms import (
     PRODUCT,
@@ -28,6 +27,7 @@ from bayesdist.assess.terms.forms import (
     NoiseField,
     Row,
 )
+from bayesdist.infer.solution import Solution
 
 __all__ = ["DrawnErrors", "generators"]
 

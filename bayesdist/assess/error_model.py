@@ -12,7 +12,6 @@ from bayesdist.assess.adjusted import with_diagnosed_errors
 from bayesdist.assess.budget.budget import ErrorBudget, budget_of
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors, generators
-from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms.correlated import Deviations, StructureErrors
 from bayesdist.assess.terms.forms import ErrorTerm, Image
 from bayesdist.assess.terms.given import Centroids, UserTerm
@@ -23,6 +22,7 @@ from bayesdist.assess.units import pixel_scale_of
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit, Posterior
+from bayesdist.infer.solution import Solution
 from bayesdist.model import LookupTable
 
 __all__ = ["ErrorModel", "error_model", "solution_with_errors"]

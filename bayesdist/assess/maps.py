@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.solution import place_of
 from bayesdist.calibration.chip_map import position_moments
+from bayesdist.infer.solution import Solution
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
 
 __all__ = ["RELATIVE", "UncertaintyMap", "uncertainty_map", "with_local"]

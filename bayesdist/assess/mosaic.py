@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.solution import place_of
+from bayesdist.infer.solution import Solution
 
 __all__ = ["chip_places"]
 

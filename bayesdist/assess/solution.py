@@ -1,4 +1,4 @@
-"""A solution as this package takes it, and its polynomial at one place.
+"""A solution at one place, where it is one polynomial.
 
 At one chip, epoch and exposure the whole model is a single polynomial of the pixel position, so
 maps, budgets and margins carry 2 K coefficients and their covariance instead of one Jacobian row
@@ -16,7 +16,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, DistortionModel, Groups, PolynomialBasis
 
-__all__ = ["Place", "Solution", "place_of"]
+__all__ = ["Place", "place_of"]
 
 Float = NDArray[np.float64]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from bayesdist.assess.solution import Solution
 from bayesdist.data.tables.units import UNITS
 from bayesdist.errors import InputError
+from bayesdist.infer.solution import Solution
 from bayesdist.limits import PIXEL_SIZE
 from bayesdist.names import require_known
 

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
-from bayesdist.infer.convergence import Convergence
 from bayesdist.model import DistortionModel
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # a file is inspected without what they import
+    from bayesdist.data.matches import Matches
+    from bayesdist.infer.convergence import Convergence
     from bayesdist.infer.stars.likelihood import Likelihood
     from bayesdist.infer.stars.mixture import OutlierMixture
 

@@ -13,6 +13,7 @@ from bayesdist.app.config import load_config
 from bayesdist.app.results import Results
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.stages.assess import run_diagnose, run_evaluate
+from bayesdist.assess import LocalErrors
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.evaluation import budget_over
 from bayesdist.infer.transforms import reference_gauge, without_frames
@@ -137,7 +138,7 @@ def table_errors(results: Results, truth: CampaignTruth) -> np.ndarray:
     is taken off the error, as polynomials follow the tables.
     """
     out = []
-    local = {term.name: term for term in results.errors.terms}
+    local = {term.name: term for term in results.errors.terms if isinstance(term, LocalErrors)}
     for table in results.fitted.tables.tables:
         chip = next(one for one in truth.chips if one.number == table.chip)
         fine = mesh(*(np.arange(1.0, n, 3.0) for n in (chip.columns, chip.rows)))

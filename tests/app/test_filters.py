@@ -15,16 +15,17 @@ import bayesdist.app.results
 import bayesdist.products.release
 from bayesdist.app.campaign.filters import compare_filters
 from bayesdist.app.campaign.reference import held_tables
-from bayesdist.app.kinds.table_file import read_tables, write_tables
+from bayesdist.app.kinds.table_file import StoredLookupTables, read_tables, write_tables
 from bayesdist.app.release import _require_alike
 from bayesdist.app.results import results_of
 from bayesdist.app.rundir import RunDirectory
+from bayesdist.assess import LocalErrors
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.data import read_exposures
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior
 from bayesdist.infer.exposures.shared_drift import drift_priors, with_drift_of
-from bayesdist.infer.nodes import held_sigma
+from bayesdist.infer.nodes.table_fit import held_sigma
 from bayesdist.infer.series import Series
 from bayesdist.infer.transforms import linear_terms, lines, reference_gauge, without_frames
 from bayesdist.missions.acs.simulate import acs_solution, making, read_acs, simulate_acs
@@ -102,6 +103,10 @@ def release(runs, folder):
 # -- what one run takes from the other ------------------------------------------------------------
 
 
+def local_errors(results):
+    return [term for term in results.errors.terms if isinstance(term, LocalErrors)]
+
+
 def test_the_detectors_tables_are_held_and_the_filters_are_fitted(by_filter):
     reference, other = (by_filter[name] for name in FILTERS)
     assert [(t.chip, t.filter) for t in reference.fitted.tables.tables] == [(1, ""), (2, "")]
@@ -120,7 +125,7 @@ def test_the_detectors_tables_are_held_and_the_filters_are_fitted(by_filter):
 
 def test_the_error_of_the_held_tables_stays_in_the_budget(by_filter):
     other = by_filter["F814W"]
-    [term] = [one for one in other.errors.terms if one.name == "look-up tables"]
+    [term] = [one for one in local_errors(other) if one.name == "look-up tables"]
     for chip in other.fit.model.chips:
         x, y = np.meshgrid(
             *(np.linspace(1, n, m) for n, m in zip(chip.size, (33, 17), strict=True))
@@ -262,7 +267,7 @@ def test_stwcs_sees_our_model_and_the_true_sky(
     [true_centre] = truth.model.predict(truth.theta[filter], 2048.0, 1024.0, **middle)
     rng = np.random.default_rng(1)
     x, y = rng.uniform(1, 4096, 600), rng.uniform(1, 2048, 600)
-    [term] = [one for one in by_filter[filter].errors.terms if one.name == "look-up tables"]
+    [term] = [one for one in local_errors(by_filter[filter]) if one.name == "look-up tables"]
     for chip in (1, 2):
         theirs = wcs[chip].all_pix2world(np.stack([x, y], axis=1), 1)
         px, py = corrected(by_filter[filter].fitted.tables.tables, x, y, chip=chip, filter=filter)
@@ -428,7 +433,7 @@ def test_runs_of_another_structure(change, words):
             config=SimpleNamespace(
                 detector=SimpleNamespace(scale_mas=scale), products=SimpleNamespace(release=1)
             ),
-            tables=(),
+            fitted=SimpleNamespace(tables=StoredLookupTables()),
             run=SimpleNamespace(path=name),
         )
 

@@ -89,7 +89,7 @@ class Dense:
         inverse = np.linalg.inv(S)
         left = self.g - np.einsum("nab,nbq,q->na", self.H, Z, inverse @ U)
         each = np.einsum("naq,qr,nbr->nab", Z, inverse, Z)
-        left = left / np.sqrt(1 - self.leverage(each))
+        left = left / (1 - self.leverage(each)) ** 0.75
         psi = self.summed(np.einsum("naq,na->nq", Z, left))
         V = psi.T @ psi + follows.T @ self.P @ follows
         size = np.sqrt(np.abs(np.einsum("naa->na", self.H)))
@@ -97,7 +97,13 @@ class Dense:
         trace = np.bincount(self.star, np.einsum("naa->n", G))
         norm = np.bincount(self.star, np.sqrt((G**2).sum((1, 2))))
         q = len(U)
-        dof = q * (q + 1) / (trace**2 + norm**2).sum()
+        # what the quoted errors say of the scatter of V, and what scores do: E|psi|^4 of normal
+        # ones is trace^2 + 2 norm^2, in directions of unit information
+        root = np.linalg.cholesky(inverse)
+        fourth = ((psi @ root) ** 2).sum(axis=1) ** 2
+        quoted, normal = trace**2 + norm**2, trace**2 + 2 * norm**2
+        found = (quoted / normal * fourth).sum() / (np.trace(root.T @ V @ root) / q) ** 2
+        dof = min(q * (q + 1) / quoted.sum(), max(q * (q + 1) / found, q + 2))
         T = (dof - q + 1) / dof * U @ np.linalg.solve(V, U)
         return T, q, dof - q + 1
 

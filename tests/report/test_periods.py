@@ -104,7 +104,7 @@ def test_the_section_has_what_was_found(converged, drawings, found):
 
 
 def test_orders_are_drawn_as_they_were_found(pairs):
-    chosen = select_order(pairs, MODEL, orders=(1, 2, 3), bins=12, regions=4, shares=20)
+    chosen = select_order(pairs, MODEL, orders=(1, 2, 3), bins=12, regions=4, folds=20)
     left, right = order_comparison(chosen).axes
     by = {line.get_label(): line.get_ydata() for line in left.lines}
     np.testing.assert_allclose(by["u"], chosen.surfaces.rms[:, 0])

@@ -14,9 +14,9 @@ import math
 import numpy as np
 
 from bayesdist.app.kinds.exposures import ExposureScatter
-from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms.parameters import EXPOSURE_SCATTER, ScaleError
 from bayesdist.data import ExposureLog
+from bayesdist.infer.solution import Solution
 
 __all__ = ["ABERRATION", "aberration_term", "scale_error"]
 

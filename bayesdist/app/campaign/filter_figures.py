@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.app.kinds.fitted import Fitted, required
-from bayesdist.assess.solution import Solution
+from bayesdist.infer.solution import Solution
 from bayesdist.infer.transforms import lines, reference_gauge, without_frames
 
 __all__ = ["draw_filters"]

@@ -12,9 +12,9 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError
 from bayesdist.infer.series import FilterDependence, Series, TrendModel, filter_dependence
+from bayesdist.infer.solution import Solution
 from bayesdist.infer.transforms import linear_terms, reference_gauge
 from bayesdist.limits import DIFFERENCE
 from bayesdist.model import TimeDependence

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import MEASURED
 from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.data import Matches
@@ -24,6 +24,7 @@ from bayesdist.infer.nodes import (
     held_sigma,
     pixel_shifts,
 )
+from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, LookupTable
 from bayesdist.model.grid import grid_pixels, mesh
 

@@ -28,11 +28,11 @@ from bayesdist.app.config.model import (
 from bayesdist.app.config.products import Products
 from bayesdist.app.config.section import Section
 from bayesdist.assess import Requirement, UserTerm
-from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.terms.given import said_by_user
 from bayesdist.assess.terms.parameters import one_size_term
 from bayesdist.infer import OutlierMixture
+from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, TimeDependence
 
 __all__ = ["RunConfig"]

@@ -9,9 +9,10 @@ import numpy as np
 from bayesdist.assess.budget.budget import ErrorBudget
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.error_model import error_model
-from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.units import pixel_scale_of
+from bayesdist.infer.solution import Solution
 from bayesdist.model.grid import DEFAULT_GRID
 
 __all__ = ["detector_budget", "error_budget"]

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.solution import Solution
 from bayesdist.infer.compare.planning import with_information
+from bayesdist.infer.solution import Solution
 
 __all__ = ["Need", "Schedule", "exposures_needed"]
 

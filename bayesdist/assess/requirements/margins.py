@@ -14,12 +14,13 @@ from bayesdist.assess.error_model import error_model
 from bayesdist.assess.requirements.remedy import Remedy, find_remedy
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.verdict import counting_error, effective_draws, verdict_of
-from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.units import convert, pixel_scale_of
 from bayesdist.checks import Check, doubts_of
 from bayesdist.errors import InputError
 from bayesdist.infer.checks import convergence_check
+from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import DEFAULT_GRID
 

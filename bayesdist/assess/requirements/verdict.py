@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 from scipy.stats import beta
 
-from bayesdist.assess.solution import Solution
 from bayesdist.checks import LARGER, Check, doubts_of
+from bayesdist.infer.solution import Solution
 from bayesdist.limits import CONFIDENCE
 
 __all__ = [

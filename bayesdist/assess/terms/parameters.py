@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import (
     GIVEN,
     MEASURED,
@@ -21,6 +21,7 @@ from bayesdist.assess.terms.forms import (
 )
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_errors import StarCovariance
+from bayesdist.infer.solution import Solution
 from bayesdist.mission import load_object, missions
 from bayesdist.model import DistortionModel
 from bayesdist.names import require_known

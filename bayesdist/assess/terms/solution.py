@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import (
     Image,
     PolynomialField,
@@ -19,6 +19,7 @@ from bayesdist.assess.terms.forms import (
     polynomial_errors,
 )
 from bayesdist.assess.terms.parameters import CatalogueErrors
+from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["COEFFICIENTS", "EXPOSURE_FRAME", "TIME_DEPENDENCE", "SolutionErrors"]

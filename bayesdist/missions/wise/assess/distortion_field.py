@@ -12,8 +12,9 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.solution import place_of
 from bayesdist.assess.vectors import VectorMap, distortion_vectors
+from bayesdist.infer.solution import Solution
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.grid import grid_pixels
 

@@ -115,7 +115,7 @@ def _measured(
     )
     results.close()
     order = results.posterior.model.order
-    binned, rng = sums.bins.axes.residuals(), np.random.default_rng(SEED)
+    binned, rng = sums.bins.residuals(), np.random.default_rng(SEED)
     where = {"grid": GRID, "epoch": results.epoch}
     convergence = results.posterior.convergence
     return BandResult(
