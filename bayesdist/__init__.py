@@ -16,8 +16,7 @@ from bayesdist.version import __version__
 _HOMES = {
     "bayesdist.errors": ("BayesdistError", "InputError"),
     "bayesdist.data": (
-        "MatchTable",
-        "PartitionedMatches",
+        "Matches",
         "ReferenceCatalog",
         "match_table",
         "open_matches",

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bayesdist.app.config import Config
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import GaussianPriors, LinearFit
 from bayesdist.infer.catalogue.added_errors import ONE, GroupedErrors, grouped_errors
@@ -28,7 +28,7 @@ MOST_LISTED = 4  # groups that are listed one by one
 
 
 def compared_errors(
-    config: Config, fit: LinearFit, sample: MatchTable, priors: GaussianPriors
+    config: Config, fit: LinearFit, sample: Matches, priors: GaussianPriors
 ) -> GroupedErrors | None:
     """Jitters of groups of stars, or the one that will do, from the residuals of a fit.
 
@@ -37,7 +37,7 @@ def compared_errors(
     config : Config
     fit : LinearFit
         With the quoted errors.
-    sample : MatchTable
+    sample : Matches
         Some of its stars.
     priors : GaussianPriors
 

@@ -11,7 +11,6 @@ from astropy.table import Table
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.assess.error_model import ErrorModel, solution_with_errors
 from bayesdist.assess.evaluation import EvaluationSettings
-from bayesdist.data import MatchTable
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
@@ -73,9 +72,8 @@ def _known_stars(data: FitData) -> StarInfluence | None:
     These stars were in the fit, in other exposures: that is no part of their residuals.
     """
     errors, held = data.matched.star_errors, data.matched.held
-    if errors is None or not isinstance(held, MatchTable) or held.star is None:
+    if errors is None or held is None or held.star is None:
         return None
-    assert isinstance(data.stars, MatchTable)
     whole = np.isin(held.exposure_names, data.matched.whole)
     codes = np.unique(held.star[whole[held.exposure]])
     return star_influence(data.fit, data.stars, errors, codes)

@@ -16,11 +16,10 @@ from bayesdist.app.init_sigma import guessed_sigma
 from bayesdist.app.match_sources import mission_template
 from bayesdist.app.matches import load_matches
 from bayesdist.app.output import refuse_existing
-from bayesdist.data import FORMATS, MatchTable
+from bayesdist.data import FORMATS, Matches
 from bayesdist.data.reading.layout import TableLayout, table_layout
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
-from bayesdist.infer import Matches
 
 __all__ = ["init"]
 
@@ -187,8 +186,7 @@ def _of_matches(
 
 def _chip_names(matches: Matches) -> tuple[str, ...]:
     """Names of the chips, in the order of their numbers."""
-    own = matches.chip_names if isinstance(matches, MatchTable) else ()
-    return own or tuple(f"chip {number}" for number in matches.chip_numbers)
+    return matches.chip_names or tuple(f"chip {number}" for number in matches.chip_numbers)
 
 
 def _read(matches: str | Path, columns: Mapping[str, str] | None) -> tuple[Matches, str, str, bool]:
@@ -239,9 +237,8 @@ def _guessed_unit(table: Matches, layout: TableLayout | None) -> str:
 
 def _reach(matches: Matches) -> dict[int, tuple[float, float]]:
     """Largest x and y on each chip, by its number."""
-    tables = [matches] if isinstance(matches, MatchTable) else (p.read() for p in matches.pieces())
     out: dict[int, tuple[float, float]] = {}
-    for table in tables:
+    for table in matches.batches():
         for code, number in enumerate(table.chip_numbers):
             rows = table.chip == code
             if rows.any():

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.model.basis import polynomial_terms
 
 __all__ = ["guessed_sigma"]
@@ -18,12 +18,12 @@ CLIP = 4.0  # robust standard deviations
 EACH = 4  # stars for each coefficient, at least
 
 
-def guessed_sigma(table: MatchTable) -> float | None:
+def guessed_sigma(table: Matches) -> float | None:
     """Robust scatter along an axis about polynomials on each chip of each exposure, two digits.
 
     Parameters
     ----------
-    table : MatchTable
+    table : Matches
 
     Returns
     -------

@@ -10,7 +10,7 @@ from typing import Protocol
 from bayesdist.app.config import ChipBlock, Data
 from bayesdist.app.matches import load_matches, reading_options
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.infer import Matches
+from bayesdist.data import Matches
 from bayesdist.mission import load_object, missions
 
 __all__ = [

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from bayesdist.app.config import ChipBlock, Data
-from bayesdist.data import input_files, open_matches, read_matches
+from bayesdist.data import Matches, input_files, open_matches, read_matches
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import InputError
-from bayesdist.infer import Matches
 
 __all__ = ["IN_MEMORY", "is_large", "load_matches", "reading_options"]
 
@@ -31,7 +30,7 @@ def load_matches(
 
     Returns
     -------
-    MatchTable or PartitionedMatches
+    Matches
 
     Raises
     ------

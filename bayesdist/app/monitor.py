@@ -21,12 +21,12 @@ from bayesdist.app.rundir import RunDirectory
 from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_late
 from bayesdist.assess.comparison.tables import comparison_table, difference_table
 from bayesdist.assess.units import convert, pixel_scale_of
-from bayesdist.data import input_files
+from bayesdist.data import Matches, input_files
 from bayesdist.diagnose.diagnostics import misfits_of, residual_sums
 from bayesdist.diagnose.residuals.misfit import worst_misfit
 from bayesdist.errors import InputError
 from bayesdist.files import sha256_of
-from bayesdist.infer import Matches, Posterior
+from bayesdist.infer import Posterior
 from bayesdist.infer.compare.change_date import PeriodScore, period_scores, scan_dates
 from bayesdist.infer.compare.monitoring import NewFit, change_of, fit_new
 from bayesdist.infer.linear import Rejection
@@ -164,7 +164,7 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
             where=str(new),
             do="give data.sigma another value",
         )
-    return matches.with_errors_by_magnitude(errors)
+    return matches.with_errors(errors)
 
 
 def _refuse_the_same(run: RunDirectory, path: Any) -> None:

@@ -11,10 +11,9 @@ from astropy.time import Time
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.assess import SAMPLE, convert, pixel_scale_of
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, bins_for
 from bayesdist.errors import InputError
-from bayesdist.infer.stars.shards import Matches
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals import PatternChange, StatisticsTable
@@ -28,7 +27,7 @@ def check_pairs(raw: Matches, config: Config) -> dict[str, int]:
 
     Parameters
     ----------
-    raw : MatchTable or PartitionedMatches
+    raw : Matches
     config : Config
 
     Returns
@@ -49,7 +48,7 @@ def check_pairs(raw: Matches, config: Config) -> dict[str, int]:
         raise InputError(
             "[periods] needs an epoch for every pair", where=where, do="map column 'epoch'"
         )
-    some = raw if isinstance(raw, MatchTable) else raw.sample(SAMPLE)
+    some = raw if raw.in_memory else raw.sample(SAMPLE)
     epoch = some.epoch
     assert epoch is not None
     share = len(raw) / len(some)

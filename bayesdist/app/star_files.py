@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bayesdist.data import MatchTable
-from bayesdist.data.write import write_columns
+from bayesdist.data import Matches
+from bayesdist.data.storage.write import write_columns
 from bayesdist.files import made_folder, remove_leftovers
-from bayesdist.infer import LinearFit, Matches, Posterior
+from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.posterior.memberships import memberships_of
 from bayesdist.infer.stars.stars import in_table_order, prepare
 
@@ -27,7 +27,7 @@ def write_star_files(matches: Matches, fit: LinearFit, posterior: Posterior, fol
 
     Parameters
     ----------
-    matches : MatchTable or PartitionedMatches
+    matches : Matches
         With errors.
     fit : LinearFit
     posterior : Posterior
@@ -43,11 +43,11 @@ def write_star_files(matches: Matches, fit: LinearFit, posterior: Posterior, fol
     remove_leftovers(folder)
     for path in part_files(folder):
         path.unlink()
-    for k, piece in enumerate(matches.pieces()):
-        _write_part(piece.read(), fit, posterior, folder / f"part-{k:05d}.parquet")
+    for k, batch in enumerate(matches.batches()):
+        _write_part(batch, fit, posterior, folder / f"part-{k:05d}.parquet")
 
 
-def _write_part(table: MatchTable, fit: LinearFit, posterior: Posterior, path: Path) -> None:
+def _write_part(table: Matches, fit: LinearFit, posterior: Posterior, path: Path) -> None:
     stars, order = prepare(posterior.model, table)
     said = memberships_of(posterior, stars).in_table_order(order)
     u, v = in_table_order(stars.residuals(posterior.mean), order).T

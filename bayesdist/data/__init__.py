@@ -1,9 +1,9 @@
 """Input: matched positions, reference catalogues, and the matching of star lists with catalogues.
 
 `read_matches` reads any known kind of file.  Each kind has a module of its own, and all of them end
-in a `MatchTable`, where units, errors and row numbers have been checked.  Tables that are larger
-than the memory are Parquet: `open_matches` leaves them on disk and gives `PartitionedMatches`,
-whose pieces are MatchTables; `write_partitioned` makes such files.
+in `Matches`, where units, errors and row numbers have been checked.  Tables that are larger than
+the memory are Parquet: `open_matches` leaves them on disk, to be read in batches;
+`write_partitioned` makes such files.
 """
 
 from __future__ import annotations
@@ -16,27 +16,20 @@ _HOMES = {
     "bayesdist.data.catalog": ("ReferenceCatalog", "catalog_from_table", "read_catalog"),
     "bayesdist.data.exposure_log": ("Exposure", "ExposureLog"),
     "bayesdist.data.exposures": ("read_exposures", "write_exposures"),
-    "bayesdist.data.hst1pass": ("Hst1passList", "read_hst1pass", "read_matchup"),
+    "bayesdist.data.formats.hst1pass": ("Hst1passList", "read_hst1pass", "read_matchup"),
     "bayesdist.data.magnitude_errors": ("MagnitudeErrors",),
-    "bayesdist.data.matches": ("MatchTable",),
+    "bayesdist.data.matches": ("Matches",),
     "bayesdist.data.matching.campaign": ("CampaignMatches", "match_campaign"),
     "bayesdist.data.matching.linear_map": ("LinearMap",),
     "bayesdist.data.matching.reports": ("ExposureReport",),
     "bayesdist.data.matching.search_radius": ("SearchRadius", "search_radius"),
     "bayesdist.data.matching.similarity": ("find_similarity", "pattern_index"),
     "bayesdist.data.matching.table": ("Matching", "match_table", "match_to_catalog"),
-    "bayesdist.data.motions": (
-        "MotionErrorLine",
-        "derive_motions",
-        "motion_error_line",
-        "select_motions",
-    ),
-    "bayesdist.data.partitioned": ("PartitionedMatches", "open_matches"),
-    "bayesdist.data.pieces": ("PIECE", "Piece"),
+    "bayesdist.data.motions": ("motion_error_line", "select_motions"),
+    "bayesdist.data.storage.on_disk": ("open_matches",),
     "bayesdist.data.preparing": (
         "centroid_errors",
         "neutralise_aberration",
-        "with_centroid_errors",
     ),
     "bayesdist.data.reading.formats": ("FORMATS", "input_files"),
     "bayesdist.data.reading.mission_formats": ("MatchFormat",),
@@ -52,7 +45,7 @@ _HOMES = {
         "star_list_of_hst1pass",
     ),
     "bayesdist.data.tables.units": ("UNITS",),
-    "bayesdist.data.write": ("write_partitioned",),
+    "bayesdist.data.storage.write": ("write_partitioned",),
 }
 
 __all__ = sorted(name for names in _HOMES.values() for name in names)

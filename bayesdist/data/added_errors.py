@@ -5,16 +5,13 @@ A group is an axis, or an axis of the stars of one chip, exposure or filter.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from bayesdist.data.matches import MatchTable
-
-__all__ = ["GROUPINGS", "AddedErrors", "group_codes"]
+__all__ = ["GROUPINGS", "AddedErrors"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -35,22 +32,12 @@ class AddedErrors:
         """These errors multiplied by a factor."""
         return replace(self, sigma=factor * self.sigma, other=factor * self.other)
 
-    def beside(self, matches: MatchTable, sigma_u: Float, sigma_v: Float) -> tuple[Float, Float]:
-        """Errors (N,) on u and v: those of the table's stars with these added in quadrature."""
-        names, codes = group_codes(matches, self.by)
+    def at(self, labels: Sequence[str], codes: Int) -> tuple[Float, Float]:
+        """Errors (N,) on u and v of stars, by the labels of their groups and codes (N,) into them.
+
+        `Matches.grouped` gives both.
+        """
         row = {label: k for k, label in enumerate(self.labels)}
-        of_name = np.array([row.get(name, len(row)) for name in names], np.int64)
-        added = np.vstack([self.sigma, self.other])[of_name[codes]]
-        return np.hypot(sigma_u, added[:, 0]), np.hypot(sigma_v, added[:, 1])
-
-
-def group_codes(matches: MatchTable, by: str) -> tuple[tuple[str, ...], Int]:
-    """Labels of the groups of a table by `AddedErrors.by`, and the code (N,) of each star's."""
-    if not by:
-        return ("",), np.zeros(len(matches), np.int64)
-    names = {
-        "chip": tuple(map(str, matches.chip_numbers)),
-        "exposure": matches.exposure_names,
-        "filter": matches.filter_names,
-    }
-    return names[by], getattr(matches, by)
+        of_label = np.array([row.get(label, len(row)) for label in labels], np.int64)
+        added = np.vstack([self.sigma, self.other])[of_label[codes]]
+        return added[:, 0], added[:, 1]

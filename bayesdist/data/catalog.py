@@ -16,7 +16,7 @@ from bayesdist.data.reading.table import with_sky_columns
 from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.data.sky.positions import sky_columns
 from bayesdist.data.sky.tangent import onto_plane
-from bayesdist.data.tables.checks import check_values, one_length, refuse_half, without_missing
+from bayesdist.data.tables.checks import check_columns, columns_of, refuse_half, without_missing
 from bayesdist.data.tables.column import SourceColumn, row_number
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import ALIASES, find_columns
@@ -31,6 +31,7 @@ Int = NDArray[np.int64]
 
 _PAIRS = (("sigma_u", "sigma_v"), ("pm_u", "pm_v"), ("sigma_pm_u", "sigma_pm_v"))
 _PARALLAX = ("parallax", "sigma_parallax")
+_COLUMNS = ("u", "v", "mag", *(name for pair in _PAIRS for name in pair), *_PARALLAX)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,17 +95,11 @@ class ReferenceCatalog:
         n = np.size(self.u)
         if n == 0:
             raise InputError("holds no stars", where=self.source, do="give a catalogue with stars")
-        names = ("u", "v", "mag", *(name for pair in _PAIRS for name in pair), *_PARALLAX)
-        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        given = columns_of(self, _COLUMNS)
         for pair, what in zip(_PAIRS, ("errors", "motions", "errors of motions"), strict=True):
             refuse_half(pair, given, where=self.source, what=what)
-        for name, values in one_length(given, where=self.source).items():
-            object.__setattr__(self, name, values)
-        check_values(
-            {name: getattr(self, name) for name in given},
-            place=lambda row: f"{self.source}, row {row + 1}",
-            not_negative=[name for name in given if name.startswith("sigma")],
-        )
+        sigmas = [name for name in _COLUMNS if name.startswith("sigma")]
+        check_columns(self, _COLUMNS, where=self.source, not_negative=sigmas)
         star = np.ascontiguousarray(np.arange(n) if self.star is None else self.star, np.int64)
         object.__setattr__(self, "star", star)
         if star.shape != (n,) or star.min() < 0:
@@ -129,20 +124,15 @@ class ReferenceCatalog:
 
     def select(self, which: NDArray[Any]) -> ReferenceCatalog:
         """Stars by mask or indices."""
-        arrays = {
-            name: getattr(self, name)[which]
-            for name in ("u", "v", "mag", *(n for pair in _PAIRS for n in pair), *_PARALLAX)
-            if getattr(self, name) is not None
-        }
+        arrays = {name: values[which] for name, values in columns_of(self, _COLUMNS).items()}
         if isinstance(self.epoch, np.ndarray):
             arrays["epoch"] = self.epoch[which]
         return replace(self, **arrays, star=self.star[which])
 
     def rescaled(self, factor: float, unit: str) -> ReferenceCatalog:
         """Catalogue in another unit, of which the present one is `factor`."""
-        lengths = ("u", "v", *(name for pair in _PAIRS for name in pair), *_PARALLAX)
-        known = {k: getattr(self, k) for k in lengths if getattr(self, k) is not None}
-        return replace(self, **{k: factor * values for k, values in known.items()}, unit=unit)
+        lengths = columns_of(self, [name for name in _COLUMNS if name != "mag"])
+        return replace(self, **{k: factor * values for k, values in lengths.items()}, unit=unit)
 
     def at(self, epoch: float) -> ReferenceCatalog:
         """Catalogue at another epoch.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.starlists import StarList
-from bayesdist.data.tables.checks import check_values, one_length
+from bayesdist.data.tables.checks import check_columns, columns_of
 from bayesdist.errors import InputError
 
 __all__ = ["NO_STAR", "Detections", "detections_of"]
@@ -19,6 +19,9 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 NO_STAR = -1
+
+_CODES = ("exposure", "chip", "star")
+_COLUMNS = ("x", "y", "sigma", "mag", *_CODES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +52,7 @@ class Detections:
             object.__setattr__(self, "chip", np.ones(n, np.int64))
         if self.star is None:
             object.__setattr__(self, "star", np.full(n, NO_STAR))
-        names = ("x", "y", "sigma", "mag", "exposure", "chip", "star")
-        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        arrays = one_length(given, integers=("exposure", "chip", "star"), where=self.source)
-        for name, values in arrays.items():
-            object.__setattr__(self, name, values)
-        check_values(arrays, place=lambda row: f"{self.source}, row {row + 1}", positive=("sigma",))
+        check_columns(self, _COLUMNS, integers=_CODES, where=self.source, positive=("sigma",))
 
     def __len__(self) -> int:
         return len(self.x)
@@ -66,10 +64,8 @@ class Detections:
 
     def select(self, which: NDArray[Any]) -> Detections:
         """Detections by mask or indices; the exposures stay."""
-        names = ("x", "y", "exposure", "chip", "sigma", "mag", "star")
-        return replace(
-            self, **{k: getattr(self, k)[which] for k in names if getattr(self, k) is not None}
-        )
+        columns = columns_of(self, _COLUMNS)
+        return replace(self, **{name: values[which] for name, values in columns.items()})
 
 
 def detections_of(

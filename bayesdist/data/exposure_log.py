@@ -160,20 +160,20 @@ class ExposureLog:
             When none is left.
         """
         filters = (filter,) if isinstance(filter, str) else filter
-        kept = [
+        chosen = [
             one
             for one in self.exposures
             if (filters is None or one.filter in filters)
             and (epochs is None or epochs[0] <= one.epoch < epochs[1])
             and (names is None or one.name in names)
         ]
-        if not kept:
+        if not chosen:
             raise InputError(
                 f"no exposure has filter {filter}, epochs {epochs}, names {names}",
                 where=self.source,
                 do="widen the selection",
             )
-        return replace(self, exposures=tuple(kept))
+        return replace(self, exposures=tuple(chosen))
 
     def require(self, *quantities: str) -> None:
         """Refuse a log in which an exposure lacks a quantity.

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy.table import Column, MaskedColumn, Table
-from numpy.typing import NDArray
 
 from bayesdist.data.exposure_log import NUMBERS, Exposure, ExposureLog
 from bayesdist.data.tables.column import SourceColumn
@@ -66,14 +65,8 @@ def read_exposures(
     """
     path = Path(path)
     table = read_table(path)
-    found = find_columns(table.colnames, columns, _ALIASES, source=str(path))
-    for key in ("exposure", "epoch"):
-        if key not in found:
-            raise InputError(
-                f"no column for {key!r} among {', '.join(table.colnames) or 'none'}",
-                where=str(path),
-                do="rename the column, or name it in the option 'columns'",
-            )
+    needed = ("exposure", "epoch")
+    found = find_columns(table.colnames, columns, _ALIASES, source=str(path), needed=needed)
     if not len(table):
         raise InputError("holds no exposures", where=str(path), do="name at least one")
 
@@ -86,7 +79,7 @@ def read_exposures(
         "epoch": column("epoch").years().tolist(),
     }
     if "filter" in found:
-        rows["filter"] = _filled(table[found["filter"]], column("filter"))
+        rows["filter"] = _filled(column("filter"))
     for key in NUMBERS:
         if key in found:
             rows[key] = _known_numbers(column(key), _UNITS.get(key))
@@ -100,41 +93,24 @@ def read_exposures(
     return ExposureLog(tuple(exposures), source=str(path))
 
 
-def _missing(values: Any) -> NDArray[np.bool_]:
-    """Boolean mask of the values of a column that are masked or NaN."""
-    mask = np.array(np.broadcast_to(getattr(values, "mask", False), len(values)))
-    if values.dtype.kind == "f":
-        mask |= np.isnan(np.ma.filled(np.ma.asarray(values), np.nan))
-    return mask
-
-
-def _filled(values: Any, column: SourceColumn) -> list[str]:
+def _filled(column: SourceColumn) -> list[str]:
     """Texts of a column, empty where they are missing."""
-    missing = _missing(values)
-    known = np.flatnonzero(~missing)
-    out = [""] * len(values)
+    known, named = column.known()
+    out = [""] * len(column.values)
     if len(known):
-        codes, labels = replace(column, values=values[known]).labels()
-        for index, code in zip(known, codes, strict=True):
-            out[index] = labels[code]
+        codes, labels = named.labels()
+        for row, code in zip(known, codes, strict=True):
+            out[row] = labels[code]
     return out
 
 
 def _known_numbers(column: SourceColumn, unit: str | None) -> list[float | None]:
     """Numbers of a column, None where they are missing."""
-    missing = _missing(column.values)
-    known = np.flatnonzero(~missing)
-    out: list[float | None] = [None] * len(missing)
-    if not len(known):
-        return out
+    numbers = column.known_numbers()
     own = column.unit
-    factor = 1.0 if own is None or unit is None else conversion(own, unit, where=column.where)
-    named = replace(
-        column, values=column.values[known], place=lambda k: column.place(int(known[k]))
-    )
-    for index, value in zip(known, named.numbers() * factor, strict=True):
-        out[index] = float(value)
-    return out
+    if own is not None and unit is not None and not np.isnan(numbers).all():
+        numbers = numbers * conversion(own, unit, where=column.where)
+    return [None if np.isnan(value) else value for value in numbers.tolist()]
 
 
 def write_exposures(log: ExposureLog, path: str | os.PathLike[str]) -> None:

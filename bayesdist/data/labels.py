@@ -1,8 +1,10 @@
-"""Several tables become one: codes renumbered, counts added, optional columns in agreement."""
+"""Labels of matches: names of codes, unit, counts and notes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,28 +12,70 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 
-__all__ = ["merged_codes", "merged_counts", "merged_optional"]
+__all__ = ["LABELS_OF_CODES", "Labels", "merged_counts", "recoded"]
 
-Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+LABELS_OF_CODES = {
+    "exposure": "exposure_names",
+    "chip": "chip_numbers",
+    "filter": "filter_names",
+}
 
-def merged_codes(
-    codes: Sequence[Int], labels: Sequence[tuple[Any, ...]], *, ordered: bool = False
-) -> tuple[Int, tuple[Any, ...]]:
-    """One numbering for codes with labels of their own: the joined codes, and the labels.
 
-    Labels stand in the order of their first appearance, or sorted.
-    """
-    every: list[Any] = list(dict.fromkeys(label for own in labels for label in own))
-    if ordered:
-        every.sort()
-    number = {label: k for k, label in enumerate(every)}
-    renumbered = [
-        np.array([number[label] for label in own], np.int64)[code]
-        for code, own in zip(codes, labels, strict=True)
-    ]
-    return np.concatenate(renumbered), tuple(every)
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Attributes that all batches of matches share; the fields are those of `Matches`."""
+
+    unit: str
+    exposure_names: tuple[str, ...]
+    chip_numbers: tuple[int, ...]
+    filter_names: tuple[str, ...]
+    sources: tuple[str, ...]
+    n_rows: int
+    tangent_point: tuple[float, float] | None = None
+    chip_names: tuple[str, ...] = ()
+    rejected: Mapping[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of `Matches` by name."""
+        return {one.name: getattr(self, one.name) for one in fields(self)}
+
+    def of_batch(self, n: int) -> Labels:
+        """Labels of a batch of n rows: those of all, with counts of its own."""
+        return replace(self, n_rows=n, rejected={})
+
+    def codes(self, key: str, block: Mapping[str, Any], *, source: str) -> Int:
+        """Codes of a block's exposures, chips or filters among those of the whole.
+
+        InputError for a label that was not there when the files were scanned.
+        """
+        known = self._numbers[key]
+        labels = block[LABELS_OF_CODES[key]]
+        try:
+            code_of_label = np.array([known[label] for label in labels], np.int64)
+        except KeyError:
+            raise InputError(
+                "has changed since it was opened", where=source, do="start again"
+            ) from None
+        return recoded(key, block, code_of_label)
+
+    @cached_property
+    def _numbers(self) -> dict[str, dict[Any, int]]:
+        """Code of each label."""
+        return {
+            key: {label: k for k, label in enumerate(getattr(self, names))}
+            for key, names in LABELS_OF_CODES.items()
+        }
+
+
+def recoded(key: str, block: Mapping[str, Any], code_of_label: Int) -> Int:
+    """Codes (N,) of a block, with the code that each of its labels has elsewhere."""
+    codes = block.get(key)
+    if codes is None:
+        codes = np.zeros(len(block["x"]), np.int64)
+    return code_of_label[codes]
 
 
 def merged_counts(counts: Sequence[Mapping[str, int]]) -> dict[str, int]:
@@ -41,21 +85,3 @@ def merged_counts(counts: Sequence[Mapping[str, int]]) -> dict[str, int]:
         for key, number in one.items():
             total[key] = total.get(key, 0) + number
     return total
-
-
-def merged_optional(
-    name: str, arrays: Sequence[Float | None], sources: Sequence[str]
-) -> Float | None:
-    """Joined column that all tables have; None where none has it; refused where only some have."""
-    present = [a for a in arrays if a is not None]
-    if not present:
-        return None
-    if len(present) < len(arrays):
-        lacking = next(s for a, s in zip(arrays, sources, strict=True) if a is None)
-        having = next(s for a, s in zip(arrays, sources, strict=True) if a is not None)
-        raise InputError(
-            f"has no {name!r}, but {having} has",
-            where=lacking,
-            do="give the column in all files or in none",
-        )
-    return np.concatenate(present)

@@ -1,41 +1,46 @@
-"""MatchTable: detector pixels with reference positions, one row for each matched star."""
+"""Matches: detector pixels with reference positions, one row for each matched star."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, replace
+from functools import partial
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.added_errors import AddedErrors
-from bayesdist.data.labels import merged_codes, merged_counts, merged_optional
+from bayesdist.data.batches import batch_edges, every_kth
+from bayesdist.data.joining import joined_arguments, joined_columns
+from bayesdist.data.labels import Labels, merged_counts
 from bayesdist.data.magnitude_errors import MagnitudeErrors, no_magnitudes
-from bayesdist.data.pieces import PIECE, Piece, TablePiece, even_edges, every_kth
-from bayesdist.data.tables.checks import absent, check_values, counted, one_length, refuse_half
-from bayesdist.data.tables.repeated import first_duplicate
-from bayesdist.data.tables.units import check_unit, conversion, unit_of, without_unit
+from bayesdist.data.match_columns import SIGMAS, MatchColumns, refuse_repeated
 from bayesdist.errors import InputError
 
-__all__ = ["MatchTable"]
+__all__ = ["BatchReader", "Matches"]
 
 Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-
-_POSITIONS = ("x", "y", "u", "v")
-_SIGMAS = ("sigma_u", "sigma_v")
-_NOMINAL = ("u_nominal", "v_nominal")
-_MOTIONS = ("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v")
-_OPTIONAL = ("epoch", "mag", "colour", *_NOMINAL, *_MOTIONS)
-_CODES = {"exposure": "exposure_names", "chip": "chip_numbers", "filter": "filter_names"}
-_INTEGERS = ("row", "source", "star", *_CODES)
+Errors = MagnitudeErrors | AddedErrors | float | tuple[ArrayLike, ArrayLike]
 
 
-@dataclass(frozen=True, eq=False)
-class MatchTable:
-    """Matched stars.
+class BatchReader(Protocol):
+    """Batch of matches that has not been read; can be pickled."""
+
+    def __len__(self) -> int:
+        """Rows."""
+
+    def load(self) -> Matches:
+        """Rows in memory, with codes by the names of all batches."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Matches(MatchColumns):
+    """Matched stars, in memory or on disk.
+
+    Stars in memory are one table; larger ones stay in files, and `batches` gives them part by part.
+    All else is alike, but the columns of stars on disk raise InputError.
 
     All arrays have length N and are float64, codes and rows int64; anything that converts to them
     is taken.  Quantities are converted to `unit` (x and y to pixels), and rows with a masked value
@@ -97,46 +102,16 @@ class MatchTable:
         unknown unit, or the same star twice.
     """
 
-    x: Float
-    y: Float
-    u: Float
-    v: Float
-    sigma_u: Float | None = None
-    sigma_v: Float | None = None
-    unit: str = "pix"
-    epoch: Float | None = None
-    mag: Float | None = None
-    colour: Float | None = None
-    exposure: Int = None  # type: ignore[assignment]
-    exposure_names: tuple[str, ...] = ("1",)
-    chip: Int = None  # type: ignore[assignment]
-    chip_numbers: tuple[int, ...] = (1,)
-    filter: Int = None  # type: ignore[assignment]
-    filter_names: tuple[str, ...] = ("",)
-    star: Int | None = None
-    row: Int = None  # type: ignore[assignment]
-    source: Int = None  # type: ignore[assignment]
-    sources: tuple[str, ...] = ("table",)
-    n_rows: int = None  # type: ignore[assignment]
-    rejected: Mapping[str, int] = field(default_factory=dict)
-    tangent_point: tuple[float, float] | None = None
-    u_nominal: Float | None = None
-    v_nominal: Float | None = None
-    pm_u: Float | None = None
-    pm_v: Float | None = None
-    sigma_pm_u: Float | None = None
-    sigma_pm_v: Float | None = None
-    chip_names: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    _readers: tuple[BatchReader, ...] | None = field(default=None, init=False)
+    _stored: frozenset[str] = field(default=frozenset(), init=False)  # columns on disk
 
     def __post_init__(self) -> None:
         self._complete()
-        self._check_values()
-        self._check_duplicates()
+        refuse_repeated(self._columns, place=self.place)
 
     @classmethod
-    def of_distinct_rows(cls, **columns: Any) -> MatchTable:
-        """Table of rows that are known to differ, made without a search for repeated rows.
+    def of_distinct_rows(cls, **columns: Any) -> Matches:
+        """Matches in memory that are known to differ, made without a search for repeated rows.
 
         All is as in the constructor, but repeated rows are not looked for.
 
@@ -147,181 +122,196 @@ class MatchTable:
 
         Returns
         -------
-        MatchTable
+        Matches
 
         Raises
         ------
         InputError
             As the constructor, but for the same star twice.
         """
-        table = object.__new__(cls)
-        for one in fields(cls):
-            if one.name not in columns and one.default is not MISSING:
-                columns[one.name] = one.default
-        columns.setdefault("rejected", {})
-        if set(columns) != {one.name for one in fields(cls)}:
-            raise TypeError(f"{', '.join(columns)} are not the columns of a table")
-        for name, value in columns.items():
-            object.__setattr__(table, name, value)
-        table._complete()
-        table._check_values()
-        return table
+        arguments = [one for one in fields(cls) if one.init]
+        defaults = {one.name: one.default for one in arguments if one.default is not MISSING}
+        values = defaults | {"rejected": {}} | columns
+        if values.keys() != {one.name for one in arguments}:
+            raise TypeError(f"{', '.join(columns)} are not the columns of matches")
+        matches = object.__new__(cls)
+        for name, value in values.items():
+            object.__setattr__(matches, name, value)
+        matches._complete()
+        return matches
 
-    def _with(self, *, distinct: bool = True, **changes: Any) -> MatchTable:
-        """Table with other columns."""
-        columns = {one.name: getattr(self, one.name) for one in fields(self)} | changes
-        return MatchTable.of_distinct_rows(**columns) if distinct else MatchTable(**columns)
+    @classmethod
+    def from_readers(
+        cls, readers: Sequence[BatchReader], labels: Labels, columns: Collection[str]
+    ) -> Matches:
+        """Matches that stay on disk.
 
-    def _complete(self) -> None:
-        """Fill in the defaults, and give every array its type."""
-        self._without_units()
-        self._without_masks()
-        n = np.size(self.x)
-        if n == 0:
-            raise InputError(
-                "holds no rows", where=", ".join(self.sources), do="give a table with matched stars"
-            )
-        for name in ("row", "source", *_CODES):
-            if getattr(self, name) is None:
-                default = np.arange(n) if name == "row" else np.zeros(n, np.int64)
-                object.__setattr__(self, name, default)
-        given = {name: getattr(self, name) for name in self._array_names()}
-        where = ", ".join(self.sources)
-        for name, values in one_length(given, integers=_INTEGERS, where=where).items():
-            object.__setattr__(self, name, values)
-        object.__setattr__(self, "n_rows", n if self.n_rows is None else int(self.n_rows))
-        object.__setattr__(self, "rejected", dict(self.rejected))
+        Parameters
+        ----------
+        readers : sequence of BatchReader
+            Whose codes are those of `labels`.
+        labels : Labels
+        columns : collection of str
+            Columns that the batches have.
 
-    def _without_units(self) -> None:
-        """Replace quantities by numbers in `unit`."""
-        units = dict.fromkeys(("x", "y"), "pix") | dict.fromkeys(_MOTIONS, f"{self.unit} / yr")
-        units |= {"epoch": "yr", "mag": "mag", "colour": "mag"}
-        for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL):
-            own = unit_of(getattr(self, name), where=f"column {name!r}")
-            if own is None:
-                continue
-            unit = units.get(name, self.unit)
-            factor = conversion(own, unit, where=f"{', '.join(self.sources)}, column {name!r}")
-            object.__setattr__(self, name, factor * without_unit(getattr(self, name)))
-
-    def _without_masks(self) -> None:
-        """Leave out rows with a masked value, and count them."""
-        names = list(self._array_names())
-        masked = [name for name in names if hasattr(getattr(self, name), "mask")]
-        n, shapes = np.size(self.x), {np.shape(getattr(self, name)) for name in names}
-        if not masked or shapes != {(n,)}:
-            return  # unequal lengths are refused where they are compared
-        reasons = [
-            (f"no value in column {name!r}", absent(getattr(self, name), not_finite=False))
-            for name in masked
-        ]
-        stay, counts = counted(reasons, n)
-        if not counts:
-            return
-        if self.row is None:
-            object.__setattr__(self, "row", np.arange(n))
-            names.append("row")
-        for name in names:
-            values = getattr(self, name)
-            plain = np.asarray(getattr(values, "unmasked", values))
-            object.__setattr__(self, name, plain[stay])
-        object.__setattr__(self, "n_rows", n if self.n_rows is None else self.n_rows)
-        object.__setattr__(self, "rejected", merged_counts([self.rejected, counts]))
-
-    def _array_names(self) -> Iterator[str]:
-        for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL, *_INTEGERS):
-            if getattr(self, name) is not None:
-                yield name
-
-    def _where(self, index: int, column: str = "") -> str:
-        """File, row (from 1) and column of a star, for an error."""
-        head = f"{self.sources[self.source[index]]}, row {self.row[index] + 1}"
-        return f"{head}, column {column!r}" if column else head
-
-    def _check_values(self) -> None:
-        check_unit(self.unit, where=", ".join(self.sources))
-        present, where = set(self._array_names()), ", ".join(self.sources)
-        refuse_half(_SIGMAS, present, where=where, what="errors")
-        refuse_half(_NOMINAL, present, where=where, what="nominal positions")
-        names_of = {**_CODES, "source": "sources"}
-        for name, labels in names_of.items():
-            codes = getattr(self, name)
-            if codes.min() < 0 or codes.max() >= len(getattr(self, labels)):
-                raise InputError(
-                    f"codes in {name!r} point outside {labels!r}",
-                    where=", ".join(self.sources),
-                    do="give a label for each code",
-                )
-        if self.star is not None and self.star.min() < 0:
-            bad = int(np.argmax(self.star < 0))
-            raise InputError(
-                f"value is {self.star[bad]}, and must not be negative",
-                where=self._where(bad, "star"),
-                do="number the reference stars from 0",
-            )
-        numbers = {name: getattr(self, name) for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL)}
-        given = {name: values for name, values in numbers.items() if values is not None}
-        check_values(given, place=self._where, positive=_SIGMAS)
-
-    def _check_duplicates(self) -> None:
-        keys = [getattr(self, k) for k in (*_POSITIONS, *_CODES)]
-        if self.epoch is not None:
-            keys.append(self.epoch)
-        pair = first_duplicate(keys)
-        if pair is not None:
-            first, second = pair
-            raise InputError(
-                f"repeats {self._where(first)}: the same x, y, u, v, exposure and chip",
-                where=self._where(second),
-                do="drop one of them",
-            )
+        Returns
+        -------
+        Matches
+        """
+        matches = object.__new__(cls)
+        for name, value in labels.arguments().items():
+            object.__setattr__(matches, name, value)
+        object.__setattr__(matches, "_readers", tuple(readers))
+        object.__setattr__(matches, "_stored", frozenset(columns))
+        return matches
 
     def __len__(self) -> int:
-        return len(self.x)
+        return len(self.x) if self._readers is None else sum(map(len, self._readers))
+
+    def __repr__(self) -> str:
+        place = "in memory" if self.in_memory else "on disk"
+        return f"<{len(self)} matches {place} from {', '.join(self.sources)}>"
+
+    @property
+    def in_memory(self) -> bool:
+        """True where the columns are in memory."""
+        return self._readers is None
+
+    def has(self, column: str) -> bool:
+        """Truth of a column being there.
+
+        Parameters
+        ----------
+        column : str
+
+        Returns
+        -------
+        bool
+        """
+        return getattr(self, column) is not None if self.in_memory else column in self._stored
 
     @property
     def has_sigma(self) -> bool:
         """True where the stars have errors."""
-        return self.sigma_u is not None
+        return self.has("sigma_u")
 
     @property
     def has_epoch(self) -> bool:
         """True where the stars have epochs."""
-        return self.epoch is not None
+        return self.has("epoch")
 
     @property
     def has_mag(self) -> bool:
         """True where the stars have magnitudes."""
-        return self.mag is not None
+        return self.has("mag")
 
     @property
     def has_nominal(self) -> bool:
         """True where the stars have nominal positions."""
-        return self.u_nominal is not None
+        return self.has("u_nominal")
 
     @property
     def exposures(self) -> tuple[str, ...]:
         """Names of the exposures that have stars, in the order of `exposure_names`."""
+        if not self.in_memory:
+            return self.exposure_names
         return tuple(self.exposure_names[k] for k in np.unique(self.exposure))
 
-    @property
-    def chip_number(self) -> Int:
-        """Number of the chip of each star (N,)."""
-        return np.asarray(self.chip_numbers, np.int64)[self.chip]
+    def readers(self) -> tuple[BatchReader, ...]:
+        """Consecutive batches, not read where they are on disk.
 
-    def select(self, which: ArrayLike, *, reason: str | None = None) -> MatchTable:
+        Returns
+        -------
+        tuple of BatchReader
+            Of at most `BATCH` rows each; they can be sent to other processes.
+        """
+        if self._readers is not None:
+            return self._readers
+        return tuple(
+            self.with_columns(
+                **{name: values[a:b] for name, values in self._columns.items()},
+                n_rows=b - a,
+                rejected={},
+            )
+            for a, b in pairwise(batch_edges(len(self)))
+        )
+
+    def batches(self) -> Iterator[Matches]:
+        """Consecutive batches in memory, read one after another.
+
+        Yields
+        ------
+        Matches
+            Of at most `BATCH` rows, with codes by the names of the whole.
+
+        Raises
+        ------
+        InputError
+            When a file is damaged, gone, or not what it was when it was opened.
+        """
+        for reader in self.readers():
+            yield reader.load()
+
+    def load(self) -> Matches:
+        """All stars in memory.
+
+        Returns
+        -------
+        Matches
+            These themselves where they are in memory.
+
+        Raises
+        ------
+        InputError
+            As `batches`.
+        """
+        return self if self.in_memory else self.sample(len(self))
+
+    def sample(self, n: int) -> Matches:
+        """Every k-th row, in memory.
+
+        Parameters
+        ----------
+        n : int
+            Largest number of rows of the sample; k is as small as this allows.
+
+        Returns
+        -------
+        Matches
+            In the order of the rows; these themselves where they are in memory and not more than n.
+
+        Raises
+        ------
+        InputError
+            For less than one row, and as `batches`.
+        """
+        k = every_kth(len(self), n)
+        if self.in_memory:
+            return self if k == 1 else self.select(np.arange(0, len(self), k))
+        parts: list[dict[str, Any]] = []
+        start = 0
+        for reader in self.readers():
+            rows = slice(-start % k, None, k)
+            start += len(reader)
+            if len(range(len(reader))[rows]):
+                # copies: a view would hold the whole batch in memory
+                columns = reader.load()._columns
+                parts.append({name: values[rows].copy() for name, values in columns.items()})
+        return Matches.of_distinct_rows(**joined_columns(parts), **self.labels.arguments())
+
+    def select(self, which: ArrayLike, *, reason: str | None = None) -> Matches:
         """Stars by mask or indices.
 
         Parameters
         ----------
         which : array_like of bool or int
-            Mask of length N, or indices without repetition.
+            Mask of length N, or indices without repetition; on disk a mask.
         reason : str, optional
             Why the others go; they are counted under it in `rejected`.
 
         Returns
         -------
-        MatchTable
+        Matches
             Codes keep their meaning: names without stars stay.
 
         Raises
@@ -332,71 +322,176 @@ class MatchTable:
         which = np.asarray(which)
         if not which.size:  # an empty list has no integer type of its own
             which = which.astype(np.int64)
+        if self._readers is not None:
+            return self._selected_on_disk(self._readers, which, reason)
         index = np.arange(len(self))[which]
+        counts = self._counts_without(len(index), reason)
+        columns = {name: values[index] for name, values in self._columns.items()}
+        selected = self.with_columns(**columns, rejected=counts)
         # rows of one table differ: only a repeated index repeats one
-        distinct = which.dtype == bool or len(np.unique(index)) == len(index)
-        picked = {name: getattr(self, name)[index] for name in self._array_names()}
-        rejected = dict(self.rejected)
-        dropped = len(self) - len(index)
-        if reason is not None and dropped:
-            rejected[reason] = rejected.get(reason, 0) + dropped
-        return self._with(distinct=distinct, **picked, rejected=rejected)
+        if which.dtype != bool and len(np.unique(index)) < len(index):
+            refuse_repeated(selected._columns, place=selected.place)
+        return selected
 
-    def pieces(self) -> tuple[Piece, ...]:
-        """Rows in consecutive pieces of about equal size.
+    def _selected_on_disk(
+        self, readers: Sequence[BatchReader], which: NDArray[Any], reason: str | None
+    ) -> Matches:
+        if which.dtype != bool or which.shape != (len(self),):
+            raise InputError(
+                "stars on disk are selected by a mask of all of them",
+                where=", ".join(self.sources),
+                do="give a mask, or load() them",
+            )
+        edges = np.cumsum([0, *map(len, readers)])
+        parts = [which[a:b] for a, b in pairwise(edges)]
+        counts = self._counts_without(int(which.sum()), reason)
+        if not which.any():
+            raise InputError(
+                "holds no rows",
+                where=", ".join(self.sources),
+                do="give a table with matched stars",
+            )
+        return Matches.from_readers(
+            [
+                _Deferred(reader, partial(_by_bits, bits=np.packbits(rows)), int(rows.sum()))
+                for reader, rows in zip(readers, parts, strict=True)
+                if rows.any()
+            ],
+            replace(self.labels, rejected=counts),
+            self._stored,
+        )
 
-        Returns
-        -------
-        tuple of Piece
-            Of at most `PIECE` rows each.
-        """
-        edges = even_edges(len(self), PIECE)
-        out: list[Piece] = []
-        for a, b in pairwise(edges):
-            part = {name: getattr(self, name)[a:b] for name in self._array_names()}
-            out.append(TablePiece(self._with(**part, n_rows=b - a, rejected={})))
-        return tuple(out)
+    def _counts_without(self, n: int, reason: str | None) -> dict[str, int]:
+        """Rows left out by reason, once n stars are left."""
+        dropped = {} if reason is None or n == len(self) else {reason: len(self) - n}
+        return merged_counts([self.rejected, dropped])
 
-    def sample(self, n: int) -> MatchTable:
-        """Every k-th row.
+    def mapped(self, step: Callable[[Matches], Matches], *, adds: Collection[str] = ()) -> Matches:
+        """Stars as a step makes them that acts on each row by itself.
 
         Parameters
         ----------
-        n : int
-            Largest number of rows of the sample; k is as small as this allows.
+        step : callable
+            It takes matches in memory and gives as many, with the same labels.  For stars on disk
+            it is taken when they are read, and must be one that can be pickled.
+        adds : collection of str
+            Columns that the stars have afterwards, whether or not they had them before.
 
         Returns
         -------
-        MatchTable
-            In the order of the rows; the table itself where it has no more than `n`.
+        Matches
+        """
+        if self._readers is None:
+            return step(self)
+        readers = [_Deferred(one, step, len(one)) for one in self._readers]
+        return Matches.from_readers(readers, self.labels, self._stored | set(adds))
+
+    def with_columns(self, **changes: Any) -> Matches:
+        """Stars in memory with some columns or labels replaced.
+
+        Parameters
+        ----------
+        **changes
+            As the constructor's arguments.  Repeated rows are not looked for.
+
+        Returns
+        -------
+        Matches
 
         Raises
         ------
         InputError
-            For less than one row.
+            As the constructor, and for stars on disk.
         """
-        k = every_kth(len(self), n)
-        return self if k == 1 else self.select(np.arange(0, len(self), k))
+        given = {one.name: getattr(self, one.name) for one in fields(self) if one.init}
+        return Matches.of_distinct_rows(**(given | changes))
 
-    def with_sigma(self, sigma_u: ArrayLike, sigma_v: ArrayLike) -> MatchTable:
+    def with_counts(self, n_rows: int, rejected: Mapping[str, int]) -> Matches:
+        """These stars with other counts of the rows that they were selected from.
+
+        Parameters
+        ----------
+        n_rows : int
+        rejected : mapping of str to int
+            Rows left out, by reason.
+
+        Returns
+        -------
+        Matches
+        """
+        if self._readers is None:
+            return self.with_columns(n_rows=n_rows, rejected=rejected)
+        labels = replace(self.labels, n_rows=n_rows, rejected=dict(rejected))
+        return Matches.from_readers(self._readers, labels, self._stored)
+
+    def with_exposure_names(self, names: tuple[str, ...]) -> Matches:
+        """These stars with other exposures, which include all of their own.
+
+        Parameters
+        ----------
+        names : tuple of str
+
+        Returns
+        -------
+        Matches
+            Whose codes are by these names.
+        """
+        if names == self.exposure_names:
+            return self
+        if self._readers is not None:
+            step = partial(Matches.with_exposure_names, names=names)
+            readers = [_Deferred(one, step, len(one)) for one in self._readers]
+            labels = replace(self.labels, exposure_names=names)
+            return Matches.from_readers(readers, labels, self._stored)
+        code = {name: k for k, name in enumerate(names)}
+        codes = np.array([code.get(name, -1) for name in self.exposure_names], np.int64)
+        return self.with_columns(exposure=codes[self.exposure], exposure_names=names)
+
+    def with_errors(self, errors: Errors, *, in_quadrature: bool = False) -> Matches:
         """These stars with other errors.
 
         Parameters
         ----------
-        sigma_u, sigma_v : array_like, shape () or (N,)
-            In `unit`.
+        errors : MagnitudeErrors, AddedErrors, float or pair of array_like
+            By magnitude; by groups of stars; one for all; or of u and of v, each a number or, in
+            memory, of shape (N,).  In `unit`.
+        in_quadrature : bool, optional
+            Add them to the errors that the stars have, if any, in quadrature.
 
         Returns
         -------
-        MatchTable
-        """
-        shape = (len(self),)
-        return self._with(
-            sigma_u=np.broadcast_to(np.asarray(sigma_u, float), shape),
-            sigma_v=np.broadcast_to(np.asarray(sigma_v, float), shape),
-        )
+        Matches
 
-    def with_errors_times(self, factor: float) -> MatchTable:
+        Raises
+        ------
+        InputError
+            Without magnitudes, where these are needed, and for errors that are not positive.
+        """
+        if isinstance(errors, MagnitudeErrors) and not self.has_mag:
+            raise no_magnitudes(", ".join(self.sources))
+        if not self.in_memory:
+            if isinstance(errors, float | int | tuple):
+                errors = _checked_numbers(errors)
+            step = partial(Matches.with_errors, errors=errors, in_quadrature=in_quadrature)
+            return self.mapped(step, adds=SIGMAS)
+        sigma_u, sigma_v = self._errors(errors)
+        if in_quadrature and self.sigma_u is not None and self.sigma_v is not None:
+            sigma_u, sigma_v = np.hypot(sigma_u, self.sigma_u), np.hypot(sigma_v, self.sigma_v)
+        return self.with_columns(sigma_u=sigma_u, sigma_v=sigma_v)
+
+    def _errors(self, errors: Errors) -> tuple[Float, Float]:
+        """Errors (N,) of u and of v."""
+        if isinstance(errors, MagnitudeErrors):
+            assert self.mag is not None
+            return errors.at(self.mag)
+        if isinstance(errors, AddedErrors):
+            return errors.at(*self.grouped(errors.by))
+        pair = errors if isinstance(errors, tuple) else (errors, errors)
+        shape = (len(self),)
+        u, v = (np.broadcast_to(np.asarray(one, float), shape) for one in pair)
+        return u, v
+
+    def with_scaled_errors(self, factor: float) -> Matches:
         """These stars with all errors multiplied by a factor.
 
         Parameters
@@ -405,49 +500,16 @@ class MatchTable:
 
         Returns
         -------
-        MatchTable
+        Matches
         """
+        if not self.in_memory:
+            return self.mapped(partial(Matches.with_scaled_errors, factor=factor))
         if self.sigma_u is None or self.sigma_v is None:
             return self
-        return self.with_sigma(factor * self.sigma_u, factor * self.sigma_v)
-
-    def with_added_errors(self, added: AddedErrors) -> MatchTable:
-        """These stars with errors added in quadrature.
-
-        Parameters
-        ----------
-        added : AddedErrors
-
-        Returns
-        -------
-        MatchTable
-        """
-        if self.sigma_u is None or self.sigma_v is None:
-            return self
-        return self.with_sigma(*added.beside(self, self.sigma_u, self.sigma_v))
-
-    def with_errors_by_magnitude(self, errors: MagnitudeErrors) -> MatchTable:
-        """These stars with errors by magnitude.
-
-        Parameters
-        ----------
-        errors : MagnitudeErrors
-
-        Returns
-        -------
-        MatchTable
-
-        Raises
-        ------
-        InputError
-            Without magnitudes.
-        """
-        if self.mag is None:
-            raise no_magnitudes(", ".join(self.sources))
-        return self.with_sigma(*errors.at(self.mag))
+        return self.with_errors((factor * self.sigma_u, factor * self.sigma_v))
 
     @staticmethod
-    def concatenate(tables: Sequence[MatchTable]) -> MatchTable:
+    def concatenate(tables: Sequence[Matches]) -> Matches:
         """Stars of several tables, in their order.
 
         Exposures, chips, filters and files of equal name become one.  Stars keep their codes, which
@@ -455,11 +517,12 @@ class MatchTable:
 
         Parameters
         ----------
-        tables : sequence of MatchTable
+        tables : sequence of Matches
+            In memory.
 
         Returns
         -------
-        MatchTable
+        Matches
 
         Raises
         ------
@@ -469,47 +532,41 @@ class MatchTable:
         """
         if not tables:
             raise InputError("there are no tables to join", do="give at least one")
-        first = tables[0]
-        if len(tables) == 1:
-            return first
-        for other in tables[1:]:
-            for name, label in (("unit", "unit"), ("tangent_point", "tangent point")):
-                if getattr(other, name) != getattr(first, name):
-                    raise InputError(
-                        f"{label} is {getattr(other, name)}, but {getattr(first, name)} in "
-                        f"{', '.join(first.sources)}",
-                        where=", ".join(other.sources),
-                        do="bring all files to one",
-                    )
-        joined: dict[str, object] = {
-            name: np.concatenate([getattr(t, name) for t in tables])
-            for name in (*_POSITIONS, "row")
-        }
-        for name in (*_SIGMAS, *_OPTIONAL):
-            joined[name] = merged_optional(
-                name, [getattr(t, name) for t in tables], [", ".join(t.sources) for t in tables]
+        return tables[0] if len(tables) == 1 else Matches(**joined_arguments(tables))
+
+
+@dataclass(frozen=True, eq=False)
+class _Deferred:
+    """Batch on which a step is taken when it is read."""
+
+    reader: BatchReader
+    step: Callable[[Matches], Matches]
+    n: int  # rows after the step
+
+    def __len__(self) -> int:
+        return self.n
+
+    def load(self) -> Matches:
+        """Rows after the step."""
+        return self.step(self.reader.load())
+
+
+def _by_bits(batch: Matches, bits: NDArray[np.uint8]) -> Matches:
+    """Rows of a batch whose bit is set."""
+    return batch.select(np.unpackbits(bits, count=len(batch)).astype(bool))
+
+
+def _checked_numbers(errors: float | tuple[ArrayLike, ArrayLike]) -> tuple[float, float]:
+    """Errors of u and v that are one number each, finite and positive."""
+    pair = errors if isinstance(errors, tuple) else (errors, errors)
+    for name, sigma in zip(SIGMAS, pair, strict=True):
+        if not isinstance(sigma, float | int):
+            raise InputError(
+                "errors of single stars are given, and the stars are on disk",
+                do="write them into the files, or load() the stars",
             )
-        stars = [t.star for t in tables if t.star is not None]
-        joined["star"] = np.concatenate(stars) if len(stars) == len(tables) else None
-        for name, labels in {**_CODES, "source": "sources"}.items():
-            joined[name], joined[labels] = merged_codes(
-                [getattr(t, name) for t in tables],
-                [getattr(t, labels) for t in tables],
-                ordered=name == "chip",
+        if not (np.isfinite(sigma) and sigma > 0):
+            raise InputError(
+                f"{name} is {sigma:g}, and must be finite and positive", do="give another"
             )
-        name_of = {
-            number: name
-            for t in tables
-            for number, name in zip(t.chip_numbers, t.chip_names, strict=False)
-        }
-        chips = cast("tuple[int, ...]", joined["chip_numbers"])
-        if len(name_of) == len(chips):
-            joined["chip_names"] = tuple(name_of[number] for number in chips)
-        return MatchTable(
-            **joined,  # type: ignore[arg-type]
-            notes=tuple(dict.fromkeys(note for t in tables for note in t.notes)),
-            unit=first.unit,
-            tangent_point=first.tangent_point,
-            n_rows=sum(t.n_rows for t in tables),
-            rejected=merged_counts([t.rejected for t in tables]),
-        )
+    return float(pair[0]), float(pair[1])  # type: ignore[arg-type]

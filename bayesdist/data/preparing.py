@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.exposures import ExposureLog
-from bayesdist.data.magnitude_errors import MagnitudeErrors, no_magnitudes
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.magnitude_errors import MagnitudeErrors
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 
-__all__ = ["centroid_errors", "neutralise_aberration", "with_centroid_errors"]
+__all__ = ["centroid_errors", "neutralise_aberration"]
 
 Float = NDArray[np.float64]
 
@@ -20,39 +20,12 @@ Float = NDArray[np.float64]
 MIN_CENTROID_FRACTION = 0.25
 
 
-def with_centroid_errors(table: MatchTable, errors: MagnitudeErrors) -> MatchTable:
-    """Matches with the errors of the centroids added to those of the catalogue in quadrature.
-
-    Parameters
-    ----------
-    table : MatchTable
-        With the errors of the catalogue, or none.
-    errors : MagnitudeErrors
-        Of the centroids, in the unit of u, v.
-
-    Returns
-    -------
-    MatchTable
-
-    Raises
-    ------
-    InputError
-        Without magnitudes.
-    """
-    if table.mag is None:
-        raise no_magnitudes(", ".join(table.sources))
-    sigma_u, sigma_v = errors.at(table.mag)
-    if table.sigma_u is not None and table.sigma_v is not None:
-        sigma_u, sigma_v = np.hypot(sigma_u, table.sigma_u), np.hypot(sigma_v, table.sigma_v)
-    return table.with_sigma(sigma_u, sigma_v)
-
-
-def centroid_errors(table: MatchTable, total: MagnitudeErrors) -> MagnitudeErrors:
+def centroid_errors(table: Matches, total: MagnitudeErrors) -> MagnitudeErrors:
     """Errors of the centroids: scatter of the residuals less the errors of the catalogue.
 
     Parameters
     ----------
-    table : MatchTable
+    table : Matches
         With magnitudes and the errors of the catalogue.
     total : MagnitudeErrors
         Scatter of its residuals.
@@ -88,8 +61,8 @@ def centroid_errors(table: MatchTable, total: MagnitudeErrors) -> MagnitudeError
 
 
 def neutralise_aberration(
-    table: MatchTable, log: ExposureLog, origin: tuple[float, float] = (0.0, 0.0)
-) -> MatchTable:
+    table: Matches, log: ExposureLog, origin: tuple[float, float] = (0.0, 0.0)
+) -> Matches:
     """Matches with catalogue positions as an aberration-free scale gives them.
 
     A true offset on the sky is VAFACTOR times that by the aberration-free scale of the detector,
@@ -98,7 +71,7 @@ def neutralise_aberration(
 
     Parameters
     ----------
-    table : MatchTable
+    table : Matches
     log : ExposureLog
         With VAFACTOR of each exposure of the table.
     origin : tuple of float, optional
@@ -106,7 +79,7 @@ def neutralise_aberration(
 
     Returns
     -------
-    MatchTable
+    Matches
 
     Raises
     ------
@@ -132,4 +105,4 @@ def neutralise_aberration(
             "u_nominal": origin[0] + (table.u_nominal - origin[0]) / factor,
             "v_nominal": origin[1] + (table.v_nominal - origin[1]) / factor,
         }
-    return replace(table, **changes)  # type: ignore[arg-type]
+    return table.with_columns(**changes)

@@ -11,9 +11,9 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.hst1pass import Hst1passList, is_hst1pass, read_hst1pass
+from bayesdist.data.formats.hst1pass import Hst1passList, is_hst1pass, read_hst1pass
 from bayesdist.data.reading.formats import exposure_names, input_files
-from bayesdist.data.tables.checks import check_values, counted, one_length
+from bayesdist.data.tables.checks import check_columns, columns_of, counted
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.files import TABLE_SUFFIXES, read_lines, read_table
 from bayesdist.data.tables.names import BASIC, find_columns
@@ -26,6 +26,7 @@ Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 Limit: TypeAlias = "float | Callable[[Float], ArrayLike]"
 
+_COLUMNS = ("x", "y", "mag", "q", "chip", "row")
 _LIST_ALIASES = {key: BASIC[key] for key in ("x", "y", "exposure", "chip", "mag")} | {
     "q": ("q", "qfit", "quality"),
     "epoch": BASIC["epoch"],
@@ -79,12 +80,13 @@ class StarList:
             object.__setattr__(self, "chip", np.ones(n, np.int64))
         if self.row is None:
             object.__setattr__(self, "row", np.arange(n))
-        names = ("x", "y", "mag", "q", "chip", "row")
-        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        arrays = one_length(given, integers=("chip", "row"), where=self._where)
-        for name, values in arrays.items():
-            object.__setattr__(self, name, values)
-        check_values(arrays, place=lambda index: f"{self.source}, row {self.row[index] + 1}")
+        check_columns(
+            self,
+            _COLUMNS,
+            integers=("chip", "row"),
+            where=self._where,
+            place=lambda index: f"{self.source}, row {self.row[index] + 1}",
+        )
 
     @property
     def _where(self) -> str:
@@ -100,10 +102,8 @@ class StarList:
 
     def select(self, which: NDArray[Any]) -> StarList:
         """Detections by mask or indices."""
-        names = ("x", "y", "chip", "mag", "q", "row")
-        return replace(
-            self, **{k: getattr(self, k)[which] for k in names if getattr(self, k) is not None}
-        )
+        columns = columns_of(self, _COLUMNS)
+        return replace(self, **{name: values[which] for name, values in columns.items()})
 
 
 @dataclass(frozen=True)
@@ -234,14 +234,7 @@ def _of_table(
     table: Table, columns: Mapping[str, str] | None, source: str, name: str, chip: int | None
 ) -> list[StarList]:
     """Star lists of the exposures of a table."""
-    found = find_columns(table.colnames, columns, _LIST_ALIASES, source=source)
-    for key in ("x", "y"):
-        if key not in found:
-            raise InputError(
-                f"no column for {key!r} among {', '.join(table.colnames) or 'none'}",
-                where=source,
-                do="rename the column, or name it in the option 'columns'",
-            )
+    found = find_columns(table.colnames, columns, _LIST_ALIASES, source=source, needed="xy")
     if not len(table):
         raise InputError("holds no detections", where=source, do="give a list with stars")
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.checks import EITHER, Check
-from bayesdist.data import MagnitudeErrors, MatchTable
+from bayesdist.data import MagnitudeErrors, Matches
 from bayesdist.diagnose.checks import holdout_checks, score_checks, structure_checks
 from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors, estimate_discrepancy
 from bayesdist.diagnose.correlated.storage import as_stored
@@ -40,7 +40,7 @@ from bayesdist.diagnose.selfcal.correlated import selfcal_discrepancy
 from bayesdist.diagnose.selfcal.leverage import taken_by_stars
 from bayesdist.diagnose.selfcal.misfit import dithered_misfit
 from bayesdist.diagnose.selfcal.score import selfcal_score_tests
-from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, Shards
+from bayesdist.infer import GaussianPriors, LinearFit, Posterior, Shards
 from bayesdist.infer.catalogue.star_errors import StarCovariance, StarErrors, star_covariance
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.selfcal import SelfCalibrationMode
@@ -152,7 +152,7 @@ def diagnose_fit(
     posterior: Posterior | None,
     stars: Matches,
     shards: Shards,
-    table: MatchTable,
+    table: Matches,
     *,
     eliminated: SelfCalibrationMode | None = None,
     centroid: MagnitudeErrors | Literal["residuals"] | None = "residuals",
@@ -164,11 +164,11 @@ def diagnose_fit(
     ----------
     fit : LinearFit
     posterior : Posterior or None
-    stars : MatchTable or PartitionedMatches
+    stars : Matches
         With errors: those that were fitted.
     shards : Shards
         The same, as passes go over them.
-    table : MatchTable
+    table : Matches
         Evenly spread ones of them, or all.
     eliminated : infer.selfcal.SelfCalibrationMode, optional
         The solution with its stars, where places of stars were fitted too.
@@ -255,10 +255,10 @@ def diagnose(
     posterior: Posterior,
     stars: Matches,
     shards: Shards,
-    table: MatchTable,
+    table: Matches,
     *,
     rng: np.random.Generator,
-    tested: MatchTable | None = None,
+    tested: Matches | None = None,
     discrepancy: DiscrepancyPriors | None = None,
     priors: GaussianPriors | None = None,
     match_radius: float | None = None,
@@ -279,7 +279,7 @@ def diagnose(
         As `diagnose_fit`.
     rng : numpy.random.Generator
         Each result is made from its numbers from their beginning.
-    tested : MatchTable, optional
+    tested : Matches, optional
         Those that the score tests look at, where they have more columns than `table`.
     discrepancy : DiscrepancyPriors, optional
         Of the size of correlated errors.
@@ -319,7 +319,7 @@ def diagnose(
         centroid=centroid,
         things=things,
     )
-    in_memory = stars if isinstance(stars, MatchTable) else None
+    in_memory = stars if stars.in_memory else None
     shared = None
     if eliminated is not None:
         estimated = selfcal_discrepancy(eliminated, rng=restarted(rng), priors=discrepancy)
@@ -360,13 +360,12 @@ def diagnose(
 
 def _column(stars: Matches, name: str) -> NDArray[np.float64] | None:
     """A column of detections that are all in memory."""
-    assert isinstance(stars, MatchTable)
     values: NDArray[np.float64] | None = getattr(stars, name)
     return values
 
 
 def catalogue_covariance(
-    fit: LinearFit, stars: MatchTable | None, errors: StarErrors | None
+    fit: LinearFit, stars: Matches | None, errors: StarErrors | None
 ) -> StarCovariance | None:
     """Covariance of the parameters by the errors of the catalogue.
 
@@ -393,7 +392,7 @@ def hold_out(
     diagnostics : Diagnostics
     predictive : Predictive
         The solution with its correlated errors, as it predicts.
-    held : MatchTable or PartitionedMatches
+    held : Matches
         Stars that were set aside, with errors.
     whole : tuple of str
         Exposures all of whose stars were.

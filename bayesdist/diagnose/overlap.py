@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.diagnose.alignment import Alignment, alignment_residuals
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
 from bayesdist.infer.solution import Solution
@@ -56,7 +56,7 @@ class OverlapTest:
 
 
 def overlap_test(
-    pairs: MatchTable,
+    pairs: Matches,
     solution: Solution,
     known: Calibration,
     tables: Sequence[LookupTable] = (),
@@ -108,7 +108,7 @@ def overlap_test(
     )
 
 
-def chosen_exposures(pairs: MatchTable) -> tuple[int, int] | None:
+def chosen_exposures(pairs: Matches) -> tuple[int, int] | None:
     """Codes of the two exposures farthest apart in time that share half of their stars.
 
     `pairs` have codes of the catalogue's stars, and epochs. The earlier exposure comes first; None
@@ -130,7 +130,7 @@ def chosen_exposures(pairs: MatchTable) -> tuple[int, int] | None:
     return (a, b) if epoch[a] < epoch[b] else (b, a)
 
 
-def _shared(pairs: MatchTable, a: int, b: int) -> tuple[Int, Int]:
+def _shared(pairs: Matches, a: int, b: int) -> tuple[Int, Int]:
     """Rows of the same stars in two exposures."""
     assert pairs.star is not None
     rows = [np.flatnonzero(pairs.exposure == code) for code in (a, b)]
@@ -139,16 +139,16 @@ def _shared(pairs: MatchTable, a: int, b: int) -> tuple[Int, Int]:
     return rows[0][first], rows[1][second]
 
 
-def _epoch(pairs: MatchTable, rows: Int) -> float:
+def _epoch(pairs: Matches, rows: Int) -> float:
     assert pairs.epoch is not None
     return float(np.median(pairs.epoch[rows]))
 
 
-def _numbers(pairs: MatchTable, rows: Int) -> Int:
+def _numbers(pairs: Matches, rows: Int) -> Int:
     return np.asarray(pairs.chip_numbers)[pairs.chip[rows]]
 
 
-def _known_plane(known: Calibration, pairs: MatchTable, rows: Int, epoch: float) -> Float:
+def _known_plane(known: Calibration, pairs: Matches, rows: Int, epoch: float) -> Float:
     """Positions (N, 2) through the known distortion, its drift included; arcseconds."""
     then = None if known.no_date else epoch
     chips = _numbers(pairs, rows)
@@ -161,7 +161,7 @@ def _known_plane(known: Calibration, pairs: MatchTable, rows: Int, epoch: float)
 
 
 def _solved_plane(
-    solution: Solution, tables: Sequence[LookupTable], pairs: MatchTable, rows: Int, epoch: float
+    solution: Solution, tables: Sequence[LookupTable], pairs: Matches, rows: Int, epoch: float
 ) -> Float:
     """Positions (N, 2) through tables, polynomial and drift of a solution, in its unit.
 
@@ -175,7 +175,7 @@ def _solved_plane(
     return np.asarray(view.model.predict(view.mean, x, y, chip=chips, epoch=then))
 
 
-def _at_first_epoch(plane: Float, pairs: MatchTable, rows: Int, motion: Float) -> Float:
+def _at_first_epoch(plane: Float, pairs: Matches, rows: Int, motion: Float) -> Float:
     """Positions with the catalogue's motions since the other epoch taken out.
 
     The catalogue is turned and scaled to the plane: pairs of one exposure say how.

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.diagnose.residuals import (
     BinnedSums,
     PatternChange,
@@ -24,7 +24,7 @@ from bayesdist.diagnose.residuals import (
 )
 from bayesdist.diagnose.residuals.misfit import STARS_PER_BIN
 from bayesdist.errors import DegenerateError
-from bayesdist.infer import LinearFit, Matches
+from bayesdist.infer import LinearFit
 from bayesdist.infer.compare.period_dates import sum_by_period
 from bayesdist.infer.compare.period_verdict import all_below, period_verdict
 from bayesdist.infer.compare.periods import (
@@ -158,7 +158,7 @@ def bins_for(n: int) -> int:
 
 
 def period_part(
-    matches: MatchTable, *, fit: LinearFit, bins: int, radial_weight: float = 1.0
+    matches: Matches, *, fit: LinearFit, bins: int, radial_weight: float = 1.0
 ) -> PeriodPart:
     """A task for `sum_by_period`.
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import FormatError
 from bayesdist.files import atomic_path
 from bayesdist.infer.convergence import Convergence, Limits
@@ -44,7 +44,7 @@ FIT_NUMBERS = ("n_rows", "n_used", "rms_u", "rms_v", "rms_rejected", "chi2", "do
 
 def save_posterior(
     posterior: Posterior,
-    matches: MatchTable | None,
+    matches: Matches | None,
     path: str | Path,
     *,
     provenance: Mapping[str, object] | None = None,
@@ -54,7 +54,7 @@ def save_posterior(
     Parameters
     ----------
     posterior : Posterior
-    matches : MatchTable or None
+    matches : Matches or None
         The data it was made from; None, or more than a million stars, leaves them out.
     path : path
         Replaced atomically.
@@ -118,7 +118,7 @@ def save_posterior(
     _write(tree, path)
 
 
-def _constants(posterior: Posterior, matches: MatchTable, xr):  # type: ignore[no-untyped-def]
+def _constants(posterior: Posterior, matches: Matches, xr):  # type: ignore[no-untyped-def]
     columns = {
         "x": matches.x,
         "y": matches.y,

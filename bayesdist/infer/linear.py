@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.gauss_newton import (
     gauss_newton,
@@ -26,7 +26,7 @@ from bayesdist.infer.equations.rank import check_coverage, require_full_rank
 from bayesdist.infer.equations.scaled import scaled_cholesky
 from bayesdist.infer.solution import Solution
 from bayesdist.infer.stars.likelihood import Clip, ClippedGaussian
-from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
+from bayesdist.infer.stars.shards import Compute, Shards, opened
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
@@ -121,7 +121,7 @@ class LinearFit(Solution):
         """Number of stars left out of the second pass."""
         return self.n_rows - self.n_used
 
-    def uses(self, matches: MatchTable) -> NDArray[np.bool_]:
+    def uses(self, matches: Matches) -> NDArray[np.bool_]:
         """Boolean mask (N,) of a table's stars that the second pass uses."""
         return self.clip.keeps(self.model, matches)
 
@@ -163,7 +163,7 @@ def build_model(
 
     Parameters
     ----------
-    matches : MatchTable or PartitionedMatches
+    matches : Matches
     order : int
         Polynomial order, 1 to 9.
     size : tuple of float, optional
@@ -231,7 +231,7 @@ def fit_linear(
 
     Parameters
     ----------
-    matches : MatchTable, PartitionedMatches or Shards
+    matches : Matches or Shards
         With errors.
     model : DistortionModel
     rejection : Rejection
@@ -320,13 +320,13 @@ def _some_chi2(stars: Stars, theta: Float, every: int) -> tuple[Float, ...]:
     return ((residual**2 / var).sum(axis=1),)
 
 
-def residuals(solution: Solution, matches: MatchTable) -> Float:
+def residuals(solution: Solution, matches: Matches) -> Float:
     """Data minus the model at a solution's mean.
 
     Parameters
     ----------
     solution : LinearFit or Posterior
-    matches : MatchTable
+    matches : Matches
 
     Returns
     -------

@@ -14,7 +14,7 @@ from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 
 if TYPE_CHECKING:  # a file is inspected without what they import
-    from bayesdist.data.matches import MatchTable
+    from bayesdist.data.matches import Matches
     from bayesdist.infer.convergence import Convergence
     from bayesdist.infer.stars.likelihood import Likelihood
     from bayesdist.infer.stars.mixture import OutlierMixture
@@ -111,7 +111,7 @@ class Solution(ABC):
         """Likelihood of a star by its position, at the mean; None for a transformed solution."""
         return None
 
-    def uses(self, matches: MatchTable) -> NDArray[np.bool_]:
+    def uses(self, matches: Matches) -> NDArray[np.bool_]:
         """Boolean mask (N,) of a table's stars that were not left out; all by default."""
         return np.ones(len(matches), bool)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 
@@ -58,7 +58,7 @@ def simulate_matches(
     outlier_scale: float = 1.0,
     outliers: str = "gaussian",
     epochs: ArrayLike | None = None,
-) -> tuple[MatchTable, Truth]:
+) -> tuple[Matches, Truth]:
     """Stars spread evenly over the chips and exposures, with known errors and false matches.
 
     Parameters
@@ -81,7 +81,7 @@ def simulate_matches(
 
     Returns
     -------
-    matches : MatchTable
+    matches : Matches
     truth : Truth
 
     Raises
@@ -114,7 +114,7 @@ def simulate_matches(
     error[false] = _false_offsets(int(false.sum()), outlier_scale, outliers, rng)
 
     true = _positions(model, theta, x, y, epoch, exposure, np.array(numbers)[chip])
-    matches = MatchTable.of_distinct_rows(  # positions drawn from a continuum do not repeat
+    matches = Matches.of_distinct_rows(  # positions drawn from a continuum do not repeat
         x=x,
         y=y,
         u=true[:, 0] + error[:, 0],

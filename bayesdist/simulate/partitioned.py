@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesdist.data.matches import MatchTable
-from bayesdist.data.pieces import even_edges
-from bayesdist.data.write import write_partitioned
+from bayesdist.data.batches import even_edges
+from bayesdist.data.matches import Matches
+from bayesdist.data.storage.write import write_partitioned
 from bayesdist.simulate.matches import Truth
 
 __all__ = ["simulate_partitioned"]
@@ -19,7 +19,7 @@ CHUNK = 1_000_000  # matches in memory at a time
 
 
 def simulate_partitioned(
-    folder: str | os.PathLike[str], n: int, simulate: Callable[[int], tuple[MatchTable, Truth]]
+    folder: str | os.PathLike[str], n: int, simulate: Callable[[int], tuple[Matches, Truth]]
 ) -> Truth:
     """Truth of matched stars that are written to a folder of Parquet files as they come.
 
@@ -44,7 +44,7 @@ def simulate_partitioned(
     truths: list[Truth] = []
     edges = even_edges(n, CHUNK)
 
-    def chunks() -> Iterator[MatchTable]:
+    def chunks() -> Iterator[Matches]:
         for size in np.diff(edges).tolist():
             matches, truth = simulate(size)
             truths.append(truth)

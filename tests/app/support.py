@@ -22,7 +22,7 @@ from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results, results_of
 from bayesdist.app.run import run_stage
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import Truth, simulate_matches
 
@@ -124,7 +124,7 @@ def truth_of(model: DistortionModel, scale: float = 1.0, offset: bool = True) ->
     return theta
 
 
-def simulated(n: int = 400, seed: int = 1, **options: Any) -> tuple[MatchTable, Truth]:
+def simulated(n: int = 400, seed: int = 1, **options: Any) -> tuple[Matches, Truth]:
     """Stars on one chip, 5 % of them false, errors 0.022 px where 0.02 is quoted."""
     model = model_of()
     options = {"fraction": 0.05, "outlier_scale": 0.5, "jitter": 0.01, "sigma": SIGMA} | options
@@ -132,7 +132,7 @@ def simulated(n: int = 400, seed: int = 1, **options: Any) -> tuple[MatchTable, 
     return simulate_matches(model, truth_of(model), n, rng=rng, **options)
 
 
-def as_table(matches: MatchTable, unit: str | None = "same") -> Table:
+def as_table(matches: Matches, unit: str | None = "same") -> Table:
     """Matches as a file holds them."""
     table = Table({k: getattr(matches, k).copy() for k in ("x", "y", "u", "v")})
     if matches.sigma_u is not None:

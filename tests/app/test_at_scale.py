@@ -12,8 +12,8 @@ from bayesdist.app.kinds.stars import fit_stars
 from bayesdist.app.matches import load_matches
 from bayesdist.app.results import open_results
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.data import MatchTable, PartitionedMatches, read_matches, write_partitioned
-from bayesdist.data.partitioned import PartPiece
+from bayesdist.data import Matches, read_matches, write_partitioned
+from bayesdist.data.storage.on_disk import StoredRows
 from bayesdist.infer import load_fit, load_posterior
 from bayesdist.model import TimeDependence
 from bayesdist.simulate import simulate_matches
@@ -36,7 +36,7 @@ N = 6000
 def on_disk(monkeypatch):
     """Tables of this size stay on disk, in pieces of 1700 rows."""
     monkeypatch.setattr(app_matches, "IN_MEMORY", 1000)
-    monkeypatch.setattr("bayesdist.data.partitioned.PIECE", 1700)
+    monkeypatch.setattr("bayesdist.data.batches.BATCH", 1700)
 
 
 @pytest.fixture(scope="module")
@@ -64,21 +64,22 @@ def test_which_stay_on_disk(job, monkeypatch, tmp_path):
     """Parquet of more rows than IN_MEMORY, as one file or several; nothing else."""
     folder = job.parent / "stars"
     files = sorted(folder.iterdir())
-    for limit, kind in ((N, MatchTable), (N - 1, PartitionedMatches)):
+    for limit, in_memory in ((N, True), (N - 1, False)):
         monkeypatch.setattr(app_matches, "IN_MEMORY", limit)
         for path in (folder, str(folder / "*.parquet"), files):
-            assert type(load_matches(path)) is kind
-        assert type(load_matches(folder, format="table")) is kind
+            assert load_matches(path).in_memory is in_memory
+        assert load_matches(folder, format="table").in_memory is in_memory
     monkeypatch.setattr(app_matches, "IN_MEMORY", 1)
     table = read_matches(files[0])
     as_table(table).write(tmp_path / "stars.ecsv")
-    assert type(load_matches(tmp_path / "stars.ecsv")) is MatchTable
+    assert load_matches(tmp_path / "stars.ecsv").in_memory
 
 
 def test_a_run_on_disk_is_the_run_in_memory(job, tmp_path, on_disk, monkeypatch):
     stages = ("fit", "sample", "assess")
     disk = begin_stagewise(tmp_path / "disk", job, *stages)
     monkeypatch.setattr(app_matches, "IN_MEMORY", 10 * N)
+    monkeypatch.setattr("bayesdist.data.batches.BATCH", 2**20)
     memory = begin_stagewise(tmp_path / "memory", job, *stages)
 
     one, other = load_fit(disk / "fit.nc"), load_fit(memory / "fit.nc")
@@ -108,9 +109,9 @@ def test_a_run_on_disk_is_the_run_in_memory(job, tmp_path, on_disk, monkeypatch)
 def test_no_stage_takes_all_rows_into_memory(job, tmp_path, on_disk, monkeypatch):
     """The largest table that is ever made has the rows of one piece, or of the sample."""
     sizes = []
-    complete = MatchTable._complete
+    complete = Matches._complete
     monkeypatch.setattr(
-        MatchTable, "_complete", lambda self: (sizes.append(np.size(self.x)), complete(self))[1]
+        Matches, "_complete", lambda self: (sizes.append(np.size(self.x)), complete(self))[1]
     )
     for name in ("kinds.fit_data", "kinds.reader", "kinds.stars", "stages.report"):
         monkeypatch.setattr(f"bayesdist.app.{name}.SAMPLE", 900, raising=False)
@@ -128,11 +129,11 @@ def test_no_stage_takes_all_rows_into_memory(job, tmp_path, on_disk, monkeypatch
 def test_the_data_are_read_once_for_all_passes(job, tmp_path, on_disk):
     """The scan, the median position, the passes, what is said of each star, and the sample."""
     read = []
-    real = PartPiece.read
+    real = StoredRows.load
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(PartPiece, "read", lambda self: (read.append(1), real(self))[1])
+        patch.setattr(StoredRows, "load", lambda self: (read.append(1), real(self))[1])
         good("run", job, "-o", tmp_path / "run")
-    pieces = len(load_matches(job.parent / "stars").pieces())
+    pieces = len(load_matches(job.parent / "stars").readers())
     assert len(read) == 4 * pieces
 
 

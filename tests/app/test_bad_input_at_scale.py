@@ -221,7 +221,7 @@ def test_a_part_that_vanishes_before_it_is_written_about(job, tmp_path, monkeypa
         real(*arguments)
         path.rename(kept)
 
-    monkeypatch.setattr("bayesdist.data.partitioned.PIECE", PART)
+    monkeypatch.setattr("bayesdist.data.batches.BATCH", PART)
     monkeypatch.setattr(star_files, "_write_part", vanish)
     result = cli("stage", "sample", run, "-q")
     assert result.code == 1

@@ -14,7 +14,7 @@ from bayesdist.app.campaign.soundness import frames_not_set, shear_warnings
 from bayesdist.app.results import results_of
 from bayesdist.app.run import STAGES
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.data.tables.files import read_table
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import fit_linear, load_fit
@@ -420,7 +420,7 @@ def test_a_catalogue_without_motions_that_stars_outrun(campaign):
 def test_refusals_of_a_campaign_do_not_advise_frames_that_it_cannot_set():
     """What the fit says to others is left out, and the rest stays."""
     x = np.linspace(1, 4000, 60)
-    table = MatchTable(
+    table = Matches(
         x=x,
         y=x[::-1] / 2,
         u=x,

@@ -13,7 +13,7 @@ from lxml import html as lxml_html
 
 from bayesdist.app import matches as app_matches
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.data import MatchTable, write_partitioned
+from bayesdist.data import Matches, write_partitioned
 from bayesdist.diagnose.periods import PeriodSettings, time_variation
 from bayesdist.infer import fit_linear
 from bayesdist.model import Chip, DistortionModel
@@ -254,7 +254,7 @@ def test_a_pattern_that_no_polynomial_follows_is_found(tmp_path):
 def test_pairs_on_disk_give_the_same(quiet, tmp_path, monkeypatch):
     run, matches, _ = quiet
     monkeypatch.setattr(app_matches, "IN_MEMORY", 1000)
-    monkeypatch.setattr("bayesdist.data.partitioned.PIECE", 1700)
+    monkeypatch.setattr("bayesdist.data.batches.BATCH", 1700)
     write_partitioned([matches], tmp_path / "stars")
     sections = {"detector": {"name": "A", "size": SIZE, "scale_mas": 50.0}, "periods": PERIODS}
     config = write_config(
@@ -307,7 +307,7 @@ def test_chips_are_compared_together():
     uv = model.predict(theta, x, y, chip=chip + 1) + 0.02 * rng.standard_normal((n, 2))
     uv[:, 0] += 0.05 * (late * (chip == 1))
     sigma = np.full(n, 0.02)
-    matches = MatchTable(x, y, *uv.T, sigma_u=sigma, sigma_v=sigma, epoch=2010.05 + late,
+    matches = Matches(x, y, *uv.T, sigma_u=sigma, sigma_v=sigma, epoch=2010.05 + late,
                          chip=chip, chip_numbers=(1, 2))  # fmt: skip
     spans = {"early": (2010.0, 2010.1), "late": (2011.0, 2011.1)}
     fit = fit_linear(matches, model)

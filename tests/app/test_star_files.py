@@ -13,7 +13,7 @@ from scipy.stats import norm
 
 from bayesdist.app import star_files
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.data import pieces, read_matches
+from bayesdist.data import batches, read_matches
 from bayesdist.data.tables.files import parquet_units
 from bayesdist.infer import load_fit, load_posterior
 from tests.app.support import begin_stagewise, good, snapshot, summary_of, write_job
@@ -83,8 +83,8 @@ def test_one_part_for_each_piece(finished, matches, part, tmp_path, monkeypatch)
     """Together they say what one part for all says, and parts of more pieces do not stay."""
     fit, posterior = load_fit(finished.path / "fit.nc"), load_posterior(finished.path)
     folder = tmp_path / "stars"
-    monkeypatch.setattr("bayesdist.data.matches.PIECE", 90)
-    assert pieces.PIECE > 400
+    assert batches.BATCH > 400
+    monkeypatch.setattr("bayesdist.data.batches.BATCH", 90)
     star_files.write_star_files(matches, fit, posterior, folder)
     parts = star_files.part_files(folder)
     assert [p.name for p in parts] == [f"part-{k:05d}.parquet" for k in range(5)]
@@ -96,7 +96,7 @@ def test_one_part_for_each_piece(finished, matches, part, tmp_path, monkeypatch)
         else:
             assert joined == values
     (folder / "notes.txt").write_text("mine")
-    monkeypatch.setattr("bayesdist.data.matches.PIECE", 1000)
+    monkeypatch.setattr("bayesdist.data.batches.BATCH", 1000)
     star_files.write_star_files(matches, fit, posterior, folder)
     assert sorted(snapshot(folder)) == ["notes.txt", "part-00000.parquet"]
 

@@ -13,7 +13,7 @@ from bayesdist.app.campaign.inputs import errors_by_star
 from bayesdist.assess.adjusted import with_shared_stars
 from bayesdist.assess.terms.parameters import CATALOGUE as POSITIONS
 from bayesdist.assess.terms.parameters import MOTIONS, catalogue_terms
-from bayesdist.data import MatchTable, ReferenceCatalog
+from bayesdist.data import Matches, ReferenceCatalog
 from bayesdist.diagnose.diagnostics import catalogue_covariance
 from bayesdist.infer import Posterior, Rejection, fit_linear
 from bayesdist.infer.stars.mixture import OutlierMixture
@@ -37,7 +37,7 @@ def matches():
     x, y = (np.tile(p, EXPOSURES) + 1e-9 * np.arange(STARS * EXPOSURES) for p in stars())
     quoted = np.full(x.size, np.hypot(CENTROID, CATALOGUE))
     code = np.tile(3 * np.arange(STARS) + 2, EXPOSURES)
-    return MatchTable(x, y, x, y, sigma_u=quoted, sigma_v=quoted, star=code)
+    return Matches(x, y, x, y, sigma_u=quoted, sigma_v=quoted, star=code)
 
 
 @pytest.fixture(scope="module")

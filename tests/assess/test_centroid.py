@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from bayesdist.assess.terms.centroid import centroid_errors
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.diagnose.residuals.centroid import centroid_scatter
 from bayesdist.diagnose.residuals.sample import StarSample
 from bayesdist.errors import InputError
@@ -16,7 +16,7 @@ def sample(n=20_000, *, seed=1, catalogue=0.015, false=0.03, with_mag=True):
     residual = rng.standard_normal((n, 2)) * np.hypot(centroid, catalogue)[:, None]
     wrong = rng.uniform(size=n) < false
     residual[wrong] = rng.uniform(-1, 1, (wrong.sum(), 2))
-    table = MatchTable(
+    table = Matches(
         x=np.arange(1.0, n + 1), y=np.ones(n), u=np.zeros(n), v=np.zeros(n), unit="pix",
         mag=mag if with_mag else None,
     )  # fmt: skip

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 import bayesdist as bd
-from bayesdist.data import PartitionedMatches, open_matches
+from bayesdist.data import open_matches
 from bayesdist.infer import GaussianPriors, kernel, load
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.stars.stars import prepare
@@ -58,7 +58,7 @@ def _truth(model: bd.DistortionModel) -> Float:
     return theta
 
 
-def _matches(n: int, order: int, rng: np.random.Generator) -> bd.MatchTable:
+def _matches(n: int, order: int, rng: np.random.Generator) -> bd.Matches:
     model = _model(order)
     quoted = SIGMA * np.exp(0.3 * rng.standard_normal((2, n)))
     matches, _ = bd.simulate_matches(
@@ -80,11 +80,11 @@ class Problem:
 
     Parameters
     ----------
-    matches : MatchTable or PartitionedMatches
+    matches : Matches
     model : DistortionModel
     """
 
-    matches: bd.MatchTable | PartitionedMatches
+    matches: bd.Matches
     model: bd.DistortionModel
 
     def __len__(self) -> int:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from bayesdist.data import MatchTable
 from bayesdist.infer import fit_by_magnitude
 from bayesdist.infer.nodes import TableFit, TablePosterior, fit_with_tables
 from bayesdist.infer.series import Series, TrendModel, fit_series
@@ -115,9 +114,7 @@ def node_errors(found: Calibrated, tables: TableFit, step: float) -> Outcome:
     }
     pairs = found.matched.stars
     model = found.matched.affine_model(found.results.config)
-    assert isinstance(pairs, MatchTable)
     _, with_errors, _ = fit_by_magnitude(pairs, model)
-    assert isinstance(with_errors, MatchTable)
     binned = fit_with_tables(with_errors, model, method="binned", step=(step, step))
     others = {table.chip: table for table in binned.tables}
     for posterior in tables.posteriors:
@@ -139,7 +136,7 @@ def node_errors(found: Calibrated, tables: TableFit, step: float) -> Outcome:
 def _noise(found: Calibrated) -> float:
     """Rms of the errors of centroids and catalogue, as they were drawn, of all pairs."""
     pairs = found.matched.stars
-    assert isinstance(pairs, MatchTable) and pairs.star is not None
+    assert pairs.star is not None
     assert pairs.sigma_u is not None and pairs.sigma_v is not None
     single = centroid_error(found.campaign.truth.stars.mag[pairs.star])
     return float(np.sqrt((single**2 + (pairs.sigma_u**2 + pairs.sigma_v**2) / 2).mean()))

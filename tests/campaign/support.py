@@ -20,7 +20,6 @@ from bayesdist.app.results import Results, open_results
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.stages.fit import run_fit
 from bayesdist.app.stages.match import run_match
-from bayesdist.data import MatchTable
 from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit
 from bayesdist.infer.nodes import Matern, NodeGrid, TableFit
@@ -212,7 +211,6 @@ def _results_of(*names: str) -> Iterator[dict[str, Any]]:
 def _with_catalogue(bare: HierarchicalFit, data: FitData) -> TransformedSolution:
     """The joint fit with the errors that a star of the catalogue has in all exposures."""
     catalog, matches = campaign_matches(data.matched).inputs.catalog, data.stars
-    assert isinstance(matches, MatchTable)
 
     def by_code(values: Any) -> np.ndarray:
         out = np.zeros(int(catalog.star.max()) + 1)

@@ -6,18 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.data import (
-    MagnitudeErrors,
-    MatchTable,
-    ReferenceCatalog,
-    read_hst1pass,
-    read_matchup,
-)
+from bayesdist.data import MagnitudeErrors, Matches, ReferenceCatalog, read_hst1pass, read_matchup
 from bayesdist.data.exposures import Exposure, ExposureLog
 from bayesdist.data.matching.campaign import match_campaign
 from bayesdist.data.matching.search_radius import search_radius
 from bayesdist.data.matching.similarity import mismatch_reason, pattern_index
-from bayesdist.data.preparing import neutralise_aberration, with_centroid_errors
+from bayesdist.data.preparing import neutralise_aberration
 from bayesdist.data.starlists import StarCuts, StarList, read_star_lists
 from bayesdist.errors import InputError
 from tests.data.sky import ZERO_POINT, campaign, positions, start
@@ -295,14 +289,15 @@ def test_errors_of_centroids_add_in_quadrature():
         n=np.array([100]), scatter_u=np.array([0.03]), scatter_v=np.array([0.05]),
     )  # fmt: skip
     k = np.arange(3.0)
-    table = MatchTable(x=k, y=k, u=k, v=k, mag=k, sigma_u=[0.04] * 3, sigma_v=[0.12] * 3)
-    both = with_centroid_errors(table, errors)
+    table = Matches(x=k, y=k, u=k, v=k, mag=k, sigma_u=[0.04] * 3, sigma_v=[0.12] * 3)
+    both = table.with_errors(errors, in_quadrature=True)
     np.testing.assert_allclose(both.sigma_u, 0.05)
     np.testing.assert_allclose(both.sigma_v, 0.13)
-    alone = with_centroid_errors(MatchTable(x=k, y=k, u=k, v=k, mag=k), errors)
+    bare = Matches(x=k, y=k, u=k, v=k, mag=k)
+    alone = bare.with_errors(errors, in_quadrature=True)
     np.testing.assert_allclose(alone.sigma_u, 0.03)
     with pytest.raises(InputError, match="no magnitudes"):
-        with_centroid_errors(MatchTable(x=k, y=k, u=k, v=k), errors)
+        Matches(x=k, y=k, u=k, v=k).with_errors(errors, in_quadrature=True)
 
 
 def test_without_aberration_a_detector_has_one_scale(rng):
@@ -315,15 +310,15 @@ def test_without_aberration_a_detector_has_one_scale(rng):
     tables = []
     for name, factor in factors.items():
         u, v = (o + factor * (p - 2048.0) for o, p in zip(origin, xy, strict=True))
-        tables.append(MatchTable(*xy, u, v, exposure_names=(name,), sigma_u=np.ones(100),
+        tables.append(Matches(*xy, u, v, exposure_names=(name,), sigma_u=np.ones(100),
                                  sigma_v=np.ones(100)))  # fmt: skip
-    t = neutralise_aberration(MatchTable.concatenate(tables), log, origin)
+    t = neutralise_aberration(Matches.concatenate(tables), log, origin)
     np.testing.assert_allclose(t.u[:100], t.u[100:], rtol=1e-13)
     np.testing.assert_allclose(t.u - origin[0], t.x - 2048.0, atol=1e-9)
     np.testing.assert_allclose(t.sigma_u[:100], 1 / 1.00009)
     with pytest.raises(InputError, match="exposure b has no vafactor"):
         bare = ExposureLog((log["a"], Exposure("b", 2005.0)))
-        neutralise_aberration(MatchTable.concatenate(tables), bare)
+        neutralise_aberration(Matches.concatenate(tables), bare)
     with pytest.raises(InputError, match="has no exposure 'b'"):
         neutralise_aberration(tables[1], log.select(names=["a"]))
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.data import MatchTable, read_catalog, read_matches, read_matchup
+from bayesdist.data import Matches, read_catalog, read_matches, read_matchup
 from bayesdist.errors import InputError
 
 
@@ -105,4 +105,4 @@ def test_truncated_real_files(data_dir, rng, tmp_path):
 
 def test_text_reads_as_a_table_of_the_right_type(rng, tmp_path):
     some_table(rng).write(tmp_path / "a.ecsv")
-    assert isinstance(read(tmp_path / "a.ecsv"), MatchTable)
+    assert isinstance(read(tmp_path / "a.ecsv"), Matches)

@@ -8,25 +8,23 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest, kstest
 
-from bayesdist.data import MatchTable, open_matches, write_partitioned
-from bayesdist.data import partitioned as on_disk
-from bayesdist.data.holdout import HELD_OUT, SetAside, exposures_drawn, split_matches
+from bayesdist.data import Matches, batches, open_matches, write_partitioned
+from bayesdist.data.holdout import HELD_OUT, HoldoutSpec, exposures_drawn, split_matches
 from bayesdist.errors import InputError
 
 NAMES = ("a", "b", "c", "d")
 
 
-def table_of(n: int = 4000, seed: int = 1, **columns) -> MatchTable:
+def table_of(n: int = 4000, seed: int = 1, **columns) -> Matches:
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(1, 1000, (2, n))
     given = {"exposure": np.arange(n) * 4 // n, "exposure_names": NAMES}
-    return MatchTable(x=x, y=y, u=x, v=y, sigma_u=x * 0 + 1, sigma_v=x * 0 + 1, **given | columns)
+    return Matches(x=x, y=y, u=x, v=y, sigma_u=x * 0 + 1, sigma_v=x * 0 + 1, **given | columns)
 
 
 def places(matches) -> set[tuple[float, float, str]]:
     out = set()
-    for piece in matches.pieces():
-        t = piece.read()
+    for t in matches.batches():
         names = np.array(t.exposure_names)[t.exposure]
         out |= set(zip(t.x.tolist(), t.y.tolist(), names.tolist(), strict=True))
     return out
@@ -34,31 +32,31 @@ def places(matches) -> set[tuple[float, float, str]]:
 
 def test_the_share_is_the_fraction_and_places_are_even():
     table = table_of(20_000)
-    which = SetAside(0.1, (), 3).which(table)
+    which = HoldoutSpec(0.1, (), 3).which(table)
     assert binomtest(int(which.sum()), len(which), 0.1).pvalue > 1e-3
     for values in (table.x, table.y):
         assert kstest(values[which], "uniform", args=(1, 999)).pvalue > 1e-3
-    other = SetAside(0.1, (), 4).which(table)
+    other = HoldoutSpec(0.1, (), 4).which(table)
     # two seeds choose independently
     assert binomtest(int((which & other).sum()), len(which), 0.01).pvalue > 1e-3
 
 
 def test_a_star_goes_with_all_its_matches():
     star = np.random.default_rng(2).integers(500, size=4000)
-    which = SetAside(0.3, (), 1).which(table_of(star=star))
+    which = HoldoutSpec(0.3, (), 1).which(table_of(star=star))
     n_held, n = np.bincount(star, which), np.bincount(star)
     assert ((n_held == 0) | (n_held == n)).all() and 0 < n_held.sum() < n.sum()
 
 
 def test_the_order_of_rows_does_not_matter():
     table, order = table_of(), np.random.default_rng(3).permutation(4000)
-    which = SetAside(0.2, (), 1).which(table)
-    assert np.array_equal(SetAside(0.2, (), 1).which(table.select(order)), which[order])
+    which = HoldoutSpec(0.2, (), 1).which(table)
+    assert np.array_equal(HoldoutSpec(0.2, (), 1).which(table.select(order)), which[order])
 
 
 def test_parts_are_disjoint_and_whole():
     table = table_of()
-    split = split_matches(table, SetAside(0.1, ("c",), 1))
+    split = split_matches(table, HoldoutSpec(0.1, ("c",), 1))
     assert split.kept.exposure_names == ("a", "b", "d")
     assert places(split.kept) | places(split.held) == places(table)
     assert not places(split.kept) & places(split.held)
@@ -67,21 +65,21 @@ def test_parts_are_disjoint_and_whole():
 
 
 def test_data_on_disk_split_alike_whatever_their_pieces(tmp_path, monkeypatch):
-    table, aside = table_of(), SetAside(0.15, ("b",), 7)
+    table, aside = table_of(), HoldoutSpec(0.15, ("b",), 7)
     here = split_matches(table, aside)
     write_partitioned(
         [table.select(np.arange(1500)), table.select(np.arange(1500, 4000))], tmp_path / "m"
     )
     for size in (2**20, 700):
-        monkeypatch.setattr(on_disk, "PIECE", size)
+        monkeypatch.setattr(batches, "BATCH", size)
         there = split_matches(open_matches(tmp_path / "m"), aside)
         for part in ("kept", "held"):
             mine, theirs = getattr(here, part), getattr(there, part)
-            assert len(mine) == len(theirs) == sum(len(p) for p in theirs.pieces())
+            assert len(mine) == len(theirs) == sum(len(p) for p in theirs.readers())
             # errors multiplied before and after
-            scaled = open_matches(tmp_path / "m").with_errors_times(2.0)
-            twice = getattr(split_matches(scaled, aside), part).with_errors_times(3.0)
-            assert all((p.read().sigma_u == 6.0).all() for p in twice.pieces())
+            scaled = open_matches(tmp_path / "m").with_scaled_errors(2.0)
+            twice = getattr(split_matches(scaled, aside), part).with_scaled_errors(3.0)
+            assert all((p.load().sigma_u == 6.0).all() for p in twice.readers())
             assert places(mine) == places(theirs)
             assert mine.exposure_names == theirs.exposure_names
             assert places(pickle.loads(pickle.dumps(theirs))) == places(mine)
@@ -101,9 +99,9 @@ def test_exposures_are_drawn_whatever_their_order():
 @pytest.mark.parametrize(
     "aside, words",
     [
-        (SetAside(0.1, ("z",)), "no exposure 'z'"),
-        (SetAside(0.0), "no star is set aside"),
-        (SetAside(0.0, NAMES), "none is left"),
+        (HoldoutSpec(0.1, ("z",)), "no exposure 'z'"),
+        (HoldoutSpec(0.0), "no star is set aside"),
+        (HoldoutSpec(0.0, NAMES), "none is left"),
     ],
 )
 def test_what_makes_no_sense_is_refused(aside, words):

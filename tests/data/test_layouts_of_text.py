@@ -103,7 +103,7 @@ def test_chips_by_name_on_disk_need_their_numbers(tmp_path):
         open_matches(tmp_path / "a.parquet", sigma=1.0, unit="pix")
     m = open_matches(tmp_path / "a.parquet", sigma=1.0, unit="pix", chips={"S2": 1, "S10": 2})
     assert m.chip_numbers == (1, 2)
-    assert m.pieces()[0].read().chip_number.tolist() == [2] * 3 + [1] * 3
+    assert m.readers()[0].load().chip_number.tolist() == [2] * 3 + [1] * 3
 
 
 @pytest.mark.parametrize(

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 from astropy.utils.masked import Masked
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.errors import InputError
 
 
 def table(n=5, **changes):
     k = np.arange(n, dtype=float)
     columns = {"x": 10 + k, "y": 20 + k, "u": 0.5 * k, "v": -k, "sources": ("stars.ecsv",)}
-    return MatchTable(**{**columns, **changes})
+    return Matches(**{**columns, **changes})
 
 
 def test_defaults_are_one_exposure_and_one_chip():
@@ -127,8 +127,8 @@ def test_numbers_of_the_chips():
     assert t.select([2, 4]).chip_number.tolist() == [7, 2]
 
 
-def test_with_sigma_takes_one_number_or_one_for_each():
-    t = table().with_sigma(0.1, np.arange(1.0, 6.0))
+def test_errors_are_one_number_or_one_for_each():
+    t = table().with_errors((0.1, np.arange(1.0, 6.0)))
     assert t.sigma_u.tolist() == [0.1] * 5 and t.sigma_v.tolist() == [1, 2, 3, 4, 5]
 
 
@@ -136,7 +136,7 @@ def test_concatenate_joins_equal_names_and_counts():
     a = table(exposure=[0, 0, 1, 1, 1], exposure_names=("e1", "e2"), chip_numbers=(2,))
     b = table(x=np.arange(5.0), exposure_names=("e2",), chip_numbers=(1,), sources=("b.csv",))
     a, b = a.select(np.arange(4), reason="late"), b.select(np.arange(3), reason="late")
-    t = MatchTable.concatenate([a, b])
+    t = Matches.concatenate([a, b])
     assert t.exposure_names == ("e1", "e2") and t.exposure.tolist() == [0, 0, 1, 1, 1, 1, 1]
     assert t.chip_numbers == (1, 2) and t.chip.tolist() == [1, 1, 1, 1, 0, 0, 0]
     assert t.sources == ("stars.ecsv", "b.csv") and t.source.tolist() == [0] * 4 + [1] * 3
@@ -146,14 +146,14 @@ def test_concatenate_joins_equal_names_and_counts():
 
 def test_concatenate_refuses_what_does_not_fit():
     with pytest.raises(InputError, match=r"unit is mas, but pix in stars\.ecsv"):
-        MatchTable.concatenate([table(), table(unit="mas", sources=("b",))])
+        Matches.concatenate([table(), table(unit="mas", sources=("b",))])
     with pytest.raises(InputError, match=r"b: has no 'mag', but stars\.ecsv has"):
-        MatchTable.concatenate([table(mag=np.ones(5)), table(sources=("b",))])
+        Matches.concatenate([table(mag=np.ones(5)), table(sources=("b",))])
     with pytest.raises(InputError):
-        MatchTable.concatenate([])
+        Matches.concatenate([])
 
 
 def test_an_error_in_a_joined_table_names_the_right_file():
-    t = MatchTable.concatenate([table(), table(x=np.arange(5.0), sources=("b.csv",))])
+    t = Matches.concatenate([table(), table(x=np.arange(5.0), sources=("b.csv",))])
     with pytest.raises(InputError, match=r"b\.csv, row 2, column 'sigma_u'"):
-        t.with_sigma(np.where(np.arange(10) == 6, -1.0, 1.0), 1.0)
+        t.with_errors((np.where(np.arange(10) == 6, -1.0, 1.0), 1.0))

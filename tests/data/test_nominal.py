@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.data import MatchTable, open_matches, read_matches
-from bayesdist.data.holdout import SetAside, split_matches
-from bayesdist.data.write import write_partitioned
+from bayesdist.data import Matches, open_matches, read_matches
+from bayesdist.data.holdout import HoldoutSpec, split_matches
+from bayesdist.data.storage.write import write_partitioned
 from bayesdist.errors import InputError
 
 NOMINAL = ("u_nominal", "v_nominal")
@@ -48,7 +48,7 @@ def test_named_converted_and_left_out(stars, tmp_path):
 
 
 def test_on_disk_as_in_memory(stars, tmp_path):
-    table = MatchTable(
+    table = Matches(
         **{name: np.asarray(stars[name]) for name in ("x", "y", "u", "v", *NOMINAL)},
         sigma_u=np.full(60, 0.02),
         sigma_v=np.full(60, 0.02),
@@ -60,27 +60,29 @@ def test_on_disk_as_in_memory(stars, tmp_path):
     for name in NOMINAL:
         expected = getattr(table, name)
         assert np.array_equal(
-            np.concatenate([getattr(p.read(), name) for p in found.pieces()]), expected
+            np.concatenate([getattr(p.load(), name) for p in found.readers()]), expected
         )
         assert np.array_equal(getattr(found.sample(10), name), expected[::6])
-        assert np.array_equal(getattr(found.with_sigma(0.1, 0.1).sample(10), name), expected[::6])
+        assert np.array_equal(
+            getattr(found.with_errors((0.1, 0.1)).sample(10), name), expected[::6]
+        )
         assert np.array_equal(getattr(read_matches(folder), name), expected)
 
 
 def test_kept_by_all_that_makes_tables(stars):
-    table = MatchTable(**{name: np.asarray(stars[name]) for name in ("x", "y", "u", "v", *NOMINAL)})
-    both = MatchTable.concatenate([table.select([0, 1]), table.select([5])])
+    table = Matches(**{name: np.asarray(stars[name]) for name in ("x", "y", "u", "v", *NOMINAL)})
+    both = Matches.concatenate([table.select([0, 1]), table.select([5])])
     assert np.array_equal(both.u_nominal, table.u_nominal[[0, 1, 5]])
     assert np.array_equal(table.sample(20).v_nominal, table.v_nominal[::3])
-    assert np.array_equal(table.with_sigma(0.1, 0.1).u_nominal, table.u_nominal)
-    assert np.array_equal(table.pieces()[0].read().v_nominal, table.v_nominal)
-    split = split_matches(table, SetAside(0.3))
-    held = SetAside(0.3).which(table)
+    assert np.array_equal(table.with_errors((0.1, 0.1)).u_nominal, table.u_nominal)
+    assert np.array_equal(table.readers()[0].load().v_nominal, table.v_nominal)
+    split = split_matches(table, HoldoutSpec(0.3))
+    held = HoldoutSpec(0.3).which(table)
     assert np.array_equal(split.held.u_nominal, table.u_nominal[held])
     assert np.array_equal(split.kept.u_nominal, table.u_nominal[~held])
     with pytest.raises(InputError, match="has no 'u_nominal'"):
-        bare = MatchTable(*(np.asarray(stars[name]) + 1 for name in ("x", "y", "u", "v")))
-        MatchTable.concatenate([table, bare])
+        bare = Matches(*(np.asarray(stars[name]) + 1 for name in ("x", "y", "u", "v")))
+        Matches.concatenate([table, bare])
 
 
 def test_wrong_input(stars, tmp_path):
@@ -96,7 +98,7 @@ def test_wrong_input(stars, tmp_path):
             error.value
         )
     with pytest.raises(InputError, match="column 'u_nominal' is missing beside its partner"):
-        MatchTable([1.0], [1.0], [1.0], [1.0], v_nominal=[1.0])
+        Matches([1.0], [1.0], [1.0], [1.0], v_nominal=[1.0])
     stars["v_nominal"][4] = np.nan
     stars.write(tmp_path / "nan.ecsv")
     with pytest.raises(InputError, match="row 5, column 'v_nominal': value is"):

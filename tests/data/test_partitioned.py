@@ -16,11 +16,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from bayesdist.data import MagnitudeErrors, MatchTable, open_matches, pieces, read_matches
+from bayesdist.data import MagnitudeErrors, Matches, batches, open_matches, read_matches
 from bayesdist.data.added_errors import AddedErrors
-from bayesdist.data.partitioned import PartPiece
+from bayesdist.data.storage.write import write_partitioned
 from bayesdist.data.tables import repeated as duplicates_module
-from bayesdist.data.write import write_partitioned
 from bayesdist.errors import FormatError, InputError
 
 ARRAYS = ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour")
@@ -62,23 +61,22 @@ def assert_bitwise(found, expected, *, where=""):
 
 def assert_same(path, *, monkeypatch, piece=150, **options):
     """All pieces together are what read_matches gives."""
-    for module in ("partitioned", "matches"):
-        monkeypatch.setattr(f"bayesdist.data.{module}.PIECE", piece)
+    monkeypatch.setattr(batches, "BATCH", piece)
     whole = read_matches(path, **options)
     opened = open_matches(path, **options)
     for name in SHARED:
         assert getattr(opened, name) == getattr(whole, name), name
     assert len(opened) == len(whole) and opened.exposures == whole.exposures
-    parts = [pickle.loads(pickle.dumps(p)) for p in opened.pieces()]
+    parts = [pickle.loads(pickle.dumps(p)) for p in opened.readers()]
     assert all(0 < len(p) <= piece for p in parts)
-    tables = [p.read() for p in parts]
+    tables = [p.load() for p in parts]
     assert [len(t) for t in tables] == [len(p) for p in parts] == [t.n_rows for t in tables]
     for name in (*ARRAYS, *CODES):
         of_pieces = [getattr(t, name) for t in tables]
         joined = None if of_pieces[0] is None else np.concatenate(of_pieces)
         assert_bitwise(joined, getattr(whole, name), where=name)
         # a table in memory goes the same way
-        of_pieces = [getattr(p.read(), name) for p in whole.pieces()]
+        of_pieces = [getattr(p.load(), name) for p in whole.readers()]
         joined = None if of_pieces[0] is None else np.concatenate(of_pieces)
         assert_bitwise(joined, getattr(whole, name), where=name)
     for t in tables:
@@ -96,7 +94,7 @@ def assert_same(path, *, monkeypatch, piece=150, **options):
 def test_one_file(rng, tmp_path, monkeypatch):
     columns = {"mag": rng.uniform(10, 20, 500), "colour": rng.uniform(0, 2, 500)}
     path = write(tmp_path / "a.parquet", stars(rng, **columns))
-    assert len(assert_same(path, monkeypatch=monkeypatch).pieces()) == 5
+    assert len(assert_same(path, monkeypatch=monkeypatch).readers()) == 5
     assert_same(path, monkeypatch=monkeypatch, columns={"mag": ""})
 
 
@@ -170,44 +168,96 @@ def test_where_errors_come_from(rng, tmp_path, monkeypatch):
     errors = MagnitudeErrors(bins, bins / 100, bins / 50, bins.astype(int), bins, bins)
     whole = read_matches(path, sigma="by_magnitude")
     added = AddedErrors("", ("",), np.array([[0.0, 0.3]]), np.zeros(2))
+    two = opened.with_errors((0.1, 0.2))
     for ours, theirs in (
-        (opened.with_errors_by_magnitude(errors), whole.with_sigma(*errors.at(whole.mag))),
-        (opened.with_sigma(0.1, 0.2), whole.with_sigma(0.1, 0.2)),
+        (opened.with_errors(errors), whole.with_errors(errors.at(whole.mag))),
+        (opened.with_errors((0.1, 0.2)), whole.with_errors((0.1, 0.2))),
         (
-            opened.with_sigma(0.1, 0.2).with_errors_times(2.0).with_errors_times(4.0),
-            whole.with_sigma(0.1, 0.2).with_errors_times(8.0),
+            two.with_scaled_errors(2.0).with_scaled_errors(4.0),
+            whole.with_errors((0.1, 0.2)).with_scaled_errors(8.0),
         ),
         (
-            opened.with_sigma(0.1, 0.2).with_errors_times(2.0).with_added_errors(added),
-            whole.with_sigma(0.2, 0.4).with_added_errors(added),
+            opened.with_errors((0.1, 0.2))
+            .with_scaled_errors(2.0)
+            .with_errors(added, in_quadrature=True),
+            whole.with_errors((0.2, 0.4)).with_errors(added, in_quadrature=True),
         ),
         (
-            opened.with_sigma(0.1, 0.2).with_added_errors(added).with_errors_times(2.0),
-            whole.with_sigma(0.2, 0.4).with_added_errors(added.times(2.0)),
+            opened.with_errors((0.1, 0.2))
+            .with_errors(added, in_quadrature=True)
+            .with_scaled_errors(2.0),
+            whole.with_errors((0.2, 0.4)).with_errors(added.times(2.0), in_quadrature=True),
         ),
     ):
         assert ours.has_sigma and not opened.has_sigma
         for name in ("sigma_u", "sigma_v"):
-            joined = np.concatenate([getattr(p.read(), name) for p in ours.pieces()])
+            joined = np.concatenate([getattr(p.load(), name) for p in ours.readers()])
             assert_bitwise(joined, getattr(theirs, name))
     with pytest.raises(InputError, match=r"a\.parquet: holds no errors"):
         open_matches(path)
     with pytest.raises(InputError, match="sigma_v is -1, and must be"):
-        opened.with_sigma(1, -1)
+        opened.with_errors((1, -1))
     path = write(tmp_path / "a.parquet", {k: bare[k] for k in "xyuv"})
     with pytest.raises(InputError, match=r"a\.parquet: holds no magnitudes"):
         open_matches(path, sigma="by_magnitude")
     with pytest.raises(InputError, match="holds no magnitudes"):
-        open_matches(path, sigma=1.0).with_errors_by_magnitude(errors)
+        open_matches(path, sigma=1.0).with_errors(errors)
     with pytest.raises(InputError, match="sigma is 'column'"):
         open_matches(path, sigma="column")
 
 
 def test_errors_in_the_file_do_not_matter_once_others_are_given(rng, tmp_path):
     path = write(tmp_path / "a.parquet", stars(rng))
-    opened = open_matches(path).with_sigma(0.1, 0.2)
-    (piece,) = opened.pieces()
-    assert (piece.read().sigma_u == 0.1).all() and (piece.read().sigma_v == 0.2).all()
+    opened = open_matches(path).with_errors((0.1, 0.2))
+    (piece,) = opened.readers()
+    assert (piece.load().sigma_u == 0.1).all() and (piece.load().sigma_v == 0.2).all()
+
+
+def mirrored(matches):
+    """A step that acts on each row by itself."""
+    return matches.with_columns(x=2049.0 - matches.x)
+
+
+def test_what_is_done_to_stars_on_disk_is_done_when_they_are_read(rng, tmp_path, monkeypatch):
+    exposure = np.array(["a", "b", "c"])[rng.integers(3, size=500)]
+    path = write(tmp_path / "a.parquet", stars(rng, exp=exposure, mag=rng.uniform(8, 15, 500)))
+    monkeypatch.setattr(batches, "BATCH", 60)
+    whole, opened = read_matches(path), open_matches(path)
+    some = rng.uniform(size=500) < 0.3
+    late = np.arange(500) >= 250  # nothing is left of the first batches
+    for step in (
+        lambda m: m.select(some, reason="faint"),
+        lambda m: m.select(late).with_scaled_errors(3.0),
+        lambda m: m.with_scaled_errors(3.0).select(late).mapped(mirrored),
+        lambda m: m.mapped(mirrored).with_errors(0.1, in_quadrature=True),
+        lambda m: m.with_exposure_names(("c", "none", "b", "a")).select(some).select(late[some]),
+        lambda m: m.with_counts(600, {"early": 100}),
+    ):
+        ours, theirs = step(opened), step(whole)
+        assert not ours.in_memory and theirs.in_memory and theirs.load() is theirs
+        assert sum(len(pickle.loads(pickle.dumps(p)).load()) for p in ours.readers()) == len(ours)
+        loaded = ours.load()
+        assert loaded.in_memory and len(ours) == len(theirs)
+        for name in (*ARRAYS, *CODES):
+            assert_bitwise(getattr(loaded, name), getattr(theirs, name), where=name)
+        for name in SHARED:
+            assert getattr(ours, name) == getattr(loaded, name) == getattr(theirs, name), name
+
+
+def test_what_takes_stars_in_memory_says_so(rng, tmp_path):
+    opened = open_matches(write(tmp_path / "a.parquet", stars(rng)))
+    one = np.full(500, 0.1)
+    for call, message in (
+        (lambda: opened.x, "the stars are on disk, and no column 'x' of them is in memory"),
+        (lambda: opened.epoch, "no column 'epoch'"),
+        (lambda: opened.with_columns(x=one), "are on disk"),
+        (lambda: opened.select([1, 2]), "are selected by a mask"),
+        (lambda: opened.select(one > 1), "holds no rows"),
+        (lambda: opened.with_errors((one, one)), "errors of single stars are given"),
+    ):
+        with pytest.raises(InputError, match=message):
+            call()
+    assert "500 matches on disk" in repr(opened) and "in memory" in repr(opened.load())
 
 
 def test_the_origin_and_units(rng, tmp_path, monkeypatch):
@@ -215,8 +265,8 @@ def test_the_origin_and_units(rng, tmp_path, monkeypatch):
     path = write(tmp_path / "a.parquet", stars(rng), units=units)
     zero = assert_same(path, monkeypatch=monkeypatch, pixel_origin=0)
     one = assert_same(path, monkeypatch=monkeypatch, unit="arcsec")
-    (a, *_), (b, *_) = zero.pieces(), one.pieces()
-    assert (a.read().x == b.read().x + 1).all() and (a.read().u == b.read().u).all()
+    (a, *_), (b, *_) = zero.readers(), one.readers()
+    assert (a.load().x == b.load().x + 1).all() and (a.load().u == b.load().u).all()
     path = write(tmp_path / "b.parquet", stars(rng), units={})
     assert assert_same(path, monkeypatch=monkeypatch, unit="mas").unit == "mas"
     with pytest.raises(InputError, match="has no unit"):
@@ -273,22 +323,22 @@ def test_any_sizes_of_row_groups_pieces_and_batches(tmp_path_factory, groups, pi
         writer.close()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bayesdist.data.tables.parquet._BATCH", batch)
-        patch.setattr("bayesdist.data.parts._BLOCK", piece + 3)
+        patch.setattr("bayesdist.data.storage.stored._BLOCK", piece + 3)
         assert_same(folder, monkeypatch=patch, piece=piece, unit="pix")
 
 
 def test_small_row_groups_and_files_are_joined(rng, tmp_path):
     for k in range(5):
         write(tmp_path / f"{k}.parquet", stars(rng, 300), group=7)
-    (piece,) = open_matches(tmp_path).pieces()
-    assert len(piece) == 1500 and isinstance(piece, PartPiece)
+    (piece,) = open_matches(tmp_path).readers()
+    assert len(piece) == 1500
 
 
 def test_large_row_groups_are_split_evenly(rng, tmp_path, monkeypatch):
-    monkeypatch.setattr("bayesdist.data.partitioned.PIECE", 100)
+    assert batches.BATCH == 2**20
+    monkeypatch.setattr(batches, "BATCH", 100)
     path = write(tmp_path / "a.parquet", stars(rng, 250), group=250)
-    assert [len(p) for p in open_matches(path).pieces()] == [83, 83, 84]
-    assert pieces.PIECE == 2**20
+    assert [len(p) for p in open_matches(path).readers()] == [83, 83, 84]
 
 
 # -- bad input ------------------------------------------------------------------------------------
@@ -344,8 +394,8 @@ def test_a_file_that_turned_bad_is_named_when_it_is_read(good, tmp_path, name, v
     write(path, planted(good, name, value), group=GROUP)
     where = rf"a\.parquet, row group 8 of 10, row {BAD_ROW}, column '{name}': {message}"
     with pytest.raises(InputError, match=where) as raised:
-        for piece in opened.pieces():
-            piece.read()
+        for piece in opened.readers():
+            piece.load()
     assert_one_sentence(raised)
 
 
@@ -374,31 +424,31 @@ def test_a_damaged_row_group_is_named(good, tmp_path, column, use_dictionary):
         open_matches(path)
     assert_one_sentence(raised)
     with pytest.raises(FormatError, match=where):
-        for piece in opened.pieces():
-            piece.read()
+        for piece in opened.readers():
+            piece.load()
 
 
 def test_files_cut_short_gone_or_replaced(good, tmp_path):
     path = write(tmp_path / "a.parquet", good, group=GROUP)
     content = path.read_bytes()
-    pieces_then = open_matches(path).pieces()
+    pieces_then = open_matches(path).readers()
     path.write_bytes(content[: len(content) // 2])
-    for call in (lambda: open_matches(path), pieces_then[0].read):
+    for call in (lambda: open_matches(path), pieces_then[0].load):
         with pytest.raises(FormatError, match=r"a\.parquet: cannot be read"):
             call()
     path.unlink()
-    for call in (lambda: open_matches(path), pieces_then[0].read):
+    for call in (lambda: open_matches(path), pieces_then[0].load):
         with pytest.raises(InputError, match=r"a\.parquet: does not exist"):
             call()
     write(path, {k: v[:-1] for k, v in good.items()}, group=GROUP)
     with pytest.raises(InputError, match=r"a\.parquet: has changed since it was opened"):
-        pieces_then[0].read()
+        pieces_then[0].load()
     write(path, {**good, "exp": np.full(N, "other")}, group=GROUP)
     with pytest.raises(InputError, match=r"a\.parquet: has changed since it was opened"):
-        pieces_then[0].read()
+        pieces_then[0].load()
     write(path, {k: v for k, v in good.items() if k != "mag"}, group=GROUP)
     with pytest.raises(InputError, match=r"a\.parquet: has changed since it was opened"):
-        pieces_then[0].read()
+        pieces_then[0].load()
 
 
 def test_parts_that_do_not_fit_together(rng, tmp_path):
@@ -439,8 +489,8 @@ def test_empty_parts(rng, tmp_path):
     write(tmp_path / "p1.parquet", some)
     opened = open_matches(tmp_path)
     assert len(opened) == 500 and len(opened.sources) == 3
-    (piece,) = opened.pieces()
-    assert (piece.read().source == 1).all() and (piece.read().x == some["x"]).all()
+    (piece,) = opened.readers()
+    assert (piece.load().source == 1).all() and (piece.load().x == some["x"]).all()
 
 
 # -- rows that stand twice -------------------------------------------------------------------------
@@ -513,7 +563,7 @@ def test_more_repetitions_than_are_compared_at_a_time(rng, monkeypatch):
 
 def some_tables(rng):
     for n in (700, 1, 300):
-        yield MatchTable(
+        yield Matches(
             **{name: rng.uniform(1, 1000, n) for name in "xyuv"},
             sigma_u=rng.uniform(0.1, 1, n), sigma_v=rng.uniform(0.1, 1, n), unit="mas",
             epoch=rng.uniform(2002, 2014, n), mag=rng.uniform(10, 20, n),
@@ -532,7 +582,7 @@ def test_what_is_written_is_read_back_to_the_last_bit(rng, tmp_path, monkeypatch
     assert sorted(os.listdir(tmp_path / "a" / "b")) == [p.name for p in paths]
     assert_same(tmp_path / "a" / "b", monkeypatch=monkeypatch)
     back = read_matches(tmp_path / "a" / "b")
-    whole = MatchTable.concatenate(tables)
+    whole = Matches.concatenate(tables)
     assert back.unit == "mas"
     for name in ARRAYS:
         assert_bitwise(getattr(back, name), getattr(whole, name), where=name)
@@ -558,7 +608,7 @@ def test_nothing_half_written_stays(rng, tmp_path):
     with pytest.raises(RuntimeError):
         write_partitioned(broken(), tmp_path / "a")
     first, *_ = some_tables(rng)
-    bare = MatchTable(x=first.x, y=first.y, u=first.u, v=first.v)
+    bare = Matches(x=first.x, y=first.y, u=first.u, v=first.v)
     with pytest.raises(InputError, match="table 2 has another unit or other columns"):
         write_partitioned([first, bare], tmp_path / "a")
     with pytest.raises(InputError, match="no tables to write"):
@@ -578,17 +628,18 @@ def test_nothing_half_written_stays(rng, tmp_path):
 MEASURE = """
 import json, sys
 import numpy as np, pyarrow as pa
-from bayesdist.data import open_matches, partitioned, parts
+from bayesdist.data import batches, open_matches
+from bayesdist.data.storage import stored
 from bayesdist.data.tables import repeated
 
 def peak():
     return int(next(s for s in open("/proc/self/status") if s.startswith("VmHWM")).split()[1])
 
-partitioned.PIECE, parts._BLOCK, repeated.HELD = 100_000, 50_000, 400_000
+batches.BATCH, stored._BLOCK, repeated.HELD = 100_000, 50_000, 400_000
 open_matches(sys.argv[1])  # what is loaded once
 before = peak()
 opened = open_matches(sys.argv[2])
-total = sum(piece.read().x.sum() for piece in opened.pieces())
+total = sum(batch.x.sum() for batch in opened.batches())
 sample = opened.sample(1000)
 pool = pa.default_memory_pool()
 print(json.dumps({"arrow": pool.max_memory(), "left": pool.bytes_allocated(),

@@ -7,7 +7,7 @@ import pytest
 from astropy.table import Table
 
 from bayesdist.data import (
-    MatchTable,
+    Matches,
     ReferenceCatalog,
     match_table,
     open_matches,
@@ -22,21 +22,21 @@ BIG = 6_123_456_789_012_345_679  # beyond the whole numbers of float64
 def table(n=6, **changes):
     k = np.arange(n, dtype=float)
     columns = {"x": 10 + k, "y": 20 + k, "u": 0.5 * k, "v": -k, "star": BIG + np.arange(n)}
-    return MatchTable(**{**columns, **changes})
+    return Matches(**{**columns, **changes})
 
 
 def test_codes_follow_their_stars():
     t = table()
     assert t.select([4, 1]).star.tolist() == [BIG + 4, BIG + 1]
-    assert t.with_sigma(1.0, 1.0).star.tolist() == t.star.tolist()
-    assert t.pieces()[0].read().star.tolist() == t.star.tolist()
+    assert t.with_errors(1.0).star.tolist() == t.star.tolist()
+    assert t.readers()[0].load().star.tolist() == t.star.tolist()
     assert replace(t, star=None).star is None and table(star=None).select([0]).star is None
 
 
 def test_joined_tables_have_codes_when_all_have_them():
     a, b = table(exposure_names=("a",)), table(exposure_names=("b",))
-    assert MatchTable.concatenate([a, b]).star.tolist() == [*a.star, *b.star]
-    assert MatchTable.concatenate([a, replace(b, star=None)]).star is None
+    assert Matches.concatenate([a, b]).star.tolist() == [*a.star, *b.star]
+    assert Matches.concatenate([a, replace(b, star=None)]).star is None
 
 
 def test_codes_are_not_negative():
@@ -72,7 +72,7 @@ def test_parts_on_disk_carry_codes(tmp_path):
     tables = [table(exposure_names=(name,)) for name in "abc"]
     write_partitioned(tables, tmp_path / "parts", rows_per_group=4)
     opened = open_matches(tmp_path / "parts", sigma=1.0)
-    read = [piece.read() for piece in opened.pieces()]
+    read = [piece.load() for piece in opened.readers()]
     assert np.concatenate([one.star for one in read]).tolist() == 3 * tables[0].star.tolist()
     assert opened.sample(6).star is not None
     with pytest.raises(InputError, match="other columns"):
@@ -83,5 +83,5 @@ def test_matching_names_the_star(rng):
     uv = rng.uniform(0, 400, (2, 200))
     catalog = ReferenceCatalog(u=uv[0], v=uv[1], star=BIG + rng.permutation(200))
     seen = uv[:, ::-1] + 3.0
-    t = match_table(MatchTable(*seen, *seen), catalog)
+    t = match_table(Matches(*seen, *seen), catalog)
     np.testing.assert_array_equal(t.star, catalog.star[199 - t.row])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose import ScoreTest, score_tests
 from bayesdist.diagnose.score.gap import gap_test
 from bayesdist.diagnose.score.motions import motion_test
@@ -65,7 +65,7 @@ class Dated:
     speed: float = 0.0
     wander: float = 1.0
 
-    def data(self, seed: int) -> tuple[DistortionModel, MatchTable]:
+    def data(self, seed: int) -> tuple[DistortionModel, Matches]:
         rng = np.random.default_rng([seed, self.exposures, self.stars])
         model = DistortionModel(
             2, TWO_CHIPS, frames=self.frames, exposures=exposures(self.exposures), time=self.time
@@ -104,7 +104,7 @@ class Dated:
             zero = np.zeros(E * S)
             added |= {"pm_u": zero, "pm_v": zero}
             added |= {f"sigma_pm_{a}": np.full(E * S, self.motion) for a in "uv"}
-        return model, matches.with_sigma(quoted, quoted)._with(**added)
+        return model, matches.with_errors((quoted, quoted)).with_columns(**added)
 
     def _second(self, rng, theta, model, matches, uv, years) -> np.ndarray:
         """What the second chip's own motion does to positions (N, 2)."""
@@ -117,7 +117,7 @@ class Dated:
         moved = np.einsum("nab,nb->na", turn[matches.exposure], own)
         return np.where(matches.chip[:, None] == 1, moved, 0.0)
 
-    def solve(self, model: DistortionModel, matches: MatchTable) -> LinearFit:
+    def solve(self, model: DistortionModel, matches: Matches) -> LinearFit:
         return fit_linear(matches, model, rejection=Rejection(clip_abs=None))
 
     def of_time(self, seed: int) -> dict[str, Outcome]:

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.data.holdout import SetAside, Split, split_matches
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.holdout import HoldoutSpec, Split, split_matches
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive
 from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_validation
 from bayesdist.infer import OutlierMixture, Rejection, load
@@ -36,14 +36,14 @@ class Field:
     ----------
     model : DistortionModel
     theta : ndarray, shape (D,)
-    matches : MatchTable
+    matches : Matches
     errors : StarErrors
         Of the catalogue.
     """
 
     model: DistortionModel
     theta: np.ndarray
-    matches: MatchTable
+    matches: Matches
     errors: StarErrors
 
 
@@ -100,7 +100,7 @@ def field(
     false = rng.uniform(size=len(x)) < fraction
     data[false] = (true + far * rng.standard_normal(true.shape))[false]
     quoted = np.sqrt(sigma**2 + errors.at(star, epoch)[:, 0])
-    matches = MatchTable(
+    matches = Matches(
         x=x,
         y=y,
         u=data[:, 0],
@@ -123,7 +123,7 @@ def solved(
 ) -> tuple[HierarchicalFit, Predictive]:
     """The joint fit of what is kept, and what it predicts."""
     kept, held = split.kept, split.held
-    assert isinstance(kept, MatchTable) and isinstance(held, MatchTable)
+    assert held is not None
     model = replace(one.model, exposures=kept.exposure_names)
     joint = fit_hierarchical(
         kept, model, rejection=Rejection(25.0 if mixture else np.inf, None), n_tau=64
@@ -162,7 +162,7 @@ def solved(
     )
 
 
-def judged(one: Field, aside: SetAside, *, mixture: bool = False) -> HoldoutValidation:
+def judged(one: Field, aside: HoldoutSpec, *, mixture: bool = False) -> HoldoutValidation:
     """Hold out, solve, predict, judge."""
     split = split_matches(one.matches, aside)
     _, predictive = solved(one, split, aside.exposures, mixture=mixture)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy import stats
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose import ScoreTest, score_tests
 from bayesdist.infer import LinearFit, Posterior, Rejection, fit_linear
 from bayesdist.model import Chip, DistortionModel, TimeDependence
@@ -52,7 +52,7 @@ class Scene:
     mixture: bool = False
     misquoted: float = 0.0  # scatter of the logarithm of quoted errors, whatever the noise is
 
-    def data(self, seed: int) -> tuple[DistortionModel, MatchTable]:
+    def data(self, seed: int) -> tuple[DistortionModel, Matches]:
         rng = np.random.default_rng([seed, self.n, self.order])
         model = DistortionModel(
             self.order,
@@ -79,13 +79,13 @@ class Scene:
         uv += SIGMA * self.noise(rng, self.n)
         false = rng.uniform(size=self.n) < self.fraction
         uv[false] += 0.5 * gaussian(rng, int(false.sum()))
-        table = table._with(u=uv[:, 0], v=uv[:, 1], colour=rng.normal(1, 0.3, self.n))
+        table = table.with_columns(u=uv[:, 0], v=uv[:, 1], colour=rng.normal(1, 0.3, self.n))
         if self.misquoted:
             factors = np.exp(self.misquoted * rng.standard_normal((2, self.n)))
-            table = table.with_sigma(*(SIGMA * factors))
+            table = table.with_errors(tuple(SIGMA * factors))
         return model, table
 
-    def solve(self, model: DistortionModel, table: MatchTable) -> LinearFit | Posterior:
+    def solve(self, model: DistortionModel, table: Matches) -> LinearFit | Posterior:
         if self.mixture:
             return mode_of(table, model)[0]
         return fit_linear(table, model, rejection=Rejection(clip_abs=None))
@@ -94,13 +94,13 @@ class Scene:
         model, table = self.data(seed)
         return by_name(score_tests(table, self.solve(model, table), **options))
 
-    def with_pattern(self, seed: int, pattern: Callable[[MatchTable], np.ndarray], **options):
+    def with_pattern(self, seed: int, pattern: Callable[[Matches], np.ndarray], **options):
         """Tests of data to which a pattern (N, 2) was added."""
         model, table = self.data(seed)
         table = moved(table, pattern(table))
         return by_name(score_tests(table, self.solve(model, table), **options))
 
-    def fitted(self, seed: int) -> tuple[MatchTable, LinearFit | Posterior]:
+    def fitted(self, seed: int) -> tuple[Matches, LinearFit | Posterior]:
         model, table = self.data(seed)
         return table, self.solve(model, table)
 
@@ -111,7 +111,7 @@ def by_name(tests: tuple[ScoreTest, ...]) -> dict[str, ScoreTest]:
     return out
 
 
-def terms_of(total: int, table: MatchTable) -> tuple[np.ndarray, np.ndarray]:
+def terms_of(total: int, table: Matches) -> tuple[np.ndarray, np.ndarray]:
     """Products of Legendre polynomials (N, total + 1) of a total order; their mean squares.
 
     On the detector of `CHIP`.
@@ -123,11 +123,11 @@ def terms_of(total: int, table: MatchTable) -> tuple[np.ndarray, np.ndarray]:
     return phi, area
 
 
-def polynomial(total: int, rms: float, seed: int) -> Callable[[MatchTable], np.ndarray]:
+def polynomial(total: int, rms: float, seed: int) -> Callable[[Matches], np.ndarray]:
     """Random terms of one total order, of this rms over the detector, both axes together."""
     c = np.random.default_rng([3, seed]).standard_normal((total + 1, 2))
 
-    def pattern(table: MatchTable) -> np.ndarray:
+    def pattern(table: Matches) -> np.ndarray:
         phi, area = terms_of(total, table)
         return phi @ c * (rms / np.sqrt((c**2).sum(axis=1) @ area))
 

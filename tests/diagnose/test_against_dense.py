@@ -124,7 +124,7 @@ def test_regressor_tests_are_those_of_dense_matrices(case, shared):
     scene = CASES[case]
     model, table = scene.data(5)
     if shared:
-        table = table._with(star=np.arange(len(table)) % (len(table) // 3))
+        table = table.with_columns(star=np.arange(len(table)) % (len(table) // 3))
     solution = scene.solve(model, table)
     found = {one.name: one for one in regressor_tests(projected(table, solution))}
     dense, n = Dense(table, solution), model.order
@@ -193,7 +193,7 @@ def with_priors():
     uv = model.predict(theta, table.x, table.y, **columns_of(table))
     uv += SIGMA * np.random.default_rng(1).standard_normal(uv.shape)
     names = {"u_1_1": (theta[4], 1e-3), "v_0_2": (theta[11], 1e-2), "e2.shift_u": (theta[12], 1e-3)}
-    return model, table._with(u=uv[:, 0], v=uv[:, 1]), GaussianPriors.of(model, names)
+    return model, table.with_columns(u=uv[:, 0], v=uv[:, 1]), GaussianPriors.of(model, names)
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_deviations_of_exposures_are_those_of_dense_matrices(case, shared):
     scene = CASES.get(case, Scene(300, 2, "none", 4))
     model, table = scene.data(5)
     if shared:
-        table = table._with(star=np.arange(len(table)) % (len(table) // 3))
+        table = table.with_columns(star=np.arange(len(table)) % (len(table) // 3))
     fit = scene.solve(model, table)
     found = exposure_test(projected(table, fit))
     dense = Dense(table, fit)

@@ -7,7 +7,7 @@ import pytest
 from astropy.table import Table
 from scipy.spatial import cKDTree
 
-from bayesdist.data import MatchTable, find_similarity, pattern_index
+from bayesdist.data import Matches, find_similarity, pattern_index
 from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
 from bayesdist.infer import build_model, fit_linear
 
@@ -28,7 +28,7 @@ def stars(years, seed, n=400, exposures=1):
         parts.append((x, y, np.full(n, k)))
     x, y, exposure = (np.concatenate(column) for column in zip(*parts, strict=True))
     many = np.tile([xi, eta, *pm], exposures)
-    return MatchTable(x, y, many[0], many[1], np.full(len(x), SIGMA), np.full(len(x), SIGMA),
+    return Matches(x, y, many[0], many[1], np.full(len(x), SIGMA), np.full(len(x), SIGMA),
                       unit="arcsec", pm_u=many[2], pm_v=many[3], exposure=exposure,
                       exposure_names=tuple(map(str, range(exposures))))  # fmt: skip
 
@@ -63,7 +63,7 @@ def test_errors_of_motions_do_not_draw_the_shift_to_zero():
         quoted = np.array([table.pm_u, table.pm_v]) + rng.normal(0, error, (2, 800))
         quoted[:, rng.uniform(size=800) < 0.4] = 0.0
         sigma = np.where(quoted == 0, 0.0, error)
-        one = found(table._with(pm_u=quoted[0], pm_v=quoted[1], sigma_pm_u=sigma[0],
+        one = found(table.with_columns(pm_u=quoted[0], pm_v=quoted[1], sigma_pm_u=sigma[0],
                                 sigma_pm_v=sigma[1]))  # fmt: skip
         assert one.significant
         pulls.append((one.years + 9.9) / one.sigma)
@@ -88,7 +88,7 @@ def test_dates_of_lists_of_hst_follow_from_gaia(data_dir, day, epoch):
     j = np.flatnonzero(distance < 0.1)
     i, sigma = nearest[j], np.full(len(j), 0.006)
     motions = {"pm_u": "vx", "pm_v": "vy", "sigma_pm_u": "vxe", "sigma_pm_v": "vye"}
-    table = MatchTable(*xy[i].T, *reference[j].T, sigma, sigma, unit="arcsec",
+    table = Matches(*xy[i].T, *reference[j].T, sigma, sigma, unit="arcsec",
                        **{key: column[name][j] for key, name in motions.items()})  # fmt: skip
     model = build_model(table, order=3, size=(2200, 2200))
     one = epoch_shift(table, fit_linear(table, model))
@@ -104,6 +104,6 @@ def test_right_epochs_are_left_alone():
 def test_without_motions_there_is_nothing_to_find():
     table = stars(-9.9, 1)
     no = dict.fromkeys(("pm_u", "pm_v"))
-    assert found(table._with(**no)) is None
-    still = table._with(pm_u=np.zeros(400), pm_v=np.zeros(400))
+    assert found(table.with_columns(**no)) is None
+    still = table.with_columns(pm_u=np.zeros(400), pm_v=np.zeros(400))
     assert found(still) is None

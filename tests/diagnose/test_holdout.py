@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2, kstest, norm
 
-from bayesdist.data.holdout import SetAside, split_matches
+from bayesdist.data.holdout import HoldoutSpec, split_matches
 from bayesdist.diagnose.holdout.predictive import (
     SCALES,
     Predictive,
@@ -63,7 +63,7 @@ def stars(seed: int, n: int, model: DistortionModel | None = None, change=None, 
         exposure = matches.exposure if model.n_frame else None
         true = model.predict(theta, matches.x, matches.y, exposure=exposure)
         offset = change(matches, np.stack([matches.u, matches.v], axis=1) - true)
-        matches = matches._with(u=true[:, 0] + offset[:, 0], v=true[:, 1] + offset[:, 1])
+        matches = matches.with_columns(u=true[:, 0] + offset[:, 0], v=true[:, 1] + offset[:, 1])
     return model, matches
 
 
@@ -95,7 +95,7 @@ def posterior_of(model: DistortionModel, kept, mixture: OutlierMixture) -> Predi
 
 def judged(seed, n, model=None, *, fitted=None, aside=None, mixture=None, **options):
     model, matches = stars(seed, n, model, **options)
-    split = split_matches(matches, aside or SetAside(0.3, (), seed))
+    split = split_matches(matches, aside or HoldoutSpec(0.3, (), seed))
     solution = posterior_of(fitted or model, split.kept, mixture or OutlierMixture(jitter=0.0))
     return holdout_validation(solution, split.held, whole=aside.exposures if aside else ())
 
@@ -141,7 +141,7 @@ def test_whole_exposures_have_uniform_probabilities(frames):
     """
     names = tuple("abcdefgh")
     model = model_of(frames=frames, exposures=names, origin=(500.0, 400.0))
-    aside = SetAside(0.1, ("c", "f"), 5)
+    aside = HoldoutSpec(0.1, ("c", "f"), 5)
     assert_calibrated([judged(2000 + seed, 1600, model, aside=aside) for seed in range(RUNS)])
 
 
@@ -155,7 +155,7 @@ def test_an_exposure_is_found_whatever_its_roll():
         theta[model.frame_slice(2)] = (120.0, -60.0, 0.01, 2.8)
         options = {"sigma": SIGMA, "fraction": F, "outlier_scale": FAR}
         matches, _ = simulate_matches(model, theta, 2400, rng=rng, **options)
-        split = split_matches(matches, SetAside(0.0, ("c",)))
+        split = split_matches(matches, HoldoutSpec(0.0, ("c",)))
         solution = posterior_of(model, split.kept, OutlierMixture(jitter=0.0))
         found = holdout_validation(solution, split.held, whole=("c",))
         assert found.n == len(split.held) == 800

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, kstest
 
-from bayesdist.data.holdout import SetAside, split_matches
+from bayesdist.data.holdout import HoldoutSpec, split_matches
 from bayesdist.diagnose.holdout.frames import frames_for
 from bayesdist.diagnose.holdout.validation import holdout_validation
 from bayesdist.errors import InputError
@@ -27,8 +27,8 @@ RUNS = 60 if os.environ.get("BAYESDIST_FULL") else 6
 WHOLE = ("j004", "j007")
 
 
-def aside(seed: int) -> SetAside:
-    return SetAside(0.25, WHOLE, seed)
+def aside(seed: int) -> HoldoutSpec:
+    return HoldoutSpec(0.25, WHOLE, seed)
 
 
 def assert_calibrated(results) -> None:
@@ -75,7 +75,7 @@ def test_false_matches_raise_no_alarm() -> None:
 def test_errors_of_stars_that_are_taken_for_independent_would_be_alarms() -> None:
     """The same stars, each match with an error of its own: what exposures share is not known."""
     one = field(1, one_pointing=True, centroid=0.004)
-    split = split_matches(one.matches, SetAside(0.25, (), 1))
+    split = split_matches(one.matches, HoldoutSpec(0.25, (), 1))
     _, right = solved(one, split, ())
     wrong = replace(right, stars=None)
     found = [holdout_validation(p, split.held) for p in (right, wrong)]
@@ -165,9 +165,9 @@ def test_a_pattern_of_the_detector_shows_whatever_the_rolls() -> None:
 
 def test_frames_of_whole_exposures_are_the_true_ones() -> None:
     one = field(8)
-    split = split_matches(one.matches, SetAside(0.0, WHOLE))
+    split = split_matches(one.matches, HoldoutSpec(0.0, WHOLE))
     _, predictive = solved(one, split, WHOLE)
-    frames = frames_for(predictive, split.held.pieces(), split.held.exposure_names)
+    frames = frames_for(predictive, split.held, split.held.exposure_names)
     assert set(frames) == set(WHOLE)
     pulls = []
     for name, frame in frames.items():
@@ -187,8 +187,8 @@ def test_frames_of_whole_exposures_are_the_true_ones() -> None:
 def test_influence_of_stars_is_what_the_fit_does_with_their_errors() -> None:
     """Moved stars move the parameters so; and summed up over all they are `star_covariance`."""
     one = field(9, n_exposures=6, n_stars=300)
-    joint, _ = solved(one, split_matches(one.matches, SetAside(0.1, ())), ())
-    kept = split_matches(one.matches, SetAside(0.1, ())).kept
+    joint, _ = solved(one, split_matches(one.matches, HoldoutSpec(0.1, ())), ())
+    kept = split_matches(one.matches, HoldoutSpec(0.1, ())).kept
     codes = np.unique(kept.star)
     found = star_influence(joint.fit, kept, one.errors, codes)
     n = joint.model.n_distortion
@@ -201,7 +201,7 @@ def test_influence_of_stars_is_what_the_fit_does_with_their_errors() -> None:
 
 def test_a_posterior_without_its_scatter_is_refused() -> None:
     one = field(1, n_exposures=6, n_stars=200)
-    split = split_matches(one.matches, SetAside(0.3, ()))
+    split = split_matches(one.matches, HoldoutSpec(0.3, ()))
     _, predictive = solved(one, split, ())
     with pytest.raises(InputError, match="how exposures scatter"):
         holdout_validation(replace(predictive, deviations=None), split.held)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import binom, kstest
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.validation import holdout_validation
 from bayesdist.model import Chip, DistortionModel, LookupTable
@@ -19,7 +19,7 @@ THETA = np.zeros(MODEL.n_params)
 RUNS = 12
 
 
-def held(seed: int, n: int = 20_000) -> MatchTable:
+def held(seed: int, n: int = 20_000) -> Matches:
     """Stars with errors of their own, and one on each axis for all stars of a cell."""
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(1, SIZE[0], n), rng.uniform(1, SIZE[1], n)
@@ -27,9 +27,7 @@ def held(seed: int, n: int = 20_000) -> MatchTable:
     data = MODEL.predict(THETA, x, y) + OWN * rng.standard_normal((n, 2))
     data += cell[(y // CELL[1]).astype(int), (x // CELL[0]).astype(int)]
     sigma = np.full(n, OWN)
-    return MatchTable(
-        x=x, y=y, u=data[:, 0], v=data[:, 1], sigma_u=sigma, sigma_v=sigma, unit="pix"
-    )
+    return Matches(x=x, y=y, u=data[:, 0], v=data[:, 1], sigma_u=sigma, sigma_v=sigma, unit="pix")
 
 
 def predictive() -> Predictive:
@@ -66,7 +64,7 @@ def test_few_large_cells_raise_no_alarm_about_distributions() -> None:
         data = MODEL.predict(THETA, x, y) + OWN * rng.standard_normal((n, 2))
         data += cell[(y // side[1]).astype(int), (x // side[0]).astype(int)]
         sigma = np.full(n, OWN)
-        stars = MatchTable(
+        stars = Matches(
             x=x, y=y, u=data[:, 0], v=data[:, 1], sigma_u=sigma, sigma_v=sigma, unit="pix"
         )
         table = LookupTable(1, np.full((2, 7, 9), local), first=(1.0, 1.0), step=side)

@@ -179,7 +179,7 @@ def test_noise_that_its_errors_do_not_describe_is_found(name, factor, mixture):
         sigma = SIGMA * np.broadcast_to(by, (len(table), 2))
         sigmas.append(sigma.std())
         # quoted rightly, it is no finding
-        right = table.with_sigma(*sigma.T)
+        right = table.with_errors(tuple(sigma.T))
         good = by_name(score_tests(right, scene.solve(model, right)))
         assert not good[f"noise by {name}"].significant
     assert median_p(found, f"noise by {name}") < 1e-6
@@ -288,7 +288,7 @@ def noise_is_found(seed: int) -> bool:
     each *= before.smallest / SIGMA / each.std()
     uv = model.predict(fit.mean, table.x, table.y)
     stretch = 1 + each[table.exposure]
-    truth = table._with(
+    truth = table.with_columns(
         u=uv[:, 0] + (table.u - uv[:, 0]) * stretch, v=uv[:, 1] + (table.v - uv[:, 1]) * stretch
     )
     found = by_name(score_tests(truth, scene.solve(model, truth)))

@@ -81,7 +81,7 @@ def test_every_question_has_a_row_where_the_data_can_be_asked():
     }
     model, table = one.data(1)
     fit = one.solve(model, table)
-    bare = table._with(mag=None, colour=np.ones(len(table)))
+    bare = table.with_columns(mag=None, colour=np.ones(len(table)))
     assert set(by_name(score_tests(bare, fit))) == always - {
         "magnitude", "colour", "noise by magnitude"
     }  # fmt: skip
@@ -153,5 +153,5 @@ def test_magnitudes_that_stand_for_none_are_no_lever():
     mag = table.mag.copy()
     mag[::300] = 99.0
     fit = scene.solve(model, table)
-    found = by_name(score_tests(table._with(mag=mag), fit))
+    found = by_name(score_tests(table.with_columns(mag=mag), fit))
     assert found["magnitude"].p_value < 1e-20

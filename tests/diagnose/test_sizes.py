@@ -93,14 +93,14 @@ def with_catalogue_errors(seed: int):
     rng = np.random.default_rng([19, seed])
     x, y = (np.tile(rng.uniform(5, n - 5, stars), exposures) for n in (1000.0, 800.0))
     x, y = (z + rng.normal(0, 1, len(z)) for z in (x, y))
-    table = table._with(x=x, y=y)
+    table = table.with_columns(x=x, y=y)
     error = SIGMA * rng.standard_normal((stars, 2)) * 0.8
     uv = model.predict(truth_of(model, rng), x, y, **columns_of(table))
     uv += np.tile(error, (exposures, 1)) + 0.6 * SIGMA * rng.standard_normal(uv.shape)
-    table = table._with(u=uv[:, 0], v=uv[:, 1], epoch=None, mag=None, colour=None)
+    table = table.with_columns(u=uv[:, 0], v=uv[:, 1], epoch=None, mag=None, colour=None)
     out = {}
     for kind, codes in (("none", None), ("star", np.tile(np.arange(stars), exposures))):
-        one = table._with(star=codes)
+        one = table.with_columns(star=codes)
         out[kind] = by_name(score_tests(one, scene.solve(model, one)))
     return out
 

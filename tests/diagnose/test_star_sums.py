@@ -14,7 +14,7 @@ from bayesdist.assess import (
     star_sample,
     star_sums,
 )
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.infer import (
     OutlierMixture,
     fit_linear,
@@ -97,7 +97,7 @@ def several():
     uv = model.predict(theta, x, y, exposure=exposure, chip=numbers)
     spread = np.where(rng.random(n) < 0.05, 0.6, 0.05)
     u, v = (uv + rng.normal(size=(n, 2)) * spread[:, None]).T
-    table = MatchTable(
+    table = Matches(
         x, y, u, v, sigma_u=np.full(n, 0.05), sigma_v=np.full(n, 0.06), exposure=exposure,
         exposure_names=names, chip=chip, chip_numbers=(1, 2),
     )  # fmt: skip
@@ -123,7 +123,7 @@ def test_one_pass_gives_what_arrays_give(several, monkeypatch):
     assert used.sum() == fit.n_used < len(table)
     numbers = table.chip_number
     for piece in (10_000, 700):
-        monkeypatch.setattr("bayesdist.data.matches.PIECE", piece)
+        monkeypatch.setattr("bayesdist.data.batches.BATCH", piece)
         sums = load(fit.model, table).sum(star_sums, fit.mean, fit.clip, BINS)
         assert set(sums.binned) == {
             (chip, bins) for chip, several in BINS.items() for bins in several
@@ -170,7 +170,7 @@ def test_stars_flagged_are_those_that_are_flagged_one_by_one(several, monkeypatc
     posterior = sample(fit, table, outliers=OutlierMixture(), target_ess=50, target_rhat=1.1)
     flagged = memberships(posterior, table).outlier_probability > 0.5
     expected = [(flagged & (table.exposure == k)).sum() for k in range(3)]
-    monkeypatch.setattr("bayesdist.data.matches.PIECE", 700)
+    monkeypatch.setattr("bayesdist.data.batches.BATCH", 700)
     found = flagged_by_exposure(load(fit.model, table), posterior)
     np.testing.assert_array_equal(found, expected)
     assert found.sum() == posterior.n_flagged > 50
@@ -201,7 +201,7 @@ def test_what_belongs_to_the_detector_is_seen_in_turned_exposures(rng):
     exposure = np.arange(n) % 4
     pattern = np.where(x // 127 % 2 == 0, 0.05, -0.05)
     u, v = model.predict(theta, x, y, exposure=exposure).T
-    table = MatchTable(
+    table = Matches(
         x, y,
         u + pattern * np.cos(rolls[exposure]) + 0.01 * rng.standard_normal(n),
         v + pattern * np.sin(rolls[exposure]) + 0.01 * rng.standard_normal(n),

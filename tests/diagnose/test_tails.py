@@ -52,7 +52,7 @@ def test_a_few_matches_beyond_an_edge_do_not_hide_it():
     table, fit = cut(Scene(2000, 2), 1, 2.4)
     u = table.u.copy()
     u[:2] += 8 * SIGMA
-    table = table._with(u=u)
+    table = table.with_columns(u=u)
     found = truncation(table, fit_linear(table, fit.model, rejection=Rejection(clip_abs=None)))
     assert found.significant
 
@@ -68,7 +68,7 @@ def test_clean_data_are_not_truncated(n):
 def test_errors_quoted_too_large_are_not_taken_for_a_cut():
     """Chi-square is far below one in both."""
     table, fit = Scene(3000, 2).fitted(1)
-    table = table.with_sigma(1.5 * SIGMA, 1.5 * SIGMA)
+    table = table.with_errors(1.5 * SIGMA)
     fit = fit_linear(table, fit.model, rejection=Rejection(clip_abs=None))
     assert fit.chi2 / fit.dof < 0.5
     found = truncation(table, fit)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer import LinearFit, OutlierMixture, Posterior, load
 from bayesdist.infer.density.laplace import starting_point
 from bayesdist.model import Chip, DistortionModel
@@ -34,15 +34,15 @@ def blocks(rng: np.random.Generator, side: float, rms: float, size: float = SIDE
     return field
 
 
-def moved(matches: MatchTable, by: np.ndarray) -> MatchTable:
-    return matches._with(u=matches.u + by[:, 0], v=matches.v + by[:, 1])
+def moved(matches: Matches, by: np.ndarray) -> Matches:
+    return matches.with_columns(u=matches.u + by[:, 0], v=matches.v + by[:, 1])
 
 
 @dataclass(frozen=True)
 class Patterned:
     model: DistortionModel
     theta: np.ndarray
-    matches: MatchTable
+    matches: Matches
     pattern: Field
 
 
@@ -63,7 +63,7 @@ def patterned(
     return Patterned(model, theta, moved(matches, pattern(matches.x, matches.y)), pattern)
 
 
-def mode_of(matches: MatchTable, model: DistortionModel) -> tuple[Posterior, LinearFit]:
+def mode_of(matches: Matches, model: DistortionModel) -> tuple[Posterior, LinearFit]:
     """A posterior that is its mode: all that the robust covariance wants to know of it."""
     target, fit = target_of(model, load(model, matches), OutlierMixture())
     psi = starting_point(target, fit)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.model import Chip, DistortionModel
 
 SIDE = 2048.0
@@ -15,7 +15,7 @@ FALSE = 0.04  # of the matches in the circle
 
 def selected(
     seed: int, cut: float, n: int = 1500, *, order: int = 3
-) -> tuple[DistortionModel, np.ndarray, MatchTable, float]:
+) -> tuple[DistortionModel, np.ndarray, Matches, float]:
     """Model, truth, matches, and the radius of their circles: so many sigma.
 
     The nominal solution differs from the truth by a polynomial of the model's order.  Detections
@@ -44,7 +44,7 @@ def selected(
     rows[false, 2:4] = (rows[:, 4:] + spread)[false]
     x, y, u, v, u_nominal, v_nominal = rows.T
     sigma = np.full(n, SIGMA)
-    matches = MatchTable(
+    matches = Matches(
         *(x, y, u, v),
         sigma_u=sigma,
         sigma_v=sigma,

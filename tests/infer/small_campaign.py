@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer import LinearFit
 from bayesdist.infer.catalogue.star_errors import StarCovariance, StarErrors, star_covariance
 from bayesdist.infer.posterior.covariance import with_covariance
@@ -121,7 +121,7 @@ def campaign(
     rolls=None,
     own=None,
     wrong=None,
-) -> tuple[DistortionModel, MatchTable, np.ndarray]:
+) -> tuple[DistortionModel, Matches, np.ndarray]:
     """Model, matches and true parameters; `wrong` adds to parameters, by name."""
     rng = np.random.default_rng(seed)
     apart = own is not None
@@ -154,7 +154,7 @@ class SharedStars:
     model : DistortionModel
     theta : ndarray, shape (D,)
         The truth.
-    matches : MatchTable
+    matches : Matches
         Where they would be without errors, with the quoted errors.
     position, motion : float
         Errors of the catalogue, pixels and pixels per year from 2004.0.
@@ -162,7 +162,7 @@ class SharedStars:
 
     model: DistortionModel
     theta: np.ndarray
-    matches: MatchTable
+    matches: Matches
     position: float
     motion: float
 
@@ -173,10 +173,10 @@ class SharedStars:
         years = self.matches.epoch[:, None] - 2004.0
         return self.position * position[code] + years * self.motion * motion[code]
 
-    def with_errors(self, error: np.ndarray) -> MatchTable:
+    def with_errors(self, error: np.ndarray) -> Matches:
         """The matches with errors (N, 2)."""
         m = self.matches
-        return m._with(u=m.u + error[:, 0], v=m.v + error[:, 1])
+        return m.with_columns(u=m.u + error[:, 0], v=m.v + error[:, 1])
 
     def covariance(self, fit: LinearFit) -> StarCovariance:
         """What the catalogue's errors make of a fit to the matches."""
@@ -211,7 +211,7 @@ def shared_stars(
     quoted = np.sqrt(centroid**2 + position**2 + (motion * (epoch - 2004.0)) ** 2)
     u, v = model.predict(theta, x, y, exposure=exposure, chip=np.array([1, 2])[chip]).T
     measured = {"x": x, "y": y, "u": u, "v": v, "sigma_u": quoted, "sigma_v": quoted}
-    matches = matches._with(**measured, exposure=exposure, chip=chip, epoch=epoch, star=star)
+    matches = matches.with_columns(**measured, exposure=exposure, chip=chip, epoch=epoch, star=star)
     return SharedStars(model, theta, matches, position, motion)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.special import logit
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer import (
     Convergence,
     GaussianPriors,
@@ -96,15 +96,15 @@ def simulated(
     return model, matches, truth
 
 
-def table(x, y, u, v, sigma=0.05, **columns) -> MatchTable:
+def table(x, y, u, v, sigma=0.05, **columns) -> Matches:
     n = len(x)
     sigma_u, sigma_v = (np.broadcast_to(s, n) for s in np.broadcast_arrays(sigma, sigma))
-    return MatchTable(x, y, u, v, sigma_u=sigma_u, sigma_v=sigma_v, **columns)
+    return Matches(x, y, u, v, sigma_u=sigma_u, sigma_v=sigma_v, **columns)
 
 
 def target_of(
     model: DistortionModel,
-    matches: MatchTable,
+    matches: Matches,
     mixture: OutlierMixture,
     priors: GaussianPriors | None = None,
     **fit_options,
@@ -114,11 +114,11 @@ def target_of(
     return Target(shards, mixture, priors or GaussianPriors.none(model)), fit
 
 
-def stars_of(model: DistortionModel, matches: MatchTable) -> Stars:
+def stars_of(model: DistortionModel, matches: Matches) -> Stars:
     return prepare(model, matches)[0]
 
 
-def columns_of(matches: MatchTable) -> dict[str, np.ndarray]:
+def columns_of(matches: Matches) -> dict[str, np.ndarray]:
     """What `DistortionModel.predict` and `jacobian` want beside the pixels."""
     return {
         "epoch": matches.epoch,
@@ -127,7 +127,7 @@ def columns_of(matches: MatchTable) -> dict[str, np.ndarray]:
     }
 
 
-def residual_of(model: DistortionModel, theta, matches: MatchTable) -> np.ndarray:
+def residual_of(model: DistortionModel, theta, matches: Matches) -> np.ndarray:
     """Data minus `DistortionModel.predict`, star by star: no groups, no powers, no kernel."""
     uv = model.predict(theta, matches.x, matches.y, **columns_of(matches))
     return np.column_stack([matches.u, matches.v]) - uv

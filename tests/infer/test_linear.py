@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.optimize import least_squares
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Rejection, build_model, fit_linear, residuals
 from bayesdist.model import FRAME_KINDS, DistortionModel, TimeDependence
@@ -188,7 +188,7 @@ def test_the_absolute_limit_counts_in_pixels_whatever_the_unit():
 
 def test_errors_that_are_too_small_as_a_whole_do_not_reject_everything():
     model, matches, _ = simulated(7, 500, order=2, sigma=0.05)
-    small = matches.with_sigma(0.002, 0.002)
+    small = matches.with_errors((0.002, 0.002))
     fit = fit_linear(small, model)
     # a chi-square above 25 with two degrees of freedom has probability 4e-6
     assert fit.uses(small).all() and fit.n_rejected == 0
@@ -436,7 +436,7 @@ def test_high_orders_on_a_round_field(radius, frames):
     u = x + 20 * X**3 + 5 * X * Y**2 + 100 * e + rng.normal(0, 0.01, n)
     v = y + 20 * Y**3 - 5 * X**2 * Y - 50 * e + rng.normal(0, 0.01, n)
     some = np.full(n, 0.01)
-    field = MatchTable(
+    field = Matches(
         x=x, y=y, u=u, v=v, sigma_u=some, sigma_v=some, unit="pix",
         exposure=e, exposure_names=("a", "b", "c")[: e.max() + 1],
     )  # fmt: skip

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.polynomial import polynomial
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import fit_linear
 from bayesdist.missions.wise.published import WISE_COEFFICIENTS
@@ -60,7 +60,7 @@ def fitted():
     for band in (1, 4):
         one = wise_set(f"W{band}", pairs=20_000, seed=5)
         c = one.chunk(0)
-        fit = fit_linear(MatchTable(c.x, c.y, c.u, c.v, c.sigma, c.sigma), one.model)
+        fit = fit_linear(Matches(c.x, c.y, c.u, c.v, c.sigma, c.sigma), one.model)
         out[band] = sip_from_solution(fit, linear="sip", inverse_order=4, scale_arcsec=2.75)
     return out
 

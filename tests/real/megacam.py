@@ -66,11 +66,11 @@ class Pairs:
         y = self.y - BOTTOMS[row] + 1
         return Table({"x": x, "y": y, "u": x + self.offset[:, 0], "v": y + self.offset[:, 1]})
 
-    def matches(self) -> bd.MatchTable:
+    def matches(self) -> bd.Matches:
         one, n = self.table(), len(self)
         columns = {name: np.array(one[name]) for name in one.colnames}
         sigma = np.full(n, SIGMA)
-        return bd.MatchTable(**columns, sigma_u=sigma, sigma_v=sigma, unit="arcsec")
+        return bd.Matches(**columns, sigma_u=sigma, sigma_v=sigma, unit="arcsec")
 
 
 def of_file(path: Path) -> Pairs:
@@ -151,12 +151,12 @@ def fitted(pairs: Pairs, true: NDArray[np.bool_] | None = None) -> Fitted:
     )
 
 
-def plain(matches: bd.MatchTable, model: bd.DistortionModel) -> bd.LinearFit:
+def plain(matches: bd.Matches, model: bd.DistortionModel) -> bd.LinearFit:
     """Least squares that leaves nobody out."""
     return bd.fit_linear(matches, model, rejection=bd.Rejection(1e12, None))
 
 
-def repeated(matches: bd.MatchTable, model: bd.DistortionModel) -> bd.LinearFit:
+def repeated(matches: bd.Matches, model: bd.DistortionModel) -> bd.LinearFit:
     """Clipping again and again within limits that someone has to choose."""
     fit = plain(matches, model)
     for limit in LIMITS:

@@ -28,7 +28,7 @@ from bayesdist.assess.budget.detector import detector_budget
 from bayesdist.assess.mosaic import chip_places
 from bayesdist.checks import Check
 from bayesdist.data.magnitude_errors import estimate
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer.checks import fit_checks, sampling_checks
 from bayesdist.infer.convergence import Convergence, Limits
 from bayesdist.infer.linear import LinearFit, fit_linear, residuals
@@ -104,7 +104,7 @@ def simulated(
     false = rng.random(n) < F
     spread = np.where(false, S_OUT, np.hypot(sigma, JITTER))
     uv = scale * (uv + rng.normal(size=(n, 2)) * spread[:, None])
-    return MatchTable(
+    return Matches(
         x, y, uv[:, 0], uv[:, 1], sigma_u=scale * sigma, sigma_v=scale * sigma, unit=unit, mag=mag,
         exposure=exposure, exposure_names=model.exposures, epoch=epoch,
         chip=chip, chip_numbers=tuple(c.number for c in model.chips),
@@ -115,7 +115,7 @@ def simulated(
 
 def sampled(
     fit: LinearFit,
-    table: MatchTable,
+    table: Matches,
     *,
     converged: bool = True,
     outliers: str = "gaussian",

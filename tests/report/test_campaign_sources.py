@@ -10,9 +10,9 @@ import pytest
 from bayesdist.app.campaign.report import _residuals
 from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.table_file import StoredLookupTables
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.diagnose.overlap import _aligned, _at_first_epoch, chosen_exposures
-from bayesdist.infer.nodes.corrected import inside_chips, with_columns
+from bayesdist.infer.nodes.corrected import inside_chips
 from bayesdist.model import Chip, DistortionModel, LookupTable, corrected
 
 SIZE = (1024.0, 512.0)
@@ -33,7 +33,7 @@ def rolled_pairs(tables, n=4000, rolls=(0.0, 100.0, 190.0, 275.0), seed=3, margi
     uv = np.concatenate([turned(flat[exposure == k], roll) for k, roll in enumerate(rolls)])
     uv += SIGMA * rng.standard_normal(uv.shape)
     sigma = np.full(exposure.size, SIGMA)
-    return MatchTable(
+    return Matches(
         x, y, *uv.T, sigma_u=sigma, sigma_v=sigma, unit="pix", exposure=exposure,
         exposure_names=tuple(f"e{k}" for k in range(len(rolls))), chip_numbers=(1,),
     )  # fmt: skip
@@ -53,7 +53,7 @@ def test_residuals_show_the_pattern_of_the_detector_whatever_the_roll(margin):
     x, y = corrected([table], pairs.x, pairs.y, chip=1)
     chip = Chip(1, "CCD", SIZE, (512.0, 256.0))
     model = DistortionModel(2, (chip,), frames="affine", exposures=pairs.exposure_names)
-    moved = with_columns(pairs, x=x, y=y)
+    moved = pairs.with_columns(x=x, y=y)
     kept = inside_chips(moved, model)
     assert kept.all() == (margin > 0)
     data = SimpleNamespace(
@@ -90,7 +90,7 @@ def shared_pairs(stars, epochs):
     star = np.concatenate(stars)
     here = 0.0 * star
     names = tuple(f"e{k}" for k in range(len(stars)))
-    return MatchTable(
+    return Matches(
         here + 1, here + 1, star + 0.0, here, unit="pix", exposure=exposure, star=star,
         exposure_names=names, epoch=np.asarray(epochs)[exposure],
     )  # fmt: skip
@@ -120,7 +120,7 @@ def test_motions_of_the_catalogue_are_taken_out_along_the_axes_of_the_exposure()
     motion = 0.3 * rng.standard_normal((500, 2))
     then = first + motion
     plane_a, plane_b = turned(first, 20.0) * 0.05, turned(then, 250.0) * 0.05  # arcseconds
-    pairs = MatchTable(then[:, 0], then[:, 1], then[:, 0], then[:, 1], unit="pix")
+    pairs = Matches(then[:, 0], then[:, 1], then[:, 0], then[:, 1], unit="pix")
     moved = _at_first_epoch(plane_b, pairs, np.arange(500), motion)
     assert np.sqrt(np.mean(_aligned(plane_a, plane_b, 0.05).rms ** 2)) > 0.2
     # what is left is the curvature of the sky over 200 arcseconds, and rounding

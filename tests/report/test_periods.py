@@ -10,7 +10,7 @@ from lxml import html as lxml_html
 from matplotlib.colors import to_hex
 from matplotlib.quiver import Quiver
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.diagnose.periods import PeriodSettings, time_variation
 from bayesdist.infer import fit_linear
 from bayesdist.infer.compare.order import select_order
@@ -39,7 +39,7 @@ def pairs():
     noise = 0.05 * rng.standard_normal((2, n))
     epoch = np.array([s[0] for s in SPANS.values()])[period] + 0.05
     sigma = np.full(n, 0.05)
-    return MatchTable(x, y, x + noise[0], v + noise[1], sigma_u=sigma, sigma_v=sigma, epoch=epoch)
+    return Matches(x, y, x + noise[0], v + noise[1], sigma_u=sigma, sigma_v=sigma, epoch=epoch)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.data import MatchTable, open_matches, read_matches
+from bayesdist.data import Matches, open_matches, read_matches
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.simulate import simulate_wise, simulate_wise_partitioned, wise_solution
 from bayesdist.simulate import partitioned as partitioned_module
@@ -32,10 +32,10 @@ def test_chunks_follow_one_generator(tmp_path, monkeypatch):
     assert len(os.listdir(tmp_path)) == 3
     rng = np.random.default_rng(3)
     chunks, truths = zip(*(simulate_wise(n, rng=rng) for n in (833, 833, 834)), strict=True)
-    expected = MatchTable.concatenate(chunks)
+    expected = Matches.concatenate(chunks)
     opened = open_matches(tmp_path)
-    (piece,) = opened.pieces()
-    back = piece.read()
+    (piece,) = opened.readers()
+    back = piece.load()
     for name in NAMES:
         assert getattr(back, name).tobytes() == getattr(expected, name).tobytes()
     assert (truth.false == np.concatenate([t.false for t in truths])).all()

@@ -6,7 +6,7 @@ from dataclasses import fields
 
 import numpy as np
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.infer import Rejection, fit_linear, sample
 from bayesdist.missions.wise.published import WISE_BANDS
 from bayesdist.missions.wise.simulate import PairChunk, WiseSet, wise_set
@@ -23,9 +23,9 @@ def pairs_of(one: WiseSet) -> PairChunk:
     return PairChunk(*(np.concatenate([getattr(c, name) for c in chunks]) for name in names))
 
 
-def matches_of(pairs: PairChunk) -> MatchTable:
+def matches_of(pairs: PairChunk) -> Matches:
     """What a calibration is given."""
-    return MatchTable(pairs.x, pairs.y, pairs.u, pairs.v, pairs.sigma, pairs.sigma)
+    return Matches(pairs.x, pairs.y, pairs.u, pairs.v, pairs.sigma, pairs.sigma)
 
 
 def calibration_of(task: int, partition: bool) -> dict[str, object]:

@@ -23,7 +23,7 @@ from bayesdist.app.kinds.exposures import FIT_AGAIN, ExposureScatter, read_hiera
 from bayesdist.app.kinds.fitted import FIT, TABLES, Fitted
 from bayesdist.app.kinds.table_file import read_tables
 from bayesdist.data import centroid_errors
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer import load, load_fit
 from bayesdist.infer.exposures.alone import ExposureSolutions, fit_exposures
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
@@ -102,7 +102,7 @@ def _fitted(matched: CampaignMatched, config: Config, base: Path) -> Fitted:
 
 
 def _joint(
-    stars: MatchTable, affine: DistortionModel, config: Config, base: Path, rejection: Rejection
+    stars: Matches, affine: DistortionModel, config: Config, base: Path, rejection: Rejection
 ) -> HierarchicalFit:
     """All exposures jointly, deviating from the model as they are found to scatter."""
     asked = config.time()
@@ -157,7 +157,7 @@ def _series(alone: ExposureSolutions, reference: Chip) -> Series:
     return Series(epoch, values, cov, tuple(labels), alone.names, source="exposures")
 
 
-def _trends(joint: HierarchicalFit, stars: MatchTable) -> list[str]:
+def _trends(joint: HierarchicalFit, stars: Matches) -> list[str]:
     """Deviations that go with time although they are taken to scatter, each as a clause.
 
     Only scale and shears: how the chips move against each other has a test of its own

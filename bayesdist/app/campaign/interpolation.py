@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import MEASURED
 from bayesdist.assess.terms.local import LocalErrors
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes, between_nodes
 from bayesdist.diagnose.tables.mean_square import MeanSquare
 from bayesdist.errors import DegenerateError
@@ -41,7 +41,7 @@ log = logging.getLogger("bayesdist")
 
 
 def measured_between(
-    pairs: MatchTable,
+    pairs: Matches,
     fit: LinearFit,
     tables: Sequence[LookupTable],
     *,
@@ -54,7 +54,7 @@ def measured_between(
 
     Parameters
     ----------
-    pairs : MatchTable
+    pairs : Matches
         At raw pixels, with errors.
     fit : LinearFit
         The polynomial that goes with the tables.

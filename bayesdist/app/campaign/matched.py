@@ -21,12 +21,11 @@ from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.split import set_aside
 from bayesdist.app.star_files import PAIRS, part_files
 from bayesdist.data import read_matches, write_partitioned
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.overlap import OverlapTest, overlap_test
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_influence import StarErrors
-from bayesdist.infer.nodes.corrected import with_columns
 from bayesdist.model import DistortionModel, LookupTable
 
 __all__ = ["CampaignMatched", "campaign_matches", "load_matched_campaign", "matched_campaign"]
@@ -42,16 +41,16 @@ class CampaignMatched(Matched):
     ----------
     inputs : Inputs
         Catalogue, exposures and star lists.
-    pairs : MatchTable
+    pairs : Matches
         All matches, fitted or held out.
     """
 
     section: ClassVar[str] = "matching"
 
-    stars: MatchTable
-    held: MatchTable | None = None
+    stars: Matches
+    held: Matches | None = None
     inputs: Inputs = field(kw_only=True)
-    pairs: MatchTable = field(kw_only=True)
+    pairs: Matches = field(kw_only=True)
 
     @property
     def mirrored(self) -> bool:
@@ -101,7 +100,7 @@ class CampaignMatched(Matched):
         """Name of the file of the reference catalogue."""
         return Path(self.inputs.catalog.source).name
 
-    def with_motions(self, table: MatchTable) -> MatchTable:
+    def with_motions(self, table: Matches) -> Matches:
         """Matches with what the catalogue states of the motions of their stars."""
         catalog = self.inputs.catalog
         if table.star is None or catalog.pm_u is None or catalog.sigma_pm_u is None:
@@ -111,7 +110,7 @@ class CampaignMatched(Matched):
             by_code = np.zeros(int(catalog.star.max()) + 1)
             by_code[catalog.star] = getattr(catalog, name)
             columns[name] = by_code[table.star]
-        return with_columns(table, **columns)
+        return table.with_columns(**columns)
 
     def overlap(
         self, posterior: Posterior, tables: tuple[LookupTable, ...], config: Config, base: Path
@@ -141,7 +140,7 @@ class CampaignMatched(Matched):
 
 
 def matched_campaign(
-    pairs: MatchTable, config: Config, inputs: Inputs, **more: Any
+    pairs: Matches, config: Config, inputs: Inputs, **more: Any
 ) -> CampaignMatched:
     """Matches of a campaign, with what the configuration holds out set aside.
 

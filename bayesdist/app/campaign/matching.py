@@ -23,7 +23,7 @@ from bayesdist.app.campaign.soundness import input_warnings, refuse_few, shear_w
 from bayesdist.app.config import Config
 from bayesdist.data import (
     ExposureLog,
-    MatchTable,
+    Matches,
     StarCuts,
     StarList,
     match_campaign,
@@ -179,7 +179,7 @@ def _gauge_first(lists: tuple[StarList, ...], cuts: StarCuts, chip: int) -> tupl
     return (lists[first], *lists[:first], *lists[first + 1 :])
 
 
-def _refuse_bare(pairs: MatchTable, chips: tuple[Chip, ...], where: str) -> None:
+def _refuse_bare(pairs: Matches, chips: tuple[Chip, ...], where: str) -> None:
     """Refuse pairs that leave a chip without any."""
     for chip in chips:
         if chip.number not in pairs.chip_numbers:

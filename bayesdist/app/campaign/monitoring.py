@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +15,13 @@ from bayesdist.app.kinds.fitted import Fitted, required
 from bayesdist.app.results import Results
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.star_files import PAIRS, part_files
-from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
+from bayesdist.data import MagnitudeErrors, Matches, read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.compare.monitoring import NewFit, fit_new, with_star_errors_of
 from bayesdist.infer.linear import Rejection
-from bayesdist.infer.nodes.corrected import on_the_chips, with_columns
+from bayesdist.infer.nodes.corrected import on_the_chips
 from bayesdist.model import corrected
 
 __all__ = ["NewExposures", "fit_exposures_of", "read_new_exposures"]
@@ -37,7 +37,7 @@ class NewExposures:
     ----------
     released : Posterior
         With the errors of the catalogue, and those that its stars share.
-    matches : MatchTable
+    matches : Matches
         At the pixels that the release's tables have corrected, with errors.
     errors : StarErrors or None
         Of the catalogue; None where stars have no codes, or pairs no errors of it.
@@ -48,7 +48,7 @@ class NewExposures:
     """
 
     released: Posterior
-    matches: MatchTable
+    matches: Matches
     errors: StarErrors | None
     same_catalogue: bool
     left_out: tuple[str, ...]
@@ -92,10 +92,7 @@ def read_new_exposures(release: Results, new: Path) -> NewExposures:
             do="give pairs of other exposures",
         )
     pairs = pairs.select(fresh)
-    names = pairs.exposures
-    code = {name: k for k, name in enumerate(names)}
-    codes = np.array([code.get(name, -1) for name in pairs.exposure_names])[pairs.exposure]
-    pairs = replace(pairs, exposure=codes, exposure_names=names)
+    pairs = pairs.with_exposure_names(pairs.exposures)
     own = None if run is None else read_magnitude_errors(run.path)
     return NewExposures(
         released,
@@ -106,7 +103,7 @@ def read_new_exposures(release: Results, new: Path) -> NewExposures:
     )
 
 
-def prepared(release: Fitted, pairs: MatchTable, errors: MagnitudeErrors | None) -> MatchTable:
+def prepared(release: Fitted, pairs: Matches, errors: MagnitudeErrors | None) -> Matches:
     """Pairs at the pixels that the release's tables have corrected, with errors of centroids."""
     tables = release.tables.tables
     if tables:
@@ -119,10 +116,10 @@ def prepared(release: Fitted, pairs: MatchTable, errors: MagnitudeErrors | None)
             chip=pairs.chip_number,
             filter=np.where(names == "", own, names),
         )
-        pairs = on_the_chips(with_columns(pairs, x=x, y=y), release.linear.model)
+        pairs = on_the_chips(pairs.with_columns(x=x, y=y), release.linear.model)
     if pairs.mag is None or errors is None:
         return pairs
-    return with_centroid_errors(pairs, errors)
+    return pairs.with_errors(errors, in_quadrature=True)
 
 
 def fit_exposures_of(release: Results, new: NewExposures) -> NewFit:
@@ -144,13 +141,11 @@ def fit_exposures_of(release: Results, new: NewExposures) -> NewFit:
         return found
     released = None
     if new.same_catalogue:
-        old = release.data.stars
-        assert isinstance(old, MatchTable)
-        released = (release.fit, old)
+        released = (release.fit, release.data.stars)
     return with_star_errors_of(new.errors, found, new.matches, released)
 
 
-def _pairs(run: RunDirectory | None, new: Path, unit: str) -> MatchTable:
+def _pairs(run: RunDirectory | None, new: Path, unit: str) -> Matches:
     """Pairs as another run keeps them, or of a table."""
     if run is None:
         if new.suffix == ".toml":
@@ -173,7 +168,7 @@ def _pairs(run: RunDirectory | None, new: Path, unit: str) -> MatchTable:
     return found
 
 
-def _refuse_other_filters(config: Config, pairs: MatchTable, where: str) -> None:
+def _refuse_other_filters(config: Config, pairs: Matches, where: str) -> None:
     mine = campaign_block(config).filter
     others = sorted({name for name in pairs.filter_names if name} - {mine})
     if mine is not None and others:
@@ -184,7 +179,7 @@ def _refuse_other_filters(config: Config, pairs: MatchTable, where: str) -> None
         )
 
 
-def _catalogue_errors(pairs: MatchTable) -> StarErrors | None:
+def _catalogue_errors(pairs: Matches) -> StarErrors | None:
     """The least error that each star of the catalogue has in its pairs, by code of the star."""
     if pairs.star is None or pairs.sigma_u is None or pairs.sigma_v is None or pairs.mag is None:
         return None

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.inputs import Inputs
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit, residuals
 
@@ -20,7 +20,7 @@ FEWEST = 5  # exposures: a parabola in time takes three
 NORMAL = 1.4826  # of the median of |z|
 
 
-def refuse_outrun_stars(inputs: Inputs, fit: LinearFit, pairs: MatchTable) -> None:
+def refuse_outrun_stars(inputs: Inputs, fit: LinearFit, pairs: Matches) -> None:
     """Refuse a catalogue without motions where residuals grow with the time from its epoch.
 
     The square of the residuals of stars that move is a parabola in time.
@@ -30,7 +30,7 @@ def refuse_outrun_stars(inputs: Inputs, fit: LinearFit, pairs: MatchTable) -> No
     inputs : Inputs
     fit : LinearFit
         Of every exposure by itself.
-    pairs : MatchTable
+    pairs : Matches
         What it was made from.
 
     Raises

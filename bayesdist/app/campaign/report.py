@@ -21,7 +21,7 @@ from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.results import Results
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.store import as_json
-from bayesdist.data import MatchTable, with_centroid_errors
+from bayesdist.data import Matches
 from bayesdist.data.motions import motion_error_line
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
 from bayesdist.infer import GaussianPriors, LinearFit, Posterior, fit_linear
@@ -183,10 +183,9 @@ def _residuals(
 ) -> tuple[ChipResiduals, ...]:
     """Pairs of each chip without the tables and with them, along the detector's axes."""
     pairs, moved, model = matched.stars, data.stars, matched.affine_model(config)
-    assert isinstance(moved, MatchTable)
     tables = data.fitted.tables.tables
     errors, farthest = data.fitted.errors.by_magnitude, config.fit.clip_abs
-    plain = pairs if errors is None else with_centroid_errors(pairs, errors)
+    plain = pairs if errors is None else pairs.with_errors(errors, in_quadrature=True)
     if any(table.filter for table in tables):  # those of the detector are not of this run
         detector = [table for table in tables if not table.filter]
         plain = corrected_matches(detector, plain)
@@ -225,7 +224,7 @@ def _cells(size: tuple[float, float], n: int) -> tuple[int, int]:
 
 
 def _binned(
-    pairs: MatchTable,
+    pairs: Matches,
     residual: Float,
     rows: NDArray[np.bool_],
     bins: tuple[int, int],

@@ -19,7 +19,7 @@ from bayesdist.app.config import Config
 from bayesdist.app.config.campaign import TablesBlock
 from bayesdist.app.kinds.table_file import StoredLookupTables
 from bayesdist.data.magnitude_errors import MagnitudeErrors
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.infer import LinearFit, fit_by_magnitude
 from bayesdist.infer.nodes import (
@@ -82,7 +82,7 @@ def fit_tables(
             return FittedTables(StoredLookupTables())
         placed = on_the_chips(corrected_matches(held, matched.stars), model)
         fit, _, errors = scatter_by_magnitude(placed, model, matched.inputs)
-        pairs = matched.stars.with_errors_by_magnitude(errors)
+        pairs = matched.stars.with_errors(errors)
         between = measured_between(pairs, fit, held, filter=filter, fitted=False)
         of_nodes = _on_the_grid(model, grid, _errors_of(held, fit))
         return FittedTables(_stored(held, of_nodes, between))
@@ -115,8 +115,8 @@ def fit_tables(
 
 
 def scatter_by_magnitude(
-    pairs: MatchTable, model: DistortionModel, inputs: Inputs
-) -> tuple[LinearFit, MatchTable, MagnitudeErrors]:
+    pairs: Matches, model: DistortionModel, inputs: Inputs
+) -> tuple[LinearFit, Matches, MagnitudeErrors]:
     """Fit of every exposure by itself and scatter by magnitude, as `fit_by_magnitude`.
 
     Raises
@@ -125,7 +125,7 @@ def scatter_by_magnitude(
         Where stars have outrun a catalogue without proper motions.
     """
     fit, _, errors = fit_by_magnitude(pairs, model)
-    scattered = pairs.with_errors_by_magnitude(errors)
+    scattered = pairs.with_errors(errors)
     refuse_outrun_stars(inputs, fit, scattered)
     return fit, scattered, errors
 
@@ -135,7 +135,7 @@ def _with_errors(
     model: DistortionModel,
     held: tuple[LookupTable, ...],
     block: TablesBlock,
-) -> MatchTable:
+) -> Matches:
     """Pairs with errors by magnitude, free of the pattern that the tables are to describe.
 
     The scatter of the residuals before any table is twice that of the stars: with errors from
@@ -153,7 +153,7 @@ def _with_errors(
         max_iterations=ROUGH,
     )
     _, _, errors = scatter_by_magnitude(rough.corrected(pairs), model, inputs)
-    return pairs.with_errors_by_magnitude(errors)
+    return pairs.with_errors(errors)
 
 
 def _stored(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
 
 import numpy as np
 from astropy.table import Table
@@ -12,9 +11,7 @@ from astropy.table import Table
 from bayesdist.app.output import write_table
 from bayesdist.data.added_errors import AddedErrors
 from bayesdist.data.magnitude_errors import MagnitudeErrors
-from bayesdist.data.matches import MatchTable
-from bayesdist.data.preparing import with_centroid_errors
-from bayesdist.infer.stars.shards import Matches
+from bayesdist.data.matches import Matches
 
 __all__ = ["QUOTED", "ErrorLaw", "read_magnitude_errors"]
 
@@ -43,20 +40,15 @@ class ErrorLaw:
     added: AddedErrors | None = None
     with_catalogue: bool = False
 
-    @overload
-    def applied(self, matches: MatchTable) -> MatchTable: ...
-    @overload
-    def applied(self, matches: Matches) -> Matches: ...
     def applied(self, matches: Matches) -> Matches:
         """Matches with these errors; they themselves where the quoted errors stand."""
         if self.factor != 1.0:
-            matches = matches.with_errors_times(self.factor)
+            matches = matches.with_scaled_errors(self.factor)
         if self.by_magnitude is not None:
-            if self.with_catalogue and isinstance(matches, MatchTable):
-                matches = with_centroid_errors(matches, self.by_magnitude)
-            else:
-                matches = matches.with_errors_by_magnitude(self.by_magnitude)
-        return matches if self.added is None else matches.with_added_errors(self.added)
+            matches = matches.with_errors(self.by_magnitude, in_quadrature=self.with_catalogue)
+        return (
+            matches if self.added is None else matches.with_errors(self.added, in_quadrature=True)
+        )
 
     def save(self, folder: Path) -> None:
         """Write the errors by magnitude; the rest is in the summary of the fit."""

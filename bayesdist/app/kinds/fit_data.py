@@ -13,11 +13,10 @@ from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.assess import SAMPLE
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.residuals.quoted import error_scale_sentence
 from bayesdist.infer import LinearFit, Shards
 from bayesdist.infer.exposures.frame_choice import FrameChoice, frames_that_help
-from bayesdist.infer.stars.shards import Matches
 from bayesdist.model import DistortionModel
 
 __all__ = ["FitData"]
@@ -78,20 +77,20 @@ class FitData:
         return self.reader.shards(self.model, self.placed, self._law)
 
     @property
-    def sample(self) -> MatchTable:
+    def sample(self) -> Matches:
         """Evenly spread ones of them, or all."""
         return self.reader.sample(self.placed, self._law)
 
     @cached_property
     def dates(self) -> Float:
         """Distinct dates of the stars, decimal years; none where they have none."""
-        table = self.placed if isinstance(self.placed, MatchTable) else self.sample
+        table = self.placed if self.placed.in_memory else self.sample
         return np.zeros(0) if table.epoch is None else np.unique(table.epoch)
 
     @cached_property
     def median_epoch(self) -> float:
         """Median date of the stars, decimal years; they have dates where the model drifts."""
-        table = self.placed if isinstance(self.placed, MatchTable) else self.placed.sample(SAMPLE)
+        table = self.placed if self.placed.in_memory else self.placed.sample(SAMPLE)
         assert table.epoch is not None
         return float(np.median(table.epoch))
 

@@ -14,13 +14,12 @@ from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.exposures import FIT_AGAIN, ExposureScatter, write_hierarchy, write_series
 from bayesdist.app.kinds.table_file import StoredLookupTables, write_tables
 from bayesdist.app.selfcal.solved import SelfCalibrated
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, LinearFit, save_fit
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.nodes import corrected_matches, inside_chips, on_the_chips
 from bayesdist.infer.series import Series
-from bayesdist.infer.stars.shards import Matches
 
 __all__ = ["FIT", "TABLES", "Fitted", "required"]
 
@@ -70,11 +69,11 @@ class Fitted:
         """
         if self.solved is not None:
             return self.solved.matches
-        if not self.tables.tables or not isinstance(stars, MatchTable):
+        if not self.tables.tables or not stars.in_memory:
             return stars
         return on_the_chips(corrected_matches(self.tables.tables, stars), self.linear.model)
 
-    def inside(self, stars: MatchTable) -> NDArray[np.bool_]:
+    def inside(self, stars: Matches) -> NDArray[np.bool_]:
         """Boolean mask (N,) of the stars that the tables do not move off their chip."""
         if not self.tables.tables:
             return np.ones(len(stars), bool)

@@ -11,11 +11,10 @@ from astropy.table import Table
 
 from bayesdist.app.config import Config
 from bayesdist.app.output import write_table
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_influence import StarErrors
-from bayesdist.infer.stars.shards import Matches
 from bayesdist.model import LookupTable
 
 __all__ = ["Matched"]
@@ -29,9 +28,9 @@ class Matched:
 
     Parameters
     ----------
-    stars : MatchTable or PartitionedMatches
+    stars : Matches
         Those that are fitted.
-    held : MatchTable or PartitionedMatches or None
+    held : Matches or None
         Those that are held out; None where none are.
     whole : tuple of str
         Exposures that are held out whole.
@@ -92,7 +91,7 @@ class Matched:
         """Name of the file of the reference catalogue, or what it is."""
         return "catalogue"
 
-    def with_motions(self, table: MatchTable) -> MatchTable:
+    def with_motions(self, table: Matches) -> Matches:
         """Matches with what the catalogue states of the motions of their stars."""
         return table
 

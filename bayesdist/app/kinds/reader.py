@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.assess import SAMPLE
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer import Shards, load
-from bayesdist.infer.stars.shards import Compute, Matches
+from bayesdist.infer.stars.shards import Compute
 from bayesdist.model import DistortionModel
 
 __all__ = ["StarReader"]
@@ -26,7 +26,7 @@ class StarReader:
         self._asked: tuple[Matches, ErrorLaw] | None = None
         self._matches: Matches | None = None
         self._shards: Shards | None = None
-        self._sample: MatchTable | None = None
+        self._sample: Matches | None = None
 
     def matches(self, stars: Matches, errors: ErrorLaw = QUOTED) -> Matches:
         """The stars with their errors."""
@@ -49,7 +49,7 @@ class StarReader:
             self._shards = load(model, matches, self.compute)
         return self._shards
 
-    def sample(self, stars: Matches, errors: ErrorLaw = QUOTED) -> MatchTable:
+    def sample(self, stars: Matches, errors: ErrorLaw = QUOTED) -> Matches:
         """Some of the stars, or all where they are not many."""
         matches = self.matches(stars, errors)
         if self._sample is None:

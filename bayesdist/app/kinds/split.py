@@ -2,34 +2,32 @@
 
 from __future__ import annotations
 
-from typing import TypeVar, cast
-
 from bayesdist.app.config import Config
 from bayesdist.app.config.holdout import HoldoutBlock
-from bayesdist.data.holdout import SetAside, exposures_drawn, split_matches
+from bayesdist.data.holdout import HoldoutSpec, exposures_drawn, split_matches
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
-from bayesdist.infer.stars.shards import Matches
 from bayesdist.limits import HELD_OUT
 
 __all__ = ["set_aside"]
 
-M = TypeVar("M", bound=Matches)
 
-
-def set_aside(config: Config, matches: M, needed: int = 0) -> tuple[M, M | None, tuple[str, ...]]:
+def set_aside(
+    config: Config, matches: Matches, needed: int = 0
+) -> tuple[Matches, Matches | None, tuple[str, ...]]:
     """Matches that are fitted, those that are held out, and exposures that are so as a whole.
 
     Parameters
     ----------
     config : Config
-    matches : MatchTable or PartitionedMatches
+    matches : Matches
     needed : int
         So many of the first exposures define the gauge and cannot be held out.
 
     Returns
     -------
-    fitted : MatchTable or PartitionedMatches
-    held : MatchTable or PartitionedMatches or None
+    fitted : Matches
+    held : Matches or None
         None where the configuration holds nothing out.
     whole : tuple of str
 
@@ -43,14 +41,14 @@ def set_aside(config: Config, matches: M, needed: int = 0) -> tuple[M, M | None,
     if block is None:
         return matches, None, ()
     whole = _whole_exposures(block, config.sampler.seed, matches.exposure_names, needed)
-    split = split_matches(matches, SetAside(block.fraction, whole, config.sampler.seed))
+    split = split_matches(matches, HoldoutSpec(block.fraction, whole, config.sampler.seed))
     if not HELD_OUT.met_by(len(split.held)):
         raise InputError(
             f"{len(split.held)} of {len(matches)} stars are held out, which say too little",
             where=", ".join(matches.sources),
             do=f"hold out at least {HELD_OUT.value}: raise holdout.fraction",
         )
-    return cast(M, split.kept), cast(M, split.held), whole
+    return split.kept, split.held, whole
 
 
 def _whole_exposures(

@@ -20,6 +20,7 @@ from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.kinds.split import set_aside
 from bayesdist.app.match_sources import read_configured
 from bayesdist.assess import SAMPLE
+from bayesdist.data import Matches
 from bayesdist.diagnose.residuals.quoted import error_scale
 from bayesdist.errors import ConfigError, DegenerateError, InputError, NotSettledError
 from bayesdist.infer import (
@@ -35,7 +36,6 @@ from bayesdist.infer import (
 )
 from bayesdist.infer.exposures.frame_choice import frames_that_help
 from bayesdist.infer.linear import Rejection
-from bayesdist.infer.stars.shards import Matches
 from bayesdist.model import DistortionModel
 
 __all__ = [
@@ -57,7 +57,7 @@ def match_stars(stars: Matches, config: Config, base: Path) -> Matched:
 
     Parameters
     ----------
-    stars : MatchTable or PartitionedMatches
+    stars : Matches
         As `read_stars` reads them.
     config : Config
         With a section [data].

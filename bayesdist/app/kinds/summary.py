@@ -9,9 +9,9 @@ from typing import Any
 
 from bayesdist.app.added_errors import added_errors_rows
 from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.data import Matches
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.skew import Skew, skew_of
-from bayesdist.infer.stars.shards import Matches
 
 __all__ = ["fit_sections", "log_fit", "sample_sections"]
 
@@ -24,7 +24,7 @@ def fit_sections(fitted: Fitted, stars: Matches, *, skew: bool = False) -> dict[
     Parameters
     ----------
     fitted : Fitted
-    stars : MatchTable or PartitionedMatches
+    stars : Matches
         As `Fitted.placed` gives them.
     skew : bool
         The skew of the axes is asked for.

@@ -16,7 +16,7 @@ from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.selfcal.given import Given
 from bayesdist.app.selfcal.matches import matches_of
 from bayesdist.data.detections import Detections
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal import SelfCalibration
@@ -56,7 +56,7 @@ class SelfcalMatched(Matched):
     section: ClassVar[str] = "selfcal"
     has_catalogue: ClassVar[bool] = False
 
-    stars: MatchTable
+    stars: Matches
     given: Given = field(kw_only=True)
     detections: Detections = field(kw_only=True)
     problem: Problem = field(kw_only=True)

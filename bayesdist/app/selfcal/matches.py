@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.selfcal.inputs import Inputs
-from bayesdist.data import MagnitudeErrors, MatchTable
+from bayesdist.data import MagnitudeErrors, Matches
 from bayesdist.data.detections import Detections
 from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.selfcal.calibrate import scatter_by_magnitude
@@ -30,7 +30,7 @@ def matches_of(
     detections: Detections,
     inputs: Inputs,
     unused: Mapping[str, int],
-) -> MatchTable:
+) -> Matches:
     """Detections of the stars beside these, in the frame of each exposure's own VAFACTOR.
 
     Parameters
@@ -56,7 +56,7 @@ def matches_of(
     chip = np.zeros(len(rows), np.int64)
     for code, number in enumerate(numbers[1:], start=1):
         chip[d.chip[rows] == number] = code
-    return MatchTable.of_distinct_rows(
+    return Matches.of_distinct_rows(
         x=d.x[rows],
         y=d.y[rows],
         u=places[:, 0],
@@ -83,9 +83,7 @@ def _axes(W: Float) -> Float:
     return np.sqrt(np.stack([W[:, 2], W[:, 0]], axis=1) / det[:, None])
 
 
-def magnitude_errors_of(
-    solution: SelfCalibrationMode, matches: MatchTable
-) -> MagnitudeErrors | None:
+def magnitude_errors_of(solution: SelfCalibrationMode, matches: Matches) -> MagnitudeErrors | None:
     """Errors of centroids by magnitude, in the unit of u, v; None without magnitudes."""
     if matches.mag is None:
         return None

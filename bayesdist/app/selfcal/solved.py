@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bayesdist.app.output import write_table
 from bayesdist.app.selfcal.gauge import gauge_table, gauge_words
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal import Gauge, SelfCalibrationMode
 
@@ -35,7 +35,7 @@ class SelfCalibrated:
         What the detections leave free, and what fixes it.
     fixed : mapping of str to str
         What fixes each property of the solution.
-    matches : MatchTable
+    matches : Matches
         Detections beside their stars.
     arrays : mapping
         From which the solution is made again.
@@ -46,7 +46,7 @@ class SelfCalibrated:
     solution: SelfCalibrationMode
     gauge: Gauge
     fixed: Mapping[str, str]
-    matches: MatchTable
+    matches: Matches
     arrays: Mapping[str, NDArray[Any]]
     contradictions: tuple[str, ...] = ()
 

@@ -16,7 +16,7 @@ from bayesdist.app.output import write_table
 from bayesdist.app.results import Results
 from bayesdist.app.selfcal.matched import selfcal_matches
 from bayesdist.data import ReferenceCatalog
-from bayesdist.data.write import write_columns
+from bayesdist.data.storage.write import write_columns
 from bayesdist.infer.selfcal import SelfCalibrationMode, StarCatalogue, star_catalogue
 
 __all__ = ["FLAGS", "star_table", "write_stars"]

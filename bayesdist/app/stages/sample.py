@@ -9,7 +9,6 @@ from bayesdist.app.kinds.summary import sample_sections
 from bayesdist.app.results import Results
 from bayesdist.app.screen import progress_bar
 from bayesdist.app.star_files import FOLDER, write_star_files
-from bayesdist.data import MatchTable
 from bayesdist.infer import Posterior, save_posterior
 
 __all__ = ["run_sample", "save_sampled"]
@@ -31,7 +30,7 @@ def save_sampled(results: Results, posterior: Posterior) -> Results:
     record = run.record
     provenance = {k: record[k] for k in ("inputs", "seed", "versions", "created")}
     provenance |= {"gauge": gauge} if gauge else {}
-    table = data.stars if isinstance(data.stars, MatchTable) else None
+    table = data.stars if data.stars.in_memory else None
     save_posterior(posterior, table, run / "posterior.nc", provenance=provenance)
     write_star_files(data.stars, data.fit, posterior, run / FOLDER)
     run.summarise(**sample_sections(posterior, in_circle=in_circle(data, results.config)))

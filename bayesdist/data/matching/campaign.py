@@ -10,7 +10,7 @@ catalogue positions (ACS ISR 2015-06, Section 4.1).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
 
@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.exposures import ExposureLog
 from bayesdist.data.labels import merged_counts
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.data.matching.exposure import ExposureMatch, match_exposure
 from bayesdist.data.matching.reports import (
     ExposureReport,
@@ -55,7 +55,7 @@ class CampaignMatches:
 
     Parameters
     ----------
-    table : MatchTable
+    table : Matches
         Raw pixels with catalogue positions at the epoch of each exposure; `sigma_u`, `sigma_v`
         are those of the catalogue there, without the centroid's error.
     reports : tuple of ExposureReport
@@ -66,7 +66,7 @@ class CampaignMatches:
         True where u has the sign that is opposite to the catalogue's.
     """
 
-    table: MatchTable
+    table: Matches
     reports: tuple[ExposureReport, ...]
     left_out: Mapping[str, str] = field(default_factory=dict)
     mirrored: bool = False
@@ -191,12 +191,12 @@ def match_campaign(
             continue
         found.append(pairs)
     refuse_astray([one.report for one in found], catalog)
-    kept = [one for one in lists if one.exposure not in failed]
+    matched = [one for one in lists if one.exposure not in failed]
     shown = catalog.mirrored() if views[0].mirrored else catalog
-    table = _table(kept, log, shown, found)
+    table = _table(matched, log, shown, found)
     if failed:
         n = sum(len(one) for one in lists) - table.n_rows
-        table = replace(table, n_rows=table.n_rows + n, rejected={**table.rejected, _LEFT_OUT: n})
+        table = table.with_counts(table.n_rows + n, {**table.rejected, _LEFT_OUT: n})
     left_out = {k: e.cause for k, e in failed.items()}
     reports = tuple(one.report for one in found)
     return CampaignMatches(table, reports, left_out, views[0].mirrored)
@@ -260,7 +260,7 @@ def _table(
     log: ExposureLog,
     catalog: ReferenceCatalog,
     found: Sequence[ExposureMatch],
-) -> MatchTable:
+) -> Matches:
     """Table of all matches, with the columns that every list has."""
     reports = [one.report for one in found]
     sizes = [len(match.index) for match in found]
@@ -282,7 +282,7 @@ def _table(
     if catalog.sigma_u is not None:
         sigmas["sigma_u"] = np.concatenate([m.sigma[0] for m in found])  # type: ignore[index]
         sigmas["sigma_v"] = np.concatenate([m.sigma[1] for m in found])  # type: ignore[index]
-    return MatchTable(
+    return Matches(
         x=joined([one.x for one in lists]),
         y=joined([one.y for one in lists]),
         u=np.concatenate([match.u for match in found]),

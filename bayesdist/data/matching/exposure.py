@@ -22,7 +22,7 @@ from bayesdist.data.matching.pairs import (
 )
 from bayesdist.data.matching.reports import ExposureReport
 from bayesdist.data.matching.search_radius import SearchRadius, search_radius
-from bayesdist.data.matching.similarity import PatternIndex, find_similarity
+from bayesdist.data.matching.similarity import PatternIndex, find_similarity, grown_map
 from bayesdist.data.matching.smooth_map import smooth_map
 from bayesdist.data.starlists import StarList
 from bayesdist.errors import InputError
@@ -270,15 +270,8 @@ def _by_patterns(
     rows = np.flatnonzero(good)
     if stars.mag is not None:
         rows = rows[np.argsort(stars.mag[rows], kind="stable")]
-    rough = iterated_map(
-        plane[rows[:_BRIGHT_STARS]],
-        patterns.positions,
-        patterns.tree,
-        found.map,
-        0.3 * patterns.spacing,
-        0.15 * patterns.spacing,
-    )
-    return (found.map if rough is None else rough), found.coincidences
+    rough = grown_map(plane[rows[:_BRIGHT_STARS]], found, patterns, narrow=0.15)
+    return rough, found.coincidences
 
 
 def _around(points: Float, catalog: ReferenceCatalog) -> Int:

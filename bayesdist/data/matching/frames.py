@@ -14,8 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bayesdist.data.matching.linear_map import LinearMap, iterated_map
-from bayesdist.data.matching.similarity import PatternIndex, find_similarity, pattern_index
+from bayesdist.data.matching.linear_map import LinearMap
+from bayesdist.data.matching.similarity import (
+    PatternIndex,
+    find_similarity,
+    grown_map,
+    pattern_index,
+)
 from bayesdist.errors import InputError
 
 __all__ = ["MutualFrames", "mutual_frames", "refuse_duplicates"]
@@ -23,7 +28,8 @@ __all__ = ["MutualFrames", "mutual_frames", "refuse_duplicates"]
 Float = NDArray[np.float64]
 
 BRIGHT_STARS = 3000  # stars of an exposure that are used
-WIDE, NARROW = 0.3, 0.1  # of the spacing: reach of the linear map, first and last
+WIDE = 0.3  # of the spacing: stars farther from those of others are new
+NARROW = 0.1  # of the spacing: last reach of the linear map
 MAX_COMMON_FRACTION = 0.5  # fraction of equal positions above which two exposures are one
 SCALES = (0.97, 1.03)
 
@@ -57,9 +63,9 @@ def mutual_frames(
     """
     groups = _groups(planes, mags)
     if len(groups) > 1:
-        told = "; ".join(_listed([names[e] for e in group]) for group in groups)
+        listed = "; ".join(_listed([names[e] for e in group]) for group in groups)
         raise InputError(
-            f"the exposures fall into {len(groups)} groups without stars in common: {told}",
+            f"the exposures fall into {len(groups)} groups without stars in common: {listed}",
             where=source,
             do="add exposures between them, calibrate each group by itself, or give a start by "
             "which their stars agree",
@@ -121,12 +127,10 @@ def _groups(planes: Sequence[Float], mags: Sequence[Float] | None) -> list[dict[
 def _onto(points: Float, mag: Float | None, index: PatternIndex) -> LinearMap | None:
     """Linear map of an exposure; None where it is not recognised."""
     try:
-        first = find_similarity(points, index, mag=mag, scale=SCALES).map
+        found = find_similarity(points, index, mag=mag, scale=SCALES)
     except InputError:
         return None
-    reach = index.spacing
-    fine = iterated_map(points, index.positions, index.tree, first, WIDE * reach, NARROW * reach)
-    return first if fine is None else fine
+    return grown_map(points, found, index, narrow=NARROW)
 
 
 def _brightest(plane: Float, mag: Float | None) -> NDArray[np.int64]:

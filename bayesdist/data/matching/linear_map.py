@@ -117,11 +117,11 @@ def robust_fit(
         if fitted is None:
             return None
         solution, away = fitted
-        kept = away <= min(_CLIP * float(np.median(away[use])) + slack, reach)
-        found = RobustFit(solution, away, kept)
-        if (kept == use).all():
+        near = away <= min(_CLIP * float(np.median(away[use])) + slack, reach)
+        found = RobustFit(solution, away, near)
+        if (near == use).all():
             break
-        use = kept
+        use = near
     return found
 
 

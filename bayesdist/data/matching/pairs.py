@@ -8,7 +8,15 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from bayesdist.data.matching.linear_map import MAX_SAMPLE
 
-__all__ = ["beats_chance", "chance_rate", "hull_of", "inside_hull", "mutual_pairs", "overlap"]
+__all__ = [
+    "beats_chance",
+    "chance_rate",
+    "hull_of",
+    "inside_hull",
+    "mean_spacing",
+    "mutual_pairs",
+    "overlap",
+]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -48,6 +56,13 @@ def overlap(points: Float, reference: Float) -> tuple[int, float]:
     """Number of reference stars in the hull of the points (at least 1), and its area."""
     equations, area = hull_of(points)
     return max(int(inside_hull(reference, equations).sum()), 1), area
+
+
+def mean_spacing(points: Float) -> float:
+    """Distance between neighbours if the points (N, 2) were a square grid; positive."""
+    extent = np.ptp(points, axis=0)
+    area = float(np.prod(np.maximum(extent, extent.max() * 1e-3)))
+    return float(np.sqrt(area / len(points))) or 1.0
 
 
 def mutual_pairs(

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from bayesdist.data.matching.linear_map import LinearMap
-from bayesdist.data.matching.pairs import chance_rate, hull_of
+from bayesdist.data.matching.linear_map import LinearMap, iterated_map
+from bayesdist.data.matching.pairs import chance_rate, hull_of, mean_spacing
 from bayesdist.data.matching.triangles import Candidate, Level, candidates
-from bayesdist.data.matching.voting import mean_spacing
 from bayesdist.errors import InputError
 
 __all__ = [
@@ -27,6 +26,7 @@ __all__ = [
     "PatternIndex",
     "Similarity",
     "find_similarity",
+    "grown_map",
     "mismatch_reason",
     "pattern_index",
 ]
@@ -39,6 +39,7 @@ _STARS_OF_FIRST_LEVEL = 400  # each further one has three times as many
 _LEVEL_FACTOR = 3
 _TOLERANCES = (0.004, 0.012)  # of the logarithms of side ratios: remainder of a distortion
 _DEPTHS = (1.0, 0.5, 2.0)  # stars of the list, in units of the number by the mean density
+_WIDE = 0.3  # mean distances between reference stars: reach of the first pairs
 _STARS_CHECKED = 1000  # stars that a candidate is checked with
 _CHANCE_SIGMAS = 8.0  # by which its coincidences must beat chance
 _MIN_AGREEING = 6  # stars that agree
@@ -223,6 +224,19 @@ def find_similarity(
         where=source,
         do="check the field, the scale, the parity and the distortion that is taken as known",
     )
+
+
+def grown_map(
+    points: Float, found: Similarity, reference: PatternIndex, *, narrow: float
+) -> LinearMap:
+    """Linear map of points (N, 2), fitted outwards from the middle, where a similarity is good.
+
+    The reach of its pairs shrinks from 0.3 to `narrow` mean distances between reference stars.  It
+    is the similarity itself where too few points have one.
+    """
+    wide, least = _WIDE * reference.spacing, narrow * reference.spacing
+    grown = iterated_map(points, reference.positions, reference.tree, found.map, wide, least)
+    return found.map if grown is None else grown
 
 
 def _tries(

@@ -1,18 +1,17 @@
-"""Matches of detections that agree with a catalogue up to a shift, a small rotation and a scale."""
+"""Matches of detections that agree with a catalogue up to a shift, a rotation and a small scale."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, iterated_map
 from bayesdist.data.matching.pairs import beats_chance, mutual_pairs, overlap
-from bayesdist.data.matching.voting import mean_spacing, vote_offset
+from bayesdist.data.matching.similarity import find_similarity, grown_map, pattern_index
 from bayesdist.errors import InputError
 
 __all__ = ["Matching", "match_table", "match_to_catalog"]
@@ -20,7 +19,8 @@ __all__ = ["Matching", "match_table", "match_to_catalog"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-_LOG10_CHANCE = -4.0  # a vote that chance wins more often than this is no match
+_BRIGHT_STARS = 2000  # stars of the first linear map
+_NARROW = 0.25  # mean distances between reference stars: reach of its last pairs
 _FALSE_RATE = 0.02  # chance matches of a detection that the default radius allows
 _CONVINCING_PAIRS = 15  # pairs that convince although most stars have none
 
@@ -38,7 +38,7 @@ class Matching:
     radius : float
         Largest distance of a pair, in the catalogue's unit.
     coincidences : int
-        Pairs that agreed in the vote on the offset.
+        Stars that agreed on rotation and shift.
     false_rate : float
         Probability that a detection without counterpart is paired by chance: 1 - exp(-density pi
         radius^2), with the mean density over the detections of reference stars that are still free.
@@ -61,33 +61,30 @@ def match_to_catalog(
     catalog: ReferenceCatalog,
     *,
     mag: ArrayLike | None = None,
-    start: LinearMap | None = None,
     radius: float | None = None,
     max_offset: float | None = None,
     source: str = "detections",
 ) -> Matching:
     """Matches of detections with reference stars, one to one.
 
-    The offset is voted for by the differences of bright pairs; a linear transformation is then
-    iterated while the radius shrinks; the pairs are mutual nearest neighbours inside the final
+    A rotation, scale and shift is found by the patterns of the stars; a linear transformation is
+    then iterated while the radius shrinks; the pairs are mutual nearest neighbours inside the final
     radius.
 
     Parameters
     ----------
     x, y : array_like, shape (N,)
-        Approximate *corrected* positions, in the catalogue's unit and orientation.
+        *Corrected* positions, in the catalogue's unit and parity.
     catalog : ReferenceCatalog
         At the epoch of the detections.
     mag : array_like, shape (N,), optional
         Magnitudes of the detections, any zero point: with those of the catalogue they let the
-        bright stars vote.
-    start : LinearMap, optional
-        Transformation that is applied before the vote; by default none.
+        bright stars be tried first.
     radius : float, optional
         Final radius; by default the one in which a detection without counterpart finds a neighbour
         by chance with probability 0.02.
     max_offset : float, optional
-        Largest offset on either axis; by default any.
+        Largest offset of the middle of the detections on either axis; by default any.
     source : str, optional
         File, for errors.
 
@@ -98,8 +95,8 @@ def match_to_catalog(
     Raises
     ------
     InputError
-        When no offset brings together more stars than chance does (another field, another
-        orientation), with the best number of coincidences.
+        When no rotation and shift brings together more stars than chance does (another field), with
+        the best number of coincidences.
     """
     points = np.column_stack([np.asarray(x, float), np.asarray(y, float)])
     reference = np.column_stack([catalog.u, catalog.v])
@@ -109,67 +106,65 @@ def match_to_catalog(
         )
     if radius is not None and not radius > 0:
         raise InputError(f"match radius is {radius}", where=source, do="give a positive radius")
-    origin = np.median(points, axis=0)
-    if start is None:
-        start = LinearMap(np.eye(2), np.zeros(2), origin)
-    moved = start(points)
-    magnitudes = None if mag is None else np.asarray(mag, float)
-    vote = vote_offset(moved, reference, magnitudes, catalog.mag, max_offset)
-    failure = InputError(
-        f"does not match {catalog.source}: the best offset brings together {vote.count} pairs, "
-        f"where chance gives {vote.expected:.1f}",
-        where=source,
-        do="check the field, the orientation, the scale and the largest offset",
+    ranked = mag is not None and catalog.mag is not None
+    magnitudes = np.asarray(mag, float) if ranked else None
+    patterns = pattern_index(reference, catalog.mag if ranked else None)
+    found = find_similarity(
+        points, patterns, mag=magnitudes, source=source, reference_name=catalog.source
     )
-    if vote.log10_chance > _LOG10_CHANCE or vote.count < MIN_PAIRS:
-        raise failure
-
-    tree = cKDTree(reference)
-    middle = np.median(vote.voters, axis=0)
-    first = LinearMap(np.eye(2), vote.offset, middle)
-    # until a nearest neighbour is the right one, only those that voted are used
-    reach = 0.25 * mean_spacing(reference)
-    rough = iterated_map(vote.voters, vote.voted, cKDTree(vote.voted), first, vote.width, reach)
-    if rough is None:
-        raise failure
-    n_over, area = overlap(rough(moved), reference)
+    failure = InputError(
+        f"does not match {catalog.source}: {found.coincidences} stars agree on a rotation and "
+        "shift, but the others do not follow",
+        where=source,
+        do="check the field, the scale and the distortion that is taken as known",
+    )
+    middle = np.median(points, axis=0)
+    offset = found(middle[None])[0] - middle
+    if max_offset is not None and np.abs(offset).max() > max_offset:
+        raise InputError(
+            f"matches {catalog.source} at an offset of ({offset[0]:.6g}, {offset[1]:.6g}), beyond "
+            f"{max_offset:g}",
+            where=source,
+            do="check the field, or allow a larger offset",
+        )
+    bright = np.arange(len(points)) if magnitudes is None else np.argsort(magnitudes, kind="stable")
+    rough = grown_map(points[bright[:_BRIGHT_STARS]], found, patterns, narrow=_NARROW)
+    n_over, area = overlap(rough(points), reference)
     if radius is None:
         radius = float(np.sqrt(-np.log1p(-_FALSE_RATE) * area / (np.pi * n_over)))
-    fine = iterated_map(moved, reference, tree, rough, max(reach, radius), radius)
-    if fine is None:
+    reach = max(_NARROW * patterns.spacing, radius)
+    transformation = iterated_map(points, reference, patterns.tree, rough, reach, radius)
+    if transformation is None:
         raise failure
-    transformation = LinearMap(
-        fine.matrix @ start.matrix, fine(start(origin[None]))[0] - origin, origin
-    )
-    found = transformation(points)
-    index, catalog_index, distance = mutual_pairs(found, reference, radius, tree=tree)
+    moved = transformation(points)
+    index, catalog_index, distance = mutual_pairs(moved, reference, radius, tree=patterns.tree)
     few = len(index) < MIN_PAIRS or len(index) < min(
         _CONVINCING_PAIRS, 0.5 * min(len(points), n_over)
     )
-    if few or not beats_chance(found, reference, tree, distance):
+    if few or not beats_chance(moved, reference, patterns.tree, distance):
         raise failure
     return Matching(
         index=index,
         catalog_index=catalog_index,
         transformation=transformation,
         radius=radius,
-        coincidences=vote.count,
+        coincidences=found.coincidences,
         false_rate=float(-np.expm1(-max(n_over - len(index), 0) / area * np.pi * radius**2)),
     )
 
 
 def match_table(
-    table: MatchTable,
+    table: Matches,
     catalog: ReferenceCatalog,
     *,
     radius: float | None = None,
     max_offset: float | None = None,
-) -> MatchTable:
+) -> Matches:
     """Matches with a catalogue's positions in place of approximate ones, exposure by exposure.
 
     Parameters
     ----------
-    table : MatchTable
+    table : Matches
         u, v are approximate corrected positions in the catalogue's unit, as hst1pass gives them.
     catalog : ReferenceCatalog
         Brought to the mean epoch of each exposure, where it has proper motions.
@@ -178,7 +173,7 @@ def match_table(
 
     Returns
     -------
-    MatchTable
+    Matches
         The matched stars, with u, v and star codes of the catalogue; the others are counted as
         rejected.  Errors stay as they are: those of a catalogue are only a part of the error of a
         match.
@@ -223,9 +218,8 @@ def match_table(
         u[pairs], v[pairs] = then.u[found.catalog_index], then.v[found.catalog_index]
         star[pairs] = then.star[found.catalog_index]
         matched[pairs] = True
-    kept = table.select(matched, reason="no counterpart in the catalogue")
-    return replace(
-        kept,
+    selected = table.select(matched, reason="no counterpart in the catalogue")
+    return selected.with_columns(
         u=u[matched],
         v=v[matched],
         star=star[matched],

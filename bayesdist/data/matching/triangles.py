@@ -119,11 +119,11 @@ def candidates(
     middle_z, middle_w = z.mean(axis=1, keepdims=True), w.mean(axis=1, keepdims=True)
     dz, dw = z - middle_z, w - middle_w
     turn = (np.conj(dz) * dw).sum(axis=1) / (np.abs(dz) ** 2).sum(axis=1)
-    kept = (np.abs(turn) > scale[0]) & (np.abs(turn) < scale[1])
-    i, j, turn = i[kept], j[kept], turn[kept]
+    right = (np.abs(turn) > scale[0]) & (np.abs(turn) < scale[1])
+    i, j, turn = i[right], j[right], turn[right]
     if not len(i):
         return
-    target = middle_w[kept, 0] - turn * middle_z[kept, 0]
+    target = middle_w[right, 0] - turn * middle_z[right, 0]
     lever = float(np.sqrt(np.mean(np.abs(stars) ** 2)))
     votes = np.stack([target.real, target.imag, lever * turn.real, lever * turn.imag], axis=-1)
     reach = 3.0 * tolerance * lever

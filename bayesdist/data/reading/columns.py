@@ -1,4 +1,4 @@
-"""Columns of a table to the arrays of a MatchTable."""
+"""Columns of a table to the arrays of a Matches."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def columns_read(
 
 
 def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any]:
-    """Arguments of `MatchTable` from rows of a table, with columns as `needed_columns`."""
+    """Arguments of `Matches` from rows of a table, with columns as `needed_columns`."""
     found, column = quantities.found, quantities.__getitem__
     out: dict[str, Any] = {}
     out["x"], out["y"] = (_pixels(column(key), options.pixel_origin) for key in ("x", "y"))

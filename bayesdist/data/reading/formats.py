@@ -7,8 +7,8 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from bayesdist.data.astrometrynet import is_astrometrynet
-from bayesdist.data.hst1pass import is_hst1pass, is_matchup
+from bayesdist.data.formats.astrometrynet import is_astrometrynet
+from bayesdist.data.formats.hst1pass import is_hst1pass, is_matchup
 from bayesdist.data.reading.mission_formats import mission_formats
 from bayesdist.data.tables.files import TABLE_SUFFIXES, is_binary, is_fits, read_lines, read_table
 from bayesdist.data.tables.text import is_text_table

@@ -1,4 +1,4 @@
-"""`read_matches`: files of any known kind to one MatchTable."""
+"""`read_matches`: files of any known kind to one Matches."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.data.astrometrynet import COLUMNS as CORR_COLUMNS
-from bayesdist.data.astrometrynet import matches_from_corr
-from bayesdist.data.hst1pass import is_matchup, read_hst1pass, read_matchup
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.formats.astrometrynet import COLUMNS as CORR_COLUMNS
+from bayesdist.data.formats.astrometrynet import matches_from_corr
+from bayesdist.data.formats.hst1pass import is_matchup, read_hst1pass, read_matchup
+from bayesdist.data.matches import Matches
 from bayesdist.data.matching.table import match_table
 from bayesdist.data.reading.chips import numbered, text_labels
 from bayesdist.data.reading.formats import FORMATS, exposure_names, input_files, kind_of
@@ -48,7 +48,7 @@ def read_matches(
     catalogue_epoch: float | None = None,
     chips: Mapping[str, int] | None = None,
     not_finite: str = "refuse",
-) -> MatchTable:
+) -> Matches:
     """Read matched star positions.
 
     Parameters
@@ -67,7 +67,7 @@ def read_matches(
 
     Returns
     -------
-    MatchTable
+    Matches
 
     Raises
     ------
@@ -108,16 +108,16 @@ def read_matches(
     return _with_errors(table, sigma)
 
 
-def _with_errors(table: MatchTable, sigma: str | float) -> MatchTable:
+def _with_errors(table: Matches, sigma: str | float) -> Matches:
     refuse_missing_errors(sigma, table.has_sigma, table.has_mag, where=", ".join(table.sources))
     if isinstance(sigma, str):
         return table
-    return table.with_sigma(float(sigma), float(sigma))
+    return table.with_errors(float(sigma))
 
 
 def _read_plain(
     files: Sequence[Path], kinds: Sequence[str], options: ReadOptions, *, in_parts: bool
-) -> MatchTable:
+) -> Matches:
     """Matches from files that hold them."""
     own = mission_formats()
     names: Sequence[str | None] = exposure_names(files)
@@ -129,7 +129,7 @@ def _read_plain(
         if kind in ("table", "astrometry.net", *own)
     }
     options = _with_common_chips(tables, _with_common_point(tables, kinds, options))
-    readers: dict[str, Callable[[Path, str | None], MatchTable]] = {
+    readers: dict[str, Callable[[Path, str | None], Matches]] = {
         "hst1pass": lambda file, name: _read_list(file, name, options),
         "astrometry.net": lambda file, name: _read_corr(file, tables[file], name, options),
         "table": lambda file, name: matches_from_table(
@@ -137,7 +137,7 @@ def _read_plain(
         ),
     }
     readers |= dict.fromkeys(own, readers["table"])
-    return MatchTable.concatenate(
+    return Matches.concatenate(
         [readers[kind](file, name) for file, kind, name in zip(files, kinds, names, strict=True)]
     )
 
@@ -172,23 +172,21 @@ def _with_common_chips(tables: Mapping[Path, Table], options: ReadOptions) -> Re
     return replace(options, chips=numbered(names)) if names else options
 
 
-def _read_list(file: Path, name: str | None, options: ReadOptions) -> MatchTable:
+def _read_list(file: Path, name: str | None, options: ReadOptions) -> Matches:
     options.refuse(str(file), "hst1pass", "columns", "pixel_origin", "tangent_point", "epoch")
     if options.unit not in (None, "pix"):
         options.refuse(str(file), "hst1pass", "unit")
     return read_hst1pass(file).matches(name=name)
 
 
-def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions) -> MatchTable:
+def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions) -> Matches:
     options.refuse(str(file), "astrometry.net", "columns", "pixel_origin")
     if options.unit not in (None, "arcsec"):
         options.refuse(str(file), "astrometry.net", "unit")
     return matches_from_corr(table, options, source=str(file), exposure_name=name)
 
 
-def _read_with_master(
-    files: Sequence[Path], kinds: Sequence[str], options: ReadOptions
-) -> MatchTable:
+def _read_with_master(files: Sequence[Path], kinds: Sequence[str], options: ReadOptions) -> Matches:
     """Matches of hst1pass lists with the MATCHUP master among the files."""
     masters: list[Path] = []
     lists: list[Path] = []
@@ -203,7 +201,7 @@ def _read_with_master(
             do="name one master together with the hst1pass lists to match with it",
         )
     names = exposure_names(lists)
-    detections = MatchTable.concatenate(
+    detections = Matches.concatenate(
         [_read_list(file, name, options) for file, name in zip(lists, names, strict=True)]
     )
     return match_table(detections, read_matchup(masters[0]))

@@ -1,4 +1,4 @@
-"""MatchTable from any object with columns."""
+"""Matches from any object with columns."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from astropy.table import Table
 from astropy.time import Time
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.data.reading.columns import columns_read, is_on_sky, match_columns
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky.positions import MOTIONS, SPARED, sky_columns
@@ -80,8 +80,8 @@ def matches_from_table(
     *,
     source: str = "table",
     exposure_name: str | None = None,
-) -> MatchTable:
-    """MatchTable from a table's columns.
+) -> Matches:
+    """Matches from a table's columns.
 
     Parameters
     ----------
@@ -94,14 +94,14 @@ def matches_from_table(
 
     Returns
     -------
-    MatchTable
+    Matches
         Without errors where these do not come from columns.
 
     Raises
     ------
     InputError
         For a missing column, text among numbers, values that are not finite, units that are missing
-        or contradict each other, no rows, and all that `MatchTable` refuses.
+        or contradict each other, no rows, and all that `Matches` refuses.
     """
     options = options or ReadOptions()
     table = with_sky_columns(as_table(data, source))
@@ -131,7 +131,7 @@ def matches_from_table(
     if exposure_name is not None:
         out.setdefault("exposure_names", (exposure_name,))
     out["notes"] = (*notes, *out.get("notes", ()))
-    return MatchTable(**out, sources=(source,), row=rows, n_rows=n, rejected=rejected)
+    return Matches(**out, sources=(source,), row=rows, n_rows=n, rejected=rejected)
 
 
 def own_epoch(header: Mapping[str, Any]) -> float | str | None:

@@ -13,8 +13,10 @@ from bayesdist.errors import InputError
 __all__ = [
     "NOT_FINITE",
     "absent",
+    "check_columns",
     "check_not_finite",
     "check_values",
+    "columns_of",
     "counted",
     "one_length",
     "refuse_half",
@@ -47,6 +49,37 @@ def one_length(
                 do="give columns of one length",
             )
     return arrays
+
+
+def columns_of(table: Any, names: Sequence[str]) -> dict[str, Any]:
+    """Columns of a table, by name, that are not None."""
+    values = {name: getattr(table, name) for name in names}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def check_columns(
+    table: Any,
+    names: Sequence[str],
+    *,
+    integers: Collection[str] = (),
+    where: str,
+    place: Callable[[int], str] | None = None,
+    positive: Collection[str] = (),
+    not_negative: Collection[str] = (),
+) -> None:
+    """Give the columns of a frozen table one length and their types, and check their values.
+
+    As `one_length` and `check_values`; a row is named by its number where it has no `place`.
+    """
+    columns = one_length(columns_of(table, names), integers=integers, where=where)
+    for name, values in columns.items():
+        object.__setattr__(table, name, values)
+    check_values(
+        columns,
+        place=place or (lambda row: f"{where}, row {row + 1}"),
+        positive=positive,
+        not_negative=not_negative,
+    )
 
 
 def check_values(

@@ -141,6 +141,24 @@ class SourceColumn:
             filled[mask] = value
         return replace(self, values=filled).numbers()
 
+    def known(self) -> tuple[Int, SourceColumn]:
+        """Rows (n,) that have a value, neither masked nor NaN, and the column of these alone."""
+        plain = getattr(self.values, "unmasked", self.values)
+        missing = np.array(np.broadcast_to(getattr(self.values, "mask", False), len(plain)))
+        if plain.dtype.kind == "f":
+            missing |= np.isnan(np.asarray(getattr(plain, "value", plain)))
+        rows = np.flatnonzero(~missing)
+        named = replace(self, values=plain[rows], place=lambda k: self.place(int(rows[k])))
+        return rows, named
+
+    def known_numbers(self) -> Float:
+        """Numbers (N,), with NaN where they are missing; text and infinity are refused."""
+        rows, named = self.known()
+        out = np.full(len(self.values), np.nan)
+        if len(rows):  # a column of nulls alone has no type
+            out[rows] = named.numbers()
+        return out
+
     def _parsed(
         self, texts: NDArray[Any], parse: Callable[[str], Any], wanted: str
     ) -> NDArray[Any]:

@@ -140,13 +140,14 @@ def find_columns(
     *,
     source: str,
     pairs: Iterable[tuple[str, str]] = (),
+    needed: Iterable[str] = (),
 ) -> dict[str, str]:
     """Column of each quantity that a file has.
 
     `mapping` gives what the user names (an empty name leaves a quantity out), `aliases` the usual
     names, in lower case, for the rest; of `pairs` the names go together: those of which the file
     has both come first.  An unknown quantity, or a column that is not in the file, is refused with
-    the nearest name.
+    the nearest name, and a file without one of the `needed` quantities.
     """
     names = list(names)
     found: dict[str, str] = {}
@@ -176,6 +177,13 @@ def find_columns(
     for key, usual in aliases.items():
         if key not in found:
             found[key] = next((lower[a] for a in usual if a in lower), "")
+    for key in needed:
+        if not found[key]:
+            raise InputError(
+                f"no column for {key!r} among {', '.join(names) or 'none'}",
+                where=source,
+                do="rename the column, or name it in the option 'columns'",
+            )
     return {key: column for key, column in found.items() if column}
 
 
@@ -218,7 +226,7 @@ def origin_of(column: str, names: Iterable[str], header: Mapping[str, Any]) -> t
     if column.lower() in _FROM_ZERO:
         return 0, f"{column} is a name of {_FROM_ZERO[column.lower()]}, which counts from 0"
     if column in ("x", "xcenter"):
-        for program, beside in _COUNTS_FROM_ZERO:
-            if beside <= lower:
-                return 0, f"{', '.join(sorted(beside))} are of {program}, which counts from 0"
+        for program, others in _COUNTS_FROM_ZERO:
+            if others <= lower:
+                return 0, f"{', '.join(sorted(others))} are of {program}, which counts from 0"
     return 1, ""

@@ -60,7 +60,8 @@ class RowBlock:
 class ParquetPart:
     """Description of a Parquet file without its rows."""
 
-    path: Path
+    path: Path  # absolute, so that it is found from any folder
+    name: str  # path as it was given, for messages
     group_rows: tuple[int, ...]  # rows of each row group
     colnames: tuple[str, ...]
     units: Mapping[str, str]
@@ -136,7 +137,7 @@ class ParquetPart:
             return
         groups = list(range(self._group_of(start), self._group_of(stop - 1) + 1))
         at = int(self._edges[groups[0]])
-        with _opened(self.path, self.texts & set(encoded)) as stored:
+        with _opened(self.path, self.name, self.texts & set(encoded)) as stored:
             if _group_rows(stored) != self.group_rows or _names(stored) != self.colnames:
                 raise self._changed()
             # only next() is guarded: exceptions of the consumer are not the file's fault
@@ -166,7 +167,7 @@ class ParquetPart:
         error: Exception,
     ) -> InputError:
         """Error about the first row group that cannot be read."""
-        where = str(self.path)
+        where = self.name
         for group in groups:
             if self._edges[group + 1] <= reached:
                 continue
@@ -176,19 +177,19 @@ class ParquetPart:
             except Exception as found:
                 error = found
                 first, last = self._edges[group] + 1, self._edges[group + 1]
-                where = f"{self.path}, {self._group_name(group)} (rows {first} to {last})"
+                where = f"{self.name}, {self._group_name(group)} (rows {first} to {last})"
                 break
-        return _as_input_error(self.path, where, error)
+        return _as_input_error(Path(self.name), where, error)
 
     def _changed(self) -> InputError:
-        return InputError("has changed since it was opened", where=str(self.path), do="start again")
+        return InputError("has changed since it was opened", where=self.name, do="start again")
 
 
 def describe_part(path: Path) -> ParquetPart:
     """Description of a Parquet file from its footer; one that is missing or damaged is refused."""
     import pyarrow
 
-    with _opened(path) as stored, naming_faults(path):
+    with _opened(path, str(path)) as stored, naming_faults(path):
         schema = stored.schema_arrow
         is_text = (
             pyarrow.types.is_string,
@@ -198,7 +199,8 @@ def describe_part(path: Path) -> ParquetPart:
             pyarrow.types.is_dictionary,
         )
         return ParquetPart(
-            path,
+            path.absolute(),
+            str(path),
             _group_rows(stored),
             _names(stored),
             parquet_units(schema),
@@ -207,11 +209,13 @@ def describe_part(path: Path) -> ParquetPart:
 
 
 @contextmanager
-def _opened(path: Path, as_codes: Collection[str] = ()) -> Iterator[pyarrow.parquet.ParquetFile]:
+def _opened(
+    path: Path, name: str, as_codes: Collection[str] = ()
+) -> Iterator[pyarrow.parquet.ParquetFile]:
     """Open file of which only the part being decoded is held in memory."""
     import pyarrow.parquet
 
-    with naming_faults(path):
+    with naming_faults(Path(name)):
         stored = pyarrow.parquet.ParquetFile(
             path,
             read_dictionary=sorted(as_codes) or None,

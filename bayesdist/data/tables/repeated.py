@@ -114,11 +114,11 @@ def _bucketed(batches: Batches, buckets: int) -> Iterator[UInt]:
             yield np.concatenate(parts)
 
 
-def _joined(pieces: Iterable[UInt]) -> Iterator[UInt]:
-    """Hashes in larger pieces, so that the list of their positions in the file stays short."""
+def _joined(parts: Iterable[UInt]) -> Iterator[UInt]:
+    """Hashes in larger parts, so that the list of their positions in the file stays short."""
     waiting: list[UInt] = []
-    for piece in pieces:
-        waiting.append(piece)
+    for part in parts:
+        waiting.append(part)
         if sum(len(w) for w in waiting) >= HELD // 4:
             yield np.concatenate(waiting)
             waiting = []

@@ -10,7 +10,7 @@ from operator import add
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.correlated.cells import CellSums, cell_sums, cells_per_side
 from bayesdist.diagnose.correlated.deviations import MAX_EXPOSURES, linear_deviations
 from bayesdist.diagnose.correlated.functions import StructureFunctions
@@ -26,7 +26,7 @@ from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.solution import Solution, likelihood_of
 from bayesdist.infer.stars.likelihood import Likelihood
-from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
+from bayesdist.infer.stars.shards import Compute, Shards, opened
 from bayesdist.infer.stars.stars import cell_of, prepare
 from bayesdist.model import DistortionModel
 
@@ -45,8 +45,8 @@ def estimate_discrepancy(
     rng: np.random.Generator,
     priors: DiscrepancyPriors | None = None,
     parameter_priors: GaussianPriors | None = None,
-    sample: MatchTable | None = None,
-    stars: MatchTable | None = None,
+    sample: Matches | None = None,
+    stars: Matches | None = None,
     structure: bool = True,
     exposures: bool = True,
     settling: Settling | None = None,
@@ -59,7 +59,7 @@ def estimate_discrepancy(
 
     Parameters
     ----------
-    matches : MatchTable, PartitionedMatches or Shards
+    matches : Matches or Shards
         Data of the solution.
     solution : Posterior or LinearFit
         Without extra weight in the corners.
@@ -67,9 +67,9 @@ def estimate_discrepancy(
     priors : DiscrepancyPriors, optional
     parameter_priors : GaussianPriors, optional
         Priors of the solution's parameters.
-    sample : MatchTable, optional
+    sample : Matches, optional
         Some of the matches, or all: structure finer than the functions shows in neighbouring stars.
-    stars : MatchTable, optional
+    stars : Matches, optional
         The matches in memory.  By the star codes, errors common to a star's matches are estimated,
         and exposures without frames of their own are separated.
     structure : bool
@@ -128,12 +128,12 @@ def estimate_discrepancy(
     return Discrepancy(model, mean, formal, noise, found, theta, linear, facts)
 
 
-def _several(stars: MatchTable) -> bool:
+def _several(stars: Matches) -> bool:
     """True for matches of several exposures, few enough that each may deviate."""
     return 1 < len(stars.exposure_names) <= MAX_EXPOSURES
 
 
-def _by_exposure(stars: MatchTable, likelihood: Likelihood, model: DistortionModel) -> CellSums:
+def _by_exposure(stars: Matches, likelihood: Likelihood, model: DistortionModel) -> CellSums:
     """Sums with separate groups for exposures that have no frames of their own."""
     side = cells_per_side(len(stars.exposure_names) * len(model.chips))
     parts = []

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
@@ -66,7 +66,7 @@ def _matern(separation: Float) -> Float:
 
 
 def shared_variances(
-    table: MatchTable, likelihood: Likelihood, model: DistortionModel
+    table: Matches, likelihood: Likelihood, model: DistortionModel
 ) -> dict[int, tuple[SharedVariance | None, SharedVariance | None]]:
     """Evidence of neighbouring stars on the two axes of each chip, by its code.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.correlated.priors import log_half_cauchy
 from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
 from bayesdist.infer.stars.likelihood import Likelihood
@@ -53,7 +53,7 @@ class SharedStars:
 
 
 def shared_stars(
-    table: MatchTable, likelihood: Likelihood, model: DistortionModel, median: float
+    table: Matches, likelihood: Likelihood, model: DistortionModel, median: float
 ) -> SharedStars | None:
     """Size of the errors that stars have in all of their matches; None where none is repeated.
 

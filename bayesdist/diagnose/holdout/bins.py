@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["ALL", "Bin", "Partition", "partitions_of"]
@@ -48,15 +48,15 @@ class Partition:
     kind: str  # 'all', 'region', 'magnitude', 'epoch', 'exposure' or 'place in exposure'
     bins: tuple[Bin, ...]
     # of a table and some of its rows: bin of each, negative where there is none
-    code: Callable[[MatchTable, Int], Int]
+    code: Callable[[Matches, Int], Int]
 
-    def codes(self, table: MatchTable, rows: Int) -> Int:
+    def codes(self, table: Matches, rows: Int) -> Int:
         """Bins (n,) of some rows."""
         return self.code(table, rows)
 
 
 def partitions_of(
-    model: DistortionModel, held: Any, sample: MatchTable, whole: Sequence[str]
+    model: DistortionModel, held: Any, sample: Matches, whole: Sequence[str]
 ) -> tuple[Partition, ...]:
     """The parts in which held-out stars are judged.
 
@@ -86,7 +86,7 @@ def _cells(model: DistortionModel, n: float, most: int) -> int:
 
 
 def _places(
-    model: DistortionModel, sample: MatchTable, share: float, whole: Sequence[str]
+    model: DistortionModel, sample: Matches, share: float, whole: Sequence[str]
 ) -> list[Partition]:
     """Cells of each exposure that was held out whole; none where stars are few."""
     if len(np.unique(sample.exposure)) < 2:
@@ -103,7 +103,7 @@ def _places(
     cells = _regions(model, side)
     number = {name: k for k, name in enumerate(names)}
 
-    def code(table: MatchTable, rows: Int) -> Int:
+    def code(table: Matches, rows: Int) -> Int:
         of_code = np.array([number.get(name, -1) for name in table.exposure_names], np.int64)
         mine = of_code[table.exposure[rows]]
         return np.where(mine < 0, -1, mine * len(cells.bins) + cells.codes(table, rows))
@@ -128,7 +128,7 @@ def _regions(model: DistortionModel, side: int) -> Partition:
                 where = f"{_place(limits, chip, side)}{f' of {chip.name}' if several else ''}"
                 bins.append(Bin(where, chip, limits))
 
-    def code(table: MatchTable, rows: Int) -> Int:
+    def code(table: Matches, rows: Int) -> Int:
         out = np.full(len(rows), -1)
         numbers = table.chip_number[rows]
         for c, chip in enumerate(model.chips):
@@ -171,7 +171,7 @@ def _quantiles(kind: str, name: str, values: Float, n: int) -> list[Partition]:
         for a, b in pairwise(edges)
     )
 
-    def code(table: MatchTable, rows: Int) -> Int:
+    def code(table: Matches, rows: Int) -> Int:
         return np.searchsorted(inner, getattr(table, name)[rows], side="right")
 
     return [Partition(kind, bins, code)]
@@ -180,7 +180,7 @@ def _quantiles(kind: str, name: str, values: Float, n: int) -> list[Partition]:
 def _exposures(names: Sequence[str], whole: set[str]) -> Partition:
     number = {name: k for k, name in enumerate(names)}
 
-    def code(table: MatchTable, rows: Int) -> Int:
+    def code(table: Matches, rows: Int) -> Int:
         of_code = np.array([number.get(name, -1) for name in table.exposure_names], np.int64)
         return of_code[table.exposure[rows]]
 

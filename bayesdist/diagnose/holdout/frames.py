@@ -15,8 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
-from bayesdist.data.pieces import Piece
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.predictions import Prediction, groups_of, noise_of, predictions
 from bayesdist.diagnose.holdout.predictive import Predictive, scores_of
 from bayesdist.model import DistortionModel
@@ -61,7 +60,7 @@ def _alone(model: DistortionModel) -> DistortionModel:
 
 
 def framed(
-    predictive: Predictive, table: MatchTable, index: Int, values: Float
+    predictive: Predictive, table: Matches, index: Int, values: Float
 ) -> Iterator[FramedPrediction]:
     """Iterator over rows (n,) of one exposure under a frame of its own, by its parameters (q,)."""
     model, n = _alone(predictive.model), predictive.model.n_distortion
@@ -75,13 +74,10 @@ def framed(
         yield FramedPrediction(one, derivative[:, :, :n], derivative[:, :, own])
 
 
-def frames_for(
-    predictive: Predictive, pieces: Sequence[Piece], names: Sequence[str]
-) -> dict[str, Frame]:
+def frames_for(predictive: Predictive, held: Matches, names: Sequence[str]) -> dict[str, Frame]:
     """Frames of exposures that the solution does not know, fitted to their own stars.
 
-    The pieces of the held-out stars are gone through once for every step. Exposures with too few
-    stars are left out.
+    The held-out stars are read once for every step. Exposures with too few stars are left out.
     """
     unknown = [name for name in names if name not in set(predictive.model.exposures)]
     if not predictive.model.n_frame or not unknown:
@@ -91,13 +87,13 @@ def frames_for(
     precision = np.zeros(len(kinds))
     if predictive.deviations is not None:
         precision = predictive.deviations.precision(kinds)
-    values = _first_guess(predictive, pieces, unknown, precision)
+    values = _first_guess(predictive, held, unknown, precision)
     for step in range(SOFT + EXACT):
-        sums = _frame_sums(predictive, pieces, values, soft=step < SOFT)
+        sums = _frame_sums(predictive, held, values, soft=step < SOFT)
         for name, (gradient, curvature, *_) in sums.items():
             pull = gradient - precision * values[name]
             values[name] = values[name] + _solved(curvature + np.diag(precision), pull)
-    final = _frame_sums(predictive, pieces, values, soft=False)
+    final = _frame_sums(predictive, held, values, soft=False)
     return {
         name: Frame(
             kinds,
@@ -127,12 +123,9 @@ def _inverse(matrix: Float) -> Float:
     return np.asarray(s[:, None] * np.linalg.pinv(s[:, None] * matrix * s) * s)
 
 
-def _of_exposures(
-    pieces: Sequence[Piece], names: Sequence[str]
-) -> Iterator[tuple[str, MatchTable, Int]]:
+def _of_exposures(held: Matches, names: Sequence[str]) -> Iterator[tuple[str, Matches, Int]]:
     """Name, table and rows of some exposures."""
-    for piece in pieces:
-        table = piece.read()
+    for table in held.batches():
         for k, name in enumerate(table.exposure_names):
             if name in names:
                 rows = np.flatnonzero(table.exposure == k)
@@ -141,14 +134,14 @@ def _of_exposures(
 
 
 def _first_guess(
-    predictive: Predictive, pieces: Sequence[Piece], names: Sequence[str], precision: Float
+    predictive: Predictive, held: Matches, names: Sequence[str], precision: Float
 ) -> dict[str, Float]:
     """Frames nearest to the linear maps that least squares finds."""
     model = predictive.model
     kind, o = model.frames, np.asarray(model.origin)
     normal = {name: np.zeros((3, 3)) for name in names}
     right = {name: np.zeros((3, 2)) for name in names}
-    for name, table, rows in _of_exposures(pieces, names):
+    for name, table, rows in _of_exposures(held, names):
         groups = groups_of(model, table, rows, None)
         effective = model.effective(predictive.mean, groups)
         for g, members in enumerate(groups.members()):
@@ -175,14 +168,14 @@ def _first_guess(
 
 
 def _frame_sums(
-    predictive: Predictive, pieces: Sequence[Piece], values: Mapping[str, Float], *, soft: bool
+    predictive: Predictive, held: Matches, values: Mapping[str, Float], *, soft: bool
 ) -> dict[str, tuple[Float, Float, Float, Float, int]]:
     """Gradient, curvature, information, what is shared with the solution, stars, by exposure."""
     q, D = _alone(predictive.model).n_frame, predictive.model.n_distortion
     shapes = ((q,), (q, q), (q, q), (q, D))
     out = {name: [np.zeros(shape) for shape in shapes] for name in values}
     count = dict.fromkeys(values, 0)
-    for name, table, index in _of_exposures(pieces, list(values)):
+    for name, table, index in _of_exposures(held, list(values)):
         for one in framed(predictive, table, index, values[name]):
             residual, A = one.prediction.residual, one.by_frame
             noise = noise_of(predictive, table, one.prediction.index)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.infer.stars.stars import errors_of
 from bayesdist.model import DistortionModel, Groups
@@ -33,7 +33,7 @@ class Prediction:
 
 
 def predictions(
-    model: DistortionModel, theta: Float, table: MatchTable, rows: Int, exposure: Int | int | None
+    model: DistortionModel, theta: Float, table: Matches, rows: Int, exposure: Int | int | None
 ) -> Iterator[Prediction]:
     """Iterator over some rows (n,) of a table, by chip, date and code of the exposure."""
     groups = groups_of(model, table, rows, exposure)
@@ -52,7 +52,7 @@ def predictions(
 
 
 def groups_of(
-    model: DistortionModel, table: MatchTable, rows: Int, exposure: Int | int | None
+    model: DistortionModel, table: Matches, rows: Int, exposure: Int | int | None
 ) -> Groups:
     """Groups of some rows (n,) of a table, of exposures with these codes."""
     return model.groups(
@@ -63,7 +63,7 @@ def groups_of(
     )
 
 
-def noise_of(predictive: Predictive, table: MatchTable, index: Int) -> Float:
+def noise_of(predictive: Predictive, table: Matches, index: Int) -> Float:
     """uu, vv and uv (n, 3) of the errors of stars without those of the solution's parameters."""
     var = np.stack(errors_of(table), axis=1)[index] ** 2 + predictive.jitter2
     if predictive.local and not predictive.local_in_noise:

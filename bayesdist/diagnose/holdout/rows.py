@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.frames import Frame, framed
 from bayesdist.diagnose.holdout.predictions import noise_of, predictions
 from bayesdist.diagnose.holdout.predictive import Predictive
@@ -59,7 +59,7 @@ class HeldRows:
 
 
 def predicted_rows(
-    predictive: Predictive, table: MatchTable, frames: Mapping[str, Frame]
+    predictive: Predictive, table: Matches, frames: Mapping[str, Frame]
 ) -> Iterator[HeldRows]:
     """Iterator over the stars of a table that can be predicted.
 
@@ -83,7 +83,7 @@ def predicted_rows(
 
 
 def _known(
-    predictive: Predictive, table: MatchTable, rows: Int, exposure: Int | None
+    predictive: Predictive, table: Matches, rows: Int, exposure: Int | None
 ) -> Iterator[HeldRows]:
     """Iterator over rows (n,) whose frame, if there is one, belongs to the solution."""
     if not len(rows):
@@ -96,7 +96,7 @@ def _known(
 
 
 def _framed(
-    predictive: Predictive, table: MatchTable, rows: Int, name: str, frame: Frame
+    predictive: Predictive, table: Matches, rows: Int, name: str, frame: Frame
 ) -> Iterator[HeldRows]:
     """Iterator over rows (n,) of an exposure with a frame of its own."""
     n = predictive.model.n_distortion

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.diagnose.clusters import joint_clusters, products_over, squares_over, sums_over
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.rows import HeldRows
@@ -46,7 +46,7 @@ class SharedErrors:
 
     def add(
         self,
-        table: MatchTable,
+        table: Matches,
         rows: HeldRows,
         place: Float,
         uniforms: Float,

@@ -11,8 +11,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_matrix
 from scipy.special import erf
 
-from bayesdist.data.matches import MatchTable
-from bayesdist.data.pieces import Piece
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.bins import ALL, Partition
 from bayesdist.diagnose.holdout.frames import Frame
 from bayesdist.diagnose.holdout.grouped import GroupedScores, ScaleSums, StarScores, membership
@@ -105,11 +104,11 @@ class HeldSums:
 
 def held_sums(
     predictive: Predictive,
-    pieces: Sequence[Piece],
+    held: Matches,
     partitions: Sequence[Partition],
     frames: Mapping[str, Frame],
 ) -> HeldSums:
-    """Sums over held-out stars, in one pass over the pieces of the data."""
+    """Sums over held-out stars, in one pass over the data."""
     D, h = predictive.model.n_params, len(predictive.free)
     several = predictive.stars is not None or predictive.cell is not None
     out = HeldSums(
@@ -124,8 +123,7 @@ def held_sums(
     )
     moments = SpreadMoments(predictive)
     around = [predictive, *_around(predictive)]
-    for piece in pieces:
-        table = piece.read()
+    for table in held.batches():
         seen = 0
         for rows in predicted_rows(predictive, table, frames):
             seen += len(rows.index)
@@ -165,7 +163,7 @@ def _add(
     moments: SpreadMoments,
     around: Sequence[Predictive],
     partitions: Iterable[Partition],
-    table: MatchTable,
+    table: Matches,
     rows: HeldRows,
 ) -> None:
     """Add some stars to all sums."""

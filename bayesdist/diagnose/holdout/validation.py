@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.bins import Bin, partitions_of
 from bayesdist.diagnose.holdout.deviations import deviation_tests
 from bayesdist.diagnose.holdout.frames import frames_for
@@ -17,7 +18,6 @@ from bayesdist.diagnose.holdout.tests import AxisCoverage, HeldTest, all_tests, 
 from bayesdist.diagnose.significance import holm, p_words
 from bayesdist.errors import InputError
 from bayesdist.infer.posterior import Posterior
-from bayesdist.infer.stars.shards import Matches
 from bayesdist.limits import HELD_OUT, HELD_OUT_DOUBTFUL, HELD_OUT_UNUSUAL
 
 __all__ = ["HoldoutValidation", "holdout_validation"]
@@ -139,10 +139,9 @@ def holdout_validation(
             where=where,
             do="give a Predictive with deviations",
         )
-    pieces = held.pieces()
     partitions = partitions_of(predictive.model, held, held.sample(SAMPLE), whole)
-    frames = frames_for(predictive, pieces, held.exposure_names)
-    sums = held_sums(predictive, pieces, partitions, frames)
+    frames = frames_for(predictive, held, held.exposure_names)
+    sums = held_sums(predictive, held, partitions, frames)
     if not HELD_OUT.met_by(sums.n):
         raise InputError(
             f"{sums.n} held-out stars say too little of the solution",

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.sample import ScoredSample, scored_sample
 from bayesdist.infer.solution import Solution
@@ -68,7 +68,7 @@ class EpochShift:
         )
 
 
-def epoch_shift(table: MatchTable, solution: Solution) -> EpochShift | None:
+def epoch_shift(table: Matches, solution: Solution) -> EpochShift | None:
     """The error of the epochs that the residuals show.
 
     Of a table of more than `SAMPLE` rows every k-th is taken. None without proper motions, or with

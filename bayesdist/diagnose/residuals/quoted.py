@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.limits import QUOTED_ERRORS
@@ -19,7 +19,7 @@ __all__ = ["error_scale", "error_scale_sentence"]
 LOW_QUANTILE = 0.1  # of the matches
 
 
-def error_scale(fit: LinearFit, table: MatchTable) -> float:
+def error_scale(fit: LinearFit, table: Matches) -> float:
     """Factor on all errors that makes small residuals what they say; 1 where it is not large.
 
     A low quantile of chi-square is compared with its expectation: most matches may be false.

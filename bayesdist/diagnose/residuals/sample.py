@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.posterior.memberships import memberships_of
@@ -26,7 +26,7 @@ class StarSample:
 
     Parameters
     ----------
-    table : MatchTable
+    table : Matches
         N stars.
     fit_residual : ndarray, shape (N, 2)
         Data minus the least-squares fit, in the unit of u and v.
@@ -42,7 +42,7 @@ class StarSample:
         places are known.
     """
 
-    table: MatchTable
+    table: Matches
     fit_residual: Float
     used: NDArray[np.bool_]
     n_total: int
@@ -65,13 +65,13 @@ class StarSample:
 
 
 def star_sample(
-    table: MatchTable, n_total: int, fit: LinearFit, posterior: Posterior | None = None
+    table: Matches, n_total: int, fit: LinearFit, posterior: Posterior | None = None
 ) -> StarSample:
     """Residuals and probabilities of some stars, by a fit and a posterior.
 
     Parameters
     ----------
-    table : MatchTable
+    table : Matches
         With errors: as of ``matches.sample(SAMPLE)``.
     n_total : int
         Stars that there are in all.

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer.solution import Solution, likelihood_of
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import DistortionModel
@@ -103,7 +103,7 @@ class ScoredSample:
         return replace(self, curvature=np.stack([good[:, 0, 0], good[:, 0, 1], good[:, 1, 1]]))
 
 
-def scored_sample(table: MatchTable, solution: Solution) -> ScoredSample:
+def scored_sample(table: Matches, solution: Solution) -> ScoredSample:
     """Sample of the detections of a table, with their scores at a solution.
 
     The table has errors; of more than `SAMPLE` rows, every k-th is taken. Raises InputError where

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.score.exposures import exposure_test
 from bayesdist.diagnose.score.families import FAMILIES
 from bayesdist.diagnose.score.gap import gap_test
@@ -31,7 +31,7 @@ ORDERS, OF_PLACE = "order ", "noise by position"
 
 
 def score_tests(
-    table: MatchTable,
+    table: Matches,
     solution: Solution,
     *,
     priors: GaussianPriors | None = None,
@@ -44,7 +44,7 @@ def score_tests(
 
     Parameters
     ----------
-    table : MatchTable
+    table : Matches
         The matches that the solution was made from, or some of them; of more than `SAMPLE` rows,
         every k-th is taken, and the tests are as strong as that sample is.
     solution : Posterior or LinearFit

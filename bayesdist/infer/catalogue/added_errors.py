@@ -30,8 +30,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.added_errors import AddedErrors, group_codes
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.added_errors import AddedErrors
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.by_magnitude import (
     LEAST_WEIGHT,
@@ -125,7 +125,7 @@ class _State:
 
 
 def grouped_errors(
-    matches: MatchTable,
+    matches: Matches,
     fit: LinearFit,
     *,
     by: str = "",
@@ -145,7 +145,7 @@ def grouped_errors(
     model = fit.model
     count = max(STARS, PER_EXPOSURE * len(model.exposures) * len(model.chips))
     table = matches.sample(count)
-    names, label = group_codes(table, by)
+    names, label = table.grouped(by)
     present, label = np.unique(label, return_inverse=True)
     labels = tuple(names[k] for k in present)
     if by and len(labels) < 2:
@@ -179,13 +179,13 @@ def grouped_errors(
     return _result(best, by, labels, states[best], quoted, codes[best], evidence, dispersion)
 
 
-def _quoted(table: MatchTable) -> Float:
+def _quoted(table: Matches) -> Float:
     """Quoted variances (2, N)."""
     assert table.sigma_u is not None and table.sigma_v is not None
     return np.stack([table.sigma_u, table.sigma_v]) ** 2
 
 
-def _starting_state(table: MatchTable, fit: LinearFit, quoted: Float, outliers: bool) -> _State:
+def _starting_state(table: Matches, fit: LinearFit, quoted: Float, outliers: bool) -> _State:
     """Starting state with one added variance for all, from the median residual."""
     square = residuals_of(fit, table) ** 2
     core = float(np.median(square)) / 0.4549  # of a squared normal variable
@@ -196,7 +196,7 @@ def _starting_state(table: MatchTable, fit: LinearFit, quoted: Float, outliers: 
 
 
 def _maximised(
-    table: MatchTable,
+    table: Matches,
     model: DistortionModel,
     quoted: Float,
     code: Int,
@@ -219,7 +219,8 @@ def _maximised(
             wide = max(least, float((bad * square).sum() / max(2.0 * bad.sum(), 1e-300)))
         before, variance = variance, _maxima(quoted, square, good, code, n_groups)
         var = quoted + variance[code]
-        weighted = table.with_sigma(*(np.sqrt(var / np.maximum(good, LEAST_WEIGHT))))
+        sigma_u, sigma_v = np.sqrt(var / np.maximum(good, LEAST_WEIGHT))
+        weighted = table.with_errors((sigma_u, sigma_v))
         fit = fit_linear(weighted, model, rejection=NO_REJECTION, priors=priors)
         residual = residuals_of(fit, table) ** 2
         square = residual + variances_of(fit, table)
@@ -269,7 +270,7 @@ def _counts(good: Float, code: Int) -> Float:
     return np.asarray(np.bincount(code.ravel(), np.concatenate([good, good])), float)
 
 
-def _dispersion(table: MatchTable, state: _State, quoted: Float, code: Int) -> float:
+def _dispersion(table: Matches, state: _State, quoted: Float, code: Int) -> float:
     """Factor by which sums of squares scatter more than those of independent normal errors."""
     var = quoted + state.variance[code]
     score = state.good * (state.square / var - 1.0)

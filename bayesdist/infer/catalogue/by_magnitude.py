@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.magnitude_law import MagnitudeLaw
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.linear import DEFAULT_REJECTION, NO_REJECTION, LinearFit, Rejection, fit_linear
-from bayesdist.infer.stars.shards import Compute, Matches
+from bayesdist.infer.stars.shards import Compute
 from bayesdist.infer.stars.stars import groups_of, in_table_order, prepare
 from bayesdist.model import DistortionModel
 
@@ -48,7 +48,7 @@ def fit_by_magnitude(
 
     Parameters
     ----------
-    matches : MatchTable or PartitionedMatches
+    matches : Matches
         With magnitudes; errors already in the table are replaced.
     model : DistortionModel
     rejection : Rejection
@@ -60,7 +60,7 @@ def fit_by_magnitude(
     -------
     fit : LinearFit
         Of all matches with these errors.
-    matches : MatchTable or PartitionedMatches
+    matches : Matches
         With these errors.
     errors : MagnitudeErrors
         The law at its nodes, and the scatter about each.
@@ -78,20 +78,20 @@ def fit_by_magnitude(
         )
     count = max(STARS, PER_EXPOSURE * len(model.exposures) * len(model.chips))
     errors = _law(matches.sample(count), model, rejection, priors)
-    table = matches.with_errors_by_magnitude(errors)
+    table = matches.with_errors(errors)
     fit = fit_linear(table, model, rejection=rejection, priors=priors, compute=compute)
     return fit, table, errors
 
 
 def _law(
-    stars: MatchTable,
+    stars: Matches,
     model: DistortionModel,
     rejection: Rejection,
     priors: GaussianPriors | None,
 ) -> MagnitudeErrors:
     """Law of the errors with magnitude of some stars."""
     assert stars.mag is not None
-    fit = fit_linear(stars.with_sigma(1.0, 1.0), model, rejection=rejection, priors=priors)
+    fit = fit_linear(stars.with_errors(1.0), model, rejection=rejection, priors=priors)
     residual = residuals_of(fit, stars)
     bins = estimate(stars.mag, *residual, n_params=model.n_params)
     law = MagnitudeLaw.of(stars.mag, bins)
@@ -102,7 +102,8 @@ def _law(
         var = law.at_stars(nodes)
         good = memberships_of(square, var, f, wide)
         weight = np.sqrt(np.maximum(good, LEAST_WEIGHT))
-        weighted = stars.with_sigma(*(np.sqrt(var) / weight))
+        sigma_u, sigma_v = np.sqrt(var) / weight
+        weighted = stars.with_errors((sigma_u, sigma_v))
         fit = fit_linear(weighted, model, rejection=NO_REJECTION, priors=priors)
         square = residuals_of(fit, stars) ** 2 + variances_of(fit, stars)
         bad = 1.0 - good
@@ -132,13 +133,13 @@ def _scatter(bins: MagnitudeErrors, mag: Float, good: Float, square: Float) -> F
     return np.sqrt(np.array(sums) / np.maximum(n, 1e-300))
 
 
-def residuals_of(fit: LinearFit, stars: MatchTable) -> Float:
+def residuals_of(fit: LinearFit, stars: Matches) -> Float:
     """Data minus model (2, N)."""
-    some, order = prepare(fit.model, stars.with_sigma(1.0, 1.0))
+    some, order = prepare(fit.model, stars.with_errors(1.0))
     return in_table_order(some.residuals(fit.mean), order).T
 
 
-def variances_of(fit: LinearFit, stars: MatchTable) -> Float:
+def variances_of(fit: LinearFit, stars: Matches) -> Float:
     """Variances (2, N) of the fitted positions of stars."""
     model = fit.model
     groups = groups_of(model, stars)

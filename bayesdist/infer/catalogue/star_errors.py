@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
 from bayesdist.infer.equations.scaled import one_thread
@@ -107,7 +107,7 @@ class StarCovariance:
 @one_thread
 def star_covariance(
     solution: Solution,
-    matches: MatchTable,
+    matches: Matches,
     errors: StarErrors,
     *,
     star: ArrayLike | None = None,
@@ -122,7 +122,7 @@ def star_covariance(
     solution : Solution
         A fit or a posterior of these matches: its covariance stands for the inverse of the normal
         matrix, so that it must not come from a fit with extra weight in the corners.
-    matches : MatchTable
+    matches : Matches
         All stars at once.
     errors : StarErrors
         Of the catalogue, by star code; where there are errors of proper motions, with dates.
@@ -174,7 +174,7 @@ def star_covariance(
     return StarCovariance(sum(motions, positions), (counted + counted.T) / 2, *motions)
 
 
-def _require_contained(matches: MatchTable, code: Int, variances: Float, levers: Float) -> None:
+def _require_contained(matches: Matches, code: Int, variances: Float, levers: Float) -> None:
     """Raise InputError for quoted errors that are smaller than the catalogue's part of them."""
     for axis, quoted in enumerate((matches.sigma_u, matches.sigma_v)):
         if quoted is None:
@@ -190,7 +190,7 @@ def _require_contained(matches: MatchTable, code: Int, variances: Float, levers:
             )
 
 
-def _codes(matches: MatchTable, star: ArrayLike | None) -> Int:
+def _codes(matches: Matches, star: ArrayLike | None) -> Int:
     given = matches.star if star is None else star
     if given is None:
         raise InputError(

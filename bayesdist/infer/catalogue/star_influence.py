@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
 from bayesdist.infer.equations.scaled import one_thread
@@ -52,7 +52,7 @@ class StarInfluence:
 
 @one_thread
 def star_influence(
-    fit: LinearFit, matches: MatchTable, errors: StarErrors, codes: Int
+    fit: LinearFit, matches: Matches, errors: StarErrors, codes: Int
 ) -> StarInfluence:
     """Effect on a fit of the catalogue errors of the stars `codes` (k,), ascending.
 

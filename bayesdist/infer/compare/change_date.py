@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 from scipy.stats import chi2 as chi_square
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer.compare.frame_fields import mean_squares, without
 from bayesdist.infer.compare.monitoring import Change, NewFit
 from bayesdist.infer.equations.normal import NormalEquations, mixture
 from bayesdist.infer.equations.scaled import FieldTest, determined
-from bayesdist.infer.stars.shards import Matches
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import nearest_frame
@@ -81,8 +80,7 @@ def period_scores(
     edges = _edges(matches, most)
     held: dict[int, tuple[NormalEquations, float, float, int]] = {}
     constants = new.target.hyper.constants(new.psi[None, new.target.n_theta :])
-    for piece in matches.pieces():
-        table = piece.read()
+    for table in matches.batches():
         assert table.epoch is not None
         of_period = np.searchsorted(edges, table.epoch, side="right")
         for b in np.unique(of_period):
@@ -106,7 +104,7 @@ def _edges(matches: Matches, most: int) -> Float:
     return dates[np.flatnonzero(np.diff(period)) + 1]
 
 
-def _sums(new: NewFit, table: MatchTable, constants) -> tuple[NormalEquations, float, float, int]:  # type: ignore[no-untyped-def]
+def _sums(new: NewFit, table: Matches, constants) -> tuple[NormalEquations, float, float, int]:  # type: ignore[no-untyped-def]
     stars, _ = prepare(new.model, table)
     assert table.epoch is not None
     equations = mixture(stars, new.theta, constants, True)

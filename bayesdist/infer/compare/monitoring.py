@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
 from bayesdist.infer.catalogue.star_influence import star_influence
@@ -29,7 +29,7 @@ from bayesdist.infer.exposures.hierarchy import held_in_reference
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.infer.solution import Solution, TransformedSolution
 from bayesdist.infer.stars.mixture import OutlierMixture
-from bayesdist.infer.stars.shards import Compute, Matches, load
+from bayesdist.infer.stars.shards import Compute, load
 from bayesdist.infer.transforms import without_frames
 from bayesdist.model import DistortionModel
 
@@ -153,7 +153,7 @@ def fit_new(
     ----------
     released : Solution
         A fit or a posterior; only the kind of its frames matters, not the frames of its exposures.
-    matches : MatchTable or PartitionedMatches
+    matches : Matches
         With errors.
     mixture : OutlierMixture, optional
         That of a released posterior by default, else Gaussian outliers.
@@ -340,8 +340,8 @@ def _at_epoch(model: DistortionModel, epoch: float | None) -> Float:
 def with_star_errors_of(
     errors: StarErrors,
     new: NewFit,
-    matches: MatchTable,
-    released: tuple[LinearFit, MatchTable] | None = None,
+    matches: Matches,
+    released: tuple[LinearFit, Matches] | None = None,
 ) -> NewFit:
     """New fit whose covariance includes the catalogue errors that all matches of a star have.
 
@@ -353,9 +353,9 @@ def with_star_errors_of(
     errors : StarErrors
         Of the catalogue, by code of the star; the quoted errors contain them.
     new : NewFit
-    matches : MatchTable
+    matches : Matches
         Those of `new`, with codes of the stars.
-    released : tuple of LinearFit and MatchTable, optional
+    released : tuple of LinearFit and Matches, optional
         The release and its matches, where they have the same catalogue and codes.
 
     Returns

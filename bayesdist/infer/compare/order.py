@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.compare.order_result import HeldOutOrders, OrderSelection, OrderSurfaces
 from bayesdist.infer.compare.order_sums import (
@@ -25,7 +26,7 @@ from bayesdist.infer.compare.order_sums import (
     truncated,
 )
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
-from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
+from bayesdist.infer.stars.shards import Compute, Shards, opened
 from bayesdist.model import DistortionModel
 from bayesdist.model.basis import MAX_ORDER
 

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from astropy.time import Time
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.errors import InputError
-from bayesdist.infer.stars.shards import Matches
 
 __all__ = ["Periods", "check_periods", "mjd_periods", "sum_by_period"]
 
@@ -70,7 +69,7 @@ def check_periods(periods: Periods) -> None:
             )
 
 
-def sum_by_period(matches: Matches, periods: Periods, task: Callable[[MatchTable], Any]) -> Any:
+def sum_by_period(matches: Matches, periods: Periods, task: Callable[[Matches], Any]) -> Any:
     """Sum of a task over the matches of each period, from one pass over the data in chunks.
 
     The matches need epochs; those outside all periods [first, end) are not used.  `task` gets the
@@ -84,8 +83,7 @@ def sum_by_period(matches: Matches, periods: Periods, task: Callable[[MatchTable
         )
     check_periods(periods)
     sums: dict[str, Any] = {}
-    for piece in matches.pieces():
-        table = piece.read()
+    for table in matches.batches():
         assert table.epoch is not None
         for name, (start, stop) in periods.items():
             inside = (table.epoch >= start) & (table.epoch < stop)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import scaled_cholesky, scaled_inverse
 from bayesdist.infer.posterior.covariance import with_covariance
@@ -32,7 +32,7 @@ class ExposureContent:
 
 def exposure_content(
     model: DistortionModel,
-    matches: MatchTable,
+    matches: Matches,
     weight: ArrayLike,
     *,
     n_total: int | None = None,

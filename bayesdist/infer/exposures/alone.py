@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
@@ -111,7 +111,7 @@ class ExposureSolutions:
 
 @one_thread
 def fit_exposures(
-    matches: MatchTable,
+    matches: Matches,
     model: DistortionModel,
     *,
     chip: int = 2,
@@ -124,7 +124,7 @@ def fit_exposures(
 
     Parameters
     ----------
-    matches : MatchTable
+    matches : Matches
         With errors and epochs.
     model : DistortionModel
         Its order, chips and unit are those of each exposure; frames and time dependence are
@@ -215,7 +215,7 @@ def fit_exposures(
     )
 
 
-def _require_stars(table: MatchTable, model: DistortionModel, least: int) -> None:
+def _require_stars(table: Matches, model: DistortionModel, least: int) -> None:
     """Raise DegenerateError for a chip of an exposure with fewer stars than terms to be fitted."""
     numbers = table.chip_number
     for chip in model.chips:
@@ -231,7 +231,7 @@ def _require_stars(table: MatchTable, model: DistortionModel, least: int) -> Non
 
 
 def _fit_held(
-    table: MatchTable,
+    table: Matches,
     model: DistortionModel,
     joint: TransformedSolution,
     epoch: float,
@@ -276,7 +276,7 @@ def _fit_held(
     return fit
 
 
-def _rotation(table: MatchTable, model: DistortionModel, known: Float) -> float:
+def _rotation(table: Matches, model: DistortionModel, known: Float) -> float:
     """Angle by which a gauge would turn (u, v), from a linear map of the joint solution."""
     bare = known.reshape(-1)
     w = model.predict(bare, table.x, table.y, chip=table.chip_number)

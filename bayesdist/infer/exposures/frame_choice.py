@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.linear import Rejection, fit_linear, residuals
 from bayesdist.model import DistortionModel
@@ -43,7 +43,7 @@ class FrameChoice:
         )
 
 
-def frames_that_help(matches: MatchTable, model: DistortionModel) -> FrameChoice | None:
+def frames_that_help(matches: Matches, model: DistortionModel) -> FrameChoice | None:
     """Simplest frames with which stars scatter as little as with any, if that is far less.
 
     Errors are not used: all stars count alike.  None for one exposure, and where no richer frames
@@ -69,7 +69,7 @@ def frames_that_help(matches: MatchTable, model: DistortionModel) -> FrameChoice
     return FrameChoice(best, found[best], before, model.unit, model.frames)
 
 
-def _scatter(matches: MatchTable, model: DistortionModel) -> float:
+def _scatter(matches: Matches, model: DistortionModel) -> float:
     """Median length of the residuals, corrected for the model's degrees of freedom.
 
     The first fit weights all matches alike; in the next ones its scatter separates false ones.
@@ -77,7 +77,7 @@ def _scatter(matches: MatchTable, model: DistortionModel) -> float:
     median = 1.0
     for _ in range(FITS):
         sigma = np.full(len(matches), max(median / MEDIAN_LENGTH, np.finfo(float).tiny))
-        table = replace(matches, sigma_u=sigma, sigma_v=sigma)
+        table = matches.with_errors((sigma, sigma))
         fit = fit_linear(table, model, rejection=Rejection(clip_abs=None))
         median = float(np.median(np.hypot(*residuals(fit, table).T)))
     return median * float(np.sqrt(2 * len(matches) / (2 * len(matches) - model.n_params)))

@@ -26,7 +26,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.normal import least_squares
 from bayesdist.infer.equations.priors import GaussianPriors
@@ -36,7 +36,7 @@ from bayesdist.infer.exposures.scatter import Scatter
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.infer.solution import Solution
 from bayesdist.infer.stars.likelihood import ClippedGaussian
-from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
+from bayesdist.infer.stars.shards import Compute, Shards, opened
 from bayesdist.infer.transforms import bare_model, reference_gauge
 from bayesdist.model import DistortionModel
 
@@ -102,7 +102,7 @@ class HierarchicalFit(Solution):
         """Normal errors of the stars in the second pass, at the mean."""
         return ClippedGaussian(self.mean, self.fit.clip)
 
-    def uses(self, matches: MatchTable) -> NDArray[np.bool_]:
+    def uses(self, matches: Matches) -> NDArray[np.bool_]:
         """Boolean mask (N,) of a table's stars that were used."""
         return self.fit.uses(matches)
 
@@ -193,7 +193,7 @@ def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -
 
     Parameters
     ----------
-    matches : MatchTable or PartitionedMatches
+    matches : Matches
     model : DistortionModel
         Of all exposures; its gauge is replaced.
     chip : int
@@ -211,8 +211,7 @@ def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -
     first = model.exposures[0]
     number = model.chips[model.chip_code(chip)].number
     parts = []
-    for piece in matches.pieces():
-        table = piece.read()
+    for table in matches.batches():
         rows = np.asarray(table.exposure_names)[table.exposure] == first
         rows &= table.chip_number == number
         if rows.any():
@@ -224,7 +223,7 @@ def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -
             do="put another exposure first",
         )
     alone = replace(bare_model(model), chips=(model.chips[model.chip_code(chip)],), time=None)
-    table = MatchTable.concatenate(parts)
+    table = Matches.concatenate(parts)
     gauge = reference_gauge(fit_linear(table, alone), chip).gauge
     assert gauge is not None
     return replace(model, gauge="held", held=(*gauge.shift, -gauge.rotation), origin=(0.0, 0.0))
@@ -248,7 +247,7 @@ def fit_hierarchical(
 
     Parameters
     ----------
-    matches : MatchTable, PartitionedMatches or Shards
+    matches : Matches or Shards
         With errors.
     model : DistortionModel
         Frames 'shift_rotation_scale' or 'affine', or deviations of single chips, in gauge 'held':

@@ -3,33 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.model import DistortionModel
 from bayesdist.model.lookup import LookupTable, corrected
 
-__all__ = ["corrected_matches", "inside_chips", "on_the_chips", "with_columns"]
+__all__ = ["corrected_matches", "inside_chips", "on_the_chips"]
 
 
-def with_columns(matches: MatchTable, **changes: Any) -> MatchTable:
-    """Matches with some columns replaced."""
-    columns = {one.name: getattr(matches, one.name) for one in fields(matches)}
-    return MatchTable.of_distinct_rows(**(columns | changes))
-
-
-def corrected_matches(tables: Sequence[LookupTable], matches: MatchTable) -> MatchTable:
+def corrected_matches(tables: Sequence[LookupTable], matches: Matches) -> Matches:
     """Matches at the pixels to which tables of the detector and of one filter move them."""
     filter = next((table.filter for table in tables if table.filter), "")
     x, y = corrected(tables, matches.x, matches.y, chip=matches.chip_number, filter=filter)
-    return with_columns(matches, x=x, y=y)
+    return matches.with_columns(x=x, y=y)
 
 
-def on_the_chips(matches: MatchTable, model: DistortionModel) -> MatchTable:
+def on_the_chips(matches: Matches, model: DistortionModel) -> Matches:
     """Matches without the few at the edge that a table has moved off the chip.
 
     There the polynomial is not defined.  They count in the tables all the same.
@@ -38,7 +30,7 @@ def on_the_chips(matches: MatchTable, model: DistortionModel) -> MatchTable:
     return matches if inside.all() else matches.select(inside, reason="moved off the chip")
 
 
-def inside_chips(matches: MatchTable, model: DistortionModel) -> NDArray[np.bool_]:
+def inside_chips(matches: Matches, model: DistortionModel) -> NDArray[np.bool_]:
     """Boolean mask (N,) of the matches whose pixels lie on their chip."""
     size = np.array([model.chips[model.chip_code(c)].size for c in matches.chip_numbers])
     nx, ny = size[matches.chip].T

@@ -17,12 +17,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import LinearFit, fit_linear
 from bayesdist.infer.nodes.binned import binned_table
-from bayesdist.infer.nodes.corrected import corrected_matches, on_the_chips, with_columns
+from bayesdist.infer.nodes.corrected import corrected_matches, on_the_chips
 from bayesdist.infer.nodes.field import field_table
 from bayesdist.infer.nodes.grid import STEP
 from bayesdist.infer.nodes.hyperparameters import SMOOTHNESS
@@ -36,7 +36,7 @@ from bayesdist.model.lookup import LookupTable
 __all__ = ["fit_with_tables"]
 
 Float = NDArray[np.float64]
-Fit = Callable[[MatchTable, DistortionModel], LinearFit]
+Fit = Callable[[Matches, DistortionModel], LinearFit]
 
 LIKELY = 0.5  # stars that are less likely true matches are left out
 SEARCHED = 2  # iterations that optimise hyperparameters, which are fixed in later ones
@@ -45,7 +45,7 @@ SEARCHED = 2  # iterations that optimise hyperparameters, which are fixed in lat
 # all large matrices are factored here, one at a time: see `field_table`
 @one_thread
 def fit_with_tables(
-    matches: MatchTable,
+    matches: Matches,
     model: DistortionModel,
     *,
     filter: str = "",
@@ -62,7 +62,7 @@ def fit_with_tables(
 
     Parameters
     ----------
-    matches : MatchTable
+    matches : Matches
         At raw pixels, with errors, of one filter.
     model : DistortionModel
         It is cut to the exposures of the matches.
@@ -120,7 +120,7 @@ def fit_with_tables(
     mixture: ResidualMixture | None = None
     progress: list[Iteration] = []
 
-    def solved(moved: MatchTable, pixel: float) -> LinearFit:
+    def solved(moved: Matches, pixel: float) -> LinearFit:
         """Polynomial fit for fixed tables; `pixel` is the size of one in u, v."""
         if mixture is not None:
             jitter = np.full(len(x), mixture.jitter)
@@ -186,7 +186,7 @@ def fit_with_tables(
         )
         if report is not None:
             report(progress[-1])
-        moved = with_columns(matches, x=x + own[:, 0], y=y + own[:, 1])
+        moved = matches.with_columns(x=x + own[:, 0], y=y + own[:, 1])
         if progress[-1].moved < tolerance:
             break
     assert mixture is not None
@@ -202,7 +202,7 @@ def fit_with_tables(
 
 
 def _check(
-    matches: MatchTable,
+    matches: Matches,
     beneath: Sequence[LookupTable | TablePosterior],
     method: str,
     max_iterations: int,
@@ -232,8 +232,8 @@ def _check(
 
 
 def _with_own_exposures(
-    matches: MatchTable, model: DistortionModel
-) -> tuple[MatchTable, DistortionModel]:
+    matches: Matches, model: DistortionModel
+) -> tuple[Matches, DistortionModel]:
     """Matches with the exposures that have stars only, and the model with these."""
     names = matches.exposures
     if model.n_frame and model.gauge != "first" and names[0] != model.exposures[0]:
@@ -241,12 +241,10 @@ def _with_own_exposures(
             f"no match is of exposure {model.exposures[0]!r}, which holds the gauge",
             do="give the filter a model of its own",
         )
-    code = np.array([names.index(n) if n in names else 0 for n in matches.exposure_names])
-    some = with_columns(matches, exposure=code[matches.exposure], exposure_names=names)
-    return some, replace(model, exposures=names)
+    return matches.with_exposure_names(names), replace(model, exposures=names)
 
 
-def _with_memberships(matches: MatchTable, mixture: ResidualMixture, jitter: Float) -> MatchTable:
+def _with_memberships(matches: Matches, mixture: ResidualMixture, jitter: Float) -> Matches:
     """Likely true matches, with errors that give the polynomial the weights of the tables.
 
     A star of probability p counts p times: its variance is divided by p.
@@ -254,8 +252,10 @@ def _with_memberships(matches: MatchTable, mixture: ResidualMixture, jitter: Flo
     assert matches.sigma_u is not None and matches.sigma_v is not None
     likely = mixture.probability >= LIKELY
     p = np.maximum(mixture.probability, LIKELY)
-    wide = matches.with_sigma(
-        np.sqrt((matches.sigma_u**2 + jitter**2) / p),
-        np.sqrt((matches.sigma_v**2 + jitter**2) / p),
+    wide = matches.with_errors(
+        (
+            np.sqrt((matches.sigma_u**2 + jitter**2) / p),
+            np.sqrt((matches.sigma_v**2 + jitter**2) / p),
+        )
     )
     return wide.select(likely, reason="false match")

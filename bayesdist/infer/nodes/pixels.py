@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.stars.stars import errors_of, groups_of
 from bayesdist.model import DistortionModel
@@ -47,14 +47,14 @@ class PixelShifts:
     variance: Float
 
 
-def pixel_shifts(solution: Solved, matches: MatchTable) -> PixelShifts:
+def pixel_shifts(solution: Solved, matches: Matches) -> PixelShifts:
     """Residuals of matches, mapped to the detector by the inverse of the local Jacobian.
 
     Parameters
     ----------
     solution : Solved
         A fit or a posterior.
-    matches : MatchTable
+    matches : Matches
         With errors, in the solution's unit.
 
     Returns

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.nodes.corrected import corrected_matches, on_the_chips
@@ -93,17 +93,17 @@ class TableFit:
         """Posteriors of the fitted tables; empty for binned ones."""
         return tuple(one for one in self.fitted if isinstance(one, TablePosterior))
 
-    def corrected(self, matches: MatchTable) -> MatchTable:
+    def corrected(self, matches: Matches) -> Matches:
         """Matches of the filter at the pixels that the tables have corrected.
 
         Parameters
         ----------
-        matches : MatchTable
+        matches : Matches
             At raw pixels.
 
         Returns
         -------
-        MatchTable
+        Matches
             The few that are moved off their chip are left out, and counted in `rejected`.
         """
         return on_the_chips(corrected_matches(self.tables, matches), self.solution.model)

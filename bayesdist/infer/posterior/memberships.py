@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer.kernel import Constants
 from bayesdist.infer.posterior.posterior import Posterior
 from bayesdist.infer.stars.likelihood import star_averages
@@ -69,13 +69,13 @@ def some_draws(theta: Float, h: Float, n_stars: int) -> tuple[Float, Float]:
     return theta[rows], h[rows]
 
 
-def memberships(posterior: Posterior, matches: MatchTable) -> Memberships:
+def memberships(posterior: Posterior, matches: Matches) -> Memberships:
     """Probability that each star is a false match, and its log-likelihood.
 
     Parameters
     ----------
     posterior : Posterior
-    matches : MatchTable
+    matches : Matches
         The stars that the posterior was made from, or some of them.
 
     Returns
@@ -106,7 +106,7 @@ def averaged_draws(posterior: Posterior) -> tuple[Float, Constants]:
     return theta, posterior.bound_mixture.constants(h)
 
 
-def star_log_likelihood(posterior: Posterior, matches: MatchTable) -> Float:
+def star_log_likelihood(posterior: Posterior, matches: Matches) -> Float:
     """Log-likelihood (chains, draws, N) of each star at every draw."""
     stars, order = prepare(posterior.model, matches)
     theta, h = posterior.sampled_points

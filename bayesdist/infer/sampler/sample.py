@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.convergence import Limits
 from bayesdist.infer.density.grid import build_proposal
@@ -25,7 +26,7 @@ from bayesdist.infer.sampler.certified import run_certified
 from bayesdist.infer.sampler.chains import Chains, Settings, run_chains
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.stars.mixture import OutlierMixture
-from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
+from bayesdist.infer.stars.shards import Compute, Shards, opened
 from bayesdist.infer.stars.stars import Stars
 
 __all__ = ["sample"]
@@ -63,7 +64,7 @@ def sample(
     ----------
     fit : LinearFit
         Of the same matches; the search for the mode starts there.
-    matches : MatchTable, PartitionedMatches or Shards
+    matches : Matches or Shards
         All stars: none is clipped.
     outliers : OutlierMixture, optional
         Gaussian outliers by default.

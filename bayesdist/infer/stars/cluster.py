@@ -1,11 +1,11 @@
 """The Dask engine: shards stay on the workers that read them, and only sums travel.
 
-Each piece of the data becomes one task whose result, a shard, stays on the worker that made it.  A
+Each batch of the data becomes one task whose result, a shard, stays on the worker that made it.  A
 pass is one map-reduce: a task for each shard, run on its worker, whose results come back and are
 added in the order of the shards, as threads add them, however many workers there are and whatever
 happens to them: a worker that is lost takes its shards along, and Dask makes them again elsewhere
-from the pieces.  The result of a kernel for one shard is reproducible up to rounding: code that was
-compiled for another processor may differ in the last bits.
+from the batches.  The result of a kernel for one shard is reproducible up to rounding: code that
+was compiled for another processor may differ in the last bits.
 
 The only module that uses dask and distributed; it is imported when the engine is requested.
 """
@@ -19,15 +19,14 @@ import threading
 import weakref
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
-from bayesdist.data.partitioned import PartPiece
-from bayesdist.data.pieces import Piece
+from bayesdist.data.matches import BatchReader, Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import kernel
-from bayesdist.infer.stars.shards import Compute, Matches, Shards, Task, shard_of, total
+from bayesdist.infer.stars.shards import Compute, Shards, Task, shard_of, total
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.survey import Survey
 from bayesdist.model import DistortionModel
@@ -61,20 +60,20 @@ _one_pass = threading.Lock()  # a pass uses all threads of its process
 class ClusterShards(Shards):
     """Shards on the workers of a Dask cluster.
 
-    Pieces of a table in memory are sent; those of a partitioned one are read by the workers, which
-    have to see the files under the same absolute paths.  With a `scheduler` in `compute`, the
+    Batches of stars in memory are sent; those on disk are read by the workers, which have to see
+    the files under the same absolute paths.  With a `scheduler` in `compute`, the
     cluster is that one; the version of bayesdist must be the same on its workers.  Otherwise
     `workers` processes are started here and ended by `close`, or when this object or the program
     goes; a script that does so needs the usual ``if __name__ == "__main__":``.
 
     InputError when the cluster cannot be reached or started, has no workers, or has workers with
-    another version of bayesdist; and as `prepare` and `Piece.read`.
+    another version of bayesdist; and as `prepare` and `BatchReader.load`.
     """
 
     def __init__(self, model: DistortionModel, matches: Matches, compute: Compute) -> None:
         super().__init__(model)
         self._shards: list[Future] = []
-        self._loading: set[str] = set()  # workers that pieces are tied to
+        self._loading: set[str] = set()  # workers that batches are tied to
         self._client, cluster, self._threads = _connected(compute)
         self._where = self._client.scheduler.address
         self._end = weakref.finalize(self, _end, self._client, cluster)
@@ -82,14 +81,14 @@ class ClusterShards(Shards):
             places = _places(self._client)
             self._loading = set(places)
             _require_version(self._client)
-            # the scheduler stores the pieces, so that a lost shard can be made again
+            # the scheduler stores the batches, so that a lost shard can be made again
             with _large_graphs():
-                for k, piece in enumerate(matches.pieces()):
+                for k, reader in enumerate(matches.readers()):
                     self._shards.append(
                         self._client.submit(
                             _shard,
                             model,
-                            _anywhere(piece),
+                            reader,
                             len(matches),
                             workers=[places[k % len(places)]],
                             allow_other_workers=True,
@@ -212,9 +211,9 @@ class _Work:
     threads: int | None
 
 
-def _shard(model: DistortionModel, piece: Piece, n_total: int) -> tuple[Stars, Survey]:
-    """On a worker: read one piece, in this function, so that Dask knows the size of a shard."""
-    return shard_of(model, piece, n_total)
+def _shard(model: DistortionModel, reader: BatchReader, n_total: int) -> tuple[Stars, Survey]:
+    """On a worker: read one batch, in this function, so that Dask knows the size of a shard."""
+    return shard_of(model, reader, n_total)
 
 
 def _survey(shard: tuple[Stars, Survey]) -> Survey:
@@ -246,16 +245,6 @@ async def _in_order(client: Any, futures: Sequence[Future]) -> list[Any]:
         if await future.exception() is not None:
             await future  # raises it
     return await client.gather(futures, asynchronous=True)
-
-
-def _anywhere(piece: Piece) -> Piece:
-    """A piece that can be read in any folder."""
-    if not isinstance(piece, PartPiece):
-        return piece
-    parts = tuple(
-        replace(one, part=replace(one.part, path=one.part.path.absolute())) for one in piece.parts
-    )
-    return replace(piece, parts=parts)
 
 
 def _connected(compute: Compute) -> tuple[Any, LocalCluster | None, int | None]:

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel import GAUSSIAN, Constants
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
@@ -44,7 +44,7 @@ class Clip:
     chi2_limit: float
     abs_limit: float  # in the unit of u, v
 
-    def keeps(self, model: DistortionModel, matches: MatchTable) -> NDArray[np.bool_]:
+    def keeps(self, model: DistortionModel, matches: Matches) -> NDArray[np.bool_]:
         """Boolean mask (N,) of a table's stars within both limits."""
         stars, order = prepare(model, matches)
         return in_table_order(self.keeps_of(stars), order).astype(bool)

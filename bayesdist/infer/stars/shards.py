@@ -12,18 +12,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from bayesdist.data.matches import MatchTable
-from bayesdist.data.partitioned import PartitionedMatches
-from bayesdist.data.pieces import Piece
+from bayesdist.data.matches import BatchReader, Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.stars.scratch import Store
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.infer.stars.survey import Survey, survey
 from bayesdist.model import DistortionModel, Groups
 
-__all__ = ["Compute", "LocalShards", "Matches", "Shards", "load", "opened", "shard_of"]
+__all__ = ["Compute", "LocalShards", "Shards", "load", "opened", "shard_of"]
 
-Matches = MatchTable | PartitionedMatches
 Task = Callable[..., Any]
 
 SAMPLE = 1_000_000  # stars from whose errors the median error is computed
@@ -108,8 +105,8 @@ class LocalShards(Shards):
         super().__init__(model)
         self._store = Store(1e6 * memory_mb)
         surveys = []
-        for piece in matches.pieces():
-            stars, found = shard_of(model, piece, len(matches))
+        for reader in matches.readers():
+            stars, found = shard_of(model, reader, len(matches))
             self._store.add(stars)
             surveys.append(found)
         self.survey = total(surveys)
@@ -123,9 +120,9 @@ class LocalShards(Shards):
         self._store.close()
 
 
-def shard_of(model: DistortionModel, piece: Piece, n_total: int) -> tuple[Stars, Survey]:
+def shard_of(model: DistortionModel, reader: BatchReader, n_total: int) -> tuple[Stars, Survey]:
     """One shard, and its survey."""
-    table = piece.read()
+    table = reader.load()
     stars, _ = prepare(model, table)
     return stars, survey(stars, table, max(1, n_total // SAMPLE))
 
@@ -159,7 +156,7 @@ def load(
     Parameters
     ----------
     model : DistortionModel
-    matches : MatchTable, PartitionedMatches or Shards
+    matches : Matches or Shards
         Shards are returned unchanged.
     compute : Compute, optional
 
@@ -178,7 +175,7 @@ def load(
                 "the shards were made for another model", do="load the matches for this one"
             )
         return matches
-    if not isinstance(matches, MatchTable | PartitionedMatches):
+    if not isinstance(matches, Matches):
         raise InputError(
             f"{type(matches).__name__} holds no matches",
             do="give what read_matches, open_matches or load returned",

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel import Constants
@@ -97,7 +97,7 @@ class Stars:
         return x, y
 
 
-def prepare(model: DistortionModel, matches: MatchTable) -> tuple[Stars, Int]:
+def prepare(model: DistortionModel, matches: Matches) -> tuple[Stars, Int]:
     """Stars of a table of matches, sorted for the passes, and the table row (N,) of each.
 
     The model's exposures are the table's `exposure_names`, its chips contain the table's.
@@ -140,7 +140,7 @@ def cell_of(X: Float, Y: Float, side: int) -> Int:
     return np.asarray(iy * side + ix)
 
 
-def errors_of(matches: MatchTable) -> tuple[Float, Float]:
+def errors_of(matches: Matches) -> tuple[Float, Float]:
     """Errors (N,) on u and v of matches; InputError when the table has none."""
     if matches.sigma_u is None or matches.sigma_v is None:
         raise InputError(
@@ -150,7 +150,7 @@ def errors_of(matches: MatchTable) -> tuple[Float, Float]:
     return matches.sigma_u, matches.sigma_v
 
 
-def groups_of(model: DistortionModel, matches: MatchTable) -> Groups:
+def groups_of(model: DistortionModel, matches: Matches) -> Groups:
     """Groups of matches with equal effective coefficients.
 
     InputError when the table has another unit than the model, a chip or an exposure that is not in

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.model import Groups, merge_groups
@@ -94,7 +94,7 @@ class Survey:
         return ", ".join(self.sources)
 
 
-def survey(stars: Stars, matches: MatchTable, every: int) -> Survey:
+def survey(stars: Stars, matches: Matches, every: int) -> Survey:
     """Survey of one piece; every n-th star gives its errors to the sample."""
     model = stars.model
     numbers = matches.chip_number
@@ -128,7 +128,7 @@ def survey(stars: Stars, matches: MatchTable, every: int) -> Survey:
     )
 
 
-def _farthest(matches: MatchTable) -> tuple[float, str]:
+def _farthest(matches: Matches) -> tuple[float, str]:
     """Largest distance of a star from its nominal position, and the star's file and row."""
     if matches.u_nominal is None or matches.v_nominal is None:
         return -1.0, ""

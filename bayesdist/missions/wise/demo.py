@@ -12,7 +12,7 @@ from bayesdist.app.run import run
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.summary_text import results_text
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path, made_folder
 from bayesdist.infer import LinearFit, Posterior
@@ -79,7 +79,7 @@ def simulation_config(band: str) -> str:
     return _CONFIG.format(band=band)
 
 
-def write_simulation(folder: Path, matches: MatchTable, truth: Truth, config: str) -> None:
+def write_simulation(folder: Path, matches: Matches, truth: Truth, config: str) -> None:
     """Write stars.ecsv, truth.ecsv and config.toml of a simulation.
 
     InputError when the folder cannot be made or written.

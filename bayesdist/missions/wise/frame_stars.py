@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.tables.checks import check_values, one_length
+from bayesdist.data.tables.checks import check_columns
 from bayesdist.errors import InputError
 
 __all__ = ["FrameStars"]
@@ -30,13 +30,12 @@ class FrameStars:
     frame: Int  # (N,): only stars of equal number are paired
 
     def __post_init__(self) -> None:
-        given = {name: getattr(self, name) for name in ("x", "y", "sigma", "frame")}
         if not np.size(self.x):
             raise InputError("a list holds no stars", where="column 'x'", do="give one with stars")
-        arrays = one_length(given, integers=("frame",), where="list of stars")
-        for name, values in arrays.items():
-            object.__setattr__(self, name, values)
-        check_values(arrays, place=lambda row: f"list of stars, row {row + 1}", positive=("sigma",))
+        columns = ("x", "y", "sigma", "frame")
+        check_columns(
+            self, columns, integers=("frame",), where="list of stars", positive=("sigma",)
+        )
 
     def __len__(self) -> int:
         return len(self.x)

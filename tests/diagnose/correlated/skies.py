@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.infer import LinearFit, Rejection, build_model, fit_linear
 
 SIZE, SIGMA = 2048.0, 0.02
@@ -45,7 +45,7 @@ def smooth(rng: np.random.Generator, length: float, rms: float) -> Map:
 
 def matched(
     n: int, rng: np.random.Generator, *fields: Map, order: int = 3, noise: Map | None = None
-) -> tuple[LinearFit, MatchTable, Map]:
+) -> tuple[LinearFit, Matches, Map]:
     """A fit, its stars, and the true map."""
     base = cubic(rng)
 
@@ -56,6 +56,6 @@ def matched(
     sigma = np.full((n, 2), SIGMA) if noise is None else noise(x, y)
     u, v = (true(x, y) + sigma * rng.standard_normal((n, 2))).T
     quoted = np.full(n, SIGMA)
-    table = MatchTable(x=x, y=y, u=u, v=v, sigma_u=quoted, sigma_v=quoted)
+    table = Matches(x=x, y=y, u=u, v=v, sigma_u=quoted, sigma_v=quoted)
     model = build_model(table, order=order, size=(SIZE, SIZE))
     return fit_linear(table, model, rejection=Rejection(1e9, 1e9)), table, true

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.data.added_errors import AddedErrors
 from bayesdist.errors import InputError
 from bayesdist.infer import build_model, fit_linear
@@ -41,7 +41,7 @@ def stars(seed, n, sigma=(0.05, 0.05), *, false=0.04, labels=1, by="chip", dof=N
             "filter": {"filter": label, "filter_names": names},
         }[by]
     quoted = np.broadcast_to(np.asarray(quoted, float), (n,))
-    return MatchTable(
+    return Matches(
         x=x,
         y=y,
         u=x + 0.4 * X**2 * Y + noise[:, 0],
@@ -108,7 +108,7 @@ def test_stated_errors_are_those_by_which_estimates_scatter():
         base = stars(seed, 600, (0.0, 0.0), false=0.03, quoted=quoted)
         rng = np.random.default_rng(1000 + seed)
         extra = rng.normal(size=(2, 600)) * np.hypot(quoted, [[0.03], [0.07]])
-        table = base._with(u=base.u + extra[0], v=base.v + extra[1])
+        table = base.with_columns(u=base.u + extra[0], v=base.v + extra[1])
         found = found_in(table)
         assert found.grouping == "axis"
         pulls.append((found.variance[0] - [0.03**2, 0.07**2]) / found.error[0])
@@ -142,7 +142,7 @@ def test_a_wild_match_makes_no_axis_where_there_are_no_false_ones():
     table = stars(5, 500, false=0.0)
     u = table.u.copy()
     u[7] += 3.0
-    assert found_in(table._with(u=u), outliers=False).grouping == "one"
+    assert found_in(table.with_columns(u=u), outliers=False).grouping == "one"
 
 
 @pytest.mark.parametrize(
@@ -207,7 +207,7 @@ def test_one_label_is_refused():
 def test_errors_are_added_in_quadrature_by_the_name_of_the_group():
     table = stars(10, 6, labels=3, by="exposure")
     added = AddedErrors("exposure", ("3", "1"), np.array([[0.0, 0.1], [0.2, 0.0]]), np.ones(2))
-    both = table.with_added_errors(added)
+    both = table.with_errors(added, in_quadrature=True)
     np.testing.assert_allclose(both.sigma_u, np.hypot(QUOTED, np.array([0.2, 1.0, 0.0] * 2)))
     np.testing.assert_allclose(both.sigma_v, np.hypot(QUOTED, np.array([0.0, 1.0, 0.1] * 2)))
     np.testing.assert_array_equal(both.u, table.u)

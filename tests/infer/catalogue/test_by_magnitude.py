@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.polynomial import legendre
 
-from bayesdist.data import MatchTable, read_matches
+from bayesdist.data import Matches, read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Rejection, build_model, fit_by_magnitude, fit_linear, residuals
 from bayesdist.infer.catalogue import by_magnitude
@@ -28,7 +28,7 @@ def lists():
 
 def test_errors_come_out_as_they_went_in(lists):
     model, matches, truth = lists
-    bare = matches.with_sigma(1.0, 1.0)
+    bare = matches.with_errors(1.0)
     fit, table, errors = fit_by_magnitude(bare, model)
     for found, true in zip(errors.at(matches.mag), true_sigma(matches.mag), strict=True):
         ratio = found / true
@@ -44,7 +44,7 @@ def test_errors_come_out_as_they_went_in(lists):
 
 def test_the_fit_is_that_of_the_table_it_returns(lists):
     model, matches, _ = lists
-    fit, table, _ = fit_by_magnitude(matches.with_sigma(1.0, 1.0), model)
+    fit, table, _ = fit_by_magnitude(matches.with_errors(1.0), model)
     np.testing.assert_array_equal(fit_linear(table, model).mean, fit.mean)
 
 
@@ -69,7 +69,7 @@ def test_one_error_for_all_is_that_of_the_residuals_and_their_freedom():
         n, order = 60, 3
         x, y = rng.uniform(1, 1000, (2, n))
         u, v = x + rng.normal(0, 0.1, n), y + rng.normal(0, 0.2, n)
-        table = MatchTable(x=x, y=y, u=u, v=v, mag=rng.uniform(15.0, 15.001, n), unit="pix")
+        table = Matches(x=x, y=y, u=u, v=v, mag=rng.uniform(15.0, 15.001, n), unit="pix")
         model = build_model(table, order=order, size=(1000, 1000))
         *_, errors = fit_by_magnitude(table, model)
         A = legendre.legvander2d(x / 500 - 1, y / 500 - 1, [order, order])
@@ -115,7 +115,7 @@ def test_errors_predict_what_was_held_out(data_dir):
         sigma = np.stack(errors.at(held.mag), axis=1)
         jacobian = model.jacobian(fit.mean, held.x, held.y)
         var = sigma**2 + np.einsum("nam,mk,nak->na", jacobian, fit.cov, jacobian)
-        pulls.append(residuals(fit, held.with_sigma(1.0, 1.0)) / np.sqrt(var))
+        pulls.append(residuals(fit, held.with_errors(1.0)) / np.sqrt(var))
         bright.append(held.mag < np.median(table.mag))
     pull, bright = np.abs(np.concatenate(pulls)), np.concatenate(bright)
     for half in (pull[bright], pull[~bright]):

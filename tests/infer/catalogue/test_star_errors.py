@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from threadpoolctl import threadpool_limits
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Rejection, fit_linear
 from bayesdist.infer.catalogue import star_sums as module
@@ -38,8 +38,8 @@ def some(seed=1, n_stars=70):
     position, motion = (rng.uniform(0.0, most, (2, n_stars)).T for most in (0.02, 0.01))
     catalogue = StarErrors(position, motion, rng.uniform(2003.0, 2006.0, n_stars))
     dt = matches.epoch - catalogue.epoch[code]
-    matches = matches.with_sigma(
-        *(
+    matches = matches.with_errors(
+        tuple(
             np.sqrt(
                 rng.uniform(0.01, 0.05, n) ** 2
                 + catalogue.position[code, a] ** 2
@@ -145,7 +145,7 @@ def test_memberships_weigh_the_matches():
 
 def test_the_column_of_the_table_is_used():
     _, matches, fit, code, catalogue = some(3)
-    a = star_covariance(fit, matches._with(star=code), catalogue)
+    a = star_covariance(fit, matches.with_columns(star=code), catalogue)
     b = star_covariance(fit, matches, catalogue, star=code)
     np.testing.assert_array_equal(a.extra, b.extra)
 
@@ -167,7 +167,7 @@ def repeated(n_stars=60, n_exposures=9, order=2):
     x, y = rng.uniform(1, SIZE[0], n_stars), rng.uniform(1, SIZE[1], n_stars)
     # a table does not hold a star twice: not quite the same pixel
     x, y = (np.tile(p, n_exposures) + 1e-9 * np.arange(n_stars * n_exposures) for p in (x, y))
-    table = MatchTable(
+    table = Matches(
         x,
         y,
         x,

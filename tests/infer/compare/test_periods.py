@@ -7,7 +7,7 @@ import pytest
 from astropy.time import Time
 from scipy.stats import kstest, ncx2
 
-from bayesdist.data import MatchTable, matches
+from bayesdist.data import Matches, batches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import Rejection, fit_linear
 from bayesdist.infer.compare.period_dates import mjd_periods, sum_by_period
@@ -40,7 +40,7 @@ def dated(rng, n, *, order=2, sigma=0.1, change=None, shares=(0.5, 0.3, 0.2), qu
         uv = uv + (period == 2)[:, None] * (phi @ change.reshape(2, -1).T)
     sigmas = sigma * rng.uniform(0.5, 2.0, (n, 2))
     uv = uv + rng.standard_normal((n, 2)) * sigmas
-    return MatchTable(x, y, *uv.T, sigma_u=sigmas[:, 0] * quoted, sigma_v=sigmas[:, 1] * quoted,
+    return Matches(x, y, *uv.T, sigma_u=sigmas[:, 0] * quoted, sigma_v=sigmas[:, 1] * quoted,
                       epoch=rng.uniform(start, stop))  # fmt: skip
 
 
@@ -94,7 +94,7 @@ def test_pairs_outside_all_periods_are_not_used(rng):
     two = {name: PERIODS[name] for name in ("early", "late")}
     found = compare_periods(fit, period_sums(fit, table, two), rescale=False)
     inside = part(table, "early"), part(table, "late")
-    whole = fit_linear(MatchTable.concatenate(inside), MODEL, **UNCLIPPED)
+    whole = fit_linear(Matches.concatenate(inside), MODEL, **UNCLIPPED)
     np.testing.assert_allclose(found.combined, whole.mean, rtol=0, atol=1e-9)
     np.testing.assert_allclose(combined_cov(found), whole.cov, rtol=1e-8, atol=1e-14)
 
@@ -143,7 +143,7 @@ def test_a_period_with_nearly_all_data_keeps_its_digits(rng):
     found = compared(table)
     difference, cov = found.difference("early")
     # theta_1 - theta = A (theta_1 - theta_rest), with A the share of the rest
-    rest = MatchTable.concatenate([part(table, "middle"), part(table, "late")])
+    rest = Matches.concatenate([part(table, "middle"), part(table, "late")])
     alone = [fit_linear(one, MODEL, **UNCLIPPED) for one in (part(table, "early"), rest)]
     share = combined_cov(found) @ np.linalg.inv(alone[1].cov)
     expected = share @ (alone[0].cov + alone[1].cov) @ share.T
@@ -297,8 +297,8 @@ def test_pieces_and_parts_of_a_period_add_up(rng, monkeypatch):
     table = dated(rng, 1000)
     fit = fit_linear(table, MODEL)
     whole = period_sums(fit, table, PERIODS)
-    monkeypatch.setattr(matches, "PIECE", 130)
-    assert len(table.pieces()) > 5
+    monkeypatch.setattr(batches, "BATCH", 130)
+    assert len(table.readers()) > 5
     pieces = period_sums(fit, table, PERIODS)
     for name in PERIODS:
         assert pieces[name].n == whole[name].n
@@ -319,7 +319,7 @@ def test_false_matches_stay_out_by_one_rule_for_all_periods(rng):
     u = table.u.copy()
     false = rng.choice(3000, 150, replace=False)
     u[false] += rng.uniform(3, 6, 150)
-    table = MatchTable(table.x, table.y, u, table.v, sigma_u=table.sigma_u, sigma_v=table.sigma_v,
+    table = Matches(table.x, table.y, u, table.v, sigma_u=table.sigma_u, sigma_v=table.sigma_v,
                        epoch=table.epoch)  # fmt: skip
     fit = fit_linear(table, MODEL)
     found = compare_periods(fit, period_sums(fit, table, PERIODS))
@@ -349,7 +349,7 @@ def test_two_chips(rng):
     model = DistortionModel(1, TWO_CHIPS)
     start = np.where(rng.uniform(size=4000) < 0.5, 2010.0, 2010.3)
     late = (start == 2010.3) & (table.chip == 1)
-    moved = MatchTable(table.x, table.y, table.u + 0.5 * late, table.v, sigma_u=table.sigma_u,
+    moved = Matches(table.x, table.y, table.u + 0.5 * late, table.v, sigma_u=table.sigma_u,
                        sigma_v=table.sigma_v, epoch=start + 0.05, chip=table.chip,
                        chip_numbers=table.chip_numbers)  # fmt: skip
     fit = fit_linear(moved, model, **UNCLIPPED)
@@ -375,7 +375,7 @@ def test_what_cannot_be_compared_is_refused(rng):
         period_sums(fit, table, PERIODS | {"none": (2012.0, 2013.0)})
     with pytest.raises(InputError, match="period back goes from"):
         period_sums(fit, table, PERIODS | {"back": (2013.0, 2012.0)})
-    bare = MatchTable(table.x, table.y, table.u, table.v, sigma_u=table.sigma_u,
+    bare = Matches(table.x, table.y, table.u, table.v, sigma_u=table.sigma_u,
                       sigma_v=table.sigma_v)  # fmt: skip
     with pytest.raises(InputError, match="need an epoch"):
         period_sums(fit, bare, PERIODS)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import build_model, fit_linear
 from bayesdist.infer.compare.planning import (
@@ -25,7 +25,7 @@ def stars(epochs, n, rng, *, frames=False, sigma=SIGMA):
     code = np.repeat(np.arange(len(epochs)), n)
     errors = sigma * rng.standard_normal((2, N))
     names = tuple(f"e{k}" for k in range(len(epochs)))
-    return MatchTable(
+    return Matches(
         x=x, y=y, u=x - 256 + errors[0], v=y - 128 + errors[1],
         sigma_u=np.full(N, sigma), sigma_v=np.full(N, sigma),
         epoch=np.repeat(epochs, n), exposure=code, exposure_names=names,

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import Rejection, fit_linear, load, residuals
 from bayesdist.infer.equations.arrow import Arrow
@@ -22,7 +22,7 @@ from bayesdist.model import DistortionModel, TimeDependence
 from ..support import CHIP, TWO_CHIPS, exposures, simulated, table
 
 
-def refusal(model: DistortionModel, matches: MatchTable) -> str:
+def refusal(model: DistortionModel, matches: Matches) -> str:
     with pytest.raises(DegenerateError) as caught:
         fit_linear(matches, model)
     return str(caught.value)

@@ -76,7 +76,7 @@ def test_a_rotated_catalogue_changes_nothing_but_the_gauge():
     """The reference gauge forgets where the catalogue's axes point."""
     model, matches, _ = campaign(2, 3, 400)
     c, s = np.cos(1.1), np.sin(1.1)
-    turned = matches._with(
+    turned = matches.with_columns(
         u=c * matches.u - s * matches.v + 77.0, v=s * matches.u + c * matches.v - 9.0
     )
     first, second = (fit_exposures(m, model) for m in (matches, turned))
@@ -192,7 +192,7 @@ def test_stars_in_a_corner_are_named_with_exposure_and_chip(some):
 def test_epochs_are_needed(some):
     model, matches, _, _ = some
     with pytest.raises(InputError, match="epoch of every exposure"):
-        fit_exposures(matches._with(epoch=None), model)
+        fit_exposures(matches.with_columns(epoch=None), model)
 
 
 def test_priors_of_one_exposure(some):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.infer.exposures.frame_choice import frames_that_help
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
@@ -30,7 +30,7 @@ def exposures(rng, *kinds, n=60, count=4):
         for name, values in zip(columns, (x, y, *w), strict=True):
             columns[name].append(values)
     table = {name: np.concatenate(parts) for name, parts in columns.items()}
-    return MatchTable(
+    return Matches(
         **table,
         unit="pix",
         exposure=np.repeat(np.arange(count), n),

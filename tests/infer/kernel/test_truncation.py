@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from scipy.special import log_ndtr, ndtr
 from scipy.stats import chi2, ncx2
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Compute, GaussianPriors, OutlierMixture, fit_linear, load, sample
 from bayesdist.infer.density.coordinates import Split
@@ -191,7 +191,7 @@ def test_density_integrates_to_one_over_the_circle(kind):
         centre = model.predict(theta, one.x, one.y, chip=one.chip_number)[0] + [offset, 0.0]
         n = len(du)
         columns = {name: np.repeat(getattr(one, name), n) for name in ("x", "y", "chip")}
-        table = MatchTable.of_distinct_rows(
+        table = Matches.of_distinct_rows(
             **columns,
             chip_numbers=one.chip_numbers,
             u=centre[0] + du,

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import fit_linear
 from bayesdist.infer.nodes import Matern, fit_with_tables, pixel_shifts
@@ -60,7 +60,7 @@ def bent(model: DistortionModel) -> np.ndarray:
 
 def observed(
     model, theta, tables, x, y, rng, *, chip=None, filters=None, names=("",), fraction=0.0, **more
-) -> MatchTable:
+) -> Matches:
     """Matches of raw pixels whose true positions go through tables and model."""
     chip = np.zeros(len(x), int) if chip is None else chip
     filters = np.zeros(len(x), int) if filters is None else filters
@@ -72,7 +72,7 @@ def observed(
     error = sigma[:, None] * rng.standard_normal((len(x), 2))
     false = rng.random(len(x)) < fraction
     error[false] = rng.normal(0.0, 1.0, (false.sum(), 2))
-    return MatchTable(
+    return Matches(
         x,
         y,
         *(uv + error).T,
@@ -223,7 +223,7 @@ def test_two_chips_and_turned_exposures(rng):
     px, py = corrected(truth, x, y, chip=numbers)
     uv = model.predict(theta, px, py, chip=numbers, exposure=exposure)
     sigma = np.full(len(x), 0.05 * NOISE)
-    matches = MatchTable(
+    matches = Matches(
         x,
         y,
         *(uv + 0.05 * NOISE * rng.standard_normal((len(x), 2))).T,

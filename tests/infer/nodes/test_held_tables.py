@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.nodes import fit_with_tables, held_sigma
-from bayesdist.infer.nodes.corrected import with_columns
 from bayesdist.model import DistortionModel
 from bayesdist.model.lookup import LookupTable, corrected
 from tests.infer.nodes.support import CHIP, ORDER, SIZE, STEP, grid, pattern, places
@@ -40,7 +39,7 @@ def matches(model):
         parts[name] = (x, y, u, v, np.full(len(x), k))
     x, y, u, v, code = (np.concatenate(column) for column in zip(*parts.values(), strict=True))
     sigma = np.full(len(x), NOISE)
-    return MatchTable(
+    return Matches(
         x=x,
         y=y,
         u=u,
@@ -84,7 +83,7 @@ def test_a_held_table_is_a_correction_made_beforehand(matches, model, over):
     some, fit = matches.select(matches.filter == 1), over[1]
     x, y = corrected(fit.tables[:1], some.x, some.y, chip=1)
     inside = (x > 0.5) & (x < SIZE[0] + 0.5) & (y > 0.5) & (y < SIZE[1] + 0.5)
-    moved = with_columns(some.select(inside), x=x[inside], y=y[inside])
+    moved = some.select(inside).with_columns(x=x[inside], y=y[inside])
     found = fit_with_tables(moved, model, **OPTIONS)
     # the few stars at the rim are left out here
     assert (np.abs(found.tables[0].values - fit.tables[1].values) < 0.3 * fit.tables[1].sigma).all()

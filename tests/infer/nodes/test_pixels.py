@@ -91,7 +91,7 @@ def test_variances_turn_with_the_roll(turned, rng):
     """Against the scatter of noise that is carried through; u ten times worse than v."""
     model, theta, matches = turned
     sigma = np.array([0.1, 0.01])
-    quoted = matches.with_sigma(*sigma)
+    quoted = matches.with_errors(tuple(sigma))
     variance = pixel_shifts(Solution(model, theta), quoted).variance
     J = model.slopes(theta, matches.x, matches.y, **columns_of(matches))
     noise = sigma * rng.standard_normal((4000, 2))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.data import matches as tables
+from bayesdist.data import batches
 from bayesdist.infer import GaussianPriors, OutlierMixture, load, memberships
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.posterior import memberships as membership
@@ -100,7 +100,7 @@ def test_outliers_are_counted(known, monkeypatch):
     # the threshold is not hit by chance
     assert np.abs(p.mean(axis=0) - 0.5).min() > 1e-6
     for piece in (2**20, 90):
-        monkeypatch.setattr(tables, "PIECE", piece)
+        monkeypatch.setattr(batches, "BATCH", piece)
         shards = load(target.model, matches)
         flagged, expected = count_outliers(shards, target.hyper, psi[:, :n], psi[:, n:])
         assert type(flagged) is int and flagged == (p.mean(axis=0) > 0.5).sum()

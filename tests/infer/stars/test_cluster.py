@@ -26,8 +26,7 @@ import pytest
 from distributed import Client, LocalCluster
 
 from bayesdist import errors
-from bayesdist.data import matches as matches_module
-from bayesdist.data import open_matches, partitioned
+from bayesdist.data import batches, open_matches
 from bayesdist.infer import Compute, fit_linear, load, sample
 from bayesdist.infer.stars import cluster as cluster_module
 from bayesdist.infer.stars.cluster import ClusterShards
@@ -43,8 +42,7 @@ pytestmark = [pytest.mark.usefixtures("small_pieces"), pytest.mark.timeout(120)]
 @pytest.fixture(scope="module")
 def small_pieces() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(matches_module, "PIECE", PIECE)
-        patch.setattr(partitioned, "PIECE", PIECE)
+        patch.setattr(batches, "BATCH", PIECE)
         yield
 
 
@@ -191,7 +189,7 @@ def test_table_on_disk_by_a_relative_path(problem, compute, tmp_path, monkeypatc
     write(tmp_path / "stars.parquet", matches)
     monkeypatch.chdir(tmp_path)
     opened = open_matches("stars.parquet")
-    assert len(opened.pieces()) == 5
+    assert len(opened.readers()) == 5
     shards = load(model, opened, compute)
     try:
         assert len(shards) == N
@@ -213,7 +211,7 @@ def test_pieces_that_hold_other_exposures(compute):
 @pytest.mark.parametrize("n_shards", [3, 5, 12])
 def test_shards_are_spread_evenly_and_stay(problem, compute, n_shards, monkeypatch):
     """Only sums travel: no shard has been copied after some passes."""
-    monkeypatch.setattr(matches_module, "PIECE", -(-N // n_shards))
+    monkeypatch.setattr(batches, "BATCH", -(-N // n_shards))
     shards = load(*problem, compute)
     pids = shards.sum(pid_of)
     assert len(pids) == n_shards
@@ -329,13 +327,13 @@ def test_worker_of_two_threads_and_then_none(problem, by_threads, monkeypatch):
 
 
 @dataclass(frozen=True)
-class DeadlyPiece:
+class DeadlyReader:
     """Kills who reads it."""
 
     def __len__(self) -> int:
         return 1
 
-    def read(self):
+    def load(self):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -343,8 +341,8 @@ class DeadlyMatches:
     def __len__(self) -> int:
         return 1
 
-    def pieces(self):
-        return (DeadlyPiece(),)
+    def readers(self):
+        return (DeadlyReader(),)
 
 
 def test_all_workers_lost_while_they_read(problem):

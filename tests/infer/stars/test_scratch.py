@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bayesdist.data import matches as tables
+from bayesdist.data import batches
 from bayesdist.errors import InputError
 from bayesdist.infer import Compute, GaussianPriors, OutlierMixture, fit_linear, load
 from bayesdist.infer.density.target import Target
@@ -88,7 +88,7 @@ def test_shards_may_be_read_while_others_are_added(shards):
 
 def test_equal_errors_are_kept_once_in_memory_and_come_back_as_both(campaign):
     model, matches, _ = campaign
-    stars = stars_of(model, matches.with_sigma(0.05, 0.05))
+    stars = stars_of(model, matches.with_errors((0.05, 0.05)))
     assert stars.var_u is stars.var_v and stars.nbytes == 5 * 8 * 900
     assert stars_of(model, matches).nbytes == 6 * 8 * 900
     box = Store(0)
@@ -188,7 +188,7 @@ def test_a_scratch_folder_that_is_not_there_is_one_sentence(shards, tmp_path, mo
 def test_the_fit_and_the_density_do_not_depend_on_the_budget(campaign, monkeypatch):
     """memory_mb = 0: everything from the scratch file, at every pass."""
     model, matches, _ = campaign
-    monkeypatch.setattr(tables, "PIECE", 300)
+    monkeypatch.setattr(batches, "BATCH", 300)
     mixture = OutlierMixture()
     fits, densities, expansions = [], [], []
     for memory_mb in (1000.0, 0.02, 0.0):

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bayesdist.data import matches as tables
-from bayesdist.data import open_matches, partitioned, write_partitioned
+from bayesdist.data import batches, open_matches, write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.infer import Compute, GaussianPriors, OutlierMixture, Rejection, fit_linear, load
 from bayesdist.infer.density.target import Target
@@ -89,9 +88,9 @@ def assert_same(found, expected, rel=1e-12):
 def test_pieces_of_a_table(campaign, monkeypatch, size):
     model, matches, theta = campaign
     whole = load(model, matches)
-    assert len(matches.pieces()) == 1
-    monkeypatch.setattr(tables, "PIECE", size)
-    assert len(matches.pieces()) == -(-1200 // size)
+    assert len(matches.readers()) == 1
+    monkeypatch.setattr(batches, "BATCH", size)
+    assert len(matches.readers()) == -(-1200 // size)
     cut = load(model, matches)
     assert len(cut) == len(whole) == 1200 and cut.groups.same(whole.groups)
     assert_same(sums_of(cut, theta), sums_of(whole, theta))
@@ -100,9 +99,9 @@ def test_pieces_of_a_table(campaign, monkeypatch, size):
 @pytest.mark.parametrize("piece", [130, 400, 2**20])
 def test_parts_on_disk(campaign, parquet, monkeypatch, piece):
     model, matches, theta = campaign
-    monkeypatch.setattr(partitioned, "PIECE", piece)
+    monkeypatch.setattr(batches, "BATCH", piece)
     on_disk = open_matches(parquet)
-    assert (len(on_disk.pieces()) == 1) == (piece > 1200)
+    assert (len(on_disk.readers()) == 1) == (piece > 1200)
     model = _in_order_of(model, on_disk.exposure_names)
     renamed = _with_names_of(matches, on_disk.exposure_names)
     assert_same(sums_of(load(model, on_disk), theta), sums_of(load(model, renamed), theta))
@@ -152,7 +151,7 @@ def _small():
 def test_the_fit_does_not_depend_on_the_pieces(campaign, parquet, monkeypatch):
     model, matches, _ = campaign
     whole = fit_linear(matches, model, rejection=Rejection(radial_weight=2.0))
-    monkeypatch.setattr(tables, "PIECE", 100)
+    monkeypatch.setattr(batches, "BATCH", 100)
     cut = fit_linear(matches, model, rejection=Rejection(radial_weight=2.0))
     np.testing.assert_allclose(
         cut.mean / whole.sigma, whole.mean / whole.sigma, rtol=1e-11, atol=1e-5
@@ -168,7 +167,7 @@ def test_a_model_need_not_know_the_exposures_that_it_has_no_frames_for(campaign,
     _, matches, _ = simulated(113, 300, n_exposures=4)
     model = DistortionModel(2, (CHIP,))
     whole = fit_linear(matches, model)
-    monkeypatch.setattr(tables, "PIECE", 50)  # the exposures stand one after the other
+    monkeypatch.setattr(batches, "BATCH", 50)  # the exposures stand one after the other
     cut = fit_linear(matches, model)
     np.testing.assert_allclose(cut.mean, whole.mean, rtol=1e-12)
     assert load(model, matches).survey.exposures.shape == (1,)
@@ -177,11 +176,11 @@ def test_a_model_need_not_know_the_exposures_that_it_has_no_frames_for(campaign,
 def test_results_add_up_in_the_order_of_the_data(campaign, monkeypatch):
     """A sum of doubles depends on its order: the order is that of the rows."""
     model, matches, _ = campaign
-    monkeypatch.setattr(tables, "PIECE", 300)
+    monkeypatch.setattr(batches, "BATCH", 300)
     shards = load(model, matches)
     first = shards.sum(_first_u)
     assert first == tuple(
-        float(piece.read().u[_first_row(model, piece)]) for piece in matches.pieces()
+        float(piece.load().u[_first_row(model, piece)]) for piece in matches.readers()
     )
     assert total([]) is None and total([3.0]) == 3.0
     assert total(iter([1e16, 1.0, 1.0])) == (1e16 + 1.0) + 1.0 != 1e16 + 2.0
@@ -192,7 +191,7 @@ def _first_u(stars):
 
 
 def _first_row(model, piece):
-    return prepare(model, piece.read())[1][0]
+    return prepare(model, piece.load())[1][0]
 
 
 def test_shards_are_given_back_as_they_are(campaign):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from bayesdist.data import matches as tables
+from bayesdist.data import batches
 from bayesdist.infer import load
 from bayesdist.infer.stars.shards import total
 from bayesdist.infer.stars.stars import prepare
@@ -159,7 +159,7 @@ def test_the_hull_of_many_stars_is_that_of_all():
 def test_shards_survey_their_pieces(campaign, monkeypatch):
     model, matches = campaign
     whole = load(model, matches).survey
-    monkeypatch.setattr(tables, "PIECE", 700)
+    monkeypatch.setattr(batches, "BATCH", 700)
     cut = load(model, matches).survey
     assert cut.n == whole.n and cut.where == whole.where
     assert cut.reference_sigma == whole.reference_sigma  # the same stars, all of them

@@ -10,7 +10,6 @@ from astropy.coordinates import SkyCoord
 from scipy import stats
 
 from bayesdist.data.matching.campaign import match_campaign
-from bayesdist.data.motions import derive_motions
 from bayesdist.data.starlists import StarCuts
 from bayesdist.errors import InputError
 from bayesdist.missions.acs.simulate import LINEAR_TERMS, acs_solution, simulate_acs
@@ -332,20 +331,6 @@ def test_errors_of_the_catalogue_are_those_quoted(campaign):
     assert truth.pm_v.std() == pytest.approx(0.01, rel=0.02)
     well = (catalog.mag > -14) & (catalog.mag < -10)
     assert np.mean(catalog.sigma_u[well] < 0.02) > 0.999  # Figure 3
-
-
-def test_motions_derived_from_both_halves_are_the_true_ones(campaign):
-    """Section 2.2, by the package's own derivation; one star in twelve is poorly measured."""
-    derived = derive_motions(campaign.early, campaign.late)
-    for own, sigma in (("pm_u", "sigma_pm_u"), ("pm_v", "sigma_pm_v")):
-        pull = (getattr(derived, own) - getattr(campaign.truth.stars, own)) / getattr(
-            derived, sigma
-        )
-        assert stats.kstest(pull, "norm").pvalue > 1e-3
-    expected = np.median(derived.sigma_pm_u[np.abs(derived.mag + 10) < 0.2])
-    bright = derived.mag < -10
-    poor = derived.sigma_pm_u[bright] > 3 * expected
-    assert 0.04 < poor.mean() < 0.12  # 4270 of 53917 are left out in the report
 
 
 def test_pairs_scatter_as_their_errors_say(campaign):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import uncertainty_map
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Rejection, fit_linear
 from bayesdist.missions.wise.assess.published import implied_sigma
@@ -22,7 +22,7 @@ def test_fits_of_even_pairs_have_it(order):
     k = 8.0 * np.arange(127) + 4.5
     x, y = (g.ravel() for g in np.meshgrid(k, k))
     n = x.size
-    pairs = MatchTable(x, y, x, y, np.full(n, 0.1), np.full(n, 0.1))
+    pairs = Matches(x, y, x, y, np.full(n, 0.1), np.full(n, 0.1))
     model = DistortionModel(order, (Chip(1, "A", SIZE, (508.5, 508.5)),))
     fit = fit_linear(pairs, model, rejection=Rejection(1e9, 1e9, 1.0))
     corner = uncertainty_map(fit, grid=(2, 2))  # centres of the outermost pixels

@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs import files as rvb_files
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
@@ -28,7 +28,7 @@ def pairs_of(rng, n=400) -> RvbPairs:
     frame = rng.integers(4, size=n)
     colour = np.where(rng.uniform(size=n) < 0.2, np.nan, np.round(rng.normal(0.3, 0.5, n), 1))
     names = ("d", "b", "a", "c")
-    matches = MatchTable(
+    matches = Matches(
         x, y, u, v, np.full(n, 0.5), np.full(n, 0.4), exposure=frame, exposure_names=names
     )
     return RvbPairs(matches, colour)
@@ -43,7 +43,7 @@ def cut(pairs: RvbPairs, size: int) -> list[RvbPairs]:
         used, code = np.unique(m.exposure, return_inverse=True)
         columns = {name: getattr(m, name) for name in ("x", "y", "u", "v", "sigma_u", "sigma_v")}
         names = tuple(m.exposure_names[k] for k in used)
-        matches = MatchTable(**columns, exposure=code, exposure_names=names, row=m.row)
+        matches = Matches(**columns, exposure=code, exposure_names=names, row=m.row)
         out.append(RvbPairs(matches, one.colour))
     return out
 
@@ -80,7 +80,7 @@ def test_what_leaves_nothing_or_cannot_be_done_is_refused(rng):
             RvbSelection(colour=(8.0, 9.0)))  # fmt: skip
     refused("hence no colours", RvbSelection(bluest=3), RvbPairs(pairs.matches))
     m = pairs.matches
-    nameless = RvbPairs(MatchTable(m.x, m.y, m.u, m.v), pairs.colour)
+    nameless = RvbPairs(Matches(m.x, m.y, m.u, m.v), pairs.colour)
     refused("no column of frames", RvbSelection(bluest=3), nameless)
     with pytest.raises(InputError, match="colours from 1 to 0"):
         RvbSelection(colour=(1.0, 0.0))
@@ -91,7 +91,7 @@ def test_what_leaves_nothing_or_cannot_be_done_is_refused(rng):
 def test_written_pairs_are_read_again(rng, tmp_path, monkeypatch):
     path = write(rvb_table(rng), tmp_path / "a.parquet")
     expected = read_rvb(path, band="W2")
-    monkeypatch.setattr(rvb_files, "PIECE", 41)
+    monkeypatch.setattr(rvb_files, "BATCH", 41)
     assert write_rvb(stream_rvb(path, band="W2"), tmp_path / "out") == len(expected)
     found = read_rvb(tmp_path / "out")
     assert len(list((tmp_path / "out").iterdir())) > 3
@@ -127,7 +127,7 @@ def test_pairs_that_stay_on_disk_are_the_same(rng, tmp_path):
     path = write(table, tmp_path / "a.parquet")
     options = OPTIONS | {"columns": {"color": ""}}
     opened = open_rvb(path, band="W1", **options)
-    (piece,) = [piece.read() for piece in opened.pieces()]
+    (piece,) = [piece.load() for piece in opened.readers()]
     expected = read_rvb(path, band="W1").matches
     for name in (*ARRAYS, "row"):
         np.testing.assert_array_equal(getattr(piece, name), getattr(expected, name))

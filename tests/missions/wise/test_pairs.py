@@ -11,7 +11,7 @@ import pytest
 from astropy.table import MaskedColumn, Table
 from astropy.time import Time
 
-from bayesdist.data import MatchTable, open_matches, write_partitioned
+from bayesdist.data import Matches, open_matches, write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs import files as rvb_files
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit, radial_rows
@@ -92,14 +92,14 @@ def test_parquet_in_small_pieces_is_the_ipac_table(rng, tmp_path, monkeypatch):
     table = rvb_table(rng)
     whole = read_rvb(write(table, tmp_path / "a.tbl"), band="w2")
     path = write(table, tmp_path / "a.parquet")
-    monkeypatch.setattr(rvb_files, "PIECE", 41)
+    monkeypatch.setattr(rvb_files, "BATCH", 41)
     pieces = list(stream_rvb(path, band="2"))
     assert len(pieces) == 8 and sum(len(p) for p in pieces) == len(whole)
     assert_same(RvbPairs.concatenate(pieces), whole)
     # what is written from the pieces is what a fit opens
     write_partitioned((p.matches for p in pieces), tmp_path / "W2")
     opened = open_matches(tmp_path / "W2")
-    joined = MatchTable.concatenate([piece.read() for piece in opened.pieces()])
+    joined = Matches.concatenate([piece.load() for piece in opened.readers()])
     for name in ("x", "y", "u", "v", "sigma_u", "epoch", "mag"):
         np.testing.assert_array_equal(getattr(joined, name), getattr(whole.matches, name))
     assert opened.filter_names == ("W2",)
@@ -201,11 +201,11 @@ def test_colour_is_shortest_minus_longest_detected(rng):
 def pairs_with(colour, frame) -> RvbPairs:
     n = len(colour)
     k = np.arange(1.0, n + 1)
-    matches = MatchTable(k, k, k, k, exposure=frame, exposure_names=("a", "b", "c"))
+    matches = Matches(k, k, k, k, exposure=frame, exposure_names=("a", "b", "c"))
     return RvbPairs(matches, np.asarray(colour, float))
 
 
-def taken(pairs: RvbPairs, **limits) -> MatchTable:
+def taken(pairs: RvbPairs, **limits) -> Matches:
     return SelectedPairs(lambda: [pairs], RvbSelection(**limits), SIZE).table()
 
 
@@ -245,7 +245,7 @@ def test_false_matches_pass_in_proportion_to_the_area_within_the_limit(rng):
     n = 200_000
     x, y = rng.uniform(0.5, 1016.5, (2, n))
     r, phi = 4.0 * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
-    matches = MatchTable(x, y, x + r * np.cos(phi), y + r * np.sin(phi))
+    matches = Matches(x, y, x + r * np.cos(phi), y + r * np.sin(phi))
     kept = taken(RvbPairs(matches), offset=RadialLimit(0.5, 3.0))
     # <(a + b s)^2> over a square, s = r^2 / r_corner^2: <s> = 1/3, <s^2> = 7/45
     share = (0.5**2 + 2 * 0.5 * 2.5 / 3 + 2.5**2 * 7 / 45) / 16
@@ -259,7 +259,7 @@ def test_limits_are_judged_about_the_expected_positions(rng):
     distorted = np.column_stack([x + 3e-6 * (x - 508.5) ** 2, y])
     noise = rng.normal(0, 0.1, (n, 2))
     u, v = (distorted + noise).T
-    matches = MatchTable(x, y, u, v, sigma_u=np.full(n, 0.1), sigma_v=np.full(n, 0.1))
+    matches = Matches(x, y, u, v, sigma_u=np.full(n, 0.1), sigma_v=np.full(n, 0.1))
     tight = RadialLimit(0.6, 0.6)
     # undistorted, what is beyond 0.6 px is lost towards the edges; expected, nothing is
     lost = taken(RvbPairs(matches), offset=tight)
@@ -276,13 +276,13 @@ def test_limits_are_judged_about_the_expected_positions(rng):
 
 def test_acceptance_refuses_what_it_cannot_judge():
     one = np.array([1.0, 2.0])
-    matches = MatchTable(one, one, one + 5, one)
+    matches = Matches(one, one, one + 5, one)
     beyond = r"no pair of 2 is left .*: offset beyond the radial limit \(2\)"
     with pytest.raises(InputError, match=beyond):
         taken(RvbPairs(matches), offset=RadialLimit(1.0, 2.0))
     with pytest.raises(InputError, match="needs errors"):
         taken(RvbPairs(matches), chi2=RadialLimit(1.0, 2.0))
-    in_mas = RvbPairs(MatchTable(one, one, one, one, unit="mas"))
+    in_mas = RvbPairs(Matches(one, one, one, one, unit="mas"))
     with pytest.raises(InputError, match="u, v are in mas"):
         taken(in_mas, offset=RadialLimit(1, 2))
     with pytest.raises(InputError, match=r"shape \(3, 2\) for 2 pairs"):

@@ -8,7 +8,7 @@ from astropy.table import Column, Table
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.missions.wise.rvb.linear import (
     FIVE,
@@ -80,7 +80,7 @@ def pairs(rng, n=400, transform=None, sigma=(0.05, 0.1), extent=(0.5, 1016.5), *
     uv = rng.uniform(*extent, (n, 2))
     xy = (transform or RvbTransform())(uv) + rng.standard_normal((n, 2)) * sigma
     sigmas = np.broadcast_to(sigma, (n, 2)).T
-    return MatchTable(*xy.T, *uv.T, sigma_u=sigmas[0], sigma_v=sigmas[1], **columns)
+    return Matches(*xy.T, *uv.T, sigma_u=sigmas[0], sigma_v=sigmas[1], **columns)
 
 
 def test_pairs_transformed_twice_are_transformed_by_the_product(rng):
@@ -162,7 +162,7 @@ def test_exact_pairs_are_recovered_exactly_and_linearised_away(rng):
     matches = pairs(rng, transform=truth, sigma=(1e-6, 1e-6))
     fit = fit_transform(linear_moments(matches, CENTRE))
     np.testing.assert_allclose(fit.transform.values, truth.values, atol=1e-8)
-    bare = MatchTable(matches.x, matches.y, matches.u, matches.v)
+    bare = Matches(matches.x, matches.y, matches.u, matches.v)
     straight = transformed(bare, fit.transform)
     np.testing.assert_allclose(straight.u, straight.x, atol=1e-5)
     np.testing.assert_allclose(straight.v, straight.y, atol=1e-5)
@@ -172,7 +172,7 @@ def test_nothing_linear_is_left_in_linearised_pairs(rng):
     """Of distorted pairs too, whose residuals are far above the errors."""
     matches = pairs(rng, transform=RvbTransform(0.5, 0.2, 0.001, 0.002, -0.001))
     bent = transformed(matches, RvbTransform())
-    bent = MatchTable(bent.x + 5e-6 * (bent.x - 300) ** 2, bent.y, bent.u, bent.v,
+    bent = Matches(bent.x + 5e-6 * (bent.x - 300) ** 2, bent.y, bent.u, bent.v,
                       sigma_u=bent.sigma_u, sigma_v=bent.sigma_v)  # fmt: skip
     fit = fit_transform(linear_moments(bent, CENTRE), free=PARAMETERS)
     assert fit.chi2 / fit.dof > 2
@@ -212,7 +212,7 @@ def frames_of(rng, n_frames, n, detector):
         xy[own] = detector(fixed[name](nominal[own]))
     xy += rng.normal(0, 0.05, (n, 2))
     sigma = np.full(n, 0.05)
-    matches = MatchTable(*xy.T, *uv.T, sigma_u=sigma, sigma_v=sigma, exposure=frame,
+    matches = Matches(*xy.T, *uv.T, sigma_u=sigma, sigma_v=sigma, exposure=frame,
                          exposure_names=names)  # fmt: skip
     return matches, free, fixed
 
@@ -272,7 +272,7 @@ def test_linear_terms_are_lost_with_free_scales_and_found_with_fixed_ones(rng):
 
 def test_what_the_pairs_do_not_determine_is_named(rng):
     x = np.linspace(1, 1000, 50)
-    line = MatchTable(x, np.full(50, 508.5), x, np.full(50, 508.5),
+    line = Matches(x, np.full(50, 508.5), x, np.full(50, 508.5),
                       sigma_u=np.ones(50), sigma_v=np.ones(50))  # fmt: skip
     with pytest.raises(DegenerateError, match="do not determine scale_v"):
         fit_transform(linear_moments(line, CENTRE))
@@ -291,7 +291,7 @@ def test_wrong_input_is_refused(rng):
     with pytest.raises(InputError, match="frame 'f1' has no solution with fixed scales"):
         rereference(matches, {"f1": RvbTransform()}, {})
     with pytest.raises(InputError, match="carry no errors"):
-        linear_moments(MatchTable(*[np.arange(3.0)] * 4), CENTRE)
+        linear_moments(Matches(*[np.arange(3.0)] * 4), CENTRE)
     with pytest.raises(InputError, match=r"scale_u .* is -1"):
         RvbTransform(scale_u=-1.0)
     with pytest.raises(InputError, match="determinant -1"):

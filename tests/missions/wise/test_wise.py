@@ -230,9 +230,7 @@ def test_the_fit_finds_the_published_coefficients(pairs):
     """Within its errors, jitter included: the quoted ones are too small by that."""
     matches, truth = pairs
     model, theta = wise_solution("W2")
-    honest = matches.with_sigma(
-        np.hypot(matches.sigma_u, truth.jitter), np.hypot(matches.sigma_v, truth.jitter)
-    ).select(~truth.false)
+    honest = matches.with_errors(truth.jitter, in_quadrature=True).select(~truth.false)
     fit = fit_linear(honest, model, rejection=Rejection(np.inf, None))
     d = fit.mean - theta
     assert 1e-3 < stats.chi2(30).sf(d @ np.linalg.solve(fit.cov, d)) < 1 - 1e-3

@@ -9,8 +9,8 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.data.exposures import ExposureLog
+from bayesdist.data.storage.write import write_columns
 from bayesdist.data.tables.files import naming_faults, read_table
-from bayesdist.data.write import write_columns
 from bayesdist.files import atomic_path
 from bayesdist.missions.acs.simulate.pointings import AcsFrames
 from bayesdist.missions.acs.simulate.stars import TrueStars

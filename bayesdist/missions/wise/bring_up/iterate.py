@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.missions.wise.bring_up.pairs import Field
@@ -78,7 +78,7 @@ class BringUp:
     rounds : tuple of Round
     fit : LinearFit
         Of the last round.
-    matches : MatchTable
+    matches : Matches
         Matches fitted in the last round; exposures are the frames.
     index, reference_index : ndarray of int, shape (n_believed,)
         Rows of these matches in the two lists.
@@ -90,7 +90,7 @@ class BringUp:
 
     rounds: tuple[Round, ...]
     fit: LinearFit
-    matches: MatchTable
+    matches: Matches
     index: Int
     reference_index: Int
     covered: Bool
@@ -216,7 +216,7 @@ def bring_up(
 
 
 def _partial_fit(
-    matches: MatchTable, model: DistortionModel, order: int, rejection: Rejection
+    matches: Matches, model: DistortionModel, order: int, rejection: Rejection
 ) -> LinearFit:
     """Fit of the part of the detector that has matches, as if it were a detector of its own."""
     low = [max(0.0, np.floor(z.min() - 0.5)) for z in (matches.x, matches.y)]
@@ -228,7 +228,7 @@ def _partial_fit(
         (float(high[0] - low[0]), float(high[1] - low[1])),
         (chip.reference_pixel[0] - low[0], chip.reference_pixel[1] - low[1]),
     )
-    moved = replace(matches, x=matches.x - low[0], y=matches.y - low[1])
+    moved = matches.with_columns(x=matches.x - low[0], y=matches.y - low[1])
     return fit_linear(moved, replace(model, order=order, chips=(part,)), rejection=rejection)
 
 

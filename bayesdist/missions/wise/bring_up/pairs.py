@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import poisson
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.data.matching.pairs import mutual_pairs
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.frame_stars import FrameStars
@@ -120,12 +120,12 @@ class Field:
             coverage=float(covered.sum() / (there > 0).sum()),
         )
 
-    def table(self, found: Believed) -> MatchTable:
+    def table(self, found: Believed) -> Matches:
         """Match table of the accepted matches, with the frames as exposures."""
         stars, others = self.detections, self.reference
         sigma = np.hypot(stars.sigma[found.index], others.sigma[found.partner])
         frames, exposure = np.unique(stars.frame[found.index], return_inverse=True)
-        return MatchTable.of_distinct_rows(  # no detection has two reference stars
+        return Matches.of_distinct_rows(  # no detection has two reference stars
             x=stars.x[found.index],
             y=stars.y[found.index],
             u=others.x[found.partner],

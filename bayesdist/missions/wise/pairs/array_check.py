@@ -1,4 +1,4 @@
-"""Are these the positions of the array that the pairs are said to be of?"""
+"""Check that positions are those of the array that the pairs are stated to be of."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _NEAR = 0.05
 
 @dataclass
 class ArrayCheck:
-    """Positions piece by piece against the array of a band."""
+    """Positions batch by batch against the array of a band."""
 
     band: str
     size: tuple[float, float]  # columns and rows of the array

@@ -10,7 +10,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.data.pieces import PIECE
+from bayesdist.data.batches import BATCH
 from bayesdist.data.reading.formats import input_files
 from bayesdist.data.tables.column import Place, SourceColumn, row_number
 from bayesdist.data.tables.files import read_table
@@ -80,7 +80,7 @@ class RvbFile:
         columns = list(dict.fromkeys(self.found[key] for key in keys if key in self.found))
         labels = {self.found[key] for key in ("band", "exposure") if key in self.found}
         labels |= {self.found["epoch"]} & part.texts if "epoch" in self.found else set()
-        for block in part.blocks(columns, encoded=labels & set(columns), size=PIECE):
+        for block in part.blocks(columns, encoded=labels & set(columns), size=BATCH):
             yield block, block.first, part.place(block.first)
 
     def column(self, table: Columns, key: str, place: Place) -> SourceColumn:
@@ -115,13 +115,6 @@ def open_rvb_files(
         else:
             contents = read_table(file)
         names = list(contents.colnames)
-        found = find_columns(names, columns, RVB_ALIASES, source=str(file))
-        for key in ("x", "y", "u", "v"):
-            if key not in found:
-                raise InputError(
-                    f"no column for {key!r} among {', '.join(names) or 'none'}",
-                    where=str(file),
-                    do="name it in the option 'columns'",
-                )
+        found = find_columns(names, columns, RVB_ALIASES, source=str(file), needed="xyuv")
         out.append(RvbFile(str(file), contents, found))
     return out

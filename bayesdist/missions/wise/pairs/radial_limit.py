@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 
 __all__ = ["CHI2", "OFFSET", "RadialLimit", "radial_rows"]
@@ -54,7 +54,7 @@ class RadialLimit:
 
 
 def radial_rows(
-    matches: MatchTable,
+    matches: Matches,
     size: tuple[float, float],
     *,
     offset: RadialLimit | None = None,

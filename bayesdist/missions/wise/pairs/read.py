@@ -2,21 +2,20 @@
 
 WSDC D-T033, section 1: the detections are raw band-frame pixels; the reference stars are brought to
 the same pixels by the frame's solution without any distortion.  Files are IPAC tables, any table
-that `read_matches` knows, or Parquet, which is gone through piece by piece.
+that `read_matches` knows, or Parquet, which is read batch by batch.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
 from astropy.table import Column
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.data.reading.columns import match_columns
 from bayesdist.data.reading.options import ReadOptions, check_sigma, refuse_missing_errors
 from bayesdist.data.tables.column import Place, SourceColumn
@@ -76,10 +75,9 @@ def stream_rvb(
     pixel_origin: int = 1,
     size: tuple[float, float] | None = None,
 ) -> Iterator[RvbPairs]:
-    """RvB pairs of one band, piece by piece.
+    """RvB pairs of one band, batch by batch.
 
-    What a piece needs is done to it, and `write_partitioned` puts the pieces where `open_matches`
-    finds them: memory is that of a piece.
+    Memory is that of a batch; `write_partitioned` puts them where `open_matches` finds them.
 
     Parameters
     ----------
@@ -106,8 +104,8 @@ def stream_rvb(
     Yields
     ------
     RvbPairs
-        Not more than `PIECE` pairs, of which no two are equal.  The magnitude is the band's own
-        where the file has no other and each pair of the piece has one.
+        Not more than `BATCH` pairs, of which no two are equal.  The magnitude is the band's own
+        where the file has no other and each pair of the batch has one.
 
     Raises
     ------
@@ -135,7 +133,7 @@ def stream_rvb(
             check.see(
                 matches.x,
                 matches.y,
-                partial(_row_name, matches),
+                matches.place,
                 reference=(matches.u, matches.v) if matches.unit == "pix" else None,
             )
             yield pairs
@@ -143,10 +141,6 @@ def stream_rvb(
     if not check.n:
         raise InputError("holds no rows", where=sources, do="give a table with matched stars")
     check.end(sources)
-
-
-def _row_name(matches: MatchTable, k: int) -> str:
-    return f"{matches.sources[matches.source[k]]}, row {matches.row[k] + 1}"
 
 
 def read_rvb(
@@ -218,7 +212,7 @@ def _pairs(
             Column(column.numbers(), unit="d"), file.source, column.name, place
         ).years()
     magnitudes = {
-        key: _magnitudes(file.column(table, key, place))[which]
+        key: file.column(table, key, place).known_numbers()[which]
         for key in MAGNITUDES
         if key in file.found
     }
@@ -229,31 +223,13 @@ def _pairs(
     if "exposure" in out:  # frames of other bands need no names here
         used, out["exposure"] = np.unique(out["exposure"], return_inverse=True)
         out["exposure_names"] = tuple(out["exposure_names"][k] for k in used)
-    matches = MatchTable(
+    matches = Matches(
         **out, filter_names=(band,), row=first + np.flatnonzero(which), sources=(file.source,)
     )
     refuse_missing_errors(sigma, matches.has_sigma, matches.has_mag, where=file.source)
     if not isinstance(sigma, str):
-        matches = matches.with_sigma(sigma, sigma)
+        matches = matches.with_errors(sigma)
     colour = colour_of(list(magnitudes.values())) if len(magnitudes) > 1 else None
     if "colour" in file.found:
-        colour = _magnitudes(file.column(table, "colour", place))[which]
+        colour = file.column(table, "colour", place).known_numbers()[which]
     return RvbPairs(matches, colour)
-
-
-def _magnitudes(column: SourceColumn) -> Float:
-    """Magnitudes; NaN where the source is not detected."""
-    values = column.values
-    mask = np.broadcast_to(getattr(values, "mask", False), np.shape(values))
-    plain = np.asarray(getattr(values, "unmasked", values))
-    known = ~mask
-    if plain.dtype.kind == "f":
-        known = known & ~np.isnan(plain)
-    rows = np.flatnonzero(known)
-    out = np.full(len(plain), np.nan)
-    named = SourceColumn(
-        Column(plain[rows]), column.source, column.name, lambda index: column.place(rows[index])
-    )
-    if len(rows):  # a column of nulls alone has no type
-        out[rows] = named.numbers()
-    return out

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,10 +14,9 @@ from bayesdist.app.matches import is_large
 from bayesdist.app.named_files import named_files
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.star_files import PAIRS, part_files
-from bayesdist.data import MatchTable, open_matches, write_partitioned
+from bayesdist.data import Matches, open_matches, write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
-from bayesdist.infer import Matches
 from bayesdist.missions.wise.pairs.files import band_name
 from bayesdist.missions.wise.pairs.read import stream_rvb
 from bayesdist.missions.wise.pairs.section import RvbData
@@ -91,7 +90,7 @@ class RvbInput:
         folder = Path(self._scratch.name) / PAIRS
         _, size = self._settings
 
-        def tables() -> Iterator[MatchTable]:
+        def tables() -> Iterator[Matches]:
             for pairs in selected:
                 _require_array(pairs.band, size)
                 yield pairs.matches
@@ -108,7 +107,8 @@ class RvbInput:
         # a number has been written into the columns
         sigma = options["sigma"] if options["sigma"] == "by_magnitude" else "columns"
         opened = open_matches(folder, unit=options["unit"], sigma=sigma)
-        return replace(opened, dropped=counts["rejected"])
+        rejected = counts["rejected"]
+        return opened.with_counts(len(opened) + sum(rejected.values()), rejected)
 
     def move_into_run(self) -> bool:
         """Move what was written into the folder of the run, which has begun.
@@ -142,7 +142,7 @@ class RvbInput:
 
 def load_rvb(
     path: str | Path | Sequence[str | Path], data: Data, size: tuple[float, float]
-) -> MatchTable:
+) -> Matches:
     """RvB pairs in memory, as a configuration reads and selects them.
 
     `size`: columns and rows of the detector. InputError for all that is wrong with files and
@@ -151,9 +151,9 @@ def load_rvb(
     assert isinstance(data, RvbData)
     if data.band is not None:
         _require_array(data.band, size)
-    pieces = list(stream_rvb(path, **_options(data, size)))
-    _require_array(pieces[0].band, size)
-    return SelectedPairs(lambda: pieces, data.rvb.selection(), size).table()
+    batches = list(stream_rvb(path, **_options(data, size)))
+    _require_array(batches[0].band, size)
+    return SelectedPairs(lambda: batches, data.rvb.selection(), size).table()
 
 
 def _options(data: RvbData, size: tuple[float, float]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 
 __all__ = ["RvbPairs", "bluest_rows", "colour_of", "colours_of"]
@@ -30,7 +30,7 @@ class RvbPairs:
 
     # x, y the detection, u, v the reference star as a detector without distortion would see it; the
     # band is the filter, the frame the exposure
-    matches: MatchTable
+    matches: Matches
     # (N,), magnitudes; NaN where fewer than two bands have one.  None where the file has no
     # magnitudes
     colour: Float | None = None
@@ -52,7 +52,7 @@ class RvbPairs:
         return self.matches.filter_names[0]
 
     def select(self, which: ArrayLike, *, reason: str | None = None) -> RvbPairs:
-        """Some of the pairs, as `MatchTable.select`."""
+        """Some of the pairs, as `Matches.select`."""
         matches = self.matches.select(which, reason=reason)
         which = np.asarray(which)
         return RvbPairs(matches, None if self.colour is None else self.colour[which])
@@ -62,14 +62,14 @@ class RvbPairs:
         """All pairs of several sets, in their order.
 
         InputError for sets of different bands, sets of which only some have colours, and as
-        `MatchTable.concatenate`.
+        `Matches.concatenate`.
         """
         bands = list(dict.fromkeys(one.band for one in several))
         if len(bands) > 1:
             raise InputError(
                 f"the sets are of bands {', '.join(bands)}", do="join those of one band"
             )
-        matches = MatchTable.concatenate([one.matches for one in several])
+        matches = Matches.concatenate([one.matches for one in several])
         colours = [one.colour for one in several if one.colour is not None]
         if colours and len(colours) < len(several):
             raise InputError(

@@ -1,4 +1,4 @@
-"""Selection of RvB pairs, piece by piece; those that it drops are counted by reason.
+"""Selection of RvB pairs, batch by batch; those that it drops are counted by reason.
 
 In memory or streamed, the same pairs pass: by the range of colours, then the bluest of each frame,
 then the radial limits.
@@ -7,12 +7,14 @@ then the radial limits.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.labels import merged_counts
+from bayesdist.data.matches import Matches
+from bayesdist.data.tables.checks import counted
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs.radial_limit import CHI2, OFFSET, RadialLimit, radial_rows
 from bayesdist.missions.wise.pairs.rvb_pairs import (
@@ -76,9 +78,9 @@ class RvbSelection:
 class SelectedPairs:
     """The pairs that a selection takes, to be gone through once."""
 
-    # gives the pairs of one band piece by piece: once more where the bluest of each frame are asked
+    # gives the pairs of one band batch by batch: once more where the bluest of each frame are asked
     # for, which takes the colours of all
-    pieces: Callable[[], Iterable[RvbPairs]]
+    batches: Callable[[], Iterable[RvbPairs]]
     selection: RvbSelection
     size: tuple[float, float]  # columns and rows of the array
     n_rows: int = 0  # pairs so far
@@ -86,21 +88,18 @@ class SelectedPairs:
     rejected: dict[str, int] = field(default_factory=dict)
 
     def __iter__(self) -> Iterator[RvbPairs]:
-        """Pieces of which something is left.
+        """Batches of which something is left.
 
         InputError without colours where they are needed, for u, v in another unit where offsets are
         judged, and when no pair at all is left.
         """
         bluest = self._bluest()
         sources: dict[str, None] = {}
-        for pairs in self.pieces():
+        for pairs in self.batches():
             sources |= dict.fromkeys(pairs.matches.sources)
-            left = np.ones(len(pairs), bool)
-            for reason, good in self._rules(pairs, bluest).items():
-                dropped = int((left & ~good).sum())
-                if dropped:
-                    self.rejected[reason] = self.rejected.get(reason, 0) + dropped
-                left &= good
+            rules = self._rules(pairs, bluest).items()
+            left, counts = counted([(reason, ~good) for reason, good in rules], len(pairs))
+            self.rejected |= merged_counts([self.rejected, counts])
             self.n_rows += len(pairs)
             if left.any():
                 yield pairs if left.all() else pairs.select(left)
@@ -112,15 +111,13 @@ class SelectedPairs:
                 do="widen its limits",
             )
 
-    def table(self) -> MatchTable:
+    def table(self) -> Matches:
         """All of them in memory, with the counts.
 
-        InputError as going through them, and as `MatchTable.concatenate`.
+        InputError as going through them, and as `Matches.concatenate`.
         """
-        found = MatchTable.concatenate([pairs.matches for pairs in self])
-        columns = {one.name: getattr(found, one.name) for one in fields(found)}
-        columns |= {"n_rows": self.n_rows, "rejected": self.rejected}
-        return MatchTable.of_distinct_rows(**columns)
+        found = Matches.concatenate([pairs.matches for pairs in self])
+        return found.with_counts(self.n_rows, self.rejected)
 
     def _rules(self, pairs: RvbPairs, bluest: Rows | None) -> Mapping[str, Rows]:
         """Boolean masks of the pairs that pass, by the reason to drop the others."""
@@ -143,7 +140,7 @@ class SelectedPairs:
         colours: list[Float] = []
         frames: list[Int] = []
         codes: dict[str, int] = {}
-        for pairs in self.pieces():
+        for pairs in self.batches():
             colour = np.where(self.selection.right_colour(pairs), colours_of(pairs), np.nan)
             names = pairs.matches.exposure_names
             code = np.array([codes.setdefault(name, len(codes)) for name in names])

@@ -6,7 +6,8 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-from bayesdist.data.partitioned import PartitionedMatches, open_matches
+from bayesdist.data.matches import Matches
+from bayesdist.data.storage.on_disk import open_matches
 from bayesdist.data.tables.column import Place
 from bayesdist.data.tables.names import ALIASES
 from bayesdist.data.tables.parquet import ParquetPart
@@ -28,7 +29,7 @@ def open_rvb(
     sigma: str | float,
     pixel_origin: int,
     size: tuple[float, float],
-) -> PartitionedMatches | None:
+) -> Matches | None:
     """RvB pairs of one band, left on disk.
 
     `path`, `band`, `columns`, `unit`, `sigma`, `pixel_origin`, `size`: as `stream_rvb`. Returns the

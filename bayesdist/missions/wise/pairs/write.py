@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.data.write import write_columns
+from bayesdist.data.storage.write import write_columns
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
@@ -20,20 +20,20 @@ __all__ = ["write_rvb"]
 _NUMBERS = ("x", "y", "u", "v", "sigma_u", "sigma_v", "mag", "epoch")
 
 
-def write_rvb(pieces: Iterable[RvbPairs], folder: str | os.PathLike[str]) -> int:
-    """Write pairs as a folder of Parquet files, one for each piece.
+def write_rvb(batches: Iterable[RvbPairs], folder: str | os.PathLike[str]) -> int:
+    """Write pairs as a folder of Parquet files, one for each batch.
 
     Reading them as RvB pairs gives the same numbers bit for bit, with bands, frames and colours.
 
-    `pieces`: only one need be in memory at a time. `folder`: a new one.  When a piece cannot be had
-    or written, the folder is removed. Returns pairs written. InputError for no pieces, a folder
-    that holds something, and when the system refuses to write.
+    `batches`: only one need be in memory at a time. `folder`: a new one.  When a batch cannot be
+    had or written, the folder is removed. Returns pairs written. InputError for no batches, a
+    folder that holds something, and when the system refuses to write.
     """
     folder = Path(folder)
     if folder.exists() and not (folder.is_dir() and next(folder.iterdir(), None) is None):
         raise InputError("is in use", where=str(folder), do="choose a new folder")
-    pieces = iter(pieces)
-    first = list(islice(pieces, 1))  # what is wrong is mostly wrong in the first
+    batches = iter(batches)
+    first = list(islice(batches, 1))  # what is wrong is mostly wrong in the first
     if not first:
         raise InputError("there are no pairs to write", where=str(folder), do="give some")
     made = not folder.exists()
@@ -41,7 +41,7 @@ def write_rvb(pieces: Iterable[RvbPairs], folder: str | os.PathLike[str]) -> int
     written: list[Path] = []
     n = 0
     try:
-        for pairs in chain(first, pieces):
+        for pairs in chain(first, batches):
             path = folder / f"part-{len(written):05d}.parquet"
             write_columns(path, _columns(pairs), _units(pairs))
             written.append(path)

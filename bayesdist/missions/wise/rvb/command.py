@@ -9,7 +9,7 @@ from math import radians
 from operator import add
 from pathlib import Path
 
-from bayesdist.data import MatchTable
+from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs.files import open_rvb_files
 from bayesdist.missions.wise.pairs.read import chosen_band, stream_rvb
@@ -100,7 +100,7 @@ def _written(
     output: str | Path,
     band: str,
     columns: Mapping[str, str],
-    move: Callable[[MatchTable], MatchTable],
+    move: Callable[[Matches], Matches],
 ) -> str:
     for path in map(Path, files):
         if path.is_dir() and Path(output).resolve().is_relative_to(path.resolve()):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform
 
@@ -53,7 +53,7 @@ class LinearMoments:
         )
 
 
-def linear_moments(matches: MatchTable, centre: tuple[float, float]) -> LinearMoments:
+def linear_moments(matches: Matches, centre: tuple[float, float]) -> LinearMoments:
     """Sums over some pairs.
 
     `matches`: with errors, and u, v in pixels of the array. `centre`: of the transformation that

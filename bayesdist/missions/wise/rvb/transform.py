@@ -9,12 +9,12 @@ what two of them do one after the other is one of them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 
 __all__ = ["PARAMETERS", "RvbTransform", "rereference", "transformed"]
@@ -23,7 +23,7 @@ Float = NDArray[np.float64]
 
 PARAMETERS = ("shift_u", "shift_v", "rotation", "scale_u", "scale_v", "skew")
 
-# Errors of u and v stay uncorrelated in a MatchTable.  A transformation that correlates them by
+# Errors of u and v stay uncorrelated in a Matches.  A transformation that correlates them by
 # more than this cannot be represented; a rotation of 0.05 with errors 1 to 1.5 makes 0.04.
 CORRELATED = 0.1
 
@@ -143,7 +143,7 @@ class RvbTransform:
         return out
 
 
-def transformed(matches: MatchTable, transform: RvbTransform) -> MatchTable:
+def transformed(matches: Matches, transform: RvbTransform) -> Matches:
     """Pairs with their reference positions transformed, and the errors with them.
 
     InputError when errors of u and v would come out correlated by more than 0.1, which a table of
@@ -155,10 +155,10 @@ def transformed(matches: MatchTable, transform: RvbTransform) -> MatchTable:
 
 
 def rereference(
-    matches: MatchTable,
+    matches: Matches,
     free: Mapping[str, RvbTransform],
     fixed: Mapping[str, RvbTransform],
-) -> MatchTable:
+) -> Matches:
     """Pairs as they would be with other solutions of their frames.
 
     The reference positions of a frame are its stars' nominal pixels, brought to the band frame by
@@ -193,8 +193,8 @@ def rereference(
 
 
 def _moved(
-    matches: MatchTable, code: NDArray[np.int64], matrix: Float, shift: Float, centre: Float
-) -> MatchTable:
+    matches: Matches, code: NDArray[np.int64], matrix: Float, shift: Float, centre: Float
+) -> Matches:
     """Pairs moved by a linear map each: that of its code."""
 
     def moved(u: Float, v: Float) -> Float:
@@ -221,5 +221,4 @@ def _moved(
                 do="give both axes the same errors before, or transform the detections instead",
             )
         columns |= {"sigma_u": out[:, 0], "sigma_v": out[:, 1]}
-    same = {one.name: getattr(matches, one.name) for one in fields(matches)}
-    return MatchTable.of_distinct_rows(**(same | columns))
+    return matches.with_columns(**columns)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.data.write import write_columns
+from bayesdist.data.storage.write import write_columns
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path, made_folder
 from bayesdist.missions.wise.simulate.sets import PairChunk, WiseSet

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from bayesdist.data.pieces import even_edges
+from bayesdist.data.batches import even_edges
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.published import (
     RESIDUAL_SIGMAS,

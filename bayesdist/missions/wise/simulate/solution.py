@@ -7,7 +7,7 @@ import os
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.published import SAMPLE_SIZES, WISE_ARRAYS, WISE_COEFFICIENTS
 from bayesdist.model import Chip, DistortionModel
@@ -71,7 +71,7 @@ def simulate_wise(
     fraction: float = 0.03,
     jitter: float = 0.03,
     outlier_scale: float = 1.0,
-) -> tuple[MatchTable, Truth]:
+) -> tuple[Matches, Truth]:
     """Pairs of WISE detections and 2MASS stars, in memory.
 
     All bands have the magnitudes and errors of W2; sets of full size with those of each band are
@@ -92,7 +92,7 @@ def simulate_wise(
 
     Returns
     -------
-    matches : MatchTable
+    matches : Matches
     truth : Truth
     """
     model, theta = wise_solution(band)
@@ -146,7 +146,7 @@ def simulate_wise_partitioned(
         As `simulate_wise` and `write_partitioned`.
     """
 
-    def simulate(size: int) -> tuple[MatchTable, Truth]:
+    def simulate(size: int) -> tuple[Matches, Truth]:
         return simulate_wise(
             size,
             band=band,

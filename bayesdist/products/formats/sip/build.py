@@ -68,7 +68,7 @@ def sip_from_solution(
         has no such pixel, A_0_0 and B_0_0 follow.  Without `tangent_point` it is written as it is,
         (0, 0) by default.
     tangent_point : tuple of float, optional
-        Sky position of (u, v) = (0, 0), degrees: `MatchTable.tangent_point`; by default that of the
+        Sky position of (u, v) = (0, 0), degrees: `Matches.tangent_point`; by default that of the
         calibration's plane, where it is on the sky.  The polynomial is
         brought to the plane of CRVAL, to 1e-5 pixels, with a higher order where that takes one.
     scale_arcsec : float, optional

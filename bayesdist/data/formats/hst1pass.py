@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.data.tables.files import read_lines
 from bayesdist.errors import FormatError
 
@@ -55,7 +55,7 @@ class Hst1passList:
     epoch: float | None
     exptime: float | None
 
-    def matches(self, *, name: str | None = None) -> MatchTable:
+    def matches(self, *, name: str | None = None) -> Matches:
         """Matches of raw pixels with the observatory's corrected positions.
 
         The block under FILEOUT calls X, Y "dist-cor", but they are raw: the header's BDRY_xy and
@@ -68,7 +68,7 @@ class Hst1passList:
 
         Returns
         -------
-        MatchTable
+        Matches
             In pixels, without errors; magnitudes are M.
 
         Raises
@@ -84,7 +84,7 @@ class Hst1passList:
                     do="run hst1pass with OUT=uvwXYMpq",
                 )
         n = len(self.columns["X"])
-        return MatchTable(
+        return Matches(
             x=self.columns["X"],
             y=self.columns["Y"],
             u=self.columns["u"],

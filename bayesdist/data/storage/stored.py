@@ -1,16 +1,16 @@
-"""Parquet files of matches as parts of one whole: their content, and their common attributes."""
+"""Parquet files of matches: how each is read, and the labels that a scan of all of them finds."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from astropy.table import Column
 from numpy.typing import NDArray
 
+from bayesdist.data.labels import LABELS_OF_CODES, Labels, recoded
 from bayesdist.data.reading.columns import (
     columns_read,
     match_columns,
@@ -28,17 +28,16 @@ from bayesdist.data.tables.quantities import Quantities
 from bayesdist.data.tables.repeated import buckets_for, first_repetition
 from bayesdist.errors import InputError
 
-__all__ = ["MatchPart", "Whole", "match_part", "scan", "tangent_point_of"]
+__all__ = ["StoredFile", "scan", "stored_file", "tangent_point_of"]
 
 Int = NDArray[np.int64]
 
 _BLOCK = 2**18  # rows scanned together
-_LABELS = {"exposure": "exposure_names", "chip": "chip_numbers", "filter": "filter_names"}
 _DEFAULTS: dict[str, Any] = {"exposure": "1", "chip": 1, "filter": ""}
 
 
 @dataclass(frozen=True, eq=False)
-class MatchPart:
+class StoredFile:
     """Parquet file of matches, and how it is read."""
 
     part: ParquetPart
@@ -51,7 +50,7 @@ class MatchPart:
     @property
     def source(self) -> str:
         """Name of the file."""
-        return str(self.part.path)
+        return self.part.name
 
     @property
     def on_sky(self) -> bool:
@@ -64,22 +63,21 @@ class MatchPart:
         start: int = 0,
         stop: int | None = None,
         size: int,
-        without: Sequence[str] = (),
     ) -> Iterator[dict[str, Any]]:
-        """Arguments of MatchTable for rows `start` to `stop`, at most `size` rows at a time.
+        """Arguments of Matches for rows `start` to `stop`, at most `size` rows at a time.
 
-        As `match_columns`, without the quantities of `without`, with codes into labels of the
-        block's own.  InputError names the row group of a wrong row.
+        As `match_columns`, with codes into labels of the block's own.  InputError names the row
+        group of a wrong row.
         """
-        found = {key: name for key, name in self.found.items() if key not in without}
-        encoded = {found[key] for key in _LABELS if key in found}
+        found = self.found
+        encoded = {found[key] for key in LABELS_OF_CODES if key in found}
         encoded |= {found["epoch"]} & self.part.texts if "epoch" in found else set()
         columns = list(dict.fromkeys(found.values()))
         # names of chips get numbers once all are known
         options = replace(self.options, unit=self.unit, chips=self.options.chips or {})
         for block in self.part.blocks(columns, encoded=encoded, start=start, stop=stop, size=size):
             out = match_columns(self._quantities(block, found), options)
-            for key, labels in _LABELS.items():
+            for key, labels in LABELS_OF_CODES.items():
                 if key not in found:
                     own = self.exposure_name if key == "exposure" else None
                     out[labels] = (_DEFAULTS[key] if own is None else own,)
@@ -99,14 +97,14 @@ class MatchPart:
         return Quantities(block, found, self.source, place, self.part.colnames)
 
 
-def match_part(
+def stored_file(
     part: ParquetPart,
     options: ReadOptions,
     *,
     exposure_name: str | None,
-) -> MatchPart:
+) -> StoredFile:
     """Layout of a file, by the names and units of its columns alone; missing ones are refused."""
-    source = str(part.path)
+    source = part.name
     found, options, notes = columns_read(part.colnames, {}, options, source=source)
     found.pop("flux", None)  # magnitudes of all rows or of none: that takes all of them
     refuse_half(("sigma_u", "sigma_v"), found, where=source, what="errors")
@@ -119,52 +117,10 @@ def match_part(
             for key in ("u", "v")
         )
         own = position_unit((u, v), options.unit)
-    return MatchPart(part, found, own, exposure_name, options, notes)
+    return StoredFile(part, found, own, exposure_name, options, notes)
 
 
-@dataclass(frozen=True, eq=False)
-class Whole:
-    """Names, unit and tangent point common to all parts."""
-
-    unit: str
-    exposure_names: tuple[str, ...]
-    chip_numbers: tuple[int, ...]
-    filter_names: tuple[str, ...]
-    sources: tuple[str, ...]
-    n_rows: int
-    tangent_point: tuple[float, float] | None
-
-    def codes(self, key: str, block: Mapping[str, Any], *, source: str) -> Int:
-        """Codes of a block's exposures, chips or filters among those of the whole.
-
-        InputError for a label that was not there when the parts were scanned.
-        """
-        known = self._numbers[key]
-        try:
-            code_of_label = np.array([known[label] for label in block[_LABELS[key]]], np.int64)
-        except KeyError:
-            raise InputError(
-                "has changed since it was opened", where=source, do="start again"
-            ) from None
-        return _recoded(key, block, code_of_label)
-
-    @cached_property
-    def _numbers(self) -> dict[str, dict[Any, int]]:
-        """Code of each label."""
-        return {
-            key: {label: k for k, label in enumerate(getattr(self, names))}
-            for key, names in _LABELS.items()
-        }
-
-
-def _recoded(key: str, block: Mapping[str, Any], code_of_label: Int) -> Int:
-    codes = block.get(key)
-    if codes is None:
-        codes = np.zeros(len(block["x"]), np.int64)
-    return code_of_label[codes]
-
-
-def tangent_point_of(parts: Sequence[MatchPart]) -> tuple[float, float]:
+def tangent_point_of(parts: Sequence[StoredFile]) -> tuple[float, float]:
     """Mean direction of all reference positions."""
     total = np.zeros(3, object)
     for one in parts:
@@ -180,8 +136,10 @@ class _Scan:
     All columns are read, so that any wrong row is found, and labels are numbered as they appear.
     """
 
-    parts: Sequence[MatchPart]
-    numbers: dict[str, dict[Any, int]] = field(default_factory=lambda: {k: {} for k in _LABELS})
+    parts: Sequence[StoredFile]
+    numbers: dict[str, dict[Any, int]] = field(
+        default_factory=lambda: {k: {} for k in LABELS_OF_CODES}
+    )
 
     def __call__(self) -> Iterator[list[NDArray[Any]]]:
         for one in self.parts:
@@ -189,16 +147,19 @@ class _Scan:
                 keys = [block[name] for name in ("x", "y", "u", "v")]
                 for key, known in self.numbers.items():
                     code_of_label = np.array(
-                        [known.setdefault(label, len(known)) for label in block[_LABELS[key]]]
+                        [
+                            known.setdefault(label, len(known))
+                            for label in block[LABELS_OF_CODES[key]]
+                        ]
                     )
                     if key in block or one.exposure_name is not None:
-                        keys.append(_recoded(key, block, code_of_label))
+                        keys.append(recoded(key, block, code_of_label))
                 if "epoch" in block:
                     keys.append(block["epoch"])
                 yield keys
 
 
-def scan(parts: Sequence[MatchPart]) -> Whole:
+def scan(parts: Sequence[StoredFile]) -> Labels:
     """Names common to all parts, from a scan of all rows; any wrong or repeated row is refused.
 
     The parts have the same quantities and unit, and a tangent point if they need one.
@@ -218,7 +179,7 @@ def scan(parts: Sequence[MatchPart]) -> Whole:
             where=second,
             do="drop one of them",
         )
-    return Whole(
+    return Labels(
         unit=parts[0].unit,
         exposure_names=tuple(rows.numbers["exposure"]),
         chip_numbers=tuple(sorted(rows.numbers["chip"])),
@@ -226,10 +187,11 @@ def scan(parts: Sequence[MatchPart]) -> Whole:
         sources=tuple(one.source for one in parts),
         n_rows=n_rows,
         tangent_point=parts[0].options.tangent_point,
+        notes=tuple(dict.fromkeys(note for one in parts for note in one.notes)),
     )
 
 
-def _named(parts: Sequence[MatchPart], row: int) -> str:
+def _named(parts: Sequence[StoredFile], row: int) -> str:
     """File, row group and row of a row counted over all parts."""
     for one in parts:
         if row < one.part.n_rows:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
-from bayesdist.data.pieces import PIECE
+from bayesdist.data.batches import BATCH
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path, made_folder
 
@@ -34,10 +34,10 @@ _LABELS = {
 
 
 def write_partitioned(
-    tables: Iterable[MatchTable],
+    tables: Iterable[Matches],
     folder: str | os.PathLike[str],
     *,
-    rows_per_group: int = PIECE,
+    rows_per_group: int = BATCH,
 ) -> list[Path]:
     """Write tables of matches as a folder of Parquet files, parts of one table.
 
@@ -48,7 +48,7 @@ def write_partitioned(
 
     Parameters
     ----------
-    tables : iterable of MatchTable
+    tables : iterable of Matches
         Of one unit and with the same columns.
     folder : path-like
         It is made if need be, and must not hold Parquet files.
@@ -103,7 +103,7 @@ def _make_empty(folder: Path) -> None:
         )
 
 
-def _schema(table: MatchTable, *, like: pyarrow.Schema | None = None) -> pyarrow.Schema:
+def _schema(table: Matches, *, like: pyarrow.Schema | None = None) -> pyarrow.Schema:
     """Columns of a table with their types and units.
 
     Labels are columns where there are other than the default, or where `like` has them.
@@ -126,7 +126,7 @@ def _schema(table: MatchTable, *, like: pyarrow.Schema | None = None) -> pyarrow
     return pyarrow.schema(out)
 
 
-def _write(table: MatchTable, schema: pyarrow.Schema, path: Path, rows_per_group: int) -> None:
+def _write(table: Matches, schema: pyarrow.Schema, path: Path, rows_per_group: int) -> None:
     import pyarrow
 
     columns = []

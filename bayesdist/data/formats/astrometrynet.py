@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from astropy.table import Table
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matches import Matches
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.reading.table import matches_from_table
 from bayesdist.data.tables.names import ALIASES
@@ -34,8 +34,8 @@ def matches_from_corr(
     *,
     source: str = "corr.fits",
     exposure_name: str | None = None,
-) -> MatchTable:
-    """MatchTable from the columns of a `corr.fits`; missing columns or values are refused.
+) -> Matches:
+    """Matches from the columns of a `corr.fits`; missing columns or values are refused.
 
     field_x and field_y are FITS 1-based pixels; index_ra and index_dec are projected to the tangent
     plane in seconds of arc.  Magnitudes are instrumental, -2.5 log10 FLUX, where all fluxes are

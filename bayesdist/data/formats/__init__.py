@@ -1,0 +1,1 @@
+"""Formats of star lists and matches of other programs."""

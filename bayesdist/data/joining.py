@@ -1,0 +1,110 @@
+"""Several tables of matches become one: codes renumbered, counts added, columns in agreement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.labels import LABELS_OF_CODES, merged_counts
+from bayesdist.data.match_columns import OPTIONAL, POSITIONS, SIGMAS, MatchColumns
+from bayesdist.errors import InputError
+
+__all__ = ["joined_arguments", "joined_columns", "merged_codes"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+def joined_arguments(tables: Sequence[MatchColumns]) -> dict[str, Any]:
+    """Arguments of `Matches` for the rows of several tables, in their order.
+
+    InputError for different units or tangent points, or an optional column that only some have.
+    """
+    first = tables[0]
+    for other in tables[1:]:
+        for name, label in (("unit", "unit"), ("tangent_point", "tangent point")):
+            if getattr(other, name) != getattr(first, name):
+                raise InputError(
+                    f"{label} is {getattr(other, name)}, but {getattr(first, name)} in "
+                    f"{', '.join(first.sources)}",
+                    where=", ".join(other.sources),
+                    do="bring all files to one",
+                )
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(t, name) for t in tables]) for name in (*POSITIONS, "row")
+    }
+    for name in (*SIGMAS, *OPTIONAL):
+        joined[name] = merged_optional(
+            name, [getattr(t, name) for t in tables], [", ".join(t.sources) for t in tables]
+        )
+    stars = [t.star for t in tables if t.star is not None]
+    joined["star"] = np.concatenate(stars) if len(stars) == len(tables) else None
+    for name, labels in {**LABELS_OF_CODES, "source": "sources"}.items():
+        joined[name], joined[labels] = merged_codes(
+            [getattr(t, name) for t in tables],
+            [getattr(t, labels) for t in tables],
+            ordered=name == "chip",
+        )
+    name_of = {
+        number: name
+        for t in tables
+        for number, name in zip(t.chip_numbers, t.chip_names, strict=False)
+    }
+    chips = joined["chip_numbers"]
+    if len(name_of) == len(chips):
+        joined["chip_names"] = tuple(name_of[number] for number in chips)
+    joined |= {
+        "notes": tuple(dict.fromkeys(note for t in tables for note in t.notes)),
+        "unit": first.unit,
+        "tangent_point": first.tangent_point,
+        "n_rows": sum(t.n_rows for t in tables),
+        "rejected": merged_counts([t.rejected for t in tables]),
+    }
+    return joined
+
+
+def joined_columns(parts: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+    """Columns that all parts have, joined in their order."""
+    names = [name for name in parts[0] if all(name in part for part in parts)]
+    if len(parts) == 1:
+        return dict(parts[0])
+    return {name: np.concatenate([part[name] for part in parts]) for name in names}
+
+
+def merged_codes(
+    codes: Sequence[Int], labels: Sequence[tuple[Any, ...]], *, ordered: bool = False
+) -> tuple[Int, tuple[Any, ...]]:
+    """One numbering for codes with labels of their own: the joined codes, and the labels.
+
+    Labels stand in the order of their first appearance, or sorted.
+    """
+    every: list[Any] = list(dict.fromkeys(label for own in labels for label in own))
+    if ordered:
+        every.sort()
+    number = {label: k for k, label in enumerate(every)}
+    renumbered = [
+        np.array([number[label] for label in own], np.int64)[code]
+        for code, own in zip(codes, labels, strict=True)
+    ]
+    return np.concatenate(renumbered), tuple(every)
+
+
+def merged_optional(
+    name: str, arrays: Sequence[Float | None], sources: Sequence[str]
+) -> Float | None:
+    """Joined column that all tables have; None where none has it; refused where only some have."""
+    present = [a for a in arrays if a is not None]
+    if not present:
+        return None
+    if len(present) < len(arrays):
+        lacking = next(s for a, s in zip(arrays, sources, strict=True) if a is None)
+        having = next(s for a, s in zip(arrays, sources, strict=True) if a is not None)
+        raise InputError(
+            f"has no {name!r}, but {having} has",
+            where=lacking,
+            do="give the column in all files or in none",
+        )
+    return np.concatenate(present)

@@ -1,0 +1,261 @@
+"""Columns of matches as plain arrays of one length and unit, and the checks of their values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.labels import LABELS_OF_CODES, Labels, merged_counts
+from bayesdist.data.tables.checks import (
+    absent,
+    check_values,
+    columns_of,
+    counted,
+    one_length,
+    refuse_half,
+)
+from bayesdist.data.tables.repeated import first_duplicate
+from bayesdist.data.tables.units import check_unit, conversion, unit_of, without_unit
+from bayesdist.errors import InputError
+
+__all__ = ["COLUMNS", "OPTIONAL", "POSITIONS", "SIGMAS", "MatchColumns", "refuse_repeated"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+POSITIONS = ("x", "y", "u", "v")
+SIGMAS = ("sigma_u", "sigma_v")
+_NOMINAL = ("u_nominal", "v_nominal")
+_MOTIONS = ("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v")
+OPTIONAL = ("epoch", "mag", "colour", *_NOMINAL, *_MOTIONS)
+_INTEGERS = ("row", "source", "star", *LABELS_OF_CODES)
+_NUMBERS = (*POSITIONS, *SIGMAS, *OPTIONAL)
+COLUMNS = (*_NUMBERS, *_INTEGERS)
+
+Columns = Mapping[str, NDArray[Any]]
+
+_LABELS = tuple(one.name for one in fields(Labels))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MatchColumns:
+    """Columns and labels of matches, which `Matches` describes: completed, and checked."""
+
+    x: Float
+    y: Float
+    u: Float
+    v: Float
+    sigma_u: Float | None = None
+    sigma_v: Float | None = None
+    unit: str = "pix"
+    epoch: Float | None = None
+    mag: Float | None = None
+    colour: Float | None = None
+    exposure: Int = None  # type: ignore[assignment]
+    exposure_names: tuple[str, ...] = ("1",)
+    chip: Int = None  # type: ignore[assignment]
+    chip_numbers: tuple[int, ...] = (1,)
+    filter: Int = None  # type: ignore[assignment]
+    filter_names: tuple[str, ...] = ("",)
+    star: Int | None = None
+    row: Int = None  # type: ignore[assignment]
+    source: Int = None  # type: ignore[assignment]
+    sources: tuple[str, ...] = ("table",)
+    n_rows: int = None  # type: ignore[assignment]
+    rejected: Mapping[str, int] = field(default_factory=dict)
+    tangent_point: tuple[float, float] | None = None
+    u_nominal: Float | None = None
+    v_nominal: Float | None = None
+    pm_u: Float | None = None
+    pm_v: Float | None = None
+    sigma_pm_u: Float | None = None
+    sigma_pm_v: Float | None = None
+    chip_names: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def _complete(self) -> None:
+        """Fill in the defaults, give every array its type, and check the values."""
+        where = ", ".join(self.sources)
+        columns, n, rejected = _completed(self._columns, unit=self.unit, where=where)
+        self.__dict__.update(columns)
+        counts = merged_counts([self.rejected, rejected]) if rejected else dict(self.rejected)
+        object.__setattr__(self, "n_rows", n if self.n_rows is None else int(self.n_rows))
+        object.__setattr__(self, "rejected", counts)
+        names = {**LABELS_OF_CODES, "source": "sources"}
+        _check(
+            columns,
+            {name: getattr(self, labels) for name, labels in names.items()},
+            unit=self.unit,
+            where=where,
+            place=self.place,
+        )
+
+    @property
+    def _columns(self) -> dict[str, Any]:
+        """Columns that the stars have."""
+        return columns_of(self, COLUMNS)
+
+    @property
+    def labels(self) -> Labels:
+        """Names, unit, counts and notes."""
+        return Labels(**{name: getattr(self, name) for name in _LABELS})
+
+    @property
+    def chip_number(self) -> Int:
+        """Number of the chip of each star (N,)."""
+        return np.asarray(self.chip_numbers, np.int64)[self.chip]
+
+    def grouped(self, by: str) -> tuple[tuple[str, ...], Int]:
+        """Labels of groups of stars, and the code (N,) of each star's group among them.
+
+        Parameters
+        ----------
+        by : str
+            'chip', 'exposure' or 'filter'; empty for one group of all stars, whose label is empty.
+
+        Returns
+        -------
+        labels : tuple of str
+        codes : ndarray of int, shape (N,)
+        """
+        if not by:
+            return ("",), np.zeros(len(self.x), np.int64)
+        return tuple(map(str, getattr(self, LABELS_OF_CODES[by]))), getattr(self, by)
+
+    def place(self, row: int, column: str = "") -> str:
+        """Name of a star for a message: file, row (from 1) and column.
+
+        Parameters
+        ----------
+        row : int
+        column : str, optional
+
+        Returns
+        -------
+        str
+        """
+        head = f"{self.sources[self.source[row]]}, row {self.row[row] + 1}"
+        return f"{head}, column {column!r}" if column else head
+
+
+class _Column:
+    """Column of matches in memory; an error where the stars are on disk."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, matches: MatchColumns | None, owner: type) -> Any:
+        if matches is None:
+            return self
+        try:
+            return matches.__dict__[self._name]
+        except KeyError:
+            raise InputError(
+                f"the stars are on disk, and no column {self._name!r} of them is in memory",
+                where=", ".join(matches.sources),
+                do="go through batches(), or take sample(n) or load()",
+            ) from None
+
+    def __set__(self, matches: MatchColumns, values: Any) -> None:
+        matches.__dict__[self._name] = values
+
+
+for _name in COLUMNS:
+    setattr(MatchColumns, _name, _Column(_name))
+
+
+def _completed(
+    given: Mapping[str, Any], *, unit: str, where: str
+) -> tuple[dict[str, NDArray[Any]], int, dict[str, int]]:
+    """Columns with their defaults, the number of rows given, and counts of those left out.
+
+    Quantities become numbers in `unit`, and rows with a masked value are left out and counted by
+    reason.
+    """
+    columns = _without_units(given, unit, where)
+    n = np.size(columns["x"])
+    columns, rejected = _without_masked(columns, n)
+    left = np.size(columns["x"])
+    if left == 0:
+        raise InputError("holds no rows", where=where, do="give a table with matched stars")
+    codes = {name: np.zeros(left, np.int64) for name in ("source", *LABELS_OF_CODES)}
+    columns = {"row": np.arange(left)} | codes | columns
+    ordered = {name: columns[name] for name in COLUMNS if name in columns}
+    return one_length(ordered, integers=_INTEGERS, where=where), n, rejected
+
+
+def _without_units(given: Mapping[str, Any], unit: str, where: str) -> dict[str, Any]:
+    """Columns with quantities replaced by numbers in `unit`."""
+    units = dict.fromkeys(("x", "y"), "pix") | dict.fromkeys(_MOTIONS, f"{unit} / yr")
+    units |= {"epoch": "yr", "mag": "mag", "colour": "mag"}
+    out = dict(given)
+    for name in _NUMBERS:
+        own = unit_of(out.get(name), where=f"column {name!r}")
+        if own is not None:
+            factor = conversion(own, units.get(name, unit), where=f"{where}, column {name!r}")
+            out[name] = factor * without_unit(out[name])
+    return out
+
+
+def _without_masked(columns: dict[str, Any], n: int) -> tuple[dict[str, Any], dict[str, int]]:
+    """Columns without the rows that have a masked value, and counts of these by reason."""
+    masked = [name for name in COLUMNS if hasattr(columns.get(name), "mask")]
+    if not masked or {np.shape(values) for values in columns.values()} != {(n,)}:
+        return columns, {}  # unequal lengths are refused where they are compared
+    gone = {name: absent(columns[name], not_finite=False) for name in masked}
+    reasons = [(f"no value in column {name!r}", rows) for name, rows in gone.items()]
+    stay, rejected = counted(reasons, n)
+    if not rejected:
+        return columns, {}
+    columns = {"row": np.arange(n)} | columns
+    plain = {name: np.asarray(getattr(a, "unmasked", a)) for name, a in columns.items()}
+    return {name: values[stay] for name, values in plain.items()}, rejected
+
+
+def _check(
+    columns: Columns,
+    labels: Mapping[str, Sequence[Any]],
+    *,
+    unit: str,
+    where: str,
+    place: Callable[[int, str], str],
+) -> None:
+    """Refuse an unknown unit, half a pair, codes without a label, and values that cannot be."""
+    check_unit(unit, where=where)
+    refuse_half(SIGMAS, columns, where=where, what="errors")
+    refuse_half(_NOMINAL, columns, where=where, what="nominal positions")
+    for name, names in labels.items():
+        if columns[name].min() < 0 or columns[name].max() >= len(names):
+            label = {**LABELS_OF_CODES, "source": "sources"}[name]
+            raise InputError(
+                f"codes in {name!r} point outside {label!r}",
+                where=where,
+                do="give a label for each code",
+            )
+    star = columns.get("star")
+    if star is not None and star.min() < 0:
+        bad = int(np.argmax(star < 0))
+        raise InputError(
+            f"value is {star[bad]}, and must not be negative",
+            where=place(bad, "star"),
+            do="number the reference stars from 0",
+        )
+    numbers = {name: columns[name] for name in _NUMBERS if name in columns}
+    check_values(numbers, place=lambda row: place(row, ""), positive=SIGMAS)
+
+
+def refuse_repeated(columns: Columns, *, place: Callable[[int], str]) -> None:
+    """Refuse the same measurement of the same star twice."""
+    names = (*POSITIONS, *LABELS_OF_CODES, "epoch")
+    pair = first_duplicate([columns[name] for name in names if name in columns])
+    if pair is not None:
+        first, second = pair
+        raise InputError(
+            f"repeats {place(first)}: the same x, y, u, v, exposure and chip",
+            where=place(second),
+            do="drop one of them",
+        )

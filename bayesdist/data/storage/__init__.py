@@ -1,0 +1,1 @@
+"""Matches in Parquet files: written, scanned, and left on disk."""

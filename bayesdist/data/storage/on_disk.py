@@ -1,0 +1,195 @@
+"""Matches that stay on disk: Parquet files, read batch by batch.
+
+A scan in the memory of one block finds what must be known of all rows: the names of exposures,
+chips and filters, the tangent point, and that no row is wrong or repeated.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data import batches
+from bayesdist.data.joining import joined_columns
+from bayesdist.data.labels import LABELS_OF_CODES, Labels
+from bayesdist.data.match_columns import COLUMNS, POSITIONS, SIGMAS
+from bayesdist.data.matches import Matches
+from bayesdist.data.reading.formats import exposure_names, input_files
+from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
+from bayesdist.data.storage.stored import StoredFile, scan, stored_file, tangent_point_of
+from bayesdist.data.tables.parquet import describe_part
+from bayesdist.errors import FormatError, InputError
+
+__all__ = ["StoredRows", "open_matches"]
+
+PathLike = str | os.PathLike[str]
+Segment = tuple[int, int, int]  # file, first row, row after the last
+
+
+@dataclass(frozen=True, eq=False)
+class StoredRows:
+    """Consecutive rows of Parquet files."""
+
+    labels: Labels
+    files: tuple[StoredFile, ...]  # of the rows
+    segments: tuple[Segment, ...]  # for each file its code, the first row, the row after the last
+
+    def __len__(self) -> int:
+        return sum(stop - start for _, start, stop in self.segments)
+
+    def load(self) -> Matches:
+        """Rows, with codes and sources by the labels.
+
+        InputError when a file is damaged, gone, or not what it was when it was opened.
+        """
+        parts = [self._segment(*both) for both in zip(self.files, self.segments, strict=True)]
+        labels = self.labels.of_batch(len(self)).arguments()
+        return Matches.of_distinct_rows(**joined_columns(parts), **labels)
+
+    def _segment(self, file: StoredFile, segment: Segment) -> dict[str, NDArray[Any]]:
+        """Columns of the rows in one file."""
+        code, start, stop = segment
+        (block,) = file.blocks(start=start, stop=stop, size=stop - start)
+        out = {name: block[name] for name in COLUMNS if name in block}
+        for key in LABELS_OF_CODES:
+            out[key] = self.labels.codes(key, block, source=file.source)
+        out["row"] = np.arange(start, stop)
+        out["source"] = np.full(stop - start, code)
+        return out
+
+
+def open_matches(path: PathLike | Sequence[PathLike], **options: Any) -> Matches:
+    """Matched star positions that stay on disk.
+
+    Parameters
+    ----------
+    path : path-like or sequence of path-like
+        Parquet: a file, a list of files, a pattern, or a folder of parts of one table.
+    **options
+        As `ReadOptions`; a row with a missing value, or one that is not finite, is refused.
+
+    Returns
+    -------
+    Matches
+        Its batches are equal to `read_matches` of these rows.
+
+    Raises
+    ------
+    InputError
+        For all that is wrong with a file or an option, in one sentence.  All files must have the
+        same quantities; one of them may be empty.
+    """
+    given = ReadOptions(**options)
+    if given.not_finite == "reject":
+        raise InputError(
+            "rows of tables on disk cannot be left out in reading",
+            where="data.not_finite",
+            do="write the table without them",
+        )
+    files = input_files(path)
+    for file in files:
+        if file.suffix.lower() != ".parquet":
+            raise FormatError(
+                "is no Parquet file, and others are read into memory",
+                where=str(file),
+                do="use read_matches",
+            )
+    in_parts = isinstance(path, str | os.PathLike) and Path(path).is_dir()
+    names: Sequence[str | None] = [None] * len(files)
+    if not in_parts and len(files) > 1:
+        names = exposure_names(files)
+    stored = [
+        stored_file(describe_part(file), given, exposure_name=name)
+        for file, name in zip(files, names, strict=True)
+    ]
+    _refuse_differences(stored)
+    first = stored[0]
+    sigma = given.sigma
+    refuse_missing_errors(sigma, _has_errors(first), "mag" in first.found, where=first.source)
+    if first.on_sky and given.tangent_point is None:
+        point = tangent_point_of(stored)
+        stored = [replace(one, options=replace(one.options, tangent_point=point)) for one in stored]
+    labels = scan(stored)
+    matches = Matches.from_readers(_readers(labels, stored), labels, _columns_of(first))
+    return matches if isinstance(sigma, str) else matches.with_errors(float(sigma))
+
+
+def _readers(labels: Labels, files: Sequence[StoredFile]) -> list[StoredRows]:
+    """Consecutive rows of all files.
+
+    Row groups, and files, are joined up to `BATCH` rows; larger ones are split evenly.
+    """
+    out: list[list[Segment]] = [[]]
+    size = 0
+    for code, file in enumerate(files):
+        for start, stop in _spans(file.part.group_rows):
+            if size + stop - start > batches.BATCH:
+                out.append([])
+                size = 0
+            size += stop - start
+            last = out[-1][-1] if out[-1] else None
+            if last is not None and last[0] == code:
+                out[-1][-1] = (code, last[1], stop)
+            else:
+                out[-1].append((code, start, stop))
+    return [
+        StoredRows(labels, tuple(files[code] for code, *_ in segments), tuple(segments))
+        for segments in out
+    ]
+
+
+def _spans(group_rows: Sequence[int]) -> list[tuple[int, int]]:
+    """First row and row after the last of each row group, large ones split evenly."""
+    out = []
+    first = 0
+    for rows in group_rows:
+        edges = [first + edge for edge in batches.batch_edges(rows)]
+        out += list(pairwise(edges))
+        first += rows
+    return out
+
+
+def _columns_of(file: StoredFile) -> set[str]:
+    """Columns of matches that a file gives."""
+    found = set(file.found) & set(COLUMNS) | {*POSITIONS, *LABELS_OF_CODES, "row", "source"}
+    if file.options.epoch is not None:
+        found.add("epoch")
+    if _has_errors(file):
+        found |= set(SIGMAS)
+    for on_sky, on_plane in (("pm_ra", "pm"), ("sigma_pm_ra", "sigma_pm")):
+        if on_sky in file.found:
+            found |= {f"{on_plane}_u", f"{on_plane}_v"}
+    return found
+
+
+def _refuse_differences(parts: Sequence[StoredFile]) -> None:
+    """Refuse parts that do not make one table."""
+    first = parts[0]
+    for other in parts[1:]:
+        for lacking, having in ((other, first), (first, other)):
+            missing = [key for key in having.found if key not in lacking.found]
+            if missing:
+                raise InputError(
+                    f"has no column for {missing[0]!r}, but {having.source} has "
+                    f"{having.found[missing[0]]!r}",
+                    where=lacking.source,
+                    do="give all parts the same columns",
+                )
+        if other.unit != first.unit:
+            raise InputError(
+                f"unit is {other.unit}, but {first.unit} in {first.source}",
+                where=other.source,
+                do="bring all files to one",
+            )
+
+
+def _has_errors(file: StoredFile) -> bool:
+    """True where a file has errors of the matches, or of the reference positions."""
+    return bool({"sigma_u", "sigma_ra"} & set(file.found))
