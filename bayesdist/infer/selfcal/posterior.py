@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.errors import DegenerateError, InputError
+from bayesdist.errors import DegenerateError
 from bayesdist.infer.convergence import Limits
 from bayesdist.infer.density.coordinates import Split
 from bayesdist.infer.density.laplace import Node
@@ -25,8 +25,8 @@ from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.equations.scaled import one_thread
-from bayesdist.infer.posterior import Posterior, SamplerInfo
-from bayesdist.infer.sampler.chains import Settings, run_chains
+from bayesdist.infer.posterior import Posterior
+from bayesdist.infer.sampler.chains import Settings, ensemble_seeds, run_chains
 from bayesdist.infer.selfcal.elimination import (
     Mixture,
     StarModes,
@@ -169,16 +169,12 @@ def sample_selfcal(
     DegenerateError, InputError
         As `sample`.
     """
-    if ensembles < 2:
-        raise InputError(
-            f"{ensembles} ensemble cannot show convergence", where="sampler.ensembles", do="use 4"
-        )
+    seeds = ensemble_seeds(seed, ensembles)
     started = time.monotonic()
     target = SelfTarget(solution, jitter, fraction_prior, jitter_scale)
     proposal = propose(target)
-    seeds = np.random.SeedSequence(seed).generate_state(ensembles + 1)
     settings = Settings(
-        seeds=tuple(int(s) for s in seeds[:-1]),
+        seeds=seeds,
         n_stars=RELATIVE_COST * len(solution.problem),
         limits=Limits(target_ess, target_rhat),
         max_steps=max_steps,
@@ -196,35 +192,23 @@ def sample_selfcal(
         progress=progress,
     )
     chains = run_chains(target, proposal, settings)  # type: ignore[arg-type]
-    E, T, W, D = chains.psi.shape
-    draws = np.swapaxes(chains.psi, 1, 2).reshape(E, W * T, D)
-    n, expansion = target.n_theta, solution.expansion
-    member = memberships(solution.problem, solution.theta, solution.mixture, solution.stars)
+    problem, draws, n = solution.problem, chains.draws, target.n_theta
+    member = memberships(problem, solution.theta, solution.mixture, solution.stars)
     posterior = Posterior(
-        model=solution.problem.model,
+        model=problem.model,
         mixture=target.mixture,
         theta=target.theta(draws[..., :n]),
         hyper=target.hyper.values(draws[..., n:]),
-        log_prob=np.swapaxes(chains.log_prob, 1, 2).reshape(E, W * T),
-        n_stars=len(solution.problem),
+        log_prob=chains.log_densities,
+        n_stars=len(problem),
         n_flagged=int((member < 0.5).sum()),
-        n_false=len(solution.problem) - expansion.n_members,
+        n_false=len(problem) - solution.expansion.n_members,
         reference_sigma=target.hyper.scale,
-        convergence=chains.verdict.among((*solution.problem.model.names, *target.hyper.names)),
-        sampler=SamplerInfo(
-            method=f"emcee {chains.plan.method}",
-            ensembles=ensembles,
-            walkers=chains.plan.walkers,
-            steps=chains.steps,
-            warmup=chains.warmup,
-            passes=chains.passes,
-            acceptance=chains.acceptance,
-            wall_s=time.monotonic() - started,
-            seed=seed,
-        ),
+        convergence=chains.verdict.among((*problem.model.names, *target.hyper.names)),
+        sampler=chains.info(seed, started),
         own_places=True,
     )
-    return _in_unit(posterior, solution.problem.model.pixel_size(solution.theta))
+    return _in_unit(posterior, problem.model.pixel_size(solution.theta))
 
 
 def _in_unit(posterior: Posterior, pixel: float) -> Posterior:
