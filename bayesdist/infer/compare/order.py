@@ -26,7 +26,7 @@ from bayesdist.infer.compare.order_sums import (
     truncated,
 )
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
-from bayesdist.infer.stars.shards import Compute, Shards, opened
+from bayesdist.infer.stars.shards import Shards, opened
 from bayesdist.model import DistortionModel
 from bayesdist.model.basis import MAX_ORDER
 
@@ -46,7 +46,6 @@ def select_order(
     regions: int = 10,
     folds: int = 100,
     rejection: Rejection = DEFAULT_REJECTION,
-    compute: Compute | None = None,
 ) -> OrderSelection:
     """Comparison of two or more polynomial orders, for one chip without frames and time dependence.
 
@@ -62,7 +61,7 @@ def select_order(
     """
     chosen = _checked(orders, model, bins, regions, folds)
     top = replace(model, order=chosen[-1])
-    with opened(top, matches, compute) as shards:
+    with opened(top, matches) as shards:
         fit = fit_linear(shards, top, rejection=rejection)
         binned = shards.sum(bin_sums, fit.mean, fit.clip, bins)
         by_fold = shards.sum(fold_sums, fit.mean, fit.clip, folds)

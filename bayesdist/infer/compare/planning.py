@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,15 +60,12 @@ def exposure_information(
     solution: Solution,
     content: ExposureContent,
     epoch: float | None,
-    *,
-    scatter: Mapping[str, float] | None = None,
 ) -> Float:
     """Fisher information (d, d) of one more exposure about polynomials and drift.
 
     The model is linearised at the solution; d is its `n_distortion`, and `epoch` (decimal years) is
     needed with time dependence.  The exposure's own frame is fitted as that of the others, and its
-    free parameters are eliminated.  `scatter` gives the standard deviations of exposures by the
-    names of their parameters, which are then not free.
+    parameters are eliminated.
     """
     model = solution.model
     D, last = model.n_params, len(model.exposures) - 1
@@ -84,11 +80,7 @@ def exposure_information(
     if exposure is None:
         return H[:n, :n]
     block = model.frame_slice(exposure)
-    local = H[block, block].copy()
-    for k, name in enumerate(model.free_frame_names(exposure)):
-        tau = (scatter or {}).get(name)
-        if tau is not None:
-            local[k, k] += 1.0 / max(tau, 1e-300) ** 2
+    local = H[block, block]
     if not np.any(local):
         return H[:n, :n]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(local), 1e-300))
