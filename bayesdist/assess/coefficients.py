@@ -38,7 +38,8 @@ def coefficient_table(fit: LinearFit, posterior: Posterior | None = None) -> Tab
         prefix = f"{chip.name}." if len(model.chips) > 1 else ""
         for axis, name in enumerate(AXES):
             part = model.coefficient_slice(chip.number, axis)
-            value, cov = basis.to_monomials(fit.mean[part], fit.cov[part, part])
+            value = basis.to_monomials(fit.mean[part])
+            cov = basis.monomial_matrix @ fit.cov[part, part] @ basis.monomial_matrix.T
             draws = None
             if posterior is not None:
                 draws = basis.to_monomials(posterior.flat[:, part])

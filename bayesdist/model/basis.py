@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from math import comb
-from typing import overload
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -274,32 +273,20 @@ class PolynomialBasis:
         """
         return np.asarray(coef, float) @ self._to_scaled_powers.T
 
-    @overload
-    def to_monomials(self, coef: ArrayLike) -> Float: ...
-    @overload
-    def to_monomials(self, coef: ArrayLike, cov: ArrayLike) -> tuple[Float, Float]: ...
-    def to_monomials(
-        self, coef: ArrayLike, cov: ArrayLike | None = None
-    ) -> Float | tuple[Float, Float]:
-        """Coefficients of (x - xref)^i (y - yref)^j, with their covariance.
+    def to_monomials(self, coef: ArrayLike) -> Float:
+        """Coefficients of (x - xref)^i (y - yref)^j.
 
         Parameters
         ----------
         coef : array_like, shape (..., n_terms)
             Legendre coefficients of one axis, in the unit of u, v.
-        cov : array_like, shape (n_terms, n_terms), optional
-            Their covariance.
 
         Returns
         -------
-        ndarray, same shape as `coef`; with `cov`, a pair with the covariance of the result
+        ndarray, same shape
             In the unit of u, v per pixel^(i + j).
         """
-        m = self.monomial_matrix
-        out = np.asarray(coef, float) @ m.T
-        if cov is None:
-            return out
-        return out, m @ np.asarray(cov, float) @ m.T
+        return np.asarray(coef, float) @ self.monomial_matrix.T
 
     def from_monomials(self, coef: ArrayLike) -> Float:
         """Legendre coefficients from those of (x - xref)^i (y - yref)^j.
