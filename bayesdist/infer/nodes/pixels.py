@@ -3,31 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError
+from bayesdist.infer.solution import Solution
 from bayesdist.infer.stars.stars import errors_of, groups_of
-from bayesdist.model import DistortionModel
 
-__all__ = ["PixelShifts", "Solved", "pixel_shifts"]
+__all__ = ["PixelShifts", "pixel_shifts"]
 
 Float = NDArray[np.float64]
 
 FOLDED = 1e-6  # area of a pixel's image over the square of its sides
-
-
-class Solved(Protocol):
-    """A model with parameter values."""
-
-    @property
-    def model(self) -> DistortionModel: ...
-
-    @property
-    def mean(self) -> Float: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +36,12 @@ class PixelShifts:
     variance: Float
 
 
-def pixel_shifts(solution: Solved, matches: Matches) -> PixelShifts:
+def pixel_shifts(solution: Solution, matches: Matches) -> PixelShifts:
     """Residuals of matches, mapped to the detector by the inverse of the local Jacobian.
 
     Parameters
     ----------
-    solution : Solved
-        A fit or a posterior.
+    solution : Solution
     matches : Matches
         With errors, in the solution's unit.
 
