@@ -58,7 +58,7 @@ def fit_selfcal(matched: SelfcalMatched) -> Fitted:
     summary = gauge_summary(solved.gauge, solved.fixed, model)
     return Fitted(
         mode.solution,
-        ErrorLaw(by_magnitude=magnitude_errors_of(solved.solution, solved.matches)),
+        ErrorLaw(by_magnitude=magnitude_errors_of(solved.mode, solved.matches)),
         GaussianPriors.none(model),
         solved=solved,
         facts={"selfcal": {**matched.facts, "gauge": summary}},
@@ -120,7 +120,7 @@ def sample_detections(
     """
     s, jitter = config.sampler, config.outliers.jitter
     return sample_selfcal(
-        required(data.fitted.solved, "solution of detections").solution,
+        required(data.fitted.solved, "solution of detections").mode,
         jitter=None if jitter == "fit" else float(jitter),
         fraction_prior=config.outliers.fraction_prior,
         jitter_scale=config.outliers.jitter_scale,
