@@ -9,9 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
-from bayesdist.infer.equations.scaled import scaled_cholesky, scaled_inverse
-from bayesdist.infer.posterior.covariance import with_covariance
-from bayesdist.infer.solution import Solution, TransformedSolution
+from bayesdist.infer.equations.scaled import recolouring, scaled_cholesky, scaled_inverse
+from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["ExposureContent", "exposure_content", "exposure_information", "with_information"]
@@ -88,7 +87,7 @@ def exposure_information(
     return H[:n, :n] - cross @ np.linalg.solve(local * np.outer(scale, scale), cross.T)
 
 
-def with_information(solution: Solution, information: Float) -> TransformedSolution:
+def with_information(solution: Solution, information: Float) -> Solution:
     """Solution with the additional information (d, d) about polynomials and drift.
 
     Frames of the existing exposures change as far as they are correlated with these.  InputError
@@ -107,4 +106,4 @@ def with_information(solution: Solution, information: Float) -> TransformedSolut
     after = root @ np.linalg.solve(inner, root.T)
     follow = cov[:, :n] @ scaled_inverse(cov[:n, :n])
     changed = cov + follow @ (after - cov[:n, :n]) @ follow.T
-    return with_covariance(solution, (changed + changed.T) / 2)
+    return solution.mapped(recolouring(cov, (changed + changed.T) / 2))

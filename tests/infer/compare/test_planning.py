@@ -11,7 +11,7 @@ from bayesdist.infer.compare.planning import (
     exposure_information,
     with_information,
 )
-from bayesdist.infer.posterior.covariance import recolouring
+from bayesdist.infer.equations.scaled import recolouring
 from bayesdist.model import TimeDependence
 
 SIZE = (512.0, 256.0)
