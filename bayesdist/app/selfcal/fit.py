@@ -118,12 +118,10 @@ def sample_detections(
     Posterior
         With errors in the unit of u, v.
     """
-    s, jitter = config.sampler, config.outliers.jitter
+    s = config.sampler
     return sample_selfcal(
         required(data.fitted.solved, "solution of detections").mode,
-        jitter=None if jitter == "fit" else float(jitter),
-        fraction_prior=config.outliers.fraction_prior,
-        jitter_scale=config.outliers.jitter_scale,
+        outliers=config.mixture(),
         seed=s.seed,
         ensembles=s.ensembles,
         target_ess=s.target_ess,

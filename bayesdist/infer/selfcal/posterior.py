@@ -58,11 +58,7 @@ class SelfTarget:
     """Density of psi = (free parameters, log j, logit f); j in pixels."""
 
     solution: SelfCalibrationMode  # the mode; parameters that it fixes stay there
-    jitter: float | None = None  # fixed value; sampled by default
-    # (a, b) of the Beta prior of the fraction of false detections
-    fraction_prior: tuple[float, float] = (1.0, 9.0)
-    # of the prior of the jitter, in pixels; by default the typical error of a detection
-    jitter_scale: float | None = None
+    outliers: OutlierMixture | None = None  # in pixels; as by `mixture` by default
 
     @property
     def problem(self) -> Problem:
@@ -77,10 +73,7 @@ class SelfTarget:
     @cached_property
     def mixture(self) -> OutlierMixture:
         """Mixture with uniform false detections, in pixels."""
-        radius = self.problem.match_radius
-        return OutlierMixture(
-            "uniform", radius, self.jitter, self.fraction_prior, self.jitter_scale
-        )
+        return self.outliers or OutlierMixture("uniform", self.problem.match_radius)
 
     @cached_property
     def hyper(self) -> Hyper:
@@ -112,7 +105,7 @@ class SelfTarget:
     def mixtures(self, hyper: Float) -> Float:
         """Jitter and fraction of false detections (n, 2) of sampled coordinates."""
         values = self.hyper.values(hyper)
-        j = values.get("j", np.full(len(hyper), self.jitter or 0.0))
+        j = values.get("j", np.full(len(hyper), self.mixture.jitter or 0.0))
         return np.stack([j, values["f"]], axis=1)
 
     def log_density(self, psi: Float) -> Float:
@@ -132,9 +125,7 @@ class SelfTarget:
 def sample_selfcal(
     solution: SelfCalibrationMode,
     *,
-    jitter: float | None = None,
-    fraction_prior: tuple[float, float] = (1.0, 9.0),
-    jitter_scale: float | None = None,
+    outliers: OutlierMixture | None = None,
     seed: int = 1,
     ensembles: int = 4,
     target_ess: float = 400.0,
@@ -149,12 +140,8 @@ def sample_selfcal(
     Parameters
     ----------
     solution : SelfCalibrationMode
-    jitter : float, optional
-        Fixed value, in pixels; sampled by default.
-    fraction_prior : tuple of float
-        As `OutlierMixture`.
-    jitter_scale : float, optional
-        As `OutlierMixture`, in pixels.
+    outliers : OutlierMixture, optional
+        In pixels; uniform within the match radius by default.
     seed, ensembles, target_ess, target_rhat, max_steps, checkpoint_every, folder, progress
         As `sample`.
 
@@ -171,7 +158,7 @@ def sample_selfcal(
     """
     seeds = ensemble_seeds(seed, ensembles)
     started = time.monotonic()
-    target = SelfTarget(solution, jitter, fraction_prior, jitter_scale)
+    target = SelfTarget(solution, outliers)
     proposal = propose(target)
     settings = Settings(
         seeds=seeds,
@@ -180,15 +167,7 @@ def sample_selfcal(
         max_steps=max_steps,
         checkpoint_every=checkpoint_every,
         folder=None if folder is None else Path(folder),
-        fingerprint=_fingerprint(
-            solution,
-            jitter,
-            fraction_prior,
-            jitter_scale,
-            seed,
-            ensembles,
-            checkpoint_every,
-        ),
+        fingerprint=_fingerprint(solution, target.mixture, seed, ensembles, checkpoint_every),
         progress=progress,
     )
     chains = run_chains(target, proposal, settings)  # type: ignore[arg-type]
@@ -320,7 +299,7 @@ def _node(target: SelfTarget, split: Split, at: Float, z: float, bend: float) ->
     """Node with mode and curvature of everything else at one jitter, for a given fraction."""
     solution, problem, free = target.solution, target.problem, target.solution.free
     theta, stars = solution.theta.copy(), solution.stars
-    held = float(np.exp(at[0])) if len(at) else float(target.jitter or 0.0)
+    held = float(np.exp(at[0])) if len(at) else float(target.mixture.jitter or 0.0)
     middles = problem.middles(theta)
     observed = True
     for _ in range(MAX_STEPS):
