@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.scaled import one_thread
-from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
+from bayesdist.infer.linear import DEFAULT_REJECTION, Rejection, fit_linear
 from bayesdist.infer.solution import TransformedSolution
 from bayesdist.infer.transforms import LinearTerms, bare_model, linear_terms, reference_gauge
 from bayesdist.model import DistortionModel
@@ -44,8 +44,6 @@ class ExposureSolutions:
         Formal covariance.
     views : tuple of TransformedSolution
         The whole solution of each exposure, in the reference gauge.
-    fits : tuple of LinearFit
-        As fitted, in the system of the catalogue.
     skipped : dict of str to str
         Exposures left out, with the reason.
     """
@@ -56,7 +54,6 @@ class ExposureSolutions:
     values: Float
     cov: Float
     views: tuple[TransformedSolution, ...]
-    fits: tuple[LinearFit, ...]
     skipped: Mapping[str, str]
 
     def __len__(self) -> int:
@@ -136,7 +133,7 @@ def fit_exposures(
     alone = replace(bare_model(model), time=None)
     order = np.argsort(matches.exposure, kind="stable")
     codes, starts = np.unique(matches.exposure[order], return_index=True)
-    names, epochs, fits, views, terms = [], [], [], [], []
+    names, epochs, views, terms = [], [], [], []
     skipped: dict[str, str] = {}
     for code, rows in zip(codes, np.split(order, starts[1:]), strict=True):
         name = matches.exposure_names[code]
@@ -154,7 +151,6 @@ def fit_exposures(
         view = reference_gauge(fit, chip)
         names.append(name)
         epochs.append(float(np.median(table.epoch)))
-        fits.append(fit)
         views.append(view)
         terms.append(linear_terms(view))
     if not names:
@@ -170,7 +166,6 @@ def fit_exposures(
         values=np.array([t.values for t in terms]),
         cov=np.array([t.cov for t in terms]),
         views=tuple(views),
-        fits=tuple(fits),
         skipped=skipped,
     )
 

@@ -22,12 +22,11 @@ from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import LinearFit, fit_linear
 from bayesdist.infer.nodes.binned import binned_table
-from bayesdist.infer.nodes.corrected import corrected_matches, on_the_chips
 from bayesdist.infer.nodes.field import field_table
 from bayesdist.infer.nodes.grid import STEP
 from bayesdist.infer.nodes.hyperparameters import SMOOTHNESS
 from bayesdist.infer.nodes.mixture import ResidualMixture, fit_mixture
-from bayesdist.infer.nodes.pixels import pixel_shifts
+from bayesdist.infer.nodes.pixels import corrected_matches, on_the_chips, pixel_shifts
 from bayesdist.infer.nodes.posterior import TablePosterior
 from bayesdist.infer.nodes.table_fit import Iteration, TableFit, table_of
 from bayesdist.model import DistortionModel

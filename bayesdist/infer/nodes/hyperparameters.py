@@ -75,12 +75,6 @@ class FittedField:
     covariance: Float  # of log amplitude and log length (2, 2), from the curvature there
     log_evidence: float  # log marginal likelihood there, up to a constant
 
-    @property
-    def log_sigma(self) -> tuple[float, float]:
-        """Standard errors of log amplitude and log length, which are relative errors."""
-        a, b = np.sqrt(np.diag(self.covariance))
-        return float(a), float(b)
-
 
 @dataclass(frozen=True, eq=False)
 class Evidence:

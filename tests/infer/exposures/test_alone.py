@@ -97,7 +97,6 @@ def test_each_is_the_fit_of_its_own_stars(some):
         model, frames="none", time=None, exposures=("1",), gauge="first", held=(0.0, 0.0, 0.0)
     )
     fit = fit_linear(one, alone)
-    np.testing.assert_array_equal(found.fits[7].mean, fit.mean)
     view = reference_gauge(fit)
     np.testing.assert_allclose(found.views[7].mean, view.mean, atol=1e-12)
     assert found.epoch[7] == one.epoch[0]
