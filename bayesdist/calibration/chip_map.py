@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.infer.compare.frame_fields import term_squares
 from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, PolynomialBasis
 from bayesdist.model.basis import point_blocks
@@ -229,7 +228,7 @@ def fitted_map(
     basis = PolynomialBasis(order, size, reference_pixel)
     # products of two terms have twice the order, for which so many nodes are exact
     x, y, weight = Chip(1, "", size, reference_pixel).quadrature(order + 1)
-    norm = term_squares(basis)[: basis.n_terms] * weight.sum()
+    norm = basis.mean_squares * weight.sum()
     coefficients = (np.stack(positions(x, y)) * weight) @ basis.evaluate(x, y) / norm
     cov = None
     if monomial_cov is not None:

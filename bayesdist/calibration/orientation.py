@@ -11,17 +11,15 @@ from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC, Agreement, Orientation, Plane
 from bayesdist.calibration.similarity import correlations
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.compare.frame_fields import term_squares
 from bayesdist.infer.solution import DerivedSolution, Solution
 from bayesdist.model import DistortionModel, PolynomialBasis
+from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.model.similarity import turned, turned_model
 
 __all__ = ["lay_on", "oriented"]
 
 Float = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-
-GRID = (33, 17)  # points on which the largest distance is sought
 
 
 def lay_on(
@@ -77,7 +75,7 @@ def lay_on(
     basis = PolynomialBasis(order, size, model.chips[0].reference_pixel)
     z, slopes = _complex(*calibration.coefficients(chip, epoch), basis.n_terms)
     w, _ = _complex(*reference.coefficients(chip, then), basis.n_terms)
-    weight = term_squares(basis)[: basis.n_terms].copy()
+    weight = basis.mean_squares
     weight[0] = 0.0  # the shift takes the mean
     S, flipped, Q = correlations(w, z, basis)
     if Q == 0 or S == 0:
@@ -207,16 +205,10 @@ def _complex(coefficients: Float, jacobian: Float, n_terms: int) -> tuple[Comple
 
 def _agreement(left: Complex, basis: PolynomialBasis) -> Agreement:
     """Rms and largest distance over the chip of a difference [arcsec] in Legendre coefficients."""
-    x, y = (
-        grid.ravel()
-        for grid in np.meshgrid(
-            *(np.linspace(1, n, m) for n, m in zip(basis.size, GRID, strict=True))
-        )
-    )
-    weight = term_squares(basis)[: basis.n_terms]
+    on_grid = basis.evaluate(*mesh(*grid_pixels(basis.size, DEFAULT_GRID))) @ left
     return Agreement(
-        rms=1e3 * float(np.sqrt(weight @ np.abs(left) ** 2)),
-        worst=1e3 * float(np.abs(basis.evaluate(x, y) @ left).max()),
+        rms=1e3 * float(np.sqrt(basis.mean_squares @ np.abs(left) ** 2)),
+        worst=1e3 * float(np.abs(on_grid).max()),
     )
 
 

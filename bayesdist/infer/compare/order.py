@@ -148,8 +148,7 @@ def _lost(
     sums: FoldStatistics, about: Float, n_terms: list[int], scale2: float, fit: LinearFit
 ) -> Float:
     """Rms over the detector of the difference of each order's fit from the highest."""
-    i, j = np.array(fit.model.basis().terms).T
-    area = 1.0 / ((2 * i + 1) * (2 * j + 1))  # mean square of a product of Legendre polynomials
+    area = fit.model.basis().mean_squares
     square = (departures(sums, about, n_terms) ** 2 @ area).sum(axis=1)
     weight = sums.weight.sum(axis=0)
     variance = np.empty(len(n_terms))
