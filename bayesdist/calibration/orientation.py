@@ -30,7 +30,6 @@ def lay_on(
     epoch: float | None = None,
     reference_drift: bool = True,
     scale_arcsec: float | None = None,
-    scale_sigma: float = 0.0,
 ) -> Orientation:
     """Similarity from a calibration to an existing one in an aperture [arcsec], with its error.
 
@@ -41,8 +40,8 @@ def lay_on(
     tilt the whole.  Where the two maps differ by a similarity only, both ways agree.
 
     `reference_drift` applies the reference's time-dependent terms.  A given `scale_arcsec`
-    (arcseconds in one unit of u, v, with error `scale_sigma`) is held; without it the scale is
-    fitted for u, v in pixels, and is that of the unit for others.
+    (arcseconds in one unit of u, v) is held; without it the scale is fitted for u, v in pixels, and
+    is that of the unit for others.
 
     The residuals of the fit are a field of 2 K - 4 free coefficients (K terms of one axis).  The
     four that it cannot see are given the mean variance of those it can: the reference may be as
@@ -107,7 +106,7 @@ def lay_on(
     n_free = 2 * basis.n_terms - (4 if held is None else 3)
     variance = (1e-3 * agreement.rms) ** 2 / n_free
     angular = variance / (abs(b) ** 2 * Q)
-    log_scale = angular if held is None else (scale_sigma / held) ** 2
+    log_scale = angular if held is None else 0.0
     return Orientation(
         angle=float(np.angle(b)),
         scale=float(abs(b)) if held is None else held,
