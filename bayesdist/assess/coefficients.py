@@ -38,8 +38,7 @@ def coefficient_table(fit: LinearFit, posterior: Posterior | None = None) -> Tab
         prefix = f"{chip.name}." if len(model.chips) > 1 else ""
         for axis, name in enumerate(AXES):
             part = model.coefficient_slice(chip.number, axis)
-            value = basis.to_monomials(fit.mean[part])
-            cov = basis.monomial_matrix @ fit.cov[part, part] @ basis.monomial_matrix.T
+            value, cov = basis.to_monomials(fit.mean[part], fit.cov[part, part])
             draws = None
             if posterior is not None:
                 draws = basis.to_monomials(posterior.flat[:, part])

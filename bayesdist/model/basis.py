@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from math import comb
+from typing import overload
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -279,20 +280,32 @@ class PolynomialBasis:
         """
         return np.asarray(coef, float) @ self._to_scaled_powers.T
 
-    def to_monomials(self, coef: ArrayLike) -> Float:
-        """Coefficients of (x - xref)^i (y - yref)^j.
+    @overload
+    def to_monomials(self, coef: ArrayLike) -> Float: ...
+    @overload
+    def to_monomials(self, coef: ArrayLike, cov: ArrayLike) -> tuple[Float, Float]: ...
+    def to_monomials(
+        self, coef: ArrayLike, cov: ArrayLike | None = None
+    ) -> Float | tuple[Float, Float]:
+        """Coefficients of (x - xref)^i (y - yref)^j, with their covariance.
 
         Parameters
         ----------
         coef : array_like, shape (..., n_terms)
             Legendre coefficients of one axis, in the unit of u, v.
+        cov : array_like, shape (n_terms, n_terms), optional
+            Their covariance.
 
         Returns
         -------
-        ndarray, same shape
+        ndarray, same shape as `coef`; with `cov`, a pair with the covariance of the result
             In the unit of u, v per pixel^(i + j).
         """
-        return np.asarray(coef, float) @ self.monomial_matrix.T
+        m = self.monomial_matrix
+        out = np.asarray(coef, float) @ m.T
+        if cov is None:
+            return out
+        return out, m @ np.asarray(cov, float) @ m.T
 
     def from_monomials(self, coef: ArrayLike) -> Float:
         """Legendre coefficients from those of (x - xref)^i (y - yref)^j.
