@@ -84,5 +84,5 @@ def _of_kind(data: FitData, config: Config) -> dict[str, Any]:
     if fitted.scatter is not None or fitted.solved is not None:
         options["centroid"] = fitted.errors.by_magnitude
     if fitted.solved is not None:
-        options["eliminated"] = fitted.solved.solution
+        options["eliminated"] = fitted.solved.mode
     return options

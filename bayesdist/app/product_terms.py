@@ -9,6 +9,7 @@ inverse is compared with the forward terms of its own file, between which a user
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -151,7 +152,7 @@ def _released(product: ProductInput, config: Config, base: Path, folder: Path) -
                 if npol is None
                 else [npol.table(c, one.pixel()[0] * npol.values(c), None) for c in npol.chips]
             )
-            sets[entry["period"]] = one.with_tables(before, after)
+            sets[entry["period"]] = replace(one, before=tuple(before), after=tuple(after))
     segments: dict[int, Calibration] = {}
     for period in block.period:
         segments.setdefault(period.segment, sets[period.name])

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.catalogue.star_errors import StarCovariance
-from bayesdist.infer.equations.scaled import scaled_cholesky
-from bayesdist.infer.posterior.covariance import recolouring
+from bayesdist.infer.equations.scaled import recolouring, scaled_cholesky
 
 __all__ = ["with_diagnosed_errors", "with_shared_stars"]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.calibration.area import determinant
-from bayesdist.calibration.chip_map import chip_map
+from bayesdist.calibration.calibration import calibration_of
 from bayesdist.errors import InputError
 from bayesdist.infer.solution import Solution
 from bayesdist.model.basis import point_blocks
@@ -82,7 +82,7 @@ def area_map(
         When the mapping is singular at the reference pixel, for an unknown chip, a missing epoch,
         or a bad grid.
     """
-    one = chip_map(solution, epoch=epoch, chip=chip)
+    one = calibration_of(solution).chip(chip, epoch, origin="stated")
     basis, covariance = one.basis, one.cov
     assert covariance is not None
     det_ref, d_ref = determinant(basis, one.coefficients, *np.array(basis.reference_pixel)[:, None])

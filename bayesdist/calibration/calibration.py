@@ -7,8 +7,8 @@ inverses, its validity period.  One calibration is of one filter.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -207,7 +207,7 @@ class Calibration:
             )
         return self.reference_date if epoch is None else epoch
 
-    # -- scale and tables -------------------------------------------------------------------------
+    # -- scale ------------------------------------------------------------------------------------
 
     def pixel(self, epoch: float | None = None) -> tuple[float, str]:
         """Size of a corrected pixel in the plane's unit, and the source of it.
@@ -222,12 +222,6 @@ class Calibration:
                 "the pixel at the zero point has no area", where=self.name, do="give --scale"
             )
         return float(np.sqrt(area)), "the pixel at the zero point"
-
-    def with_tables(
-        self, before: Iterable[LookupTable] = (), after: Iterable[LookupTable] = ()
-    ) -> Calibration:
-        """Calibration with look-up tables before and after its polynomials."""
-        return replace(self, before=tuple(before), after=tuple(after))
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,10 +242,8 @@ def calibration_of(
     name: str = "solution",
     *,
     plane: Plane | None = None,
-    instrument: str = "",
     detector: str = "",
     filter: str = "",
-    before: Iterable[LookupTable] = (),
     scale: tuple[float, str] | None = None,
 ) -> Calibration:
     """Calibration of a fit or a posterior, without the frames of its exposures.
@@ -267,10 +259,8 @@ def calibration_of(
         name,
         bare,
         plane or Plane(),
-        instrument,
-        detector,
-        filter,
-        before=tuple(before),
+        detector=detector,
+        filter=filter,
         scale=size,
         scale_from=source,
     )

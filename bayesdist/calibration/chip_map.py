@@ -10,15 +10,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
 from bayesdist.infer.solution import Solution
-from bayesdist.model import PolynomialBasis
+from bayesdist.model import Chip, PolynomialBasis
 from bayesdist.model.basis import point_blocks
 
-__all__ = ["ChipMap", "Monomials", "chip_map", "fitted_map", "position_moments", "sampling_of"]
+__all__ = ["ChipMap", "Monomials", "fitted_map", "position_moments", "sampling_of"]
 
 Float = NDArray[np.float64]
 
@@ -209,43 +208,6 @@ def sampling_of(solution: Solution) -> tuple[float, tuple[str, ...]]:
     return float(convergence.ess_bulk_min), notes
 
 
-def chip_map(
-    solution: Solution,
-    *,
-    name: str = "",
-    chip: int | None = None,
-    epoch: float | None = None,
-    exposure: int | str | None = None,
-) -> ChipMap:
-    """Map of a chip (the first by default) of a fit or a posterior at an epoch (decimal years).
-
-    Without an exposure, by code or name, there are no frames.  InputError for an unknown chip or
-    exposure, or a missing or infinite epoch.
-    """
-    model = solution.model
-    if epoch is not None and not np.isfinite(epoch):
-        raise InputError(f"the epoch is {epoch}", do="give it in decimal years")
-    if chip is not None:
-        model.chip_code(chip)  # a model of one chip would accept any number
-    group = model.groups(1, epoch=epoch, exposure=exposure, chip=chip)
-    number = model.chips[int(group.chip[0])].number
-    [(columns, d)] = model.effective_jacobian(solution.mean, group)
-    d = d.reshape(2 * model.n_terms, -1)
-    cov = d @ np.asarray(solution.cov, float)[np.ix_(columns, columns)] @ d.T
-    draws, notes = sampling_of(solution)
-    return ChipMap(
-        name=name,
-        basis=model.basis(number),
-        unit=model.unit,
-        coefficients=model.effective(solution.mean, group)[0],
-        cov=cov,
-        draws=draws,
-        chip=number,
-        epoch=None if epoch is None else float(epoch),
-        notes=notes,
-    )
-
-
 def fitted_map(
     positions: Callable[[Float, Float], tuple[Float, Float]],
     name: str,
@@ -255,10 +217,7 @@ def fitted_map(
     reference_pixel: tuple[float, float],
     unit: str,
     monomial_cov: Float | None = None,
-    correlated: bool = True,
     chip: int | None = None,
-    epoch: float | None = None,
-    notes: tuple[str, ...] = (),
 ) -> ChipMap:
     """Map with the values of a function from pixels to (u, v) that is a polynomial.
 
@@ -268,20 +227,15 @@ def fitted_map(
     """
     basis = PolynomialBasis(order, size, reference_pixel)
     # products of two terms have twice the order, for which so many nodes are exact
-    nodes, weights = legendre.leggauss(order + 1)
-    X, Y = (grid.ravel() for grid in np.meshgrid(nodes, nodes))
-    (sx, sy), (nx, ny) = basis.half_size, size
-    values = np.stack(positions(X * sx + (nx + 1) / 2, Y * sy + (ny + 1) / 2))
-    i, j = np.array(basis.terms).T
-    norm = (2 * i + 1) * (2 * j + 1) / 4
-    weight = np.outer(weights, weights).ravel()
-    coefficients = (values * weight) @ basis.evaluate_scaled(X, Y) * norm
+    x, y, weight = Chip(1, "", size, reference_pixel).quadrature(order + 1)
+    norm = basis.mean_squares * weight.sum()
+    coefficients = (np.stack(positions(x, y)) * weight) @ basis.evaluate(x, y) / norm
     cov = None
     if monomial_cov is not None:
         back = np.kron(np.eye(2), basis.from_monomials(np.eye(basis.n_terms)).T)
         cov = back @ monomial_cov @ back.T
         cov = (cov + cov.T) / 2
-    return ChipMap(name, basis, unit, coefficients, cov, correlated, np.inf, chip, epoch, notes)
+    return ChipMap(name, basis, unit, coefficients, cov, chip=chip)
 
 
 def position_moments(

@@ -11,17 +11,15 @@ from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC, Agreement, Orientation, Plane
 from bayesdist.calibration.similarity import correlations
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.compare.frame_fields import term_squares
 from bayesdist.infer.solution import DerivedSolution, Solution
 from bayesdist.model import DistortionModel, PolynomialBasis
+from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.model.similarity import turned, turned_model
 
 __all__ = ["lay_on", "oriented"]
 
 Float = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-
-GRID = (33, 17)  # points on which the largest distance is sought
 
 
 def lay_on(
@@ -32,7 +30,6 @@ def lay_on(
     epoch: float | None = None,
     reference_drift: bool = True,
     scale_arcsec: float | None = None,
-    scale_sigma: float = 0.0,
 ) -> Orientation:
     """Similarity from a calibration to an existing one in an aperture [arcsec], with its error.
 
@@ -43,8 +40,8 @@ def lay_on(
     tilt the whole.  Where the two maps differ by a similarity only, both ways agree.
 
     `reference_drift` applies the reference's time-dependent terms.  A given `scale_arcsec`
-    (arcseconds in one unit of u, v, with error `scale_sigma`) is held; without it the scale is
-    fitted for u, v in pixels, and is that of the unit for others.
+    (arcseconds in one unit of u, v) is held; without it the scale is fitted for u, v in pixels, and
+    is that of the unit for others.
 
     The residuals of the fit are a field of 2 K - 4 free coefficients (K terms of one axis).  The
     four that it cannot see are given the mean variance of those it can: the reference may be as
@@ -77,7 +74,7 @@ def lay_on(
     basis = PolynomialBasis(order, size, model.chips[0].reference_pixel)
     z, slopes = _complex(*calibration.coefficients(chip, epoch), basis.n_terms)
     w, _ = _complex(*reference.coefficients(chip, then), basis.n_terms)
-    weight = term_squares(basis)[: basis.n_terms].copy()
+    weight = basis.mean_squares
     weight[0] = 0.0  # the shift takes the mean
     S, flipped, Q = correlations(w, z, basis)
     if Q == 0 or S == 0:
@@ -109,7 +106,7 @@ def lay_on(
     n_free = 2 * basis.n_terms - (4 if held is None else 3)
     variance = (1e-3 * agreement.rms) ** 2 / n_free
     angular = variance / (abs(b) ** 2 * Q)
-    log_scale = angular if held is None else (scale_sigma / held) ** 2
+    log_scale = angular if held is None else 0.0
     return Orientation(
         angle=float(np.angle(b)),
         scale=float(abs(b)) if held is None else held,
@@ -207,16 +204,10 @@ def _complex(coefficients: Float, jacobian: Float, n_terms: int) -> tuple[Comple
 
 def _agreement(left: Complex, basis: PolynomialBasis) -> Agreement:
     """Rms and largest distance over the chip of a difference [arcsec] in Legendre coefficients."""
-    x, y = (
-        grid.ravel()
-        for grid in np.meshgrid(
-            *(np.linspace(1, n, m) for n, m in zip(basis.size, GRID, strict=True))
-        )
-    )
-    weight = term_squares(basis)[: basis.n_terms]
+    on_grid = basis.evaluate(*mesh(*grid_pixels(basis.size, DEFAULT_GRID))) @ left
     return Agreement(
-        rms=1e3 * float(np.sqrt(weight @ np.abs(left) ** 2)),
-        worst=1e3 * float(np.abs(basis.evaluate(x, y) @ left).max()),
+        rms=1e3 * float(np.sqrt(basis.mean_squares @ np.abs(left) ** 2)),
+        worst=1e3 * float(np.abs(on_grid).max()),
     )
 
 

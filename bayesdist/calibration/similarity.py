@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.infer.compare.frame_fields import term_squares
 from bayesdist.model import PolynomialBasis
 
 __all__ = ["as_real", "correlations", "similarity_fields", "turn_between"]
@@ -29,7 +28,7 @@ def correlations(
 
     `za` and `zb` (K,) are coefficients of u + i v.
     """
-    weight = term_squares(basis)[: basis.n_terms].copy()
+    weight = basis.mean_squares
     weight[0] = 0.0  # the shift takes the mean
     straight = complex(np.sum(weight * za * zb.conj()))
     flipped = complex(np.sum(weight * za * zb))

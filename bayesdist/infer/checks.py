@@ -131,19 +131,15 @@ def sampling_checks(posterior: Posterior | None) -> tuple[Check, ...]:
             f"at most {c.limits.rhat:g}",
             level_of(c.rhat_max <= c.limits.rhat),
         ),
-        Check(
-            SAMPLING,
-            "Smallest bulk effective sample size",
-            count(np.floor(c.ess_bulk_min)),
-            f"at least {c.limits.ess:g}",
-            level_of(c.ess_bulk_min >= c.limits.ess),
-        ),
-        Check(
-            SAMPLING,
-            "Smallest tail effective sample size",
-            count(np.floor(c.ess_tail_min)),
-            f"at least {c.limits.ess:g}",
-            level_of(c.ess_tail_min >= c.limits.ess),
+        *(
+            Check(
+                SAMPLING,
+                f"Smallest {part} effective sample size",
+                count(np.floor(ess)),
+                f"at least {c.limits.ess:g}",
+                level_of(ess >= c.limits.ess),
+            )
+            for part, ess in (("bulk", c.ess_bulk_min), ("tail", c.ess_tail_min))
         ),
         Check(
             SAMPLING,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from bayesdist.limits import DRAWS_PER_WALKER
 
 __all__ = [
+    "DIAGNOSTICS",
     "Convergence",
     "Limits",
     "diagnose",
@@ -27,7 +28,7 @@ __all__ = [
 
 Float = NDArray[np.float64]
 
-_COLUMNS = ("rhat", "ess_bulk", "ess_tail", "mcse_mean", "mcse_sd")
+DIAGNOSTICS = ("rhat", "ess_bulk", "ess_tail", "mcse_mean", "mcse_sd")
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ class Convergence:
             out[at] = values
             return out
 
-        columns: dict[str, Any] = {name: spread(getattr(self, name)) for name in _COLUMNS}
+        columns: dict[str, Any] = {name: spread(getattr(self, name)) for name in DIAGNOSTICS}
         return replace(self, names=names, **columns)
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from bayesdist.data.matches import Matches
 from bayesdist.errors import FormatError
 from bayesdist.files import atomic_path
-from bayesdist.infer.convergence import Convergence, Limits
+from bayesdist.infer.convergence import DIAGNOSTICS, Convergence, Limits
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.posterior import Certificate, Posterior, SamplerInfo
 from bayesdist.infer.posterior.memberships import memberships, star_log_likelihood
@@ -80,10 +80,7 @@ def save_posterior(
             attrs=asdict(posterior.sampler) | {"exact": int(posterior.sampler.exact)},
         ),
         "diagnostics": xr.Dataset(
-            {
-                name: ("sampled", getattr(c, name))
-                for name in ("rhat", "ess_bulk", "ess_tail", "mcse_mean", "mcse_sd")
-            },
+            {name: ("sampled", getattr(c, name)) for name in DIAGNOSTICS},
             coords={"sampled": sampled},
             attrs={
                 "pareto_k": c.pareto_k,
@@ -184,11 +181,7 @@ def load_posterior(path: str | Path) -> Posterior:
             reference_sigma=float(attrs["reference_sigma"]),
             convergence=Convergence(
                 names=tuple(str(n) for n in checks["sampled"].values),
-                rhat=checks["rhat"].values,
-                ess_bulk=checks["ess_bulk"].values,
-                ess_tail=checks["ess_tail"].values,
-                mcse_mean=checks["mcse_mean"].values,
-                mcse_sd=checks["mcse_sd"].values,
+                **{name: checks[name].values for name in DIAGNOSTICS},
                 pareto_k=float(checks.attrs["pareto_k"]),
                 importance_efficiency=float(checks.attrs["importance_efficiency"]),
                 converged=bool(checks.attrs["converged"]),

@@ -130,17 +130,7 @@ class LinearFit(Solution):
         return scaled_cholesky(self.cov)  # parameters fixed by a gauge have no error
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Parameter vectors from the Gaussian with this mean and covariance.
-
-        Parameters
-        ----------
-        n : int
-        rng : numpy.random.Generator
-
-        Returns
-        -------
-        ndarray, shape (n, D)
-        """
+        """Parameter vectors (n, D) from the Gaussian with this mean and covariance."""
         return self.mean + rng.standard_normal((n, len(self.mean))) @ self._root.T
 
     def mapped(self, matrix: Float) -> LinearFit:

@@ -150,6 +150,12 @@ class PolynomialBasis:
         return (self.order + 1) * (self.order + 2) // 2
 
     @property
+    def mean_squares(self) -> Float:
+        """Mean square (n_terms,) of each basis function over the detector."""
+        i, j = np.array(self.terms).T
+        return 1.0 / ((2 * i + 1) * (2 * j + 1))
+
+    @property
     def half_size(self) -> tuple[float, float]:
         """Half the detector's extent on x and y: the length of X = 1, in pixels."""
         return self.size[0] / 2, self.size[1] / 2

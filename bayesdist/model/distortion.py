@@ -22,14 +22,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.model.effective import (
-    effective_coefficients,
-    effective_derivatives,
-    frame_of,
-    polynomials,
-)
+from bayesdist.model.effective import EffectiveCoefficients
 from bayesdist.model.grouping import Groups, group_by
-from bayesdist.model.layout import ParameterLayout
 
 __all__ = ["DistortionModel"]
 
@@ -40,7 +34,7 @@ NO_EXPOSURE = -1  # code of the polynomial itself where it is no exposure's
 
 
 @dataclass(frozen=True)
-class DistortionModel(ParameterLayout):
+class DistortionModel(EffectiveCoefficients):
     """Structure of a distortion solution, without its values.
 
     theta holds first the *global* parameters (Legendre coefficients of each chip and axis, then
@@ -153,57 +147,6 @@ class DistortionModel(ParameterLayout):
     def drift_terms(self, chip: int | None = None) -> Float:
         """Legendre coefficients (n terms, K) of the monomials of a chip (by number) that drift."""
         return self.drift_columns[0][0 if chip is None else self.chip_code(chip)]
-
-    def polynomials(self, theta: ArrayLike, chip: Int, epoch: Float) -> Float:
-        """Legendre coefficients of w, before the exposure frame.
-
-        Parameters
-        ----------
-        theta : array_like, shape (..., n_params)
-        chip : ndarray of int, shape (G,)
-            Chip codes.
-        epoch : ndarray, shape (G,)
-
-        Returns
-        -------
-        ndarray, shape (..., G, 2, K)
-        """
-        return polynomials(self, theta, chip, epoch)
-
-    def frame(self, theta: ArrayLike, exposure: int) -> tuple[Float, Float]:
-        """Linear part (..., 2, 2) and shift (..., 2) of T_e for an exposure code."""
-        return frame_of(self, theta, exposure)
-
-    def effective(self, theta: ArrayLike, groups: Groups) -> Float:
-        """Effective Legendre coefficients of each group: the whole model as polynomials.
-
-        Parameters
-        ----------
-        theta : array_like, shape (..., n_params)
-        groups : Groups
-
-        Returns
-        -------
-        ndarray, shape (..., G, 2, K)
-        """
-        return effective_coefficients(self, theta, groups)
-
-    def effective_jacobian(self, theta: ArrayLike, groups: Groups) -> list[tuple[Int, Float]]:
-        """Derivatives of the effective coefficients.
-
-        Parameters
-        ----------
-        theta : array_like, shape (n_params,)
-            The point at which the frames are linearised.
-        groups : Groups
-
-        Returns
-        -------
-        list of (columns, derivative), one for each group
-            `columns` (m,) are the entries of theta that the group depends on (global ones first),
-            `derivative` (2, K, m).
-        """
-        return effective_derivatives(self, theta, groups)
 
     def predict(
         self,

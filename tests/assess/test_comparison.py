@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
@@ -193,7 +195,8 @@ def test_sigmas_without_correlations_test_single_terms_only(rng) -> None:
         return dx + 2e-8 * dx**2, dy + 0.0 * dx
 
     options = {"order": 4, "size": SIZE, "reference_pixel": (500.0, 400.0), "unit": "pix"}
-    given = fitted_map(positions, "A", monomial_cov=np.diag(sigma**2), correlated=False, **options)
+    given = fitted_map(positions, "A", monomial_cov=np.diag(sigma**2), **options)
+    given = replace(given, correlated=False)
     plain = fitted_map(lambda x, y: (x - 500.0, y - 400.0), "B", **options)
     found = compare(given, plain, rng=rng)
     assert found.field is None and "without their correlations" in verdict(found)

@@ -10,8 +10,8 @@ import numpy as np
 from bayesdist.data.matches import Matches
 from bayesdist.infer import LinearFit
 from bayesdist.infer.catalogue.star_errors import StarCovariance, StarErrors, star_covariance
-from bayesdist.infer.posterior.covariance import with_covariance
-from bayesdist.infer.solution import Solution, TransformedSolution
+from bayesdist.infer.equations.scaled import recolouring
+from bayesdist.infer.solution import Solution
 from bayesdist.infer.transforms import lines, without_frames
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.frames import CHIP_DEVIATIONS
@@ -226,9 +226,9 @@ class Truth(Solution):
         return np.tile(self.mean, (n, 1))
 
 
-def with_star_errors(solution, stars: StarCovariance) -> TransformedSolution:
+def with_star_errors(solution: Solution, stars: StarCovariance) -> Solution:
     """A solution whose covariance and draws know that a star has one error."""
-    return with_covariance(solution, np.asarray(solution.cov) + stars.extra)
+    return solution.mapped(recolouring(solution.cov, solution.cov + stars.extra))
 
 
 def seen_by(exposure: str, epoch: float | None, model: DistortionModel, theta: np.ndarray) -> Truth:

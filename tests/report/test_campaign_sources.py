@@ -12,7 +12,7 @@ from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.table_file import StoredLookupTables
 from bayesdist.data import Matches
 from bayesdist.diagnose.overlap import _aligned, _at_first_epoch, chosen_exposures
-from bayesdist.infer.nodes.corrected import inside_chips
+from bayesdist.infer.nodes.pixels import inside_chips
 from bayesdist.model import Chip, DistortionModel, LookupTable, corrected
 
 SIZE = (1024.0, 512.0)

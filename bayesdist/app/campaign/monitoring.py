@@ -21,7 +21,7 @@ from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.compare.monitoring import NewFit, fit_new, with_star_errors_of
 from bayesdist.infer.linear import Rejection
-from bayesdist.infer.nodes.corrected import on_the_chips
+from bayesdist.infer.nodes.pixels import on_the_chips
 from bayesdist.model import corrected
 
 __all__ = ["NewExposures", "fit_exposures_of", "read_new_exposures"]

@@ -58,7 +58,7 @@ def fit_selfcal(matched: SelfcalMatched) -> Fitted:
     summary = gauge_summary(solved.gauge, solved.fixed, model)
     return Fitted(
         mode.solution,
-        ErrorLaw(by_magnitude=magnitude_errors_of(solved.solution, solved.matches)),
+        ErrorLaw(by_magnitude=magnitude_errors_of(solved.mode, solved.matches)),
         GaussianPriors.none(model),
         solved=solved,
         facts={"selfcal": {**matched.facts, "gauge": summary}},
@@ -118,12 +118,10 @@ def sample_detections(
     Posterior
         With errors in the unit of u, v.
     """
-    s, jitter = config.sampler, config.outliers.jitter
+    s = config.sampler
     return sample_selfcal(
-        required(data.fitted.solved, "solution of detections").solution,
-        jitter=None if jitter == "fit" else float(jitter),
-        fraction_prior=config.outliers.fraction_prior,
-        jitter_scale=config.outliers.jitter_scale,
+        required(data.fitted.solved, "solution of detections").mode,
+        outliers=config.mixture(),
         seed=s.seed,
         ensembles=s.ensembles,
         target_ess=s.target_ess,

@@ -26,11 +26,11 @@ ARRAYS = ("theta", "stars", "mixture", "held", "n_free", "reference")
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibrated:
-    """A solution with its stars, and its gauge.
+    """The mode of a self-calibration, with its gauge and matches.
 
     Parameters
     ----------
-    solution : SelfCalibrationMode
+    mode : SelfCalibrationMode
     gauge : Gauge
         What the detections leave free, and what fixes it.
     fixed : mapping of str to str
@@ -43,7 +43,7 @@ class SelfCalibrated:
         Where what is known beside the detections does not go with them, as sentences.
     """
 
-    solution: SelfCalibrationMode
+    mode: SelfCalibrationMode
     gauge: Gauge
     fixed: Mapping[str, str]
     matches: Matches
@@ -53,12 +53,12 @@ class SelfCalibrated:
     @property
     def gauge_words(self) -> str:
         """In which gauge the solution stands, as a sentence."""
-        return gauge_words(self.gauge, self.fixed, self.solution.problem.model)
+        return gauge_words(self.gauge, self.fixed, self.mode.problem.model)
 
     def save(self, folder: Path) -> None:
         """Write the files of a run's folder that belong to it."""
         write_arrays(folder / SOLUTION, "", self.arrays)
-        table = gauge_table(self.gauge, self.fixed, self.solution.problem.model)
+        table = gauge_table(self.gauge, self.fixed, self.mode.problem.model)
         write_table(table, folder / GAUGE)
 
 

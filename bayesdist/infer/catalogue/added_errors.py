@@ -35,12 +35,12 @@ from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.by_magnitude import (
     LEAST_WEIGHT,
-    memberships_of,
     residuals_of,
     variances_of,
 )
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.linear import NO_REJECTION, LinearFit, fit_linear
+from bayesdist.infer.stars.likelihood import good_probability, log_densities
 from bayesdist.model import DistortionModel
 
 __all__ = ["ONE", "GroupedErrors", "grouped_errors"]
@@ -211,7 +211,7 @@ def _maximised(
     fit = start.fit
     for _ in range(TURNS):
         var = quoted + variance[code]
-        good = memberships_of(square, var, f, wide) if outliers else np.ones(len(table))
+        good = good_probability(square, var, f, wide) if outliers else np.ones(len(table))
         if outliers:
             bad = 1.0 - good
             f = float((bad.sum() + FALSE[0] * FALSE[1]) / (len(bad) + FALSE[1]))
@@ -227,9 +227,7 @@ def _maximised(
         if (np.abs(variance - before) < SETTLED * (typical + variance)).all():
             break
     if outliers:
-        log_bad = np.log(f) - 0.5 * (residual / wide).sum(axis=0) - np.log(wide)
-        log_good = np.log1p(-f) - 0.5 * (residual / var + np.log(var)).sum(axis=0)
-        each = np.logaddexp(log_good, log_bad)
+        each = np.logaddexp(*log_densities(residual, var, f, wide))
     else:
         each = -0.5 * (residual / var + np.log(var)).sum(axis=0)
     # the determinant of the fit's normal matrix makes the likelihood the restricted one

@@ -19,11 +19,17 @@ from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.magnitude_law import MagnitudeLaw
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.linear import DEFAULT_REJECTION, NO_REJECTION, LinearFit, Rejection, fit_linear
+from bayesdist.infer.stars.likelihood import good_probability
 from bayesdist.infer.stars.shards import Compute
 from bayesdist.infer.stars.stars import groups_of, in_table_order, prepare
 from bayesdist.model import DistortionModel
 
-__all__ = ["LEAST_WEIGHT", "fit_by_magnitude", "memberships_of", "residuals_of", "variances_of"]
+__all__ = [
+    "LEAST_WEIGHT",
+    "fit_by_magnitude",
+    "residuals_of",
+    "variances_of",
+]
 
 Float = NDArray[np.float64]
 
@@ -100,7 +106,7 @@ def _law(
     f, wide = FALSE[0], max(narrowest, float((square.sum(axis=0)).max()) / 8.0)
     for _ in range(TURNS):
         var = law.at_stars(nodes)
-        good = memberships_of(square, var, f, wide)
+        good = good_probability(square, var, f, wide)
         weight = np.sqrt(np.maximum(good, LEAST_WEIGHT))
         sigma_u, sigma_v = np.sqrt(var) / weight
         weighted = stars.with_errors((sigma_u, sigma_v))
@@ -115,13 +121,6 @@ def _law(
     sigma_u, sigma_v = np.exp(nodes)
     scatter_u, scatter_v = _scatter(bins, stars.mag, good, square)
     return MagnitudeErrors(bins.mag, sigma_u, sigma_v, bins.n, scatter_u, scatter_v)
-
-
-def memberships_of(square: Float, var: Float, f: float, wide: float) -> Float:
-    """Probability (N,) that each star is a good match."""
-    log_good = np.log1p(-f) - 0.5 * (square / var + np.log(var)).sum(axis=0)
-    log_bad = np.log(f) - 0.5 * (square / wide).sum(axis=0) - np.log(wide)
-    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * (log_good - log_bad))))
 
 
 def _scatter(bins: MagnitudeErrors, mag: Float, good: Float, square: Float) -> Float:

@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
@@ -89,7 +89,7 @@ class StarCovariance:
         Covariance of the parameters' error that the catalogue causes.
     counted : ndarray, shape (D, D)
         The part of it that is in the solution's covariance, by errors taken as independent from
-        match to match.  Zero where the quoted errors do not contain the catalogue's.
+        match to match.
     motions : ndarray, shape (D, D), optional
         The part of `total` that the errors of the proper motions cause; None where there are none.
     """
@@ -110,9 +110,6 @@ def star_covariance(
     matches: Matches,
     errors: StarErrors,
     *,
-    star: ArrayLike | None = None,
-    weight: ArrayLike | None = None,
-    included: bool = True,
     frames: bool = True,
 ) -> StarCovariance:
     """Covariance of a solution's parameters by the errors of the catalogue.
@@ -123,16 +120,10 @@ def star_covariance(
         A fit or a posterior of these matches: its covariance stands for the inverse of the normal
         matrix, so that it must not come from a fit with extra weight in the corners.
     matches : Matches
-        All stars at once.
+        All stars at once, with their codes.  Their quoted errors contain the catalogue's; those
+        that a fit left out do not count.
     errors : StarErrors
         Of the catalogue, by star code; where there are errors of proper motions, with dates.
-    star : array_like of int, shape (N,), optional
-        Code of the star of each match; the table's by default.
-    weight : array_like, shape (N,), optional
-        Probability that a match is true.  By default 1 for the stars that a fit used and 0 for
-        those that it left out.
-    included : bool
-        True if the quoted errors of the matches contain the catalogue's.
     frames : bool
         True to propagate to the frames of the exposures exactly.  If False, only polynomials and
         drift are exact, in a fraction of the time (a seventh with 110 exposures), and the errors of
@@ -148,25 +139,27 @@ def star_covariance(
         When the stars have no codes, for errors that are negative or not finite, or of too few
         stars, and errors of the catalogue that quoted errors do not contain.
     """
-    code = _codes(matches, star)
+    if matches.star is None:
+        raise InputError(
+            "the matches do not say which star is which",
+            where=", ".join(matches.sources),
+            do="give a table with a column 'star'",
+        )
+    code = matches.star
     errors = errors.checked(int(code.max()) + 1)
     if errors.motion is not None and matches.epoch is None:
         raise InputError("errors of proper motions need the epochs of the matches")
     levers, variances = errors.levers(code, matches.epoch), errors.variances
-    if weight is None:
-        weight = solution.uses(matches)
-    weight = np.broadcast_to(np.asarray(weight, float), (len(matches),))
-
-    if included:
-        _require_contained(matches, code, variances, levers)
+    _require_contained(matches, code, variances, levers)
     stars, order = prepare(solution.model, matches)
-    inverse = np.stack([weight[order] / stars.var_u, weight[order] / stars.var_v])
+    used = solution.uses(matches)[order]
+    inverse = np.stack([used / stars.var_u, used / stars.var_v])
     sums = StarSums.of(stars, code[order], inverse, list(levers[:, order]))
     cov, mean = np.asarray(solution.cov, float), np.asarray(solution.mean)
     D = solution.model.n_params if frames else solution.model.n_distortion
     influence = influence_by_group(solution.model, mean, stars.groups, cov, D)
     parts = sums.shared(influence, list(variances))
-    counted = sums.independent(influence, list(variances)) if included else np.zeros((D, D))
+    counted = sums.independent(influence, list(variances))
     if not frames:
         follow = np.linalg.solve(cov[:D, :D], cov[:D]).T
         parts, counted = (follow @ c @ follow.T for c in (parts, counted))
@@ -186,26 +179,8 @@ def _require_contained(matches: Matches, code: Int, variances: Float, levers: Fl
                 f"the quoted errors of {int(small.sum())} matches are smaller than the error of "
                 "their star in the catalogue",
                 where="sigma_" + "uv"[axis],
-                do="add the catalogue's errors to them, or say that they are not included",
+                do="add the catalogue's errors to them",
             )
-
-
-def _codes(matches: Matches, star: ArrayLike | None) -> Int:
-    given = matches.star if star is None else star
-    if given is None:
-        raise InputError(
-            "the matches do not say which star is which",
-            where=", ".join(matches.sources),
-            do="give a table with a column 'star', or the codes",
-        )
-    code = np.asarray(given)
-    if code.shape != (len(matches),) or code.dtype.kind not in "iu" or code.min() < 0:
-        raise InputError(
-            f"star codes have shape {code.shape} and type {code.dtype} for {len(matches)} matches",
-            where="star",
-            do="give one integer, 0 or more, for each match",
-        )
-    return code.astype(np.int64)
 
 
 def _checked(values: Float, n_stars: int, name: str, *, signed: bool = False) -> Float:

@@ -15,7 +15,7 @@ Float = NDArray[np.float64]
 
 def term_squares(basis: PolynomialBasis) -> Float:
     """Mean square (2 K,) over the detector of each term of u and then of v."""
-    return np.tile([1.0 / ((2 * i + 1) * (2 * j + 1)) for i, j in basis.terms], 2)
+    return np.tile(basis.mean_squares, 2)
 
 
 def mean_squares(model: DistortionModel) -> Float:

@@ -26,7 +26,7 @@ from bayesdist.infer.compare.order_sums import (
     truncated,
 )
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
-from bayesdist.infer.stars.shards import Compute, Shards, opened
+from bayesdist.infer.stars.shards import Shards, opened
 from bayesdist.model import DistortionModel
 from bayesdist.model.basis import MAX_ORDER
 
@@ -46,7 +46,6 @@ def select_order(
     regions: int = 10,
     folds: int = 100,
     rejection: Rejection = DEFAULT_REJECTION,
-    compute: Compute | None = None,
 ) -> OrderSelection:
     """Comparison of two or more polynomial orders, for one chip without frames and time dependence.
 
@@ -62,7 +61,7 @@ def select_order(
     """
     chosen = _checked(orders, model, bins, regions, folds)
     top = replace(model, order=chosen[-1])
-    with opened(top, matches, compute) as shards:
+    with opened(top, matches) as shards:
         fit = fit_linear(shards, top, rejection=rejection)
         binned = shards.sum(bin_sums, fit.mean, fit.clip, bins)
         by_fold = shards.sum(fold_sums, fit.mean, fit.clip, folds)
@@ -149,8 +148,7 @@ def _lost(
     sums: FoldStatistics, about: Float, n_terms: list[int], scale2: float, fit: LinearFit
 ) -> Float:
     """Rms over the detector of the difference of each order's fit from the highest."""
-    i, j = np.array(fit.model.basis().terms).T
-    area = 1.0 / ((2 * i + 1) * (2 * j + 1))  # mean square of a product of Legendre polynomials
+    area = fit.model.basis().mean_squares
     square = (departures(sums, about, n_terms) ** 2 @ area).sum(axis=1)
     weight = sums.weight.sum(axis=0)
     variance = np.empty(len(n_terms))

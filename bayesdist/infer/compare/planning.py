@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
-from bayesdist.infer.equations.scaled import scaled_cholesky, scaled_inverse
-from bayesdist.infer.posterior.covariance import with_covariance
-from bayesdist.infer.solution import Solution, TransformedSolution
+from bayesdist.infer.equations.scaled import recolouring, scaled_cholesky, scaled_inverse
+from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["ExposureContent", "exposure_content", "exposure_information", "with_information"]
@@ -61,15 +59,12 @@ def exposure_information(
     solution: Solution,
     content: ExposureContent,
     epoch: float | None,
-    *,
-    scatter: Mapping[str, float] | None = None,
 ) -> Float:
     """Fisher information (d, d) of one more exposure about polynomials and drift.
 
     The model is linearised at the solution; d is its `n_distortion`, and `epoch` (decimal years) is
     needed with time dependence.  The exposure's own frame is fitted as that of the others, and its
-    free parameters are eliminated.  `scatter` gives the standard deviations of exposures by the
-    names of their parameters, which are then not free.
+    parameters are eliminated.
     """
     model = solution.model
     D, last = model.n_params, len(model.exposures) - 1
@@ -84,11 +79,7 @@ def exposure_information(
     if exposure is None:
         return H[:n, :n]
     block = model.frame_slice(exposure)
-    local = H[block, block].copy()
-    for k, name in enumerate(model.free_frame_names(exposure)):
-        tau = (scatter or {}).get(name)
-        if tau is not None:
-            local[k, k] += 1.0 / max(tau, 1e-300) ** 2
+    local = H[block, block]
     if not np.any(local):
         return H[:n, :n]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(local), 1e-300))
@@ -96,7 +87,7 @@ def exposure_information(
     return H[:n, :n] - cross @ np.linalg.solve(local * np.outer(scale, scale), cross.T)
 
 
-def with_information(solution: Solution, information: Float) -> TransformedSolution:
+def with_information(solution: Solution, information: Float) -> Solution:
     """Solution with the additional information (d, d) about polynomials and drift.
 
     Frames of the existing exposures change as far as they are correlated with these.  InputError
@@ -115,4 +106,4 @@ def with_information(solution: Solution, information: Float) -> TransformedSolut
     after = root @ np.linalg.solve(inner, root.T)
     follow = cov[:, :n] @ scaled_inverse(cov[:n, :n])
     changed = cov + follow @ (after - cov[:n, :n]) @ follow.T
-    return with_covariance(solution, (changed + changed.T) / 2)
+    return solution.mapped(recolouring(cov, (changed + changed.T) / 2))

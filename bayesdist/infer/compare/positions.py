@@ -10,6 +10,7 @@ from scipy.stats import chi2 as chi_square_distribution
 
 from bayesdist.infer.equations.scaled import chi_square, scaled_cholesky
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.model.grid import grid_pixels, mesh
 
 __all__ = [
     "DifferenceField",
@@ -70,7 +71,7 @@ def largest_difference(
     noise = rng.standard_normal((n_draws, len(cov))) @ scaled_cholesky(cov).T
     largest, worst = np.zeros(n_draws), (-1.0, 0, (0.0, 0.0), 0.0)
     for chip in model.chips:
-        x, y = (a.ravel() for a in np.meshgrid(*_axes(chip, (grid, grid))))
+        x, y = mesh(*grid_pixels(chip.size, (grid, grid)))
         phi = model.basis(chip.number).evaluate(x, y)
         u, v = (model.coefficient_slice(chip.number, axis) for axis in (0, 1))
         radial = (noise[:, u] @ phi.T) ** 2 + (noise[:, v] @ phi.T) ** 2
@@ -103,8 +104,8 @@ def difference_field(
     model: DistortionModel, difference: Float, cov: Float, chip: Chip, grid: tuple[int, int]
 ) -> DifferenceField:
     """Difference on a grid (nx, ny) of one chip; other arguments as of `largest_difference`."""
-    x, y = _axes(chip, grid)
-    phi = model.basis(chip.number).evaluate(*(a.ravel() for a in np.meshgrid(x, y)))
+    x, y = grid_pixels(chip.size, grid)
+    phi = model.basis(chip.number).evaluate(*mesh(x, y))
     parts = [model.coefficient_slice(chip.number, axis) for axis in (0, 1)]
     field = np.stack([phi @ difference[part] for part in parts], axis=-1)
     joint = np.empty((len(phi), 2, 2))
@@ -116,8 +117,3 @@ def difference_field(
         a.reshape(len(y), len(x)) for a in (*field.T, chi_square_distribution.sf(z2, 2))
     )
     return DifferenceField(chip, x, y, du, dv, p_value)
-
-
-def _axes(chip: Chip, grid: tuple[int, int]) -> tuple[Float, Float]:
-    """Pixel coordinates along both axes, from edge to edge of a chip."""
-    return np.linspace(1, chip.size[0], grid[0]), np.linspace(1, chip.size[1], grid[1])

@@ -99,15 +99,6 @@ class Arrow:
             out[np.ix_(rows, border)] = self.edge[e].T
         return out
 
-    def times(self, vectors: Float) -> Float:
-        """Product (..., size) of the matrix with vectors."""
-        b, l = self.split(vectors)
-        top = b @ self.border + np.einsum("...nq,nbq->...b", l, self.edge)
-        low = np.einsum("...b,nbq->...nq", b, self.edge) + np.einsum(
-            "...nq,nqr->...nr", l, self.blocks
-        )
-        return self.join(top, low)
-
     def factor(self) -> ArrowFactor:
         """Cholesky factors with the local blocks eliminated first.
 

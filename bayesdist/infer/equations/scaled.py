@@ -23,6 +23,7 @@ __all__ = [
     "determined",
     "known_terms",
     "one_thread",
+    "recolouring",
     "scaled_cholesky",
     "scaled_inverse",
     "unit_diagonal",
@@ -66,6 +67,19 @@ def scaled_inverse(matrix: Float) -> Float:
     unit, scale = unit_diagonal(matrix)
     inverse = np.linalg.inv(unit) / np.outer(scale, scale)
     return (inverse + inverse.T) / 2
+
+
+def recolouring(before: Float, after: Float) -> Float:
+    """Linear map A (D, D) with A before A^T = after; the identity where the two are equal.
+
+    Both are positive definite, but for parameters without variance, which A leaves as they are.
+    """
+    free = np.flatnonzero(np.diag(before) > 0)
+    inner = np.ix_(free, free)
+    old, new = (scaled_cholesky(cov[inner]) for cov in (before, after))
+    out = np.eye(len(before))
+    out[inner] = np.linalg.solve(old.T, new.T).T
+    return out
 
 
 class FieldTest(NamedTuple):

@@ -19,7 +19,6 @@ likelihood of the deviations; tau, and all parameters given tau, then follow by 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -36,7 +35,7 @@ from bayesdist.infer.exposures.scatter import Scatter
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.infer.solution import Solution
 from bayesdist.infer.stars.likelihood import ClippedGaussian
-from bayesdist.infer.stars.shards import Compute, Shards, opened
+from bayesdist.infer.stars.shards import Shards, opened
 from bayesdist.infer.transforms import bare_model, reference_gauge
 from bayesdist.model import DistortionModel
 
@@ -154,23 +153,6 @@ class HierarchicalFit(Solution):
             theta[rows] = mean + factor.colour(theta[rows])
         return np.asarray(rng.permutation(self.settling.draws(theta, self.tau_draws[which], rng)))
 
-    def deviations(self, exposure: str) -> dict[str, tuple[float, float]]:
-        """Mean and standard deviation of the deviations of one exposure.
-
-        Raises
-        ------
-        InputError
-            For an unknown exposure.
-        """
-        if exposure not in self.model.exposures:
-            raise InputError(f"there is no exposure {exposure!r}")
-        names = [f"{exposure}.{kind}" for kind in self.scatter.kinds]
-        at = [self.model.names.index(name) for name in names]
-        pairs = zip(self.mean[at], self.sigma[at], strict=True)
-        return {
-            k: (float(m), float(s)) for k, (m, s) in zip(self.scatter.kinds, pairs, strict=True)
-        }
-
 
 def _root_mean_square(tau: Float) -> Float:
     return np.asarray(np.sqrt((tau**2).mean(axis=0)))
@@ -234,14 +216,12 @@ def fit_hierarchical(
     matches: Matches | Shards,
     model: DistortionModel,
     *,
-    deviations: Sequence[str] | None = None,
     priors: GaussianPriors | None = None,
     scale: float = SCALE,
     pixel: float = 1.0,
     n_tau: int = 256,
     seed: int = 1,
     rejection: Rejection = DEFAULT_REJECTION,
-    compute: Compute | None = None,
 ) -> HierarchicalFit:
     """Fit all exposures jointly, with the scatter of their scale and shear.
 
@@ -252,9 +232,6 @@ def fit_hierarchical(
     model : DistortionModel
         Frames 'shift_rotation_scale' or 'affine', or deviations of single chips, in gauge 'held':
         see `held_in_reference`.
-    deviations : sequence of str, optional
-        Kinds of deviation that scatter; all that the frames have by default.  The others need a
-        prior.
     priors : GaussianPriors, optional
         On other parameters.
     scale : float
@@ -268,7 +245,6 @@ def fit_hierarchical(
     seed : int
         Of these draws.
     rejection : Rejection
-    compute : Compute, optional
         As of `fit_linear`.
 
     Returns
@@ -278,13 +254,17 @@ def fit_hierarchical(
     Raises
     ------
     InputError
-        For a model without such frames, another gauge, or an unknown deviation.
+        For a model without such frames, or another gauge.
     DegenerateError
         When the data do not determine the scatter, by name; else as `fit_linear`.
     """
-    has = list(model.free_frame_names(0)) if model.gauge == "held" else []
-    kinds = tuple(has if deviations is None else deviations)
-    _check(model, has, kinds)
+    kinds = model.free_frame_names(0) if model.gauge == "held" else ()
+    if not kinds:
+        raise InputError(
+            f"frames '{model.frames}' in gauge '{model.gauge}' leave nothing that scatters",
+            where="model.frames",
+            do="choose 'shift_rotation_scale' or 'affine' in gauge 'held' (held_in_reference)",
+        )
     others = priors or GaussianPriors.none(model)
     names = {name: k for k, name in enumerate(model.names)}
     index = np.array([names[f"{e}.{kind}"] for kind in kinds for e in model.exposures])
@@ -293,7 +273,7 @@ def fit_hierarchical(
     half = max(max(chip.size) for chip in model.chips) / 2
     of_gap = np.array(["shift" in name for name in kinds])
     scales = scale * np.where(of_gap, half * pixel, 1.0)
-    with opened(model, matches, compute) as shards:
+    with opened(model, matches) as shards:
         wide = _with_deviations(others, index, scales[kind] ** -2)
         first = fit_linear(shards, model, rejection=rejection, priors=wide)
         equations = shards.sum(least_squares, first.mean, first.clip)
@@ -343,24 +323,6 @@ def _outlying(scatter: Scatter, member: NDArray[np.int64]) -> NDArray[np.bool_]:
             return found
         found[worst] = True
     return np.zeros(n, bool)
-
-
-def _check(model: DistortionModel, has: list[str], kinds: tuple[str, ...]) -> None:
-    if model.gauge != "held" or not has:
-        raise InputError(
-            f"frames '{model.frames}' in gauge '{model.gauge}' leave nothing that scatters",
-            where="model.frames",
-            do="choose 'shift_rotation_scale' or 'affine' in gauge 'held' (held_in_reference)",
-        )
-    unknown = [kind for kind in kinds if kind not in has]
-    if unknown or not kinds:
-        raise InputError(
-            f"{unknown[0]!r} is no deviation of frames '{model.frames}'"
-            if unknown
-            else "no deviation is named",
-            where="deviations",
-            do=f"choose among {', '.join(has)}",
-        )
 
 
 def _require_determined(scatter: Scatter, model: DistortionModel) -> None:

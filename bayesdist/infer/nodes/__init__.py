@@ -5,13 +5,18 @@
 """
 
 from bayesdist.infer.nodes.binned import binned_table, quadratic_smoother
-from bayesdist.infer.nodes.corrected import corrected_matches, inside_chips, on_the_chips
 from bayesdist.infer.nodes.field import field_table
 from bayesdist.infer.nodes.fit import fit_with_tables
 from bayesdist.infer.nodes.grid import NodeGrid
 from bayesdist.infer.nodes.hyperparameters import Matern
 from bayesdist.infer.nodes.mixture import ResidualMixture, fit_mixture
-from bayesdist.infer.nodes.pixels import PixelShifts, pixel_shifts
+from bayesdist.infer.nodes.pixels import (
+    PixelShifts,
+    corrected_matches,
+    inside_chips,
+    on_the_chips,
+    pixel_shifts,
+)
 from bayesdist.infer.nodes.posterior import AxisField, TablePosterior
 from bayesdist.infer.nodes.table_fit import Iteration, TableFit, held_sigma
 

@@ -22,12 +22,11 @@ from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import LinearFit, fit_linear
 from bayesdist.infer.nodes.binned import binned_table
-from bayesdist.infer.nodes.corrected import corrected_matches, on_the_chips
 from bayesdist.infer.nodes.field import field_table
 from bayesdist.infer.nodes.grid import STEP
 from bayesdist.infer.nodes.hyperparameters import SMOOTHNESS
 from bayesdist.infer.nodes.mixture import ResidualMixture, fit_mixture
-from bayesdist.infer.nodes.pixels import pixel_shifts
+from bayesdist.infer.nodes.pixels import corrected_matches, on_the_chips, pixel_shifts
 from bayesdist.infer.nodes.posterior import TablePosterior
 from bayesdist.infer.nodes.table_fit import Iteration, TableFit, table_of
 from bayesdist.model import DistortionModel
@@ -36,7 +35,6 @@ from bayesdist.model.lookup import LookupTable
 __all__ = ["fit_with_tables"]
 
 Float = NDArray[np.float64]
-Fit = Callable[[Matches, DistortionModel], LinearFit]
 
 LIKELY = 0.5  # stars that are less likely true matches are left out
 SEARCHED = 2  # iterations that optimise hyperparameters, which are fixed in later ones
@@ -55,7 +53,6 @@ def fit_with_tables(
     tolerance: float = 2e-4,
     step: tuple[float, float] = STEP,
     smoothness: Sequence[float] = SMOOTHNESS,
-    fit: Fit = fit_linear,
     report: Callable[[Iteration], None] | None = None,
 ) -> TableFit:
     """Fit the polynomial and the look-up tables of one filter in turn.
@@ -82,8 +79,6 @@ def fit_with_tables(
         Pixels between nodes.
     smoothness : sequence of float
         Matern smoothness to choose from, for 'field'.
-    fit : callable
-        Takes matches and a model, returns a solution with `model`, `mean` and `cov`.
     report : callable, optional
         Called with each iteration.
 
@@ -127,7 +122,7 @@ def fit_with_tables(
             for number, posterior in posteriors.items():
                 jitter[numbers == number] = posterior.jitter
             moved = _with_memberships(moved, mixture, jitter * pixel)
-        return fit(on_the_chips(moved, model), model)
+        return fit_linear(on_the_chips(moved, model), model)
 
     def new_table(chip: int, rows: NDArray[np.bool_], shift: Float, variance: Float) -> LookupTable:
         where = model.chips[model.chip_code(chip)]

@@ -73,15 +73,7 @@ class FittedField:
 
     prior: Matern
     covariance: Float  # of log amplitude and log length (2, 2), from the curvature there
-    # log marginal likelihood by smoothness, at its own best amplitude and length, up to a common
-    # constant; without those that the first, cheap search rules out
-    log_evidence: dict[float, float]
-
-    @property
-    def log_sigma(self) -> tuple[float, float]:
-        """Standard errors of log amplitude and log length, which are relative errors."""
-        a, b = np.sqrt(np.diag(self.covariance))
-        return float(a), float(b)
+    log_evidence: float  # log marginal likelihood there, up to a constant
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,16 +189,12 @@ def fitted_field(evidence: Evidence, smoothness: Sequence[float], *, thorough: b
             else:
                 found[nu] = (*found[nu][:2], -np.inf)
     chosen = max(found, key=lambda nu: found[nu][2])
-    point, covariance, _ = found[chosen]
-    tops = {nu: top for nu, (_, _, top) in found.items() if np.isfinite(top)}
-    return FittedField(_prior(point, chosen), covariance, tops)
+    point, covariance, top = found[chosen]
+    return FittedField(_prior(point, chosen), covariance, top)
 
 
 def refined_field(evidence: Evidence, earlier: FittedField) -> FittedField:
-    """Most probable amplitude and length, starting from those of nearly the same data.
-
-    The smoothness of `earlier`, and the differences of its log evidence, are used again.
-    """
+    """Most probable amplitude and length, starting from those of nearly the same data."""
     nu = earlier.prior.smoothness
 
     def density(point: Float) -> float:
@@ -215,9 +203,7 @@ def refined_field(evidence: Evidence, earlier: FittedField) -> FittedField:
 
     start = np.log([earlier.prior.amplitude, earlier.prior.length])
     point, covariance, top = _summit(density, start, covariance=earlier.covariance)
-    moved = top - earlier.log_evidence[nu]
-    tops = {other: value + moved for other, value in earlier.log_evidence.items()}
-    return FittedField(_prior(point, nu), covariance, tops)
+    return FittedField(_prior(point, nu), covariance, top)
 
 
 def _prior(point: Float, nu: float) -> Matern:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from bayesdist.infer.stars.likelihood import good_probability
 from bayesdist.infer.stars.mixture import OUTLIER_MODE, OUTLIER_SHAPE, OutlierMixture
 
 __all__ = ["ResidualMixture", "fit_mixture", "jitter_variance"]
@@ -68,10 +69,7 @@ def fit_mixture(residual: Float, variance: Float) -> ResidualMixture:
 
 def _true(residual: Float, variance: Float, f: float, j2: float, out2: float) -> Float:
     """Probability (N,) of being a true match."""
-    total = variance + j2
-    inside = np.log1p(-f) - 0.5 * (residual**2 / total + np.log(total)).sum(axis=1)
-    outside = np.log(f) - 0.5 * (residual**2).sum(axis=1) / out2 - np.log(out2)
-    return np.asarray(1.0 / (1.0 + np.exp(np.clip(outside - inside, -700, 700))))
+    return good_probability((residual**2).T, (variance + j2).T, f, out2)
 
 
 def jitter_variance(

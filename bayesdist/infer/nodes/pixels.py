@@ -1,33 +1,31 @@
-"""Residuals of (u, v) as pixel shifts, which a look-up table has to add to (x, y)."""
+"""Matches at the pixels that tables have corrected, and residuals of (u, v) as pixel shifts."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError
+from bayesdist.infer.solution import Solution
 from bayesdist.infer.stars.stars import errors_of, groups_of
 from bayesdist.model import DistortionModel
+from bayesdist.model.lookup import LookupTable, corrected
 
-__all__ = ["PixelShifts", "Solved", "pixel_shifts"]
+__all__ = [
+    "PixelShifts",
+    "corrected_matches",
+    "inside_chips",
+    "on_the_chips",
+    "pixel_shifts",
+]
 
 Float = NDArray[np.float64]
 
 FOLDED = 1e-6  # area of a pixel's image over the square of its sides
-
-
-class Solved(Protocol):
-    """A model with parameter values."""
-
-    @property
-    def model(self) -> DistortionModel: ...
-
-    @property
-    def mean(self) -> Float: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +45,12 @@ class PixelShifts:
     variance: Float
 
 
-def pixel_shifts(solution: Solved, matches: Matches) -> PixelShifts:
+def pixel_shifts(solution: Solution, matches: Matches) -> PixelShifts:
     """Residuals of matches, mapped to the detector by the inverse of the local Jacobian.
 
     Parameters
     ----------
-    solution : Solved
-        A fit or a posterior.
+    solution : Solution
     matches : Matches
         With errors, in the solution's unit.
 
@@ -91,3 +88,27 @@ def pixel_shifts(solution: Solved, matches: Matches) -> PixelShifts:
     return PixelShifts(
         np.einsum("nab,nb->na", inverse, residual), np.einsum("nab,nb->na", inverse**2, variance)
     )
+
+
+def corrected_matches(tables: Sequence[LookupTable], matches: Matches) -> Matches:
+    """Matches at the pixels to which tables of the detector and of one filter move them."""
+    filter = next((table.filter for table in tables if table.filter), "")
+    x, y = corrected(tables, matches.x, matches.y, chip=matches.chip_number, filter=filter)
+    return matches.with_columns(x=x, y=y)
+
+
+def on_the_chips(matches: Matches, model: DistortionModel) -> Matches:
+    """Matches without the few at the edge that a table has moved off the chip.
+
+    There the polynomial is not defined.  They count in the tables all the same.
+    """
+    inside = inside_chips(matches, model)
+    return matches if inside.all() else matches.select(inside, reason="moved off the chip")
+
+
+def inside_chips(matches: Matches, model: DistortionModel) -> NDArray[np.bool_]:
+    """Boolean mask (N,) of the matches whose pixels lie on their chip."""
+    size = np.array([model.chips[model.chip_code(c)].size for c in matches.chip_numbers])
+    nx, ny = size[matches.chip].T
+    x, y = matches.x, matches.y
+    return np.asarray((x >= 0.5) & (x <= nx + 0.5) & (y >= 0.5) & (y <= ny + 0.5))

@@ -94,18 +94,7 @@ class TablePosterior:
         return np.stack([axis.cov for axis in self.axes])
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Node values from the posterior.
-
-        Parameters
-        ----------
-        n : int
-        rng : numpy.random.Generator
-
-        Returns
-        -------
-        ndarray, shape (n, 2, ny, nx)
-            Pixels.
-        """
+        """Node values (n, 2, ny, nx) from the posterior, pixels."""
         planes = []
         for axis in self.axes:
             xi = rng.standard_normal((n, axis.root.shape[1]))

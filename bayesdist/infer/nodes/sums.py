@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.nodes.grid import NodeGrid
+from bayesdist.infer.stars.sums import Sums
 
 __all__ = ["NodeSums", "node_sums"]
 
@@ -26,7 +27,7 @@ BLOCK = 65_536  # stars at once: their polynomials take 11 MB at order 5
 
 
 @dataclass(frozen=True, eq=False)
-class NodeSums:
+class NodeSums(Sums):
     """Normal equations of one axis."""
 
     nodes: scipy.sparse.csr_array  # W^T N^-1 W (n, n), nine entries in a row
@@ -34,15 +35,6 @@ class NodeSums:
     polynomial: Float  # Phi^T N^-1 Phi (K, K)
     right: Float  # W^T N^-1 r (n,)
     right_polynomial: Float  # Phi^T N^-1 r (K,)
-
-    def __add__(self, other: NodeSums) -> NodeSums:
-        return NodeSums(
-            self.nodes + other.nodes,
-            self.cross + other.cross,
-            self.polynomial + other.polynomial,
-            self.right + other.right,
-            self.right_polynomial + other.right_polynomial,
-        )
 
     @cached_property
     def _factor(self) -> tuple[Float, bool]:

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.linear import LinearFit
-from bayesdist.infer.nodes.corrected import corrected_matches, on_the_chips
 from bayesdist.infer.nodes.mixture import ResidualMixture
+from bayesdist.infer.nodes.pixels import corrected_matches, on_the_chips
 from bayesdist.infer.nodes.posterior import TablePosterior
 from bayesdist.model.lookup import LookupTable, corrected
 

@@ -185,17 +185,7 @@ class Posterior(Solution):
         return np.quantile(self.flat, [tail, 1 - tail], axis=0).T
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Random draws of theta, without replacement as long as there are enough.
-
-        Parameters
-        ----------
-        n : int
-        rng : numpy.random.Generator
-
-        Returns
-        -------
-        ndarray, shape (n, D)
-        """
+        """Random draws (n, D) of theta, without replacement as long as there are enough."""
         total = len(self.flat)
         return self.flat[rng.choice(total, size=n, replace=n > total)]
 

@@ -7,6 +7,7 @@ on it.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.errors import DegenerateError
+from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.convergence import (
     Convergence,
     Limits,
@@ -28,6 +29,7 @@ from bayesdist.infer.density.importance import (
 )
 from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Target
+from bayesdist.infer.posterior import SamplerInfo
 from bayesdist.infer.sampler.checkpoints import Block, Walkers
 from bayesdist.infer.sampler.ensembles import Ensembles, Whitening
 from bayesdist.infer.sampler.move_schedule import (
@@ -45,7 +47,7 @@ from bayesdist.infer.sampler.move_schedule import (
 from bayesdist.infer.sampler.proposal_batch import ProposalBatch, pilot_batch
 from bayesdist.limits import DRAWS_PER_WALKER, PARETO_K
 
-__all__ = ["Chains", "Settings", "run_chains"]
+__all__ = ["Chains", "Settings", "ensemble_seeds", "run_chains"]
 
 Float = NDArray[np.float64]
 
@@ -80,6 +82,42 @@ class Chains:
     warmup: int  # steps that were dropped
     passes: int  # evaluations of the posterior density
     acceptance: float
+
+    @property
+    def draws(self) -> Float:
+        """Draws (ensembles, walkers * steps stored, D), walker after walker."""
+        E, T, W, D = self.psi.shape
+        return np.swapaxes(self.psi, 1, 2).reshape(E, W * T, D)
+
+    @property
+    def log_densities(self) -> Float:
+        """Log posterior density (ensembles, walkers * steps stored) of the draws."""
+        return np.swapaxes(self.log_prob, 1, 2).reshape(len(self.log_prob), -1)
+
+    def info(self, seed: int, started: float, *, exact: bool = True) -> SamplerInfo:
+        """Record of the run, which began at `started` by `time.monotonic`."""
+        method = self.plan.method
+        return SamplerInfo(
+            method=f"emcee {method}" if exact else method,
+            ensembles=len(self.psi),
+            walkers=self.plan.walkers,
+            steps=self.steps,
+            warmup=self.warmup,
+            passes=self.passes,
+            acceptance=self.acceptance,
+            wall_s=time.monotonic() - started,
+            seed=seed,
+            exact=exact,
+        )
+
+
+def ensemble_seeds(seed: int, ensembles: int) -> tuple[int, ...]:
+    """Seed of each ensemble; InputError for fewer than two, which cannot show convergence."""
+    if ensembles < 2:
+        raise InputError(
+            f"{ensembles} ensemble cannot show convergence", where="sampler.ensembles", do="use 4"
+        )
+    return tuple(int(s) for s in np.random.SeedSequence(seed).generate_state(ensembles))
 
 
 @dataclass(eq=False)

@@ -9,7 +9,6 @@ from importlib import metadata
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
@@ -20,18 +19,16 @@ from bayesdist.infer.density.target import Target
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import LinearFit
-from bayesdist.infer.posterior import Certificate, Posterior, SamplerInfo
+from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.posterior.memberships import count_outliers
 from bayesdist.infer.sampler.certified import run_certified
-from bayesdist.infer.sampler.chains import Chains, Settings, run_chains
+from bayesdist.infer.sampler.chains import Settings, ensemble_seeds, run_chains
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Shards, opened
 from bayesdist.infer.stars.stars import Stars
 
 __all__ = ["sample"]
-
-Float = NDArray[np.float64]
 
 METHODS = ("exact", "certified")
 FORMAT = 3  # of the checkpoints
@@ -106,10 +103,7 @@ def sample(
     InputError
         For checkpoints of other data or settings, or a disk that is full.
     """
-    if ensembles < 2:
-        raise InputError(
-            f"{ensembles} ensemble cannot show convergence", where="sampler.ensembles", do="use 4"
-        )
+    seeds = ensemble_seeds(seed, ensembles)
     if method not in METHODS:
         raise InputError(
             f"there is no method {method!r}",
@@ -125,9 +119,8 @@ def sample(
         folder = None if folder is None else Path(folder)
         known = _fingerprint(target, seed, ensembles, walkers, checkpoint_every, method)
         proposal = _proposal(target, fit, folder, known)
-        seeds = np.random.SeedSequence(seed).generate_state(ensembles + 1)
         settings = Settings(
-            seeds=tuple(int(s) for s in seeds[:-1]),
+            seeds=seeds,
             n_stars=len(shards),
             walkers=walkers,
             limits=Limits(target_ess, target_rhat),
@@ -142,43 +135,23 @@ def sample(
             chains = run_chains(target, proposal, settings)
         else:
             chains, certificate, exact = run_certified(target, proposal, settings, second_stage)
-        info = SamplerInfo(
-            method=f"emcee {chains.plan.method}" if exact else chains.plan.method,
-            ensembles=ensembles,
-            walkers=chains.plan.walkers,
-            steps=chains.steps,
-            warmup=chains.warmup,
-            passes=chains.passes,
-            acceptance=chains.acceptance,
-            wall_s=time.monotonic() - started,
-            seed=seed,
-            exact=exact,
+        draws, n = chains.draws, target.n_theta
+        flat = draws.reshape(-1, draws.shape[-1])
+        flagged, expected = count_outliers(shards, target.hyper, flat[:, :n], flat[:, n:])
+        return Posterior(
+            model=target.model,
+            mixture=mixture,
+            theta=draws[..., :n].copy(),
+            hyper=target.hyper.values(draws[..., n:]),
+            log_prob=chains.log_densities,
+            n_stars=len(shards),
+            n_flagged=flagged,
+            n_false=expected,
+            reference_sigma=target.hyper.scale,
+            convergence=chains.verdict,
+            sampler=chains.info(seed, started, exact=exact),
+            certificate=certificate,
         )
-        return _posterior(target, chains, info, certificate)
-
-
-def _posterior(
-    target: Target, chains: Chains, info: SamplerInfo, certificate: Certificate | None
-) -> Posterior:
-    E, T, W, D = chains.psi.shape
-    draws = np.swapaxes(chains.psi, 1, 2).reshape(E, W * T, D)
-    flat = draws.reshape(-1, D)
-    n = target.n_theta
-    flagged, expected = count_outliers(target.shards, target.hyper, flat[:, :n], flat[:, n:])
-    return Posterior(
-        model=target.model,
-        mixture=target.mixture,
-        theta=draws[..., :n].copy(),
-        hyper=target.hyper.values(draws[..., n:]),
-        log_prob=np.swapaxes(chains.log_prob, 1, 2).reshape(E, W * T),
-        n_stars=len(target.shards),
-        n_flagged=flagged,
-        n_false=expected,
-        reference_sigma=target.hyper.scale,
-        convergence=chains.verdict,
-        sampler=info,
-        certificate=certificate,
-    )
 
 
 def _fingerprint(target: Target, *settings: object) -> str:

@@ -78,8 +78,7 @@ class Surrogate:
     is the exact envelope of rejection sampling.
     """
 
-    n_hyper: int  # h: the last h coordinates are hyperparameters
-    centre: Float  # (h,)
+    centre: Float  # (h,) of the hyperparameters, which are the last h coordinates
     root: Float  # (h, h)
     constant: float
     coefficients: Float  # (p,)
@@ -217,7 +216,6 @@ def _fit(white: Float, log_weights: Float, n_hyper: int) -> Surrogate:
     # half the range more on either side: about five standard deviations
     margin = np.ptp(fitted) / 2
     return Surrogate(
-        n_hyper,
         centre,
         root,
         constant,

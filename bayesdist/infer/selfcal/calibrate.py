@@ -166,7 +166,7 @@ def self_calibrate(
             if measured:  # with the errors of this iteration
                 sigma = detections.sigma
                 assert sigma is not None
-                problem = mode.problem.with_sigma(sigma[mode.problem.rows])
+                problem = replace(mode.problem, var=sigma[mode.problem.rows] ** 2)
                 mode = solve_in_gauge(
                     problem,
                     theta,

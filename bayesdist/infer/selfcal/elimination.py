@@ -91,7 +91,6 @@ class Expansion:
     curvature: Float  # minus the Hessian (D, D)
     stars: Float  # modes (S, q)
     n_members: float  # expected number of true detections
-    n_doubtful: float  # sum of w (1 - w) over the detections
     chi2: float  # sum of w times the squared normalised residual
 
 
@@ -118,8 +117,8 @@ def expand(
         np.add.at(gradient, structure.columns[used], pull_own.sum(axis=0)[used])
         scalars += some.sum(axis=0)
     curvature = (curvature + curvature.T) / 2
-    value, members, doubtful, chi2 = scalars
-    return Expansion(float(value), gradient, curvature, found, members, doubtful, chi2)
+    value, members, _, chi2 = scalars
+    return Expansion(float(value), gradient, curvature, found, members, chi2)
 
 
 def eliminated_rows(

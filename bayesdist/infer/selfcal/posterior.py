@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.errors import DegenerateError, InputError
+from bayesdist.errors import DegenerateError
 from bayesdist.infer.convergence import Limits
 from bayesdist.infer.density.coordinates import Split
 from bayesdist.infer.density.laplace import Node
@@ -25,8 +25,8 @@ from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.equations.scaled import one_thread
-from bayesdist.infer.posterior import Posterior, SamplerInfo
-from bayesdist.infer.sampler.chains import Settings, run_chains
+from bayesdist.infer.posterior import Posterior
+from bayesdist.infer.sampler.chains import Settings, ensemble_seeds, run_chains
 from bayesdist.infer.selfcal.elimination import (
     Mixture,
     StarModes,
@@ -58,11 +58,7 @@ class SelfTarget:
     """Density of psi = (free parameters, log j, logit f); j in pixels."""
 
     solution: SelfCalibrationMode  # the mode; parameters that it fixes stay there
-    jitter: float | None = None  # fixed value; sampled by default
-    # (a, b) of the Beta prior of the fraction of false detections
-    fraction_prior: tuple[float, float] = (1.0, 9.0)
-    # of the prior of the jitter, in pixels; by default the typical error of a detection
-    jitter_scale: float | None = None
+    outliers: OutlierMixture | None = None  # in pixels; as by `mixture` by default
 
     @property
     def problem(self) -> Problem:
@@ -77,10 +73,7 @@ class SelfTarget:
     @cached_property
     def mixture(self) -> OutlierMixture:
         """Mixture with uniform false detections, in pixels."""
-        radius = self.problem.match_radius
-        return OutlierMixture(
-            "uniform", radius, self.jitter, self.fraction_prior, self.jitter_scale
-        )
+        return self.outliers or OutlierMixture("uniform", self.problem.match_radius)
 
     @cached_property
     def hyper(self) -> Hyper:
@@ -112,7 +105,7 @@ class SelfTarget:
     def mixtures(self, hyper: Float) -> Float:
         """Jitter and fraction of false detections (n, 2) of sampled coordinates."""
         values = self.hyper.values(hyper)
-        j = values.get("j", np.full(len(hyper), self.jitter or 0.0))
+        j = values.get("j", np.full(len(hyper), self.mixture.jitter or 0.0))
         return np.stack([j, values["f"]], axis=1)
 
     def log_density(self, psi: Float) -> Float:
@@ -132,9 +125,7 @@ class SelfTarget:
 def sample_selfcal(
     solution: SelfCalibrationMode,
     *,
-    jitter: float | None = None,
-    fraction_prior: tuple[float, float] = (1.0, 9.0),
-    jitter_scale: float | None = None,
+    outliers: OutlierMixture | None = None,
     seed: int = 1,
     ensembles: int = 4,
     target_ess: float = 400.0,
@@ -149,12 +140,8 @@ def sample_selfcal(
     Parameters
     ----------
     solution : SelfCalibrationMode
-    jitter : float, optional
-        Fixed value, in pixels; sampled by default.
-    fraction_prior : tuple of float
-        As `OutlierMixture`.
-    jitter_scale : float, optional
-        As `OutlierMixture`, in pixels.
+    outliers : OutlierMixture, optional
+        In pixels; uniform within the match radius by default.
     seed, ensembles, target_ess, target_rhat, max_steps, checkpoint_every, folder, progress
         As `sample`.
 
@@ -169,62 +156,38 @@ def sample_selfcal(
     DegenerateError, InputError
         As `sample`.
     """
-    if ensembles < 2:
-        raise InputError(
-            f"{ensembles} ensemble cannot show convergence", where="sampler.ensembles", do="use 4"
-        )
+    seeds = ensemble_seeds(seed, ensembles)
     started = time.monotonic()
-    target = SelfTarget(solution, jitter, fraction_prior, jitter_scale)
+    target = SelfTarget(solution, outliers)
     proposal = propose(target)
-    seeds = np.random.SeedSequence(seed).generate_state(ensembles + 1)
     settings = Settings(
-        seeds=tuple(int(s) for s in seeds[:-1]),
+        seeds=seeds,
         n_stars=RELATIVE_COST * len(solution.problem),
         limits=Limits(target_ess, target_rhat),
         max_steps=max_steps,
         checkpoint_every=checkpoint_every,
         folder=None if folder is None else Path(folder),
-        fingerprint=_fingerprint(
-            solution,
-            jitter,
-            fraction_prior,
-            jitter_scale,
-            seed,
-            ensembles,
-            checkpoint_every,
-        ),
+        fingerprint=_fingerprint(solution, target.mixture, seed, ensembles, checkpoint_every),
         progress=progress,
     )
     chains = run_chains(target, proposal, settings)  # type: ignore[arg-type]
-    E, T, W, D = chains.psi.shape
-    draws = np.swapaxes(chains.psi, 1, 2).reshape(E, W * T, D)
-    n, expansion = target.n_theta, solution.expansion
-    member = memberships(solution.problem, solution.theta, solution.mixture, solution.stars)
+    problem, draws, n = solution.problem, chains.draws, target.n_theta
+    member = memberships(problem, solution.theta, solution.mixture, solution.stars)
     posterior = Posterior(
-        model=solution.problem.model,
+        model=problem.model,
         mixture=target.mixture,
         theta=target.theta(draws[..., :n]),
         hyper=target.hyper.values(draws[..., n:]),
-        log_prob=np.swapaxes(chains.log_prob, 1, 2).reshape(E, W * T),
-        n_stars=len(solution.problem),
+        log_prob=chains.log_densities,
+        n_stars=len(problem),
         n_flagged=int((member < 0.5).sum()),
-        n_false=len(solution.problem) - expansion.n_members,
+        n_false=len(problem) - solution.expansion.n_members,
         reference_sigma=target.hyper.scale,
-        convergence=chains.verdict.among((*solution.problem.model.names, *target.hyper.names)),
-        sampler=SamplerInfo(
-            method=f"emcee {chains.plan.method}",
-            ensembles=ensembles,
-            walkers=chains.plan.walkers,
-            steps=chains.steps,
-            warmup=chains.warmup,
-            passes=chains.passes,
-            acceptance=chains.acceptance,
-            wall_s=time.monotonic() - started,
-            seed=seed,
-        ),
+        convergence=chains.verdict.among((*problem.model.names, *target.hyper.names)),
+        sampler=chains.info(seed, started),
         own_places=True,
     )
-    return _in_unit(posterior, solution.problem.model.pixel_size(solution.theta))
+    return _in_unit(posterior, problem.model.pixel_size(solution.theta))
 
 
 def _in_unit(posterior: Posterior, pixel: float) -> Posterior:
@@ -336,7 +299,7 @@ def _node(target: SelfTarget, split: Split, at: Float, z: float, bend: float) ->
     """Node with mode and curvature of everything else at one jitter, for a given fraction."""
     solution, problem, free = target.solution, target.problem, target.solution.free
     theta, stars = solution.theta.copy(), solution.stars
-    held = float(np.exp(at[0])) if len(at) else float(target.jitter or 0.0)
+    held = float(np.exp(at[0])) if len(at) else float(target.mixture.jitter or 0.0)
     middles = problem.middles(theta)
     observed = True
     for _ in range(MAX_STEPS):

@@ -270,10 +270,6 @@ class Problem:
             rows=self.rows[rows],
         )
 
-    def with_sigma(self, sigma: Float) -> Problem:
-        """Problem with other errors (N,), in the order of this object."""
-        return replace(self, var=sigma**2)
-
 
 def _square(W: Float) -> Float:
     return np.asarray(W[:, [0, 1, 1, 2]].reshape(-1, 2, 2))

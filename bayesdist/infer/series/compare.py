@@ -16,11 +16,10 @@ from astropy.table import Table
 from numpy.typing import NDArray
 from scipy.stats import t as student_t
 
-from bayesdist.errors import InputError
 from bayesdist.infer.series.breaks import BreakMoves
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.fit import fit_series
-from bayesdist.infer.series.heldout import N_FOLDS, HeldOut, block_folds, exposure_folds, held_out
+from bayesdist.infer.series.heldout import HeldOut, block_folds, exposure_folds, held_out
 from bayesdist.infer.series.posterior import SeriesPosterior
 from bayesdist.infer.series.problem import WIDE, Problem, normal_equations
 from bayesdist.infer.series.series import Series
@@ -50,7 +49,7 @@ class Comparison:
     posteriors : tuple of SeriesPosterior
     scores : tuple of HeldOut
     scheme : str
-        How they were held out: 'exposures', 'each', 'blocks', or 'given'.
+        How they were held out: 'exposures' by themselves, or whole 'blocks'.
     correlation : float
         Lag-1 correlation of the residuals of the trend that leaves least.
     """
@@ -61,24 +60,19 @@ class Comparison:
     scheme: str
     correlation: float
 
-    @property
-    def single(self) -> bool:
-        """True if exposures count as independent of each other."""
-        return self.scheme in ("exposures", "each")
-
     def difference(self, a: int, b: int) -> tuple[float, float]:
         """Score of trend a minus that of trend b, and its standard error."""
         each = self.scores[a].log_density - self.scores[b].log_density
         fold = self.scores[a].fold
         # where whole blocks are held out they are the independent items, else the exposures
-        items = np.bincount(fold, each) if not self.single else each
+        items = np.bincount(fold, each) if self.scheme == "blocks" else each
         return float(each.sum()), float(np.sqrt(len(items)) * items.std(ddof=1))
 
     def beats(self, a: int, b: int) -> bool:
         """True if trend a predicts significantly better than trend b."""
         value, error = self.difference(a, b)
-        n = len(self.scores[a].fold)
-        n = n if self.single else len(np.unique(self.scores[a].fold))
+        fold = self.scores[a].fold
+        n = len(np.unique(fold)) if self.scheme == "blocks" else len(fold)
         quantile = float(student_t.ppf((1 + CONFIDENCE) / 2, n - 1))
         return value >= MIN_DIFFERENCE and value >= quantile * error
 
@@ -129,14 +123,11 @@ class Comparison:
         return out
 
 
-def compare(
-    series: Series,
-    candidates: Sequence[TrendModel],
-    *,
-    folds: str | Int = "auto",
-    seed: int = 1,
-) -> Comparison:
+def compare(series: Series, candidates: Sequence[TrendModel], *, seed: int = 1) -> Comparison:
     """Compare trends by their predictive densities of held-out exposures.
+
+    They are held out in 30 groups, neighbours in different ones; successive ones together where the
+    residuals of every trend but the drifting ones are correlated in time.
 
     Parameters
     ----------
@@ -144,10 +135,6 @@ def compare(
     candidates : sequence of TrendModel
         The constant is added, and to every trend with breaks and slopes the one without slopes:
         without them a slope could not be distinguished from none.
-    folds : str or ndarray of int, shape (E,)
-        'exposures': in 30 groups, neighbours in different ones; 'each': one by one; 'blocks':
-        successive ones together; 'auto': exposures, or blocks where the residuals of every trend
-        but the drifting ones are correlated in time; or codes of those to be held out together.
     seed : int
 
     Returns
@@ -159,27 +146,11 @@ def compare(
     trends, posteriors = _fitted(series, _completed(candidates), seed)
     found = [serial_correlation(p) for p in posteriors if not p.trend.drifts]
     correlation = min(found, key=abs)
-    breaks = tuple(sorted({b for c in trends for b in c.breaks}))
-    if isinstance(folds, str):
-        if folds not in ("auto", "exposures", "each", "blocks"):
-            raise InputError(
-                f"folds is {folds!r}",
-                where=series.source,
-                do="choose auto, exposures, each or blocks",
-            )
-        scheme = folds
-        if folds == "auto":
-            serial = correlation * np.sqrt(len(series)) > MIN_SERIAL_CORRELATION
-            scheme = "blocks" if serial else "exposures"
-        fold = _folds(series, scheme, breaks, correlation)
+    if correlation * np.sqrt(len(series)) > MIN_SERIAL_CORRELATION:
+        breaks = tuple(sorted({b for c in trends for b in c.breaks}))
+        scheme, fold = "blocks", _blocks(series, breaks, correlation)
     else:
-        scheme, fold = "given", np.unique(np.asarray(folds), return_inverse=True)[1]
-        if len(fold) != len(series) or fold.max() < 1:
-            raise InputError(
-                f"{len(fold)} folds for {len(series)} exposures",
-                where=series.source,
-                do="give one for each exposure, at least two different",
-            )
+        scheme, fold = "exposures", exposure_folds(series.epoch)
     scores = tuple(held_out(p, fold, seed=seed) for p in posteriors)
     return Comparison(trends, posteriors, scores, scheme, correlation)
 
@@ -250,13 +221,11 @@ def _completed(candidates: Sequence[TrendModel]) -> tuple[TrendModel, ...]:
     return tuple(sorted(out, key=cost))
 
 
-def _folds(series: Series, scheme: str, breaks: tuple[float, ...], correlation: float) -> Int:
-    n = len(series)
-    if scheme != "blocks":
-        return exposure_folds(series.epoch, n if scheme == "each" else N_FOLDS)
+def _blocks(series: Series, breaks: tuple[float, ...], correlation: float) -> Int:
+    """Blocks (E,) of successive exposures, longer than their correlation where there are enough."""
     rho = float(np.clip(correlation, 0.0, 0.95))
     length = int(np.ceil(CORRELATION_LENGTHS * (1 + rho) / (1 - rho)))
-    return block_folds(series.epoch, breaks, max(1, min(length, n // MIN_BLOCKS)))
+    return block_folds(series.epoch, breaks, max(1, min(length, len(series) // MIN_BLOCKS)))
 
 
 def serial_correlation(posterior: SeriesPosterior) -> float:

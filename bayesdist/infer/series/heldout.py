@@ -21,7 +21,7 @@ from bayesdist.infer.series.scatter import log_mixture
 from bayesdist.infer.series.small import cholesky, solve_factor
 from bayesdist.limits import PARETO_K
 
-__all__ = ["N_FOLDS", "HeldOut", "block_folds", "exposure_folds", "held_out"]
+__all__ = ["HeldOut", "block_folds", "exposure_folds", "held_out"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -129,10 +129,14 @@ class SeriesPosterior:
     engine: Engine
     last: State
 
+    @property
+    def _parameters(self) -> Float:
+        """Draws (n, k, p) of the columns' parameters."""
+        return self.raw.b.reshape(-1, *self.raw.b.shape[2:])
+
     @cached_property
     def _lines(self) -> tuple[Float, Float]:
-        b = self.raw.b.reshape(-1, *self.raw.b.shape[2:])
-        level, slope = self.design.lines(b, self._breaks)
+        level, slope = self.design.lines(self._parameters, self._breaks)
         unit = self.series.spread
         return self.series.centre + level * unit, slope * unit
 
@@ -209,8 +213,8 @@ class SeriesPosterior:
         return self._group_columns(first) * self.series.spread / self.design.years
 
     def _group_columns(self, first: int) -> Float:
-        b = self.raw.b.reshape(-1, *self.raw.b.shape[2:])
-        return np.swapaxes(b[..., first : first + self.design.n_groups - 1], 1, 2)
+        columns = slice(first, first + self.design.n_groups - 1)
+        return np.swapaxes(self._parameters[..., columns], 1, 2)
 
     def change(self, number: int = 0) -> tuple[Change, Change]:
         """Changes at a break: of the coefficients at its date, and of their slopes.
@@ -266,15 +270,11 @@ class SeriesPosterior:
         mean = trend.mean(axis=0)
         off = trend - mean
         cov = np.einsum("nmi,nmj->mij", off, off) / (len(off) - 1)
-        drift = self.design.drift
-        if drift:
-            first, last = self.series.span
-            unseen = np.where((t < first) | (t > last), drift.unseen(t), 0.0)
-            k = self.series.n_coefficients
-            power = (self.raw.drift.reshape(-1, k) ** 2).mean(axis=0) * self.series.spread**2
-            cov = cov + unseen[:, None, None] * np.diag(power)
+        if self.design.drift:
+            power = (self._amplitude**2).mean(axis=0)
+            cov = cov + self._unseen(t)[:, None, None] * np.diag(power)
         cov_new = cov + self.scatter.mean(axis=0)
-        beyond = self._beyond(t)
+        beyond = self._outside(t) & (self.design.drift is None)
         if beyond.any():
             shared, unit = self._shared(t[beyond], group), self.series.spread
             mean[beyond] = self.series.centre + np.stack([s.mean for s in shared], axis=1) * unit
@@ -284,10 +284,20 @@ class SeriesPosterior:
             cov_new[beyond] = cov[beyond] + own[:, None] * self._common * own
         return Prediction(t, mean, cov, cov_new)
 
-    def _beyond(self, t: Float) -> NDArray[np.bool_]:
-        """Boolean mask (M,) of epochs outside the series, for a trend without a random part."""
+    def _outside(self, t: Float) -> NDArray[np.bool_]:
+        """Boolean mask (M,) of epochs outside the series."""
         first, last = self.series.span
-        return ((t < first) | (t > last)) & (self.design.drift is None)
+        return (t < first) | (t > last)
+
+    def _unseen(self, t: Float) -> Float:
+        """Variance (M,) of the random part outside the series, of unit amplitude."""
+        assert self.design.drift is not None
+        return np.where(self._outside(t), self.design.drift.unseen(t), 0.0)
+
+    @property
+    def _amplitude(self) -> Float:
+        """Draws (n, k) of the amplitude of the random part."""
+        return self.raw.drift.reshape(-1, self.series.n_coefficients) * self.series.spread
 
     @property
     def _common(self) -> Float:
@@ -340,16 +350,11 @@ class SeriesPosterior:
         t = np.atleast_1d(np.asarray(epoch, float))
         trend = self._trend_draws(t, group, extrapolate)
         n, m, k = trend.shape
-        drift = self.design.drift
-        if drift:
-            first, last = self.series.span
-            unseen = np.where((t < first) | (t > last), drift.unseen(t), 0.0)
-            amplitude = self.raw.drift.reshape(-1, k) * self.series.spread
-            trend = trend + np.sqrt(unseen)[:, None] * amplitude[:, None] * rng.standard_normal(
-                trend.shape
-            )
+        if self.design.drift:
+            size = np.sqrt(self._unseen(t))[:, None] * self._amplitude[:, None]
+            trend = trend + size * rng.standard_normal(trend.shape)
         total = np.broadcast_to(self.scatter[:, None], (n, m, k, k)).copy()
-        beyond = self._beyond(t)
+        beyond = self._outside(t) & (self.design.drift is None)
         if beyond.any():
             root = np.linalg.cholesky(self._common)
             white = rng.standard_normal((n, int(beyond.sum()), k)) @ root.T
@@ -387,7 +392,6 @@ class SeriesPosterior:
                 do=f"choose among {', '.join(names)}" if names else "the series has no groups",
             )
         code = np.full(len(t), names.index(group) if group is not None else 0)
-        b = self.raw.b.reshape(-1, *self.raw.b.shape[2:])
         columns = self.design.matrix(t, code, self._breaks)  # (n or 1, M, p)
-        values = columns @ np.swapaxes(b, 1, 2)
+        values = columns @ np.swapaxes(self._parameters, 1, 2)
         return self.series.centre + values * self.series.spread

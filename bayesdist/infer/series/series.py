@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -231,14 +231,13 @@ class Series:
     def take(self, rows: ArrayLike) -> Series:
         """Series of the exposures of a mask (E,) or of row numbers."""
         which = np.arange(len(self))[np.asarray(rows)]
-        return Series(
-            self.epoch[which],
-            self.values[which],
-            self.cov[which],
-            self.coefficients,
-            tuple(self.names[i] for i in which),
-            tuple(self.group[i] for i in which) if self.group else (),
-            self.source,
+        return replace(
+            self,
+            epoch=self.epoch[which],
+            values=self.values[which],
+            cov=self.cov[which],
+            names=tuple(self.names[i] for i in which),
+            group=tuple(self.group[i] for i in which) if self.group else (),
         )
 
     def only(self, *coefficients: str) -> Series:
@@ -251,12 +250,9 @@ class Series:
                     do=f"choose among {', '.join(self.coefficients)}",
                 )
         columns = [self.coefficients.index(name) for name in coefficients]
-        return Series(
-            self.epoch,
-            self.values[:, columns],
-            self.cov[np.ix_(range(len(self)), columns, columns)],
-            tuple(coefficients),
-            self.names,
-            self.group,
-            self.source,
+        return replace(
+            self,
+            values=self.values[:, columns],
+            cov=self.cov[np.ix_(range(len(self)), columns, columns)],
+            coefficients=tuple(coefficients),
         )

@@ -14,7 +14,15 @@ from bayesdist.infer.kernel import GAUSSIAN, Constants
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
 from bayesdist.model import DistortionModel
 
-__all__ = ["Clip", "ClippedGaussian", "Likelihood", "MixtureAt", "star_averages"]
+__all__ = [
+    "Clip",
+    "ClippedGaussian",
+    "Likelihood",
+    "MixtureAt",
+    "good_probability",
+    "log_densities",
+    "star_averages",
+]
 
 Float = NDArray[np.float64]
 
@@ -130,3 +138,19 @@ def star_averages(stars: Stars, theta: Float, constants: Constants) -> Float:
             stars.blocks, stars.columns, circle, powers, order, constants
         )
     return kernel.memberships(stars.blocks, stars.columns, powers, order, constants)
+
+
+def log_densities(square: Float, var: Float, f: float, wide: float) -> tuple[Float, Float]:
+    """Log densities (N,), up to a constant, of stars as good and as false matches.
+
+    `square` (2, N) are squared residuals, `var` (2, N) the variances of good matches; a fraction
+    `f` is false, of variance `wide` on each axis.
+    """
+    log_good = np.log1p(-f) - 0.5 * (square / var + np.log(var)).sum(axis=0)
+    return log_good, np.log(f) - 0.5 * (square / wide).sum(axis=0) - np.log(wide)
+
+
+def good_probability(square: Float, var: Float, f: float, wide: float) -> Float:
+    """Probability (N,) that each star is a good match; arguments as of `log_densities`."""
+    log_good, log_bad = log_densities(square, var, f, wide)
+    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * (log_good - log_bad))))

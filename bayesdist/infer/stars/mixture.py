@@ -156,7 +156,8 @@ class OutlierMixture:
 class Hyper:
     """An `OutlierMixture` with the scale of the data: likelihood terms and priors.
 
-    A point is a vector h in the order of `mixture.hyper`: log j, logit f, log w.
+    A point is a vector h in the order of `mixture.hyper`: log j, logit f, log w.  Proposals may lie
+    where numbers overflow: there the density is zero or NaN.
     """
 
     mixture: OutlierMixture
@@ -167,6 +168,7 @@ class Hyper:
         """Names of the sampled coordinates."""
         return tuple(HYPER_NAMES[k] for k in self.mixture.hyper)
 
+    @np.errstate(over="ignore", invalid="ignore")
     def values(self, h: Float) -> dict[str, Float]:
         """j, f and s_out of points (..., n_hyper), in natural form."""
         out = {}
@@ -190,6 +192,7 @@ class Hyper:
                 columns.append(logit(value) if name == "f" else np.log(value))
         return np.stack(columns, axis=-1) if columns else np.zeros(0)
 
+    @np.errstate(over="ignore", invalid="ignore")
     def core(self, h: Float) -> Float:
         """Variance (...) of true matches on an axis, with the median quoted error."""
         if self.mixture.jitter is None:
@@ -218,6 +221,7 @@ class Hyper:
             bend[s, j] = bend[j, s] = -2 * of_excess * of_jitter
         return by.T @ gradient, by.T @ curvature @ by - gradient[s] * bend, by
 
+    @np.errstate(over="ignore", invalid="ignore")
     def constants(self, h: Float) -> Constants:
         """Constants of the likelihood at points (n, n_hyper)."""
         n = len(h)
@@ -239,6 +243,7 @@ class Hyper:
 
     # -- priors -----------------------------------------------------------------------------------
 
+    @np.errstate(over="ignore", invalid="ignore")
     def log_prior(self, h: Float) -> Float:
         """Log prior density of points (..., n_hyper) in sampled coordinates, normalised."""
         out = np.zeros(h.shape[:-1])

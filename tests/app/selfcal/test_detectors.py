@@ -46,7 +46,7 @@ def test_chips_lie_as_their_stars_say(tmp_path):
     )
     results = fitted(tmp_path / "run", config)
     found = directions(results)
-    model, theta = results.fit.model, results.fitted.solved.solution.theta
+    model, theta = results.fit.model, results.fitted.solved.mode.theta
     rows = functionals(truth.model, truth.theta)
     # by how much the solution differs from the truth in what both chips say of each other
     off = {name: rows[name] @ (_as_true(results, truth) - truth.theta) for name in rows}
@@ -62,7 +62,7 @@ def test_chips_lie_as_their_stars_say(tmp_path):
 def _as_true(results, truth):
     """The solution, moved along free directions to where the truth has what the gauge holds."""
     theta, null, held = (
-        results.fitted.solved.solution.theta,
+        results.fitted.solved.mode.theta,
         results.fitted.solved.gauge.null,
         results.fitted.solved.gauge.held,
     )
@@ -96,8 +96,8 @@ def test_vafactor_is_applied(tmp_path):
         config = write_selfcal(folder / "input", lists, selfcal=block | {"exposures": "log.ecsv"})
         _log(truth, config.parent, factors if name == "with" else np.ones(8))
         results = fitted(folder / "run", config)
-        sigma = np.sqrt(np.diag(results.fitted.solved.solution.cov))[at]
-        scales.append((results.fitted.solved.solution.theta[at], sigma))
+        sigma = np.sqrt(np.diag(results.fitted.solved.mode.cov))[at]
+        scales.append((results.fitted.solved.mode.theta[at], sigma))
     (known, sigma), (unknown, _) = scales
     # the simulated sky is smaller on the detector where the frame's scale is larger: what the
     # frames have without VAFACTOR is VAFACTOR, and with it what is left is its square
@@ -134,7 +134,7 @@ def test_motions_of_stars_that_do_not_move(tmp_path):
     )
     _log(truth, config.parent, np.ones(8))
     results = fitted(tmp_path / "run", config)
-    stars = star_catalogue(results.fitted.solved.solution)
+    stars = star_catalogue(results.fitted.solved.mode)
     assert stars.values.shape[1] == 4 and stars.epoch == pytest.approx(EPOCHS.mean())
     assert results.fitted.solved.gauge.rates == ("drift_u", "drift_v", "spin")
     assert not results.fitted.solved.gauge.unnamed
@@ -184,8 +184,8 @@ def test_parallaxes(tmp_path):
     assert "parallax" in results.fitted.solved.gauge.rates
     assert "parallax of the whole sky" in " ".join(results.fitted.solved.gauge.sentences)
     problem, stars = (
-        results.fitted.solved.solution.problem,
-        star_catalogue(results.fitted.solved.solution),
+        results.fitted.solved.mode.problem,
+        star_catalogue(results.fitted.solved.mode),
     )
     whose = d.star[problem.rows[problem.starts[:-1]]]
     sigma = np.sqrt(stars.own[:, 4, 4])
@@ -196,7 +196,7 @@ def test_parallaxes(tmp_path):
     low, high = stats.chi2.ppf([1e-3, 1 - 1e-3], len(pulls) - 1)
     # the distortion's errors come on top of the stars' own
     assert low < (pulls**2).sum() < 1.15 * high
-    table = star_table(results.fitted.solved.solution, stars)
+    table = star_table(results.fitted.solved.mode, stars)
     assert table["parallax"].unit == "mas" and table["pm_u"].unit == "mas / yr"
 
 
@@ -218,7 +218,7 @@ def _on_the_sky(places: np.ndarray) -> Table:
 def _stars(results) -> Path:
     path = results.run / "stars.ecsv"
     write_table(
-        star_table(results.fitted.solved.solution, star_catalogue(results.fitted.solved.solution)),
+        star_table(results.fitted.solved.mode, star_catalogue(results.fitted.solved.mode)),
         path,
     )
     return path

@@ -98,7 +98,7 @@ def test_the_scale_is_that_of_the_offsets(truth, offsets):
 
 
 def _pixel(results):
-    return _pixel_of(results.fit.model, results.fitted.solved.solution.theta)
+    return _pixel_of(results.fit.model, results.fitted.solved.mode.theta)
 
 
 def _pixel_of(model, theta):
@@ -194,14 +194,14 @@ def test_reference_stars(truth, tmp_path):
         assert found[name]["state"] == "free"
         assert found[name]["fixed_by"] == "reference stars"
     assert not results.run.summary["selfcal"]["gauge"]["held"]
-    used = results.fitted.solved.solution.problem.priors.informed
+    used = results.fitted.solved.mode.problem.priors.informed
     assert used.sum() > 100
     # the closed form for stars whose own detections have no errors: it is the lower bound
-    at = results.fitted.solved.solution.stars[used]
+    at = results.fitted.solved.mode.stars[used]
     lever = np.sqrt(((at - at.mean(axis=0)) ** 2).sum())
     scale = found["scale"]["sigma_fixed"]
     assert sigma / lever < scale < 2 * sigma / lever
-    stars = star_catalogue(results.fitted.solved.solution)
+    stars = star_catalogue(results.fitted.solved.mode)
     # every star, reference star or not, lies where the catalogue's sky has it
     where = np.column_stack([table["u"], table["v"]]) * 1000
     distance = np.sqrt(((stars.values[used, None] - where) ** 2).sum(axis=2)).min(axis=1)

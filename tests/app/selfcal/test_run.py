@@ -89,7 +89,7 @@ def test_functions_find_what_the_run_has_found(one_roll):
     np.testing.assert_array_equal(fitted.linear.cov, known.cov)
     results = results_of(RunDirectory.open(one_roll.path))
     np.testing.assert_array_equal(
-        fitted.solved.solution.stars, results.fitted.solved.solution.stars
+        fitted.solved.mode.stars, results.fitted.solved.mode.stars
     )
     np.testing.assert_array_equal(fitted.solved.gauge.held, results.fitted.solved.gauge.held)
     assert fitted.solved.fixed == results.fitted.solved.fixed
@@ -104,7 +104,7 @@ def test_stars_are_where_they_were(three_rolls):
     """But for a similarity of the sky, and by the errors of their own detections."""
     stars, truth = Table.read(three_rolls.path / "stars.ecsv"), three_rolls.truth
     found = np.column_stack([stars["u"], stars["v"]])
-    problem = results_of(RunDirectory.open(three_rolls.path)).fitted.solved.solution.problem
+    problem = results_of(RunDirectory.open(three_rolls.path)).fitted.solved.mode.problem
     every = np.split(truth.detections.star[problem.rows], problem.starts[1:-1])
     whose = np.array([np.median(one) for one in every]).astype(int)
     assert len(np.unique(whose)) == len(whose) == len(stars)

@@ -56,7 +56,7 @@ def some(seed=1, n_stars=70):
     fit = fit_linear(
         matches, model, priors=GaussianPriors.of(model, named), rejection=Rejection(clip_chi2=4.0)
     )
-    return model, matches, fit, code, catalogue
+    return model, matches.with_columns(star=code), fit, code, catalogue
 
 
 def dense(fit, matches, code, catalogue, weight):
@@ -85,7 +85,7 @@ def test_it_is_the_dense_formula(scratch, monkeypatch):
     assert 0 < (~used).sum() < 100
     pairs = {tuple(p) for p in np.column_stack([code, matches.exposure, matches.chip])}
     assert len(pairs) < len(matches)  # some do stand twice
-    found = star_covariance(fit, matches, catalogue, star=code)
+    found = star_covariance(fit, matches, catalogue)
     total, counted = dense(fit, matches, code, catalogue, used.astype(float))
     scale = np.sqrt(np.diag(total))
     unit = np.outer(scale, scale)
@@ -96,25 +96,22 @@ def test_it_is_the_dense_formula(scratch, monkeypatch):
 
 @pytest.mark.parametrize("frames", [True, False])
 def test_motions_are_the_part_that_is_left_without_errors_of_positions(frames):
-    _, matches, fit, code, catalogue = some(3)
-    options = {"star": code, "frames": frames}
-    found = star_covariance(fit, matches, catalogue, **options)
+    _, matches, fit, _, catalogue = some(3)
+    found = star_covariance(fit, matches, catalogue, frames=frames)
     exact = replace(catalogue, position=0 * catalogue.position)
-    alone = star_covariance(fit, matches, exact, **options).total
+    alone = star_covariance(fit, matches, exact, frames=frames).total
     scale = np.sqrt(np.diag(found.total))
     np.testing.assert_allclose(
         found.motions / np.outer(scale, scale), alone / np.outer(scale, scale), atol=1e-10
     )
     still = replace(catalogue, motion=0 * catalogue.motion)
-    assert star_covariance(fit, matches, still, **options).motions is None
+    assert star_covariance(fit, matches, still, frames=frames).motions is None
 
 
 def test_without_the_frames_the_polynomials_are_the_same():
     """And the frames follow by regression: nothing else is said of them."""
-    model, matches, fit, code, catalogue = some(11)
-    whole, part = (
-        star_covariance(fit, matches, catalogue, star=code, frames=f) for f in (True, False)
-    )
+    model, matches, fit, _, catalogue = some(11)
+    whole, part = (star_covariance(fit, matches, catalogue, frames=f) for f in (True, False))
     n = model.n_distortion
     for a, b in ((whole.total, part.total), (whole.counted, part.counted)):
         scale = np.sqrt(np.diag(a))
@@ -131,31 +128,11 @@ def test_without_the_frames_the_polynomials_are_the_same():
         )
 
 
-def test_memberships_weigh_the_matches():
-    _, matches, fit, code, catalogue = some(2)
-    weight = np.random.default_rng(0).uniform(size=len(matches))
-    found = star_covariance(fit, matches, catalogue, star=code, weight=weight, included=False)
-    total, _ = dense(fit, matches, code, catalogue, weight)
-    scale = np.sqrt(np.diag(total))
-    np.testing.assert_allclose(
-        found.total / np.outer(scale, scale), total / np.outer(scale, scale), atol=1e-10
-    )
-    assert not found.counted.any()
-
-
-def test_the_column_of_the_table_is_used():
-    _, matches, fit, code, catalogue = some(3)
-    a = star_covariance(fit, matches.with_columns(star=code), catalogue)
-    b = star_covariance(fit, matches, catalogue, star=code)
-    np.testing.assert_array_equal(a.extra, b.extra)
-
-
 def test_stars_that_are_seen_once_add_nothing():
     model, matches, _ = simulated(4, 200, order=2)
     fit = fit_linear(matches, model)
-    found = star_covariance(
-        fit, matches, alike(0.03, 0.04, 200), star=np.random.default_rng(0).permutation(200)
-    )
+    matches = matches.with_columns(star=np.random.default_rng(0).permutation(200))
+    found = star_covariance(fit, matches, alike(0.03, 0.04, 200))
     scale = np.sqrt(np.diag(found.total))
     assert (scale > 0).all()
     np.testing.assert_allclose(found.extra / np.outer(scale, scale), 0, atol=1e-12)
@@ -228,8 +205,8 @@ def test_repeated_catalogues():
 
 
 def test_draws_are_spread_to_the_covariance():
-    _, matches, fit, code, catalogue = some(7)
-    solution = with_star_errors(fit, star_covariance(fit, matches, catalogue, star=code))
+    _, matches, fit, _, catalogue = some(7)
+    solution = with_star_errors(fit, star_covariance(fit, matches, catalogue))
     draws = solution.draws(4000, np.random.default_rng(1))
     white = np.linalg.solve(np.linalg.cholesky(solution.cov), (draws - solution.mean).T)
     assert stats.kstest((white**2).sum(axis=0), stats.chi2(len(fit.mean)).cdf).pvalue > 1e-3
@@ -255,9 +232,9 @@ class Skewed(Solution):
 
 
 def test_a_posterior_keeps_its_shape_and_stays_one():
-    _, matches, fit, code, catalogue = some(8)
+    _, matches, fit, _, catalogue = some(8)
     posterior = Skewed(fit.model, fit.mean, fit.cov)
-    found = star_covariance(posterior, matches, catalogue, star=code, weight=fit.uses(matches))
+    found = star_covariance(posterior, matches, catalogue)
     solution = with_star_errors(posterior, found)
     assert solution.convergence == "judged" and solution.approximation == ""
     assert with_star_errors(fit, found).convergence is None
@@ -272,8 +249,9 @@ def test_views_carry_it_on():
     # what is seen in one place of the detector is one star: errors that add up
     x, y = np.int64(matches.x // 400), np.int64(matches.y // 400)
     code = (matches.chip * 11 + x) * 6 + y
+    matches = matches.with_columns(star=code)
     found = fit_hierarchical(matches, model)
-    stars = star_covariance(found, matches, alike(0.01, 0.01, code.max() + 1), star=code)
+    stars = star_covariance(found, matches, alike(0.01, 0.01, code.max() + 1))
     wide = with_star_errors(found, stars)
     a, b = (linear_terms(reference_gauge(s), 1, epoch=2004.5) for s in (wide, found))
     np.testing.assert_array_equal(a.values, b.values)
@@ -287,22 +265,18 @@ def test_what_is_wrong_is_said():
     _, matches, fit, code, _ = some(10)
     n = code.max() + 1
     with pytest.raises(InputError, match="do not say which star is which"):
-        star_covariance(fit, matches, alike(0.01, 0.01, n))
-    for wrong in (code[:-1], code - 5, code.astype(float)):
-        with pytest.raises(InputError, match="star codes have shape"):
-            star_covariance(fit, matches, alike(0.01, 0.01, n), star=wrong)
+        star_covariance(fit, matches.with_columns(star=None), alike(0.01, 0.01, n))
     with pytest.raises(InputError, match="position is given for 3 stars, and codes go up"):
-        star_covariance(fit, matches, alike(0.01, 0.01, 3), star=code)
+        star_covariance(fit, matches, alike(0.01, 0.01, 3))
     with pytest.raises(InputError, match=r"position is -0\.01"):
-        star_covariance(fit, matches, alike(-0.01, 0.01, n), star=code)
+        star_covariance(fit, matches, alike(-0.01, 0.01, n))
     with pytest.raises(InputError, match="need the catalogue's epoch"):
         moving = replace(alike(0.01, 0.01, n), motion=np.full((n, 2), 0.1))
-        star_covariance(fit, matches, moving, star=code)
+        star_covariance(fit, matches, moving)
     dated = replace(moving, epoch=np.full(n, 2004.0))
     with pytest.raises(InputError, match="need the epochs of the matches"):
-        star_covariance(fit, replace(matches, epoch=None), dated, star=code)
+        star_covariance(fit, replace(matches, epoch=None), dated)
     with pytest.raises(InputError, match="epoch is nan"):
-        star_covariance(fit, matches, replace(moving, epoch=np.full(n, np.nan)), star=code)
+        star_covariance(fit, matches, replace(moving, epoch=np.full(n, np.nan)))
     with pytest.raises(InputError, match=r"sigma_u: the quoted errors of \d+ matches are smaller"):
-        star_covariance(fit, matches, alike(0.03, 0.01, n), star=code)
-    star_covariance(fit, matches, alike(0.03, 0.01, n), star=code, included=False)
+        star_covariance(fit, matches, alike(0.03, 0.01, n))

@@ -11,7 +11,7 @@ from bayesdist.infer.compare.planning import (
     exposure_information,
     with_information,
 )
-from bayesdist.infer.posterior.covariance import recolouring
+from bayesdist.infer.equations.scaled import recolouring
 from bayesdist.model import TimeDependence
 
 SIZE = (512.0, 256.0)
@@ -86,19 +86,6 @@ def test_a_sample_stands_for_all_stars():
     assert part.n_stars == whole.n_stars
     diagonal = [np.einsum("akk->ak", c.moments[1]) for c in (part, whole)]
     assert diagonal[0] == pytest.approx(diagonal[1], rel=0.05)
-
-
-def test_an_exposure_whose_scale_may_not_scatter_tells_more_than_one_with_a_free_scale():
-    rng = np.random.default_rng(6)
-    first = stars([2005.0, 2008.0, 2012.0], 400, rng)
-    fit = fit_linear(first, model_of(first, "shift_rotation_scale", DRIFT))
-    content = content_of(fit, first, n_exposures=3)
-    free = exposure_information(fit, content, 2015.0)
-    tied = exposure_information(fit, content, 2015.0, scatter={"scale": 1e-9})
-    wide = exposure_information(fit, content, 2015.0, scatter={"scale": 1e3})
-    size = np.sqrt(np.maximum(np.diag(tied), 1e-3 * np.diag(tied).max()))  # shifts tell nothing
-    assert np.linalg.eigvalsh((tied - free) / np.outer(size, size)).max() > 0.1
-    assert wide == pytest.approx(free, rel=1e-6, abs=1e-6 * np.abs(free).max())
 
 
 def test_draws_of_the_planned_solution_have_its_covariance():

@@ -413,7 +413,7 @@ def test_slope_of_a_search_that_stops_early(along):
     target, split, nodes, _ = along
     node = nodes[2]
     tangent = node.tangent[-1]
-    length = np.sqrt(tangent @ node.factor.matrix.times(tangent))
+    length = np.sqrt(tangent @ node.factor.matrix.dense() @ tangent)
     if length < 1e-6:
         pytest.skip("the mode does not depend on log j")
     for step in (-0.05, 0.05):

@@ -318,7 +318,7 @@ def test_draws_outside_the_support_are_left_out():
 
 
 def test_a_surrogate_that_accepts_nothing_says_so():
-    surrogate = Surrogate(0, np.zeros(0), np.zeros((0, 0)), -20.0, np.zeros(4), -30.0, 0.0)
+    surrogate = Surrogate(np.zeros(0), np.zeros((0, 0)), -20.0, np.zeros(4), -30.0, 0.0)
     with pytest.raises(NotConvergedError, match="accepts 0 of"):
         draw_surrogate(gaussian(2), lambda x: x, surrogate, 10, np.random.default_rng(23))
 

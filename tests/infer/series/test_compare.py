@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.errors import InputError
 from bayesdist.infer.series import (
     Series,
     TrendModel,
@@ -153,13 +152,6 @@ def test_folds():
     groups = exposure_folds(epoch, 6)
     assert (np.bincount(groups) == 4).all() and (np.diff(groups) != 0).all()
     assert len(np.unique(exposure_folds(epoch, 30))) == 24
-
-
-def test_wrong_folds():
-    with pytest.raises(InputError, match="folds is 'seasons'"):
-        compare(white(5, n=12), SIMPLE, folds="seasons")
-    with pytest.raises(InputError, match="3 folds for 12 exposures"):
-        compare(white(5, n=12), SIMPLE, folds=np.array([0, 1, 2]))
 
 
 def test_default_candidates_have_what_is_asked():

@@ -188,6 +188,14 @@ def test_extreme_residuals_stay_finite(hyper):
         assert np.isfinite(getattr(moments, name)).all(), name
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("point", [(400.0, 0.0, 1.0), (400.0, 0.0, 400.0), (-400.0, 0.0, -400.0)])
+def test_where_numbers_overflow_there_is_no_density_and_no_warning(point):
+    bound, h = OutlierMixture().bind(0.02), np.array([point])
+    assert not (bound.log_prior(h) > -700).any()
+    assert not np.isnan(bound.constants(h).j2).any() and "s_out" in bound.values(h)
+
+
 def test_constants_are_those_of_the_values(hyper):
     """Each point by itself, and what is fixed stands in every row."""
     rng = np.random.default_rng(5)
