@@ -35,6 +35,11 @@ class Block:
     columns: Int  # (m,) parameters that the polynomial depends on, the global ones first
     derivative: Float  # (2, K, m) of the effective coefficients by them
 
+    def parts(self, n_global: int) -> tuple[Float, Float]:
+        """Derivatives (2, K, m) by global parameters, and by those of the exposure."""
+        n = int((self.columns < n_global).sum())
+        return self.derivative[..., :n], self.derivative[..., n:]
+
 
 @dataclass(frozen=True, eq=False)
 class ScoredSample:

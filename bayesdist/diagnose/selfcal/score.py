@@ -112,12 +112,11 @@ def _summed(
     p, scores = columns.problem, scores_of_detections(solution).at(rows)
     n, D = columns.sparse.stop, columns.n_params
     known, taken, square = (np.zeros((n, n)) for _ in range(3))
-    prior, score, psi = p.priors, np.zeros(n), []
-    pull = np.einsum("skq,sq->sk", prior.precision, prior.centre - stars)
+    score, psi = np.zeros(n), []
     unit = np.broadcast_to(np.eye(2), (len(p), 2, 2))
     for piece in pieces(columns):
-        here, s = scores.at(piece.rows), piece.stars
-        sums = star_sums(columns, piece, here, pull[s], prior.precision[s])
+        here = scores.at(piece.rows)
+        sums = star_sums(columns, piece, here, stars)
         taken += sums.rows.T @ sums.rows
         score -= sums.rows.T @ sums.right
         add_products(known, columns, columns, piece, here.curvature)
