@@ -240,10 +240,10 @@ def drawn_errors(
 
 
 def budget_over(
-    errors: ErrorModel, settings: EvaluationSettings, rng: np.random.Generator, n: int | None = None
+    errors: ErrorModel, settings: EvaluationSettings, rng: np.random.Generator
 ) -> ErrorBudget:
     """The budget over the grid of all chips."""
-    return errors.at(settings.domain(errors), n=n or settings.draws, rng=restarted(rng))
+    return errors.at(settings.domain(errors), n=settings.draws, rng=restarted(rng))
 
 
 def judged(

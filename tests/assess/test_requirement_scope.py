@@ -8,10 +8,10 @@ from scipy.spatial.distance import pdist
 from bayesdist.assess import Requirement, UserTerm, check_requirements
 from bayesdist.assess.error_model import error_model
 from bayesdist.assess.requirements.validity import validity_period
-from bayesdist.assess.requirements.verdict import clopper_pearson
 from bayesdist.assess.statistics import extent
 from bayesdist.assess.terms.given import Centroids
 from bayesdist.data import MagnitudeErrors
+from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 

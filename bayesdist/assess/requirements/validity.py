@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.requirements.margins import domains_of
 from bayesdist.assess.requirements.requirement import Requirement
-from bayesdist.assess.requirements.verdict import clopper_pearson
 from bayesdist.assess.units import convert
+from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.errors import InputError
 from bayesdist.model.grid import DEFAULT_GRID
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.correlated.deviations import DeviationColumns
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.selfcal.leverage import places_by_star
@@ -259,10 +260,9 @@ def star_sums(columns: Columns, piece: Piece, scores: DetectionScores, stars: Fl
     pull = np.einsum("skq,sq->sk", precision, priors.centre[piece.stars] - stars[piece.stars])
     S, q = pull.shape
     S_H = np.swapaxes(piece.by_star, 1, 2) @ scores.curvature  # (n, q, 2)
-    own = np.array(precision)
-    np.add.at(own, piece.star, S_H @ piece.by_star)
-    b = -np.array(pull)
-    np.add.at(b, piece.star, np.einsum("naq,na->nq", piece.by_star, scores.gradient))
+    own = precision + sums_over(piece.star, S_H @ piece.by_star, S)
+    gradient = np.einsum("naq,na->nq", piece.by_star, scores.gradient)
+    b = sums_over(piece.star, gradient, S) - pull
     T = np.zeros((S * q, columns.sparse.stop))
     turned = S_H @ piece.frame
     for code, (here, values) in enumerate(piece.dense):
