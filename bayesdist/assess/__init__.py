@@ -20,7 +20,6 @@ _HOMES = {
     "bayesdist.assess.terms.local": ("LocalErrors",),
     "bayesdist.assess.units": ("UNITS", "convert", "pixel_scale_of"),
     "bayesdist.assess.vectors": ("VectorMap", "distortion_vectors"),
-    "bayesdist.diagnose.alignment": ("Alignment", "alignment_residuals"),
     "bayesdist.diagnose.residuals.binned": (
         "BinnedResiduals",
         "BinnedSums",
