@@ -19,7 +19,7 @@ from bayesdist.assess import Margin
 from bayesdist.assess.budget.budget import ErrorBudget
 from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.evaluation import Evaluation
-from bayesdist.assess.requirements.validity import Horizon
+from bayesdist.assess.requirements.validity import ValidityPeriod
 from bayesdist.checks import warnings_of
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
@@ -81,7 +81,7 @@ def save_margins(
     posterior: Posterior,
     gauge: str,
     margins: Sequence[Margin],
-    validity: Sequence[Horizon],
+    validity: Sequence[ValidityPeriod],
 ) -> None:
     """Replace the margins and validity periods of a run by others.
 
@@ -90,7 +90,7 @@ def save_margins(
     run, fit, posterior, gauge
         As of `save_evaluation`.
     margins : sequence of Margin
-    validity : sequence of Horizon
+    validity : sequence of ValidityPeriod
     """
     _write_margins(run, posterior, provenance_notes(posterior, gauge), margins, validity)
     if (run / FILE).exists():
@@ -135,7 +135,7 @@ def _write_margins(
     posterior: Posterior,
     head: Mapping[str, Any],
     margins: Sequence[Margin],
-    validity: Sequence[Horizon],
+    validity: Sequence[ValidityPeriod],
 ) -> None:
     table = margin_table(margins, several=len(posterior.model.chips) > 1)
     table.meta = dict(head)
@@ -144,7 +144,7 @@ def _write_margins(
     run.summarise(margins=margin_rows(margins), horizons=validity_rows(validity))
 
 
-def _write_validity(path: Path, validity: Sequence[Horizon]) -> None:
+def _write_validity(path: Path, validity: Sequence[ValidityPeriod]) -> None:
     if not validity:
         path.unlink(missing_ok=True)
         return
@@ -166,7 +166,7 @@ def _write_validity(path: Path, validity: Sequence[Horizon]) -> None:
     write_table(table, path)
 
 
-def validity_rows(validity: Sequence[Horizon]) -> list[dict[str, Any]]:
+def validity_rows(validity: Sequence[ValidityPeriod]) -> list[dict[str, Any]]:
     """Dates as plain rows, for files and for the screen."""
     return [
         {

@@ -28,7 +28,7 @@ from bayesdist.assess.evaluation import (
     validity_of,
 )
 from bayesdist.assess.requirements.margins import judge
-from bayesdist.assess.requirements.validity import Horizon
+from bayesdist.assess.requirements.validity import ValidityPeriod
 from bayesdist.assess.terms.forms import Known
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import BayesdistError, InputError
@@ -115,7 +115,7 @@ def margins_of(results: Results, requirements: Sequence[Requirement]) -> tuple[M
 
 def validity_periods_of(
     results: Results, requirements: Sequence[Requirement]
-) -> tuple[Horizon, ...]:
+) -> tuple[ValidityPeriod, ...]:
     """Until when requirements are met by a run, where something depends on time."""
     return validity_of(
         results.errors,

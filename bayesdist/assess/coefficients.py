@@ -28,7 +28,7 @@ def coefficient_table(fit: LinearFit, posterior: Posterior | None = None) -> Tab
     form); unit.
     """
     model = fit.model
-    blocks = [_Block.of(fit.mean, np.sqrt(np.diag(fit.cov)), posterior and posterior.flat)]
+    blocks = [_columns(fit.mean, np.sqrt(np.diag(fit.cov)), posterior and posterior.flat)]
     rows = [
         (p.name, p.chip, p.axis, p.i, p.j, "legendre" if p.kind == "polynomial" else p.kind, p.unit)
         for p in model.parameters
@@ -42,7 +42,7 @@ def coefficient_table(fit: LinearFit, posterior: Posterior | None = None) -> Tab
             draws = None
             if posterior is not None:
                 draws = basis.to_monomials(posterior.flat[:, part])
-            blocks.append(_Block.of(value, np.sqrt(np.diag(cov)), draws))
+            blocks.append(_columns(value, np.sqrt(np.diag(cov)), draws))
             for i, j in basis.terms:
                 unit = model.unit + (f" / pix{i + j}" if i + j else "")
                 label = f"{prefix}{name}[x^{i} y^{j}]"
@@ -55,35 +55,24 @@ def coefficient_table(fit: LinearFit, posterior: Posterior | None = None) -> Tab
         mask = [v is None for v in values]
         filled = [blank if v is None else v for v in values]
         table[column] = MaskedColumn(filled, mask=mask) if any(mask) else filled
-    for column in _Block.columns(posterior is not None):
-        table[column] = np.concatenate([getattr(b, column) for b in blocks])
+    for column in blocks[0]:
+        table[column] = np.concatenate([block[column] for block in blocks])
     if posterior is not None:
-        blank = np.full(len(rows) - model.n_params, np.nan)
+        unknown = np.full(len(rows) - model.n_params, np.nan)
         c = posterior.convergence
-        for column, values in (("rhat", c.rhat), ("ess_bulk", c.ess_bulk)):
-            filled = np.concatenate([values[: model.n_params], blank])
-            table[column] = MaskedColumn(filled, mask=~np.isfinite(filled))
+        for column, measured in (("rhat", c.rhat), ("ess_bulk", c.ess_bulk)):
+            every = np.concatenate([measured[: model.n_params], unknown])
+            table[column] = MaskedColumn(every, mask=~np.isfinite(every))
     table["unit"] = [row[-1] for row in rows]
     return table
 
 
-class _Block:
-    """Numbers of some rows."""
-
-    def __init__(self, **columns: Float) -> None:
-        self.__dict__.update(columns)
-
-    @staticmethod
-    def columns(sampled: bool) -> tuple[str, ...]:
-        names = ("value", "sigma")
-        return (*names, "mean", "sd", "lo68", "hi68", "lo95", "hi95") if sampled else names
-
-    @classmethod
-    def of(cls, value: Float, sigma: Float, draws: Float | None) -> _Block:
-        columns = {"value": value, "sigma": sigma}
-        if draws is not None:
-            tails = (0.16, 0.84, 0.025, 0.975)
-            quantiles = np.quantile(draws, tails, axis=0)
-            columns |= {"mean": draws.mean(axis=0), "sd": draws.std(axis=0, ddof=1)}
-            columns |= dict(zip(("lo68", "hi68", "lo95", "hi95"), quantiles, strict=True))
-        return cls(**columns)
+def _columns(value: Float, sigma: Float, draws: Float | None) -> dict[str, Float]:
+    """Columns of some rows, by name: with draws (n, rows) also what is known of these."""
+    columns = {"value": value, "sigma": sigma}
+    if draws is not None:
+        tails = {"lo68": 0.16, "hi68": 0.84, "lo95": 0.025, "hi95": 0.975}
+        quantiles = np.quantile(draws, list(tails.values()), axis=0)
+        columns |= {"mean": draws.mean(axis=0), "sd": draws.std(axis=0, ddof=1)}
+        columns |= dict(zip(tails, quantiles, strict=True))
+    return columns

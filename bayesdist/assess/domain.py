@@ -122,7 +122,8 @@ class EvaluationDomain:
         return cls(
             model,
             np.repeat(np.array(numbers, np.int64), counts),
-            *(np.concatenate([p[k] for p in points]) for k in (0, 1)),
+            np.concatenate([x for x, _ in points]),
+            np.concatenate([y for _, y in points]),
             epoch=None if epoch is None else float(epoch),
             magnitude=magnitude,
             relative="pairs" if relative else "",
@@ -162,8 +163,8 @@ class EvaluationDomain:
             one position.
         """
         size = place_of(model, epoch=epoch, chip=chip).chip.size
-        at = [np.atleast_1d(np.asarray(a, float)) for a in (x, y)]
-        for name, values, extent in zip("xy", at, size, strict=True):
+        x, y = (np.atleast_1d(np.asarray(a, float)) for a in (x, y))
+        for name, values, extent in zip("xy", (x, y), size, strict=True):
             outside = ~((values >= 0.5) & (values <= extent + 0.5))
             if outside.any():
                 raise InputError(
@@ -171,12 +172,13 @@ class EvaluationDomain:
                     f"{size[0]:g} x {size[1]:g} pixels",
                     do="give FITS 1-based pixels",
                 )
-        if relative and at[0].size < 2:
+        if relative and x.size < 2:
             raise InputError("a relative error is of two positions", do="give a second one")
         return cls(
             model,
-            np.full(at[0].size, chip, np.int64),
-            *at,
+            np.full(x.size, chip, np.int64),
+            x,
+            y,
             epoch=None if epoch is None else float(epoch),
             magnitude=magnitude,
             relative="first" if relative else "",

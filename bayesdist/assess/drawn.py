@@ -154,12 +154,11 @@ class DrawnErrors:
 
         `axis`: one of '', 'u', 'v', of which axis; of both by default.
         """
-        variance = sum(
-            one.total()
-            for one in self.at(domain.positions)
+        variance = np.zeros((domain.size, 2))
+        for one in self.at(domain.positions):
             # what all positions share is no error of a difference
-            if not (one.uniform and domain.relative)
-        )
+            if not (one.uniform and domain.relative):
+                variance += one.total()
         total = variance.sum(axis=1) if not axis else variance[:, "uv".index(axis)]
         k = int(np.argmax(total))
         at = int(domain.chip[k]), float(domain.x[k]), float(domain.y[k])

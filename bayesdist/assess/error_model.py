@@ -12,6 +12,7 @@ from bayesdist.assess.adjusted import with_diagnosed_errors
 from bayesdist.assess.budget.budget import ErrorBudget, budget_of
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors, generators
+from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.correlated import Deviations, StructureErrors
 from bayesdist.assess.terms.forms import ErrorTerm, Image
 from bayesdist.assess.terms.given import Centroids, UserTerm
@@ -24,8 +25,9 @@ from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.solution import Solution
 from bayesdist.model import LookupTable
+from bayesdist.model.grid import DEFAULT_GRID
 
-__all__ = ["ErrorModel", "error_model", "solution_with_errors"]
+__all__ = ["ErrorModel", "error_budget", "error_model", "solution_with_errors"]
 
 Float = NDArray[np.float64]
 
@@ -202,6 +204,60 @@ def error_model(
     if not any(isinstance(term, Centroids) for term in others):
         others.append(Centroids(None))  # a domain that names a magnitude asks for it
     return ErrorModel(of_solution, tuple(others), aligned)
+
+
+def error_budget(
+    solution: Solution,
+    *,
+    terms: Sequence[ErrorTerm] = (),
+    aligned: bool = False,
+    grid: tuple[int, int] = DEFAULT_GRID,
+    epoch: float | None = None,
+    chip: int | None = None,
+    n_draws: int = 4000,
+    rng: np.random.Generator,
+    pixel_scale: float | None = None,
+) -> ErrorBudget:
+    """The error budget of a solution over a grid on a chip, at an epoch.
+
+    The parts of the model are combined by joint draws, for they are correlated; other terms are
+    independent and added in quadrature.
+
+    Parameters
+    ----------
+    solution : LinearFit or Posterior
+    terms : sequence of ErrorTerm
+        Of the user, and others; each gives one row or more.
+    aligned : bool
+        Whether shift and rotation of the exposure are the observer's to fit, as of `ErrorModel`.
+    grid : tuple of int
+        Points on x and y.
+    epoch : float, optional
+        Decimal years; needed by a model with time dependence.
+    chip : int, optional
+        Chip number; the first chip by default.
+    n_draws : int
+    rng : numpy.random.Generator
+    pixel_scale : float, optional
+        Size of one pixel in mas; `pixel_scale_of` the solution by default.
+
+    Returns
+    -------
+    ErrorBudget
+        In the unit of u, v.
+
+    Raises
+    ------
+    InputError
+        For an unknown chip, a missing epoch, a bad grid, fewer than two draws, or a term whose unit
+        needs a pixel scale that is not known.
+    """
+    chip = place_of(solution.model, epoch=epoch, chip=chip).chip.number
+    if pixel_scale is None:
+        pixel_scale = pixel_scale_of(solution, chip)
+    errors = error_model(solution, terms=terms, aligned=aligned, pixel_scale=pixel_scale)
+    domain = EvaluationDomain.of_chips(solution.model, grid, chips=(chip,), epoch=epoch)
+    return errors.at(domain, n=n_draws, rng=rng)
 
 
 def _with_diagnosed(

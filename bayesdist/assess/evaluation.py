@@ -18,7 +18,7 @@ from bayesdist.assess.maps import RELATIVE, UncertaintyMap, uncertainty_map, wit
 from bayesdist.assess.requirements.margins import Margin, judge
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.rests_on import rests_on
-from bayesdist.assess.requirements.validity import Horizon, horizon_of
+from bayesdist.assess.requirements.validity import ValidityPeriod, validity_period
 from bayesdist.assess.requirements.verdict import effective_draws
 from bayesdist.assess.terms.centroid import centroids_of
 from bayesdist.assess.terms.correlated import StructureErrors
@@ -117,7 +117,7 @@ class Evaluation:
     surface : BudgetSurface or None
         At every position and epoch; None where errors contradict each other.
     margins : tuple of Margin
-    validity : tuple of Horizon
+    validity : tuple of ValidityPeriod
         Until when requirements are met; empty where nothing depends on time.
     checks : tuple of Check
     """
@@ -130,7 +130,7 @@ class Evaluation:
     budget: ErrorBudget
     surface: BudgetSurface | None
     margins: tuple[Margin, ...]
-    validity: tuple[Horizon, ...]
+    validity: tuple[ValidityPeriod, ...]
     checks: tuple[Check, ...]
 
     @property
@@ -240,10 +240,10 @@ def drawn_errors(
 
 
 def budget_over(
-    errors: ErrorModel, settings: EvaluationSettings, rng: np.random.Generator, n: int | None = None
+    errors: ErrorModel, settings: EvaluationSettings, rng: np.random.Generator
 ) -> ErrorBudget:
     """The budget over the grid of all chips."""
-    return errors.at(settings.domain(errors), n=n or settings.draws, rng=restarted(rng))
+    return errors.at(settings.domain(errors), n=settings.draws, rng=restarted(rng))
 
 
 def judged(
@@ -300,7 +300,7 @@ def validity_of(
     requirements: Sequence[Requirement],
     settings: EvaluationSettings,
     rng: np.random.Generator,
-) -> tuple[Horizon, ...]:
+) -> tuple[ValidityPeriod, ...]:
     """Until when requirements at one date are met, on fewer draws than their margins.
 
     `errors`, `diagnostics`, `requirements`, `settings`, `rng`: as `evaluate`. The result is empty
@@ -314,7 +314,7 @@ def validity_of(
     n = min(VALIDITY_DRAWS, settings.draws)
     drawn = drawn_errors(errors, diagnostics, settings, rng, n=n)
     return tuple(
-        horizon_of(
+        validity_period(
             drawn,
             r,
             np.linspace(last, last + settings.years_ahead, VALIDITY_EPOCHS),

@@ -24,12 +24,12 @@ OF_EXPOSURES, OF_CURVATURE = "exposures", "curvature in time"
 
 
 def structure_checks(
-    misfits: Sequence[Misfit], correlated: Discrepancy | None = None, *, fit: str = "the fit"
+    misfits: Sequence[Misfit], correlated: Discrepancy | None = None
 ) -> Iterator[Check]:
     """Checks of the structure that a fit leaves in the residuals.
 
     There is one misfit for each chip, or none; `correlated` errors of the solution hold some of the
-    structure; `fit` says which fit, in words.
+    structure.
     """
     if not misfits:
         return
@@ -50,7 +50,7 @@ def structure_checks(
             doubt = LARGER
     yield Check(
         FIT,
-        f"Structure in the residuals of {fit}, beyond noise",
+        "Structure in the residuals of the fit, beyond noise",
         f"{found}, {probability(one.p_value)}",
         f"p at least {number(STRUCTURE.value, 1)}",
         "warn" if one.significant or one.underpowered else "pass",

@@ -1,4 +1,4 @@
-"""Probabilities of what is found by chance, in words and corrected for the number of tests."""
+"""Probabilities: of what is found by chance, corrected for the number of tests, and counted."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import beta, chi2
 
-__all__ = ["chi_square_of", "holm", "hotelling_p", "p_words"]
+__all__ = ["chi_square_of", "clopper_pearson", "holm", "hotelling_p", "p_words"]
 
 Float = NDArray[np.float64]
 
@@ -45,3 +45,15 @@ def hotelling_p(statistic: float, dof: float, n: float) -> float:
 def chi_square_of(p: float, dof: float) -> float:
     """Chi-square of a probability, for sums of tests that have other distributions."""
     return float(chi2.isf(max(p, MIN_P), dof))
+
+
+def clopper_pearson(fraction: float, n: float, confidence: float) -> tuple[float, float]:
+    """Exact central interval of a binomial probability, by the fraction of successes in n trials.
+
+    Clopper & Pearson 1934, Biometrika 26, 404, in its form with quantiles of the beta distribution:
+    neither the trials nor the successes need be whole.
+    """
+    tail, k = (1.0 - confidence) / 2.0, fraction * n
+    low = float(beta.ppf(tail, k, n - k + 1.0)) if k > 0 else 0.0
+    high = float(beta.ppf(1.0 - tail, k + 1.0, n - k)) if k < n else 1.0
+    return low, high

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     )
     from bayesdist.assess.budget.budget import ErrorBudget
     from bayesdist.assess.budget.surface import BudgetSurface
-    from bayesdist.assess.requirements.validity import Horizon
+    from bayesdist.assess.requirements.validity import ValidityPeriod
     from bayesdist.data import MagnitudeErrors
     from bayesdist.diagnose import ScoreTest
     from bayesdist.diagnose.holdout.validation import HoldoutValidation
@@ -145,7 +145,7 @@ class ReportInput:
     budget: ErrorBudget | None = None
     surface: BudgetSurface | None = None  # budget at every position and epoch, for the page
     margins: tuple[Margin, ...] = ()
-    horizons: tuple[Horizon, ...] = ()  # validity periods; empty where nothing depends on time
+    horizons: tuple[ValidityPeriod, ...] = ()  # empty where nothing depends on time
     products: tuple[Product, ...] = ()
     checks: tuple[Check, ...] = ()  # criteria and remarks but those of requirements and products
     score_tests: tuple[ScoreTest, ...] = ()  # of the residuals

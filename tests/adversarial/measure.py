@@ -21,8 +21,8 @@ from bayesdist.app.results import Results
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.evaluation import budget_over
-from bayesdist.assess.requirements.verdict import clopper_pearson
 from bayesdist.assess.statistics import field_statistic
+from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.model.grid import grid_pixels, mesh
 from tests.app.support import after_stages
 
@@ -131,7 +131,7 @@ def attainable(margin: Margin, factor: float) -> float:
     """
     asked, draws = margin.requirement.probability, np.sort(margin.draws)
     fractions = np.linspace(asked, 1.0, 501)
-    lower = np.array([clopper_pearson(f, margin.n_effective)[0] for f in fractions])
+    lower = np.array([clopper_pearson(f, margin.n_effective, 0.99)[0] for f in fractions])
     enough = fractions[lower >= asked]
     at_or_under = np.searchsorted(draws, factor * draws, side="right") / draws.size
     return float(np.mean(at_or_under >= enough[0])) if enough.size else 0.0

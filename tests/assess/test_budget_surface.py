@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from bayesdist.assess.budget.budget import place_budget
-from bayesdist.assess.budget.detector import detector_budget
 from bayesdist.assess.budget.surface import JOINT, budget_surface
 from bayesdist.assess.error_model import error_model
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.grid import grid_pixels, mesh
+from tests.budgets import detector_budget
 
 SIZE = (201.0, 101.0)
 CHIPS = tuple(Chip(k, f"WFC{k}", SIZE, (101.0, 51.0)) for k in (1, 2))

@@ -11,11 +11,10 @@ from scipy import stats
 
 from bayesdist.assess import Requirement, UserTerm, check_requirements
 from bayesdist.assess.budget.budget import budget_of, place_budget
-from bayesdist.assess.budget.detector import detector_budget
 from bayesdist.assess.budget.surface import budget_surface
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.error_model import error_model
-from bayesdist.assess.requirements.validity import horizon_of
+from bayesdist.assess.requirements.validity import validity_period
 from bayesdist.assess.terms.correlated import (
     STRUCTURE,
     STRUCTURE_IN_FIT,
@@ -32,6 +31,7 @@ from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.correlated.deviations import LinearDeviations
 from bayesdist.diagnose.tables.mean_square import MeanSquare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
+from tests.budgets import detector_budget
 
 from .conftest import StandIn
 
@@ -322,7 +322,7 @@ def test_a_term_that_is_new_is_in_every_result():
     assert margin.probability_met == pytest.approx(expected, abs=5 * np.sqrt(0.25 / DRAWS))
     assert margin.verdict == "missed" and margin.remedy.term == "ripple"
     errors = drawn(toy)
-    course = horizon_of(errors, asked, [2008.0, 2009.0, 2010.0], grid=(9, 3))
+    course = validity_period(errors, asked, [2008.0, 2009.0, 2010.0], grid=(9, 3))
     np.testing.assert_allclose(course.probability, expected, atol=5 * np.sqrt(0.25 / DRAWS))
     surface = budget_surface(errors, (9, 3), epoch=EPOCH, years=(2000.0, 2010.0))
     [local] = [t for t in surface.local if t.row.name == "ripple"]

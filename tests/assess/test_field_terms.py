@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import LocalErrors, Requirement, UserTerm, check_requirements
-from bayesdist.assess.budget.detector import detector_budget
 from bayesdist.assess.error_model import error_model
+from bayesdist.assess.terms.forms.polynomials import without_rigid
 from bayesdist.assess.terms.parameters import (
     MOTIONS,
     CatalogueErrors,
     ExposureVariation,
     ScaleError,
 )
-from bayesdist.assess.terms.rigid import without_rigid
 from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.errors import InputError
 from bayesdist.infer.transforms import reference_gauge, without_frames
+from tests.budgets import detector_budget
 from tests.infer.small_campaign import campaign_model, campaign_truth
 
 from .drawn_fields import JOINT, drawn_fields, fields_at

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import error_budget
-from bayesdist.assess.budget.detector import detector_budget
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
+from tests.budgets import detector_budget
 
 SIZE = (1001.0, 501.0)
 SCALE = 0.05  # arcsec per pixel

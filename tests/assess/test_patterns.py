@@ -10,7 +10,12 @@ from scipy import stats
 from scipy.sparse import coo_array, csr_array, hstack
 from scipy.sparse.linalg import spsolve
 
-from bayesdist.assess.planning.dithers import Beforehand, Camera, PlannedStars, compare_patterns
+from bayesdist.assess.planning.dithers import (
+    Camera,
+    PlannedStars,
+    PriorInformation,
+    compare_patterns,
+)
 from bayesdist.assess.planning.words import lacking
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal import self_calibrate
@@ -35,7 +40,7 @@ SIZE = (1024.0, 1024.0)
 CHIP = Chip(1, "C", SIZE, (512.0, 512.0))
 CAMERA = Camera((CHIP,), flat_coefficients(3, (CHIP,)))
 STARS = PlannedStars(600.0, 0.02)
-NOTHING = Beforehand()
+NOTHING = PriorInformation()
 
 
 def _pattern(name="some", n=8, rolls=(0, 60, 130), largest=0.75):
@@ -134,7 +139,8 @@ def test_laws_of_errors_and_numbers():
 def test_absolute_scale_by_closed_form():
     """Commanded offsets fix the scale as a regression does, whatever the rolls."""
     pattern, sigma = _pattern(), 0.3
-    [found] = compare_patterns([pattern], CAMERA, replace(STARS, sigma=0.001), Beforehand(sigma))
+    stars, known = replace(STARS, sigma=0.001), PriorInformation(sigma)
+    [found] = compare_patterns([pattern], CAMERA, stars, known)
     lever = np.sqrt(((pattern.offsets - pattern.offsets.mean(axis=0)) ** 2).sum())
     expected = sigma / lever
     for name in ("scale", "rotation"):
@@ -147,7 +153,7 @@ def test_absolute_scale_by_closed_form():
     square = sum((g**2).mean() for g in grid)
     assert found.rms("absolute") == pytest.approx(expected * np.sqrt(2 * square), rel=1e-3)
     # a scale of better error beside them
-    tied = Beforehand(sigma, scale_sigma=1e-6)
+    tied = PriorInformation(sigma, scale_sigma=1e-6)
     [found] = compare_patterns([pattern], CAMERA, replace(STARS, sigma=0.001), tied)
     scale = next(d for d in found.solution.gauge.directions if d.name == "scale")
     assert scale.sigma_fixed == pytest.approx(1 / np.hypot(1 / expected, 1e6), rel=1e-3)
@@ -166,7 +172,7 @@ def test_large_offsets_with_rolls_are_best_and_five_pixels_alone_worst():
         _of_five_pixels((0, 60, 130), "5 pix, rolls"),
         _pattern("3/4, rolls", 9),
     ]
-    known = Beforehand(offset_sigma=0.1)
+    known = PriorInformation(offset_sigma=0.1)
     found = compare_patterns(patterns, CAMERA, STARS, known)
     assert [one.pattern.name for one in found] == ["3/4, rolls", "5 pix, rolls", "3/4", "5 pix"]
     by_name = {one.pattern.name: one for one in found}
@@ -195,7 +201,7 @@ def test_offsets_along_one_line_and_rolls_alone_are_told():
     turned = DitherPattern("turned", np.zeros((4, 2)), np.radians([0, 40, 90, 140]))
     found = {
         one.pattern.name: one
-        for one in compare_patterns([line, turned], CAMERA, STARS, Beforehand(0.1))
+        for one in compare_patterns([line, turned], CAMERA, STARS, PriorInformation(0.1))
     }
     assert any("along one line" in text and "is free" in text for text in lacking(found["line"]))
     # with s along the line and t across it: two zero points, four linear maps, t^2 and t^3 on both

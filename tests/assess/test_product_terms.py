@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from bayesdist.assess.budget.budget import place_budget, with_product
-from bayesdist.assess.budget.detector import detector_budget
 from bayesdist.assess.budget.surface import budget_surface
 from bayesdist.assess.error_model import error_model
 from bayesdist.assess.terms.forms import PRODUCT, Known, Row
 from bayesdist.model import Chip, DistortionModel
+from tests.budgets import detector_budget
 
 SIZE, GRID = (201.0, 101.0), (9, 5)
 CHIPS = tuple(Chip(k, f"C{k}", SIZE, (101.0, 51.0)) for k in (1, 2))

@@ -7,11 +7,11 @@ from scipy.spatial.distance import pdist
 
 from bayesdist.assess import Requirement, UserTerm, check_requirements
 from bayesdist.assess.error_model import error_model
-from bayesdist.assess.requirements.validity import horizon_of
-from bayesdist.assess.requirements.verdict import clopper_pearson
+from bayesdist.assess.requirements.validity import validity_period
 from bayesdist.assess.statistics import extent
 from bayesdist.assess.terms.given import Centroids
 from bayesdist.data import MagnitudeErrors
+from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
@@ -165,7 +165,7 @@ def test_the_horizon_is_where_a_growing_error_passes_the_limit(solution_of):
     solution = with_sigma(solution_of, model, **{rate: S / EDGE})
     errors = error_model(solution).drawn(4000, np.random.default_rng(2))
     r = Requirement("edge", "max", 0.2, probability=0.9)
-    found = horizon_of(errors, r, np.arange(2010.5, 2020.0, 0.25), grid=(5, 5))
+    found = validity_period(errors, r, np.arange(2010.5, 2020.0, 0.25), grid=(5, 5))
     # sigma at the edge is S years; met with probability 0.9 where 1.645 sigma is the limit
     date = 2010.0 + 0.2 / (S * stats.norm.ppf(0.95))
     early, late = found.interval
@@ -182,13 +182,13 @@ def test_the_horizon_is_where_a_growing_error_passes_the_limit(solution_of):
 def test_a_horizon_may_lie_beyond_and_may_have_passed(solution_of):
     errors = drifting_errors(solution_of, 1e-9)
     r = Requirement("edge", "max", 0.2)
-    assert horizon_of(errors, r, [2015.0, 2030.0]).date is None
-    assert "until 2030.0" in horizon_of(errors, r, [2015.0, 2030.0]).sentence
-    missed = horizon_of(errors, Requirement("edge", "max", 1e-12), [2012.0, 2013.0])
+    assert validity_period(errors, r, [2015.0, 2030.0]).date is None
+    assert "until 2030.0" in validity_period(errors, r, [2015.0, 2030.0]).sentence
+    missed = validity_period(errors, Requirement("edge", "max", 1e-12), [2012.0, 2013.0])
     assert missed.date == 2012.0
     with pytest.raises(InputError, match="does not depend on time"):
         still = error_model(solution_of(FLAT)).drawn(10, np.random.default_rng(1))
-        horizon_of(still, r, [2012.0, 2013.0])
+        validity_period(still, r, [2012.0, 2013.0])
 
 
 # -- of which star ---------------------------------------------------------------------------------

@@ -6,8 +6,8 @@ import pytest
 from scipy import stats
 
 from bayesdist.assess import STATISTICS, Requirement, UserTerm, check_requirements, drawn
-from bayesdist.assess.requirements.verdict import clopper_pearson
 from bayesdist.checks import EITHER, LARGER, Check
+from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.errors import InputError
 from bayesdist.infer.checks import scatter_too_small
 from bayesdist.model import Chip, DistortionModel
@@ -183,7 +183,7 @@ def test_verdicts_are_rarely_wrong(exact):
 @pytest.mark.parametrize(("fraction", "n"), [(0.0, 50), (0.94, 50), (0.5, 400), (1.0, 400)])
 def test_the_interval_is_the_exact_binomial_one(fraction, n):
     theirs = stats.binomtest(round(fraction * n), n).proportion_ci(0.99, method="exact")
-    np.testing.assert_allclose(clopper_pearson(fraction, n), theirs, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(clopper_pearson(fraction, n, 0.99), theirs, rtol=1e-9, atol=1e-12)
 
 
 def test_the_counting_error_is_that_of_a_count(exact):

@@ -13,10 +13,10 @@ from bayesdist.assess import (
     check_requirements,
     error_budget,
 )
-from bayesdist.assess.budget.detector import detector_budget
-from bayesdist.assess.mosaic import chip_places
+from bayesdist.assess.solution import chip_places
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
+from tests.budgets import detector_budget
 
 S = 0.03
 CHIPS = tuple(Chip(k, f"C{k}", (100.0, 80.0), (50.0, 40.0)) for k in (1, 2))

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from bayesdist.assess.budget.detector import detector_budget
 from bayesdist.assess.error_model import error_model
 from bayesdist.assess.terms.parameters import CatalogueErrors, ExposureVariation
 from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.infer import fit_linear
 from bayesdist.infer.exposures.hierarchy import fit_hierarchical
+from tests.budgets import detector_budget
 from tests.infer.small_campaign import campaign, campaign_truth, shared_stars, with_star_errors
 from tests.infer.support import UNCLIPPED
 

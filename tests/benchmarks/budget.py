@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from bayesdist.assess import Requirement, UserTerm
-from bayesdist.assess.budget.detector import detector_budget
 from bayesdist.assess.error_model import error_model
-from bayesdist.assess.requirements.validity import horizon_of
+from bayesdist.assess.requirements.validity import validity_period
 from bayesdist.infer import Solution
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from tests.benchmarks.timing import median, say
+from tests.budgets import detector_budget
 
 __all__ = ["FULL", "QUICK", "Sizes", "run"]
 
@@ -85,7 +85,7 @@ def run(sizes: Sizes) -> dict[str, Any]:
         model = error_model(solution, terms=what["terms"])
         errors = model.drawn(sizes.draws, np.random.default_rng(1))
         asked = Requirement("r", statistic, 0.1, "pix", probability=0.95)
-        horizon_of(errors, asked, epochs, grid=sizes.grid)
+        validity_period(errors, asked, epochs, grid=sizes.grid)
 
     rows = [{"what": "budget by term", "seconds": median(budgets)}]
     for name in STATISTICS:

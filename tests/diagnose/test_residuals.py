@@ -3,6 +3,7 @@ import pytest
 from scipy.stats import binned_statistic_2d
 
 from bayesdist.assess import binned_residuals, residual_statistics
+from bayesdist.diagnose.residuals import pair_statistics
 from bayesdist.errors import InputError
 
 SIZE = (1016.0, 508.0)
@@ -106,25 +107,16 @@ def test_statistics_of_whole_numbers():
 
 
 def test_differences_of_all_pairs_of_bins():
-    """WSDC D-T033, before Table 5-3: mean and median vanish, extremes and percentiles are opposite.
-
-    Its sigmas are sqrt(2) those of Table 5-1, at 2.75 arcsec per pixel.
-    """
-    r = np.random.default_rng(3).gamma(2.0, 0.01, size=(31, 31))
-    one = residual_statistics(r)
-    all_pairs = residual_statistics(r.ravel()[:, None] - r.ravel()[None, :])
-    assert all_pairs["mean"] == pytest.approx(0, abs=1e-15)
-    assert all_pairs["median"] == 0
-    assert all_pairs["min"] == -all_pairs["max"]
-    assert all_pairs["p01"] == pytest.approx(-all_pairs["p99"], rel=1e-12)
-    assert all_pairs["sigma"] == pytest.approx(np.sqrt(2) * one["sigma"], rel=1e-12)
+    """WSDC D-T033, Tables 5-1 and 5-3: of sigmas of bins follow those of pairs, in arcsec."""
+    r = np.random.default_rng(3).gamma(2.0, 0.01, 31 * 31)
     published = {
         "W2/X": (0.01679, 0.06531),
         "W2/Y": (0.008914, 0.03467),
         "W3/Y": (0.008846, 0.0344),
     }
     for single, paired in published.values():
-        assert paired / single == pytest.approx(2.75 * np.sqrt(2), rel=1e-3)
+        bins = r * single / residual_statistics(r)["sigma"]
+        assert 2.75 * pair_statistics(bins)["sigma"] == pytest.approx(paired, rel=1e-3)
 
 
 def test_empty_bins_are_left_out_and_nothing_is_refused():

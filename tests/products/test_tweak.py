@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from bayesdist.calibration.calibration import Calibration, calibration_of
-from bayesdist.diagnose.alignment import Alignment, PixelToSky, alignment_residuals
-from bayesdist.errors import DegenerateError, InputError
+from bayesdist.data.sky.tangent import mean_direction, tangent_plane
+from bayesdist.diagnose.overlap import Alignment, align
 from bayesdist.missions.acs.simulate.tables import detector_tables, filter_tables
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.products.release import Period, write_release
@@ -136,25 +137,20 @@ def aligned(calibration, field, tmp_path_factory) -> dict[str, Alignment]:
             )
             for k, pointing in enumerate(POINTINGS)
         ]  # fmt: skip
-        out[name] = alignment_residuals(
-            OfChips(wcs[0], a.chip), OfChips(wcs[1], b.chip), a.xy, b.xy, pixel_arcsec=0.05
-        )
+        sky = [sky_of(one, exposure) for one, exposure in zip(wcs, (a, b), strict=True)]
+        point = mean_direction(*sky[0].T)
+        planes = [np.stack(tangent_plane(*one.T, point), axis=1) / 0.05 for one in sky]
+        out[name] = align(*planes)
     return out
 
 
-@dataclass(frozen=True)
-class OfChips:
-    """The WCS of an exposure: that of each star's chip."""
-
-    wcs: Mapping[int, PixelToSky]
-    chip: np.ndarray
-
-    def all_pix2world(self, pixels, origin):
-        out = np.empty_like(pixels)
-        for number in np.unique(self.chip):
-            rows = self.chip == number
-            out[rows] = self.wcs[number].all_pix2world(pixels[rows], origin)
-        return out
+def sky_of(wcs: Mapping[int, Any], exposure: Exposure) -> np.ndarray:
+    """Right ascension and declination (N, 2) of detections by the WCS of their chips."""
+    out = np.empty_like(exposure.xy)
+    for number in np.unique(exposure.chip):
+        rows = exposure.chip == number
+        out[rows] = wcs[number].all_pix2world(exposure.xy[rows], 1)
+    return out
 
 
 def vectors(alignment: Alignment, sigma: np.ndarray, cells: int = 8):
@@ -228,22 +224,10 @@ def test_the_fit_is_that_of_tweakwcs(aligned) -> None:
         assert np.abs(left - alignment.residual).max() < 1e-8
 
 
-def test_wrong_lists_are_refused() -> None:
-    from astropy.wcs import WCS
-
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
-    wcs.wcs.cdelt = [-1e-5, 1e-5]
-    xy = np.array([[1.0, 1.0], [500.0, 30.0], [40.0, 900.0], [800.0, 850.0]])
-    same = alignment_residuals(wcs, wcs, xy, xy + 3.0, pixel_arcsec=0.036)
-    assert np.abs(same.residual).max() < 1e-5
-    assert np.hypot(*same.shift) == pytest.approx(3 * np.sqrt(2), rel=1e-5)
-    for message, call in (
-        ("4 stars in exposure a and 3", lambda: alignment_residuals(wcs, wcs, xy, xy[:3])),
-        ("2 stars leave nothing", lambda: alignment_residuals(wcs, wcs, xy[:2], xy[:2])),
-        ("no finite array", lambda: alignment_residuals(wcs, wcs, xy * np.nan, xy)),
-    ):
-        with pytest.raises(InputError, match=message):
-            call()
-    with pytest.raises(DegenerateError, match="at one place"):
-        alignment_residuals(wcs, wcs, xy, np.ones((4, 2)))
+def test_what_a_similarity_takes_up_is_no_residual() -> None:
+    b = np.array([[1.0, 1.0], [500.0, 30.0], [40.0, 900.0], [800.0, 850.0]])
+    turned = 1.001 * b @ np.array([[np.cos(0.02), np.sin(0.02)], [-np.sin(0.02), np.cos(0.02)]])
+    found = align(turned + np.array([3.0, -4.0]), b)
+    assert np.abs(found.residual).max() < 1e-10
+    assert found.shift == pytest.approx([3.0, -4.0])
+    assert (found.scale, found.rotation) == pytest.approx((1.001, 0.02))

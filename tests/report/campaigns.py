@@ -10,7 +10,7 @@ from astropy.table import Table
 
 from bayesdist.assess import binned_residuals
 from bayesdist.data import MagnitudeErrors
-from bayesdist.diagnose.overlap import OverlapTest, _aligned, _binned
+from bayesdist.diagnose.overlap import OverlapTest, _binned, align
 from bayesdist.model import LookupTable
 from bayesdist.report.campaign import (
     CampaignResults,
@@ -172,7 +172,10 @@ def overlap(seed: int = 5) -> OverlapTest:
     b = (a - 3.0) @ turn.T
     noise = 0.001 * rng.standard_normal((800, 2))
     bent = b + np.column_stack([3e-6 * b[:, 0] ** 2, 0 * b[:, 0]])
-    old, new = (_aligned(a + noise, other, 0.05) for other in (bent, b))
+    old, new = (
+        align(*((one - one.mean(axis=0)) / 0.05 for one in (a + noise, other)))
+        for other in (bent, b)
+    )
     corner, binned_old, binned_new = _binned(old, new)
     return OverlapTest(
         ("e001", "e059"), (2002.5, 2014.2), (12.0, 220.0), old, new, binned_old, binned_new,

@@ -24,8 +24,7 @@ from bayesdist.assess import (
     star_sums,
     uncertainty_map,
 )
-from bayesdist.assess.budget.detector import detector_budget
-from bayesdist.assess.mosaic import chip_places
+from bayesdist.assess.solution import chip_places
 from bayesdist.checks import Check
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.data.matches import Matches
@@ -37,6 +36,7 @@ from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import load
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.report.context import ChipResults, Product, ReportInput
+from tests.budgets import detector_budget
 
 SIZE = (1016.0, 1016.0)
 CENTRE = (508.5, 508.5)

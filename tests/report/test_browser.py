@@ -15,7 +15,6 @@ import pytest
 
 from bayesdist.assess import UserTerm
 from bayesdist.assess.budget.budget import place_budget
-from bayesdist.assess.budget.detector import detector_budget
 from bayesdist.assess.budget.surface import budget_surface
 from bayesdist.assess.error_model import error_model
 from bayesdist.assess.terms.forms import PRODUCT, Known, Row
@@ -24,6 +23,7 @@ from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.report.run_report import write_report
+from tests.budgets import detector_budget
 
 from .plots import drawings_of, plots_of
 from .runs import TERMS, report_input

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from matplotlib.collections import QuadMesh
 
-from bayesdist.assess.planning.dithers import Beforehand, Camera, PlannedStars, compare_patterns
+from bayesdist.assess.planning.dithers import (
+    Camera,
+    PlannedStars,
+    PriorInformation,
+    compare_patterns,
+)
 from bayesdist.model import Chip
 from bayesdist.report.drawing import png_of
 from bayesdist.report.patterns import pattern_maps
@@ -24,7 +29,7 @@ def planned():
         DitherPattern("straight", offsets, np.zeros(5)),
     ]
     camera = Camera(chips, flat_coefficients(2, chips))
-    return compare_patterns(patterns, camera, PlannedStars(300.0, 0.02), Beforehand())
+    return compare_patterns(patterns, camera, PlannedStars(300.0, 0.02), PriorInformation())
 
 
 def test_footprints_and_maps_at_one_scale(planned):

@@ -20,7 +20,7 @@ from bayesdist.app.config import (
     validated,
 )
 from bayesdist.app.config.section import Section
-from bayesdist.assess.planning.dithers import Beforehand, Camera, PlannedStars
+from bayesdist.assess.planning.dithers import Camera, PlannedStars, PriorInformation
 from bayesdist.model import Chip
 from bayesdist.simulate.dithers import dither_pattern
 from bayesdist.simulate.patterns import (
@@ -194,10 +194,10 @@ class PlanConfig(Section):
         s, least = self.stars, self.selfcal.min_detections
         return PlannedStars(s.per_detector, s.sigma, s.false, least, s.seed)
 
-    def known(self) -> Beforehand:
+    def known(self) -> PriorInformation:
         """What will be known beside the detections."""
         g = self.gauge
-        return Beforehand(
+        return PriorInformation(
             g.offset_sigma,
             None if g.roll_sigma_deg is None else float(np.radians(g.roll_sigma_deg)),
             g.exposure_scale_sigma,

@@ -16,7 +16,7 @@ from bayesdist.app.store import as_json
 from bayesdist.assess import VectorMap, distortion_vectors
 from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.evaluation import Evaluation
-from bayesdist.assess.mosaic import chip_places
+from bayesdist.assess.solution import chip_places
 from bayesdist.checks import Check
 from bayesdist.infer import Posterior
 from bayesdist.model import Chip

@@ -210,25 +210,20 @@ def budget_of(errors: DrawnErrors, domain: EvaluationDomain) -> ErrorBudget:
         squares = one.squares()
         for row in one.rows:
             known = {c: one.relative_error(row.name, c, monte_carlo) for c in domain.chips}
-            found = BudgetTerm(
-                row.name,
-                row.kind,
-                *np.sqrt(squares[row.name]).T,
-                row.source,
-                known[domain.chips[0]],
-                known,
-            )
+            u, v = np.sqrt(squares[row.name]).T
+            first = known[domain.chips[0]]
+            found = BudgetTerm(row.name, row.kind, u, v, row.source, first, known)
             if row.kind == PRODUCT:
                 products.append(found)
             else:
                 terms.append((not one.of_parameters(row.name), found))
-    total = sum(one.total() for one in fields)
+    u, v = np.sqrt(sum(one.total() for one in fields)).T
     return ErrorBudget(
         domain,
         errors.unit,
         # errors of parameters come first, whatever else their term holds
         tuple(t for _, t in sorted(terms, key=lambda pair: pair[0])),
-        BudgetTerm(TOTAL, TOTAL, *np.sqrt(total).T, TOGETHER),
+        BudgetTerm(TOTAL, TOTAL, u, v, TOGETHER),
         errors.n_draws,
         tuple(products),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import f as fisher
@@ -160,16 +160,10 @@ def change_maps(
         basis = model.basis(chip.number)
         rows = slice(c * size, (c + 1) * size)
         cov = change.cov[rows, rows]
-        old = change.released[c]
-        shared = {"unit": model.unit, "chip": chip.number, "epoch": change.epoch}
-        new = ChipMap(names[0], basis, coefficients=old + change.difference[c], cov=cov, **shared)
-        out.append(
-            compare(
-                new,
-                ChipMap(names[1], basis, coefficients=old, **shared),
-                rng=rng,
-                grid=grid,
-                keep=True,
-            )
+        coefficients = change.released[c]
+        old = ChipMap(
+            names[1], basis, model.unit, coefficients, chip=chip.number, epoch=change.epoch
         )
+        new = replace(old, name=names[0], coefficients=coefficients + change.difference[c], cov=cov)
+        out.append(compare(new, old, rng=rng, grid=grid, keep=True))
     return tuple(out)

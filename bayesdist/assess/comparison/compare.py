@@ -12,7 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.comparison.frame import CommonFrame, Similarity, common_frame
+from bayesdist.assess.comparison.frame import (
+    CommonFrame,
+    Similarity,
+    common_frame,
+    draws_of_sum,
+    with_errors,
+)
 from bayesdist.calibration.chip_map import ChipMap, position_moments
 from bayesdist.infer.equations.scaled import FieldTest, chi_square, known_terms
 from bayesdist.limits import DIFFERENCE
@@ -116,10 +122,7 @@ class Comparison:
     @property
     def errors_of(self) -> str:
         """Whose errors the significance rests on: 'both', 'A', 'B' or 'none'."""
-        has = [c.cov is not None for c in (self.a, self.b)]
-        return {(True, True): "both", (True, False): "A", (False, True): "B"}.get(
-            (has[0], has[1]), "none"
-        )
+        return with_errors(self.a.cov, self.b.cov)
 
     @property
     def differs(self) -> bool | None:
@@ -179,9 +182,7 @@ def compare(
         product = (sigma_u * sigma_v).ravel()
         correlation = np.divide(uv, product, out=np.zeros_like(uv), where=product > 0)
         correlation = np.clip(correlation, -1.0, 1.0).reshape(shape)
-        # of a sum of estimates as Welch and Satterthwaite count them
-        lost = sum(share**2 / c.draws for share, c in zip(frame.shares, (a, b), strict=True))
-        draws = 1.0 / lost if lost > 0 else np.inf
+        draws = draws_of_sum(zip(frame.shares, (a, b), strict=True))
         field = chi_square(
             d.ravel(), frame.raw_cov, without=frame.taken, norm=frame.norm, draws=draws
         )
@@ -191,7 +192,8 @@ def compare(
         sigma = term_sigmas(frame)
         noise = rng.standard_normal((n_draws, 2 * K)) @ _root(frame.cov).T
         z_max, p_z = _largest(d.ravel()[None], noise, sigma)
-        others = np.array([_of_two(*(phi @ n.reshape(2, K).T).T, uu, vv, uv) for n in noise])
+        fields = (n.reshape(2, K) @ phi.T for n in noise)
+        others = np.array([_of_two(along_x, along_y, uu, vv, uv) for along_x, along_y in fields])
         top = float(np.nanmax(chi2, initial=0.0))
         p_chi2 = _share(np.nanmax(others, axis=1, initial=0.0), top)
         chi2 = chi2.reshape(shape)

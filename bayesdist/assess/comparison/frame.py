@@ -11,6 +11,7 @@ divided by the linear part of A.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +28,11 @@ __all__ = [
     "CommonFrame",
     "Similarity",
     "common_frame",
+    "draws_of_sum",
+    "least_squares",
     "linear_part",
+    "turn_matrix",
+    "with_errors",
 ]
 
 Float = NDArray[np.float64]
@@ -118,9 +123,7 @@ def common_frame(a: ChipMap, b: ChipMap, *, keep: bool = False) -> CommonFrame:
         )
     used = 1.0 if keep else turn
     moved = used * zb
-    of_b = np.array([[used.real, -used.imag], [used.imag, used.real]]) * factor
-    if mirrored:
-        of_b = of_b * np.array([1.0, -1.0])
+    of_b = turn_matrix(used, mirrored=mirrored) * factor
     parts = [] if cov_a is None else [cov_a]
     if cov_b is not None:
         change = np.kron(of_b, np.eye(basis.n_terms))
@@ -133,8 +136,7 @@ def common_frame(a: ChipMap, b: ChipMap, *, keep: bool = False) -> CommonFrame:
         shares = (of_a, 1.0 - of_a)
 
     fields = similarity_fields(moved)
-    weighted = fields * term_squares(basis)[:, None]
-    estimate = np.linalg.solve(fields.T @ weighted, weighted.T)
+    estimate = least_squares(fields, basis)
     raw = as_real(za - moved)
     found = estimate @ raw
     errors = None
@@ -155,6 +157,34 @@ def common_frame(a: ChipMap, b: ChipMap, *, keep: bool = False) -> CommonFrame:
         ),
         pixel_mas=_pixel_mas(a, b, linear, turn),
     )
+
+
+def with_errors(a: Float | None, b: Float | None) -> str:
+    """Sides with a covariance: 'both', 'A', 'B' or 'none'."""
+    if a is not None:
+        return "A" if b is None else "both"
+    return "none" if b is None else "B"
+
+
+def draws_of_sum(parts: Iterable[tuple[float, ChipMap]]) -> float:
+    """Draws that a sum of estimated covariances is worth, as Welch and Satterthwaite count them.
+
+    `parts` are the fraction of each estimate in the sum, and the map that states its draws.
+    """
+    lost = sum(share**2 / one.draws for share, one in parts)
+    return 1.0 / lost if lost > 0 else np.inf
+
+
+def turn_matrix(turn: complex, *, mirrored: bool) -> Float:
+    """Matrix (2, 2) of a scale and rotation, behind a mirror where there is one."""
+    matrix = np.array([[turn.real, -turn.imag], [turn.imag, turn.real]])
+    return matrix * np.array([1.0, -1.0]) if mirrored else matrix
+
+
+def least_squares(fields: Float, basis: PolynomialBasis) -> Float:
+    """Matrix (q, 2 K) from a difference to what fields (2 K, q) explain of it over the chip."""
+    weighted = fields * term_squares(basis)[:, None]
+    return np.asarray(np.linalg.solve(fields.T @ weighted, weighted.T))
 
 
 def linear_part(basis: PolynomialBasis, coefficients: Float, a: ChipMap) -> Float:

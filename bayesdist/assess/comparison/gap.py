@@ -17,12 +17,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.comparison.frame import linear_part
+from bayesdist.assess.comparison.frame import (
+    draws_of_sum,
+    least_squares,
+    linear_part,
+    turn_matrix,
+    with_errors,
+)
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.similarity import as_real, similarity_fields, turn_between
 from bayesdist.errors import InputError
-from bayesdist.infer.compare.frame_fields import term_squares
 from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.model import PolynomialBasis
 
@@ -53,7 +58,7 @@ class GapDifference:
     values: Float
     cov: Float | None  # (4, 4)
     test: FieldTest | None  # of all four at once; None without errors on either side
-    errors_of: str  # as in `Comparison`
+    errors_of: str  # 'both', 'A', 'B' or 'none': as of `with_errors`
 
     @property
     def sigma(self) -> Float | None:
@@ -96,7 +101,9 @@ def gap_difference(a: ChipPair, b: ChipPair) -> GapDifference:
     turn, mirrored = turn_between(za[0], zb[0], bases[0], b.reference.name)
     moved = [turn * (z.conj() if mirrored else z) for z in zb]
     raw = [as_real(x - y) for x, y in zip(za, moved, strict=True)]
-    fits = [_estimate(similarity_fields(z), basis) for z, basis in zip(moved, bases, strict=True)]
+    fits = [
+        least_squares(similarity_fields(z), basis) for z, basis in zip(moved, bases, strict=True)
+    ]
     # what the similarity of the reference chip does to the other one
     about = moved[1].copy()
     about[0] -= moved[0][0]
@@ -108,17 +115,13 @@ def gap_difference(a: ChipPair, b: ChipPair) -> GapDifference:
     estimate = linear @ np.hstack([-fits[1] @ carried @ fits[0], fits[1]])
     values = estimate @ np.concatenate(raw)
 
-    turned = np.array([[turn.real, -turn.imag], [turn.imag, turn.real]])
-    if mirrored:
-        turned = turned * np.array([1.0, -1.0])
-    change = np.kron(np.eye(2), np.kron(turned, np.eye(K)))
+    turned = np.kron(turn_matrix(turn, mirrored=mirrored), np.eye(K))
+    change = np.kron(np.eye(2), turned)
     errors = [
         by @ _padded_pair(pair, K) @ by.T
         for pair, by in ((a, estimate), (b, estimate @ change))
         if pair.cov is not None
     ]
-    has = (a.cov is not None, b.cov is not None)
-    names = {(True, True): "both", (True, False): "A", (False, True): "B"}
     assert a.other.chip is not None and a.reference.chip is not None
     cov = sum(errors[1:], errors[0]) if errors else None
     return GapDifference(
@@ -127,7 +130,7 @@ def gap_difference(a: ChipPair, b: ChipPair) -> GapDifference:
         values,
         cov,
         None if cov is None else _test(values, cov, errors, (a, b), bases[1]),
-        names.get(has, "none"),
+        with_errors(a.cov, b.cov),
     )
 
 
@@ -141,18 +144,10 @@ def _test(
     """Chi-square of all four, each as what it does to a star at the edge of the chip."""
     lever = float(np.hypot(*basis.half_size))
     norm = np.array([1.0, 1.0, lever, lever]) ** 2
-    with_errors = [pair.other for pair in pairs if pair.cov is not None]
-    # of a sum of estimates as Welch and Satterthwaite count them
+    known = [pair.other for pair in pairs if pair.cov is not None]
     shares = [float(np.mean(np.diag(e) / np.diag(cov))) for e in errors]
-    lost = sum(share**2 / c.draws for share, c in zip(shares, with_errors, strict=True))
-    draws = 1.0 / lost if lost > 0 else np.inf
+    draws = draws_of_sum(zip(shares, known, strict=True))
     return chi_square(values, cov, norm=norm, draws=draws)
-
-
-def _estimate(fields: Float, basis: PolynomialBasis) -> Float:
-    """Least squares over the chip: matrix (4, 2 K) from a difference to what fields explain."""
-    weighted = fields * term_squares(basis)[:, None]
-    return np.asarray(np.linalg.solve(fields.T @ weighted, weighted.T))
 
 
 def _padded_pair(pair: ChipPair, n_terms: int) -> Float:

@@ -6,12 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 from astropy.table import Table
+from numpy.typing import NDArray
 
 from bayesdist.assess.comparison.compare import Comparison, term_sigmas
 from bayesdist.assess.comparison.gap import GapDifference
 from bayesdist.model import AXES
 
 __all__ = ["comparison_table", "difference_table", "gap_table"]
+
+Float = NDArray[np.float64]
 
 
 def comparison_table(found: Comparison) -> Table:
@@ -24,7 +27,7 @@ def comparison_table(found: Comparison) -> Table:
     frame = found.frame
     K, basis = frame.basis.n_terms, frame.basis
     to_monomials = np.kron(np.eye(2), basis.monomial_matrix)
-    forms = {
+    forms: dict[str, tuple[Float, Float | None]] = {
         "legendre": (frame.difference.ravel(), None),
         "monomial": (to_monomials @ frame.difference.ravel(), None),
     }

@@ -32,10 +32,10 @@ from bayesdist.simulate.patterns import DitherPattern
 
 __all__ = [
     "KINDS",
-    "Beforehand",
     "Camera",
     "PlannedPattern",
     "PlannedStars",
+    "PriorInformation",
     "compare_patterns",
 ]
 
@@ -84,7 +84,7 @@ class PlannedStars:
 
 
 @dataclass(frozen=True)
-class Beforehand:
+class PriorInformation:
     """Knowledge beside the detections; None for what is not known."""
 
     offset_sigma: float | None = None  # error of a commanded offset on one axis, pixels
@@ -188,7 +188,7 @@ def compare_patterns(
     patterns: Sequence[DitherPattern],
     camera: Camera,
     stars: PlannedStars,
-    known: Beforehand,
+    known: PriorInformation,
 ) -> tuple[PlannedPattern, ...]:
     """Outcomes of several patterns on one sky, the best one first.
 
@@ -228,12 +228,13 @@ def _planned(
     truth: Float,
     sky: Float,
     stars: PlannedStars,
-    known: Beforehand,
+    known: PriorInformation,
 ) -> PlannedPattern:
     x, y, exposure, chip, star = stars_on_detector(model, truth, sky)
     # a false detection says nothing, as if it were not there
     true = np.random.default_rng([stars.seed, 1]).uniform(size=len(x)) >= stars.false
-    x, y, exposure, chip, star = (a[true] for a in (x, y, exposure, chip, star))
+    x, y = x[true], y[true]
+    exposure, chip, star = exposure[true], chip[true], star[true]
     _require_overlap(pattern, exposure, star)
     sigma = np.full(len(x), stars.sigma)
     detections = Detections(

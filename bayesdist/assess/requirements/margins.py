@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bayesdist.assess.domain import EvaluationDomain, WorstPosition
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.error_model import error_model
-from bayesdist.assess.requirements.remedy import Remedy, find_remedy
+from bayesdist.assess.requirements.reduction import RequiredReduction, required_reduction
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.verdict import counting_error, effective_draws, verdict_of
 from bayesdist.assess.solution import place_of
@@ -65,7 +65,7 @@ class Margin:
         Where the error is largest, at that epoch; its size in `unit`.
     rests_on : tuple of str
         What the verdict takes for granted or has measured, as clauses.
-    remedy : Remedy or None
+    remedy : RequiredReduction or None
         The term that would have to shrink, and how far, for the requirement to be met; None where
         it is met, and where there is doubt about all numbers.
     """
@@ -83,7 +83,7 @@ class Margin:
     n_effective: float
     draws: Float
     worst: WorstPosition
-    remedy: Remedy | None = None
+    remedy: RequiredReduction | None = None
     rests_on: tuple[str, ...] = ()
 
     @property
@@ -252,11 +252,11 @@ def domains_of(
                 where=r.where,
                 do="leave epochs out, or give the model time-dependent terms",
             )
-        first, last = r.epochs
-        inner = [b for b in model.time.breaks if first < b < last]
+        start, stop = r.epochs
+        inner = [b for b in model.time.breaks if start < b < stop]
         # a break belongs to what follows it: just before it the earlier drift has run longest
-        before = [np.nextafter(b, first) for b in inner]
-        epochs = sorted({*np.linspace(first, last, EPOCHS).tolist(), *inner, *before})
+        before = [float(np.nextafter(b, start)) for b in inner]
+        epochs = [*sorted({*np.linspace(start, stop, EPOCHS).tolist(), *inner, *before})]
     elif epochs[0] is None and model.time is not None:
         raise InputError(
             "the model depends on time and no epoch is given",
@@ -348,7 +348,7 @@ def _margin(
     position = errors.worst(worst_epoch, axis)
     remedy = None
     if verdict == "missed" and not doubts:
-        remedy = find_remedy(errors, requirement, worst_epoch, factor)
+        remedy = required_reduction(errors, requirement, worst_epoch, factor)
     return Margin(
         requirement=requirement,
         value=float(median),

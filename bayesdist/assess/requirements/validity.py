@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.requirements.margins import domains_of
 from bayesdist.assess.requirements.requirement import Requirement
-from bayesdist.assess.requirements.verdict import clopper_pearson
 from bayesdist.assess.units import convert
+from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.errors import InputError
 from bayesdist.model.grid import DEFAULT_GRID
 
-__all__ = ["Horizon", "horizon_of"]
+__all__ = ["ValidityPeriod", "validity_period"]
 
 Float = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ BAND = 0.95
 
 
 @dataclass(frozen=True, eq=False)
-class Horizon:
+class ValidityPeriod:
     """The probability of meeting a requirement, epoch by epoch."""
 
     requirement: Requirement
@@ -77,7 +77,7 @@ class Horizon:
         )
 
 
-def horizon_of(
+def validity_period(
     errors: DrawnErrors,
     requirement: Requirement,
     epochs: ArrayLike,
@@ -85,7 +85,7 @@ def horizon_of(
     grid: tuple[int, int] = DEFAULT_GRID,
     n_effective: float | None = None,
     pixel_scale: float | None = None,
-) -> Horizon:
+) -> ValidityPeriod:
     """Follow a requirement through time.
 
     The error at each epoch is that of the drift as the model has it, extrapolated with its
@@ -117,4 +117,4 @@ def horizon_of(
     draws = factor * np.array([one[requirement.statistic] for one in found])
     met, value = np.mean(draws <= requirement.limit, axis=1), np.median(draws, axis=1)
     low, high = np.array([clopper_pearson(p, n, BAND) for p in met]).T
-    return Horizon(requirement, at, met, low, high, value)
+    return ValidityPeriod(requirement, at, met, low, high, value)

@@ -8,18 +8,11 @@ from collections.abc import Sequence
 from scipy.stats import beta
 
 from bayesdist.checks import LARGER, Check, doubts_of
+from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.infer.solution import Solution
 from bayesdist.limits import CONFIDENCE
 
-__all__ = [
-    "VERDICTS",
-    "clopper_pearson",
-    "counting_error",
-    "effective_draws",
-    "verdict_of",
-]
-
-VERDICTS = ("met", "missed", "undecided")
+__all__ = ["counting_error", "effective_draws", "verdict_of"]
 
 
 def effective_draws(solution: Solution, n_draws: int) -> float:
@@ -40,34 +33,6 @@ def effective_draws(solution: Solution, n_draws: int) -> float:
     return max(1.0 / (1.0 / n_draws + 1.0 / ess), 1.0)
 
 
-def clopper_pearson(
-    fraction: float, n: float, confidence: float = CONFIDENCE.value
-) -> tuple[float, float]:
-    """Exact central interval of a binomial probability.
-
-    Parameters
-    ----------
-    fraction : float
-        Successes over trials.
-    n : float
-        Trials; need not be whole.
-    confidence : float
-
-    Returns
-    -------
-    low, high : float
-
-    References
-    ----------
-    Clopper & Pearson 1934, Biometrika 26, 404, in its form with quantiles of the beta distribution.
-    """
-    tail = (1.0 - confidence) / 2.0
-    k = fraction * n
-    low = float(beta.ppf(tail, k, n - k + 1.0)) if k > 0 else 0.0
-    high = float(beta.ppf(1.0 - tail, k + 1.0, n - k)) if k < n else 1.0
-    return low, high
-
-
 def counting_error(fraction: float, n: float) -> float:
     """Standard deviation of a probability counted in n draws, under Jeffreys' prior: never zero."""
     k = fraction * n
@@ -86,7 +51,7 @@ def verdict_of(
     all of them make errors larger, else 'undecided'. `reason`: what decided, and with doubts what
     the draws alone point to.
     """
-    low, high = clopper_pearson(fraction, n)
+    low, high = clopper_pearson(fraction, n, CONFIDENCE.value)
     interval = f"the probability is {low:.4g} to {high:.4g} (99 % Monte-Carlo interval)"
     if low >= asked:
         verdict, reason = "met", f"{interval}, at or above the {asked:g} asked for"

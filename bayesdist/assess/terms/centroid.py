@@ -29,10 +29,9 @@ def centroid_errors(
     result is at least a quarter of the scatter: the other errors are not that well known.
     InputError where an error that is said to be in the residuals is larger than these.
     """
-    left = {}
-    for axis, name in ((1, "sigma_u"), (2, "sigma_v")):
-        sigma = getattr(scatter, name)
-        known = np.sqrt(sum(one[axis] ** 2 for one in contained))
+    squares = np.sum([(u**2, v**2) for _, u, v in contained] or [(0.0, 0.0)], axis=0)
+    left = np.sqrt(squares)
+    for sigma, known in zip((scatter.sigma_u, scatter.sigma_v), left, strict=True):
         # the median of n absolute residuals is known to 1.17 / sqrt(n)
         too_small = sigma * (1.0 + 3.0 * 1.17 / np.sqrt(scatter.n)) < known
         if too_small.any():
@@ -43,8 +42,7 @@ def centroid_errors(
                 where=f"budget term {contained[0][0]!r}",
                 do="correct them, or set included_in_scatter = false",
             )
-        left[name] = known
-    return without(scatter, left["sigma_u"], left["sigma_v"])
+    return without(scatter, float(left[0]), float(left[1]))
 
 
 def without(errors: MagnitudeErrors, sigma_u: float, sigma_v: float) -> MagnitudeErrors:

@@ -59,7 +59,9 @@ class StructureErrors:
         fit = Polynomials(self.rows[0], found.model, found.mean, theta, frames=self.frames)
         if not self.left:
             return fit
-        coefficients = {chip: one.coefficients for chip, one in found.structure.items()}
+        coefficients: dict[int | None, NDArray[np.floating]] = {
+            chip: one.coefficients for chip, one in found.structure.items()
+        }
         left = Functions(self.rows[1], coefficients, partial(_functions, found), n)
         return Together((fit, left), remainder=True)
 

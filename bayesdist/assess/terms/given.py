@@ -118,10 +118,9 @@ class UserTerm:
         if self.kind == "random":
             return Independent(self.rows[0], partial(_everywhere, size))
         offset = size * rng.standard_normal((n, 2))
-        covariance = {None: (size**2)[:, None, None]}
-        return Functions(
-            self.rows[0], {None: offset[..., None]}, _one, n, uniform=True, covariance=covariance
-        )
+        everywhere: dict[int | None, Float] = {None: offset[..., None]}
+        covariance: dict[int | None, Float] = {None: (size**2)[:, None, None]}
+        return Functions(self.rows[0], everywhere, _one, n, uniform=True, covariance=covariance)
 
     def treatments(
         self, model: DistortionModel, grid: tuple[int, int] | None
@@ -167,7 +166,8 @@ class SmoothTerm:
 
     def draw(self, n: int, rng: np.random.Generator) -> Functions:
         """Coefficients of polynomials, of each chip by itself."""
-        n_own, coefficients, covariance = min(n, SMOOTH_DRAWS), {}, {}
+        n_own, coefficients = min(n, SMOOTH_DRAWS), dict[int | None, Float]()
+        covariance: dict[int | None, Float] = {}
         size = np.array([self.term.sigma_u, self.term.sigma_v])[:, None]
         for chip in self.model.chips:
             phi = self(chip.number, *mesh(*grid_pixels(chip.size, self.grid)))

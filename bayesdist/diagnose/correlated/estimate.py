@@ -26,7 +26,7 @@ from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.solution import Solution, likelihood_of
 from bayesdist.infer.stars.likelihood import Likelihood
-from bayesdist.infer.stars.shards import Compute, Shards, opened
+from bayesdist.infer.stars.shards import Shards, opened
 from bayesdist.infer.stars.stars import cell_of, prepare
 from bayesdist.model import DistortionModel
 
@@ -51,7 +51,6 @@ def estimate_discrepancy(
     exposures: bool = True,
     settling: Settling | None = None,
     n_draws: int = DRAWS,
-    compute: Compute | None = None,
 ) -> Discrepancy:
     """Estimate the structure that a solution leaves out, with priors on its size.
 
@@ -79,7 +78,6 @@ def estimate_discrepancy(
     settling : Settling, optional
         Transformation of the single chips' shifts that was made after sampling.
     n_draws : int
-    compute : Compute, optional
 
     Returns
     -------
@@ -95,7 +93,7 @@ def estimate_discrepancy(
     if exposures and stars is not None and model.frames == "none" and _several(stars):
         sums = _by_exposure(stars, likelihood, model)
     else:
-        with opened(model, matches, compute) as shards:
+        with opened(model, matches) as shards:
             sums = shards.sum(cell_sums, likelihood, cells_per_side(len(shards.groups)))
     mean = likelihood.theta
     working = Information(model, mean, sums, parameter_priors or GaussianPriors.none(model))

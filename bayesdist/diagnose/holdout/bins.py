@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -47,12 +48,8 @@ class Partition:
 
     kind: str  # 'all', 'region', 'magnitude', 'epoch', 'exposure' or 'place in exposure'
     bins: tuple[Bin, ...]
-    # of a table and some of its rows: bin of each, negative where there is none
-    code: Callable[[Matches, Int], Int]
-
-    def codes(self, table: Matches, rows: Int) -> Int:
-        """Bins (n,) of some rows."""
-        return self.code(table, rows)
+    # of a table and some of its rows (n,): bin (n,) of each, negative where there is none
+    codes: Callable[[Matches, Int], Int]
 
 
 def partitions_of(
@@ -101,11 +98,9 @@ def _places(
     if side * len(model.chips) < 2:
         return []
     cells = _regions(model, side)
-    number = {name: k for k, name in enumerate(names)}
 
     def code(table: Matches, rows: Int) -> Int:
-        of_code = np.array([number.get(name, -1) for name in table.exposure_names], np.int64)
-        mine = of_code[table.exposure[rows]]
+        mine = _among(names, table, rows)
         return np.where(mine < 0, -1, mine * len(cells.bins) + cells.codes(table, rows))
 
     bins = [
@@ -178,13 +173,14 @@ def _quantiles(kind: str, name: str, values: Float, n: int) -> list[Partition]:
 
 
 def _exposures(names: Sequence[str], whole: set[str]) -> Partition:
-    number = {name: k for k, name in enumerate(names)}
-
-    def code(table: Matches, rows: Int) -> Int:
-        of_code = np.array([number.get(name, -1) for name in table.exposure_names], np.int64)
-        return of_code[table.exposure[rows]]
-
     bins = (
         Bin(f"in exposure {name}{', held out whole' if name in whole else ''}") for name in names
     )
-    return Partition("exposure", tuple(bins), code)
+    return Partition("exposure", tuple(bins), partial(_among, names))
+
+
+def _among(names: Sequence[str], table: Matches, rows: Int) -> Int:
+    """Which of some exposures each of some rows belongs to; negative for others."""
+    number = {name: k for k, name in enumerate(names)}
+    of_code = np.array([number.get(name, -1) for name in table.exposure_names], np.int64)
+    return np.asarray(of_code[table.exposure[rows]])

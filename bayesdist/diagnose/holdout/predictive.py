@@ -86,10 +86,6 @@ class Predictive:
             out[here] = (table.evaluate(x[here], y[here]) ** 2).mean(axis=1)
         return out
 
-    def hyper(self) -> Float:
-        """Squared jitter, fraction and log scale."""
-        return np.array([self.jitter2, self.fraction, np.log(self.scale)])
-
     def outlier_density(self, r2: Float, scale: float) -> Float:
         """Density of false matches at squared distances."""
         if self.outliers == "gaussian":

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betainc, erf
-from scipy.stats import beta, chi2
+from scipy.stats import chi2
 
 from bayesdist.diagnose.holdout.bins import ALL, Partition
 from bayesdist.diagnose.holdout.grouped import ScaleSums
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.sums import LEVELS, PIT_BINS, STEP, TAILS, BinSums, HeldSums
-from bayesdist.diagnose.significance import hotelling_p
+from bayesdist.diagnose.significance import clopper_pearson, hotelling_p
 from bayesdist.limits import HELD_OUT_DISTRIBUTION, HELD_OUT_RATIO, HELD_OUT_TAILS
 
 __all__ = ["AXIS", "AxisCoverage", "HeldTest", "all_tests", "coverage_of"]
@@ -28,6 +28,7 @@ Float = NDArray[np.float64]
 
 AXIS = "axis"  # a part: the stars along one axis
 
+INTERVAL = 0.95  # of fractions
 MIN_STARS = 20  # of a bin that is judged by itself
 STARS_PER_PIT_BIN = 20
 SINGULAR = 0.05  # of a variance: what is left where frames have taken up nearly all
@@ -93,7 +94,7 @@ def coverage_of(sums: HeldSums) -> tuple[AxisCoverage, ...]:
             sums.n,
             float(sums.within[a, k]) / sums.n,
             float(erf(level / np.sqrt(2))),
-            _interval(int(sums.within[a, k]), sums.n),
+            clopper_pearson(float(sums.within[a, k]) / sums.n, sums.n, INTERVAL),
         )
         for a, axis in enumerate("uv")
         for k, level in enumerate(LEVELS)
@@ -222,7 +223,7 @@ def _tails(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
         more = 1.0 if sums.shared is None else sums.shared.overdispersion(limit)
         below = float(weights @ _at_most(seen / more, sums.n / more, share))
         above = float(weights @ _at_least(seen / more, sums.n / more, share))
-        interval = _interval(seen, sums.n)
+        interval = clopper_pearson(seen / sums.n, sums.n, INTERVAL)
         p = float(min(1.0, 2 * min(below, above)))
         out.append(
             HeldTest(
@@ -239,14 +240,6 @@ def _tails(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
             )
         )
     return out
-
-
-def _interval(seen: int, n: int) -> tuple[float, float]:
-    """Interval of 95 % of a fraction (Clopper and Pearson 1934)."""
-    return (
-        float(beta.ppf(0.025, seen, n - seen + 1)) if seen else 0.0,
-        float(beta.ppf(0.975, seen + 1, n - seen)) if seen < n else 1.0,
-    )
 
 
 def _at_least(k: float, n: float, share: Float) -> Float:

@@ -297,7 +297,6 @@ def band_bins(
     *,
     bins: int | tuple[int, int] = 31,
     size: tuple[float, float],
-    weights: ArrayLike | None = None,
 ) -> BinnedSums:
     """Sums of residuals and of their lengths in bins, as section 5 of WSDC D-T033.
 
@@ -307,7 +306,7 @@ def band_bins(
     5 of WSDC D-T033 and 45 in its Appendix C.
     """
     length = np.hypot(np.asarray(ru, float), np.asarray(rv, float))
-    return binned_sums(x, y, ru, rv, length, bins=bins, size=size, weights=weights)
+    return binned_sums(x, y, ru, rv, length, bins=bins, size=size)
 
 
 def _edges(size: float, n: int) -> Float:

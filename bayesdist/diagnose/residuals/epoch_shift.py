@@ -143,6 +143,6 @@ def _left_over(sample: ScoredSample, weight: Float, *fields: Float) -> Iterator[
 
 def _together(sample: ScoredSample) -> list[Int]:
     """Rows of each chip of each exposure."""
-    keys = np.column_stack([sample.codes("chip"), sample.codes("exposure")])
+    keys = np.column_stack([sample.chip, sample.exposure])
     code = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
     return np.split(np.argsort(code, kind="stable"), np.cumsum(np.bincount(code))[:-1])

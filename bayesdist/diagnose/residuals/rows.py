@@ -43,8 +43,7 @@ class StatisticsRow:
     noise_free: Mapping[str, float]
     variance: float  # what is left of sigma^2 without noise; below zero where chance makes it so
     variance_error: float  # its standard deviation
-    # n_bins, n_left_out: bins used, and those without a standard error; of both bands together
-    # where all pairs of two are compared
+    # n_bins, n_left_out: bins used, and those without a standard error
     n_bins: int
     n_left_out: int
 
@@ -69,38 +68,20 @@ def bin_row(
 
 
 def pair_row(
-    label: str,
-    first: BinValues,
-    second: BinValues | None = None,
-    *,
-    absorbed: int,
-    rng: np.random.Generator,
+    label: str, bins: BinValues, *, absorbed: int, rng: np.random.Generator
 ) -> StatisticsRow:
     """A row of Table 5-3 of WSDC D-T033: differences over all pairs of bins.
 
-    `second` are bins of another band, which are subtracted; by default those of the same one.
     `absorbed` and `rng` as of `bin_row`. Raises `DegenerateError` as `bin_row`.
     """
-    a = _Bins.of(label, first, absorbed)
-    b = a if second is None else _Bins.of(label, second, absorbed)
-    drawn_a = a.draws(rng)
-    drawn_b = drawn_a if second is None else b.draws(rng)
-    coarse = _COARSE * float(np.hypot(a.value["sigma"], b.value["sigma"]))
-    rows = [
-        pair_statistics(x, x if second is None else y, tolerance=coarse)
-        for x, y in zip(drawn_a, drawn_b, strict=True)
-    ]
+    some = _Bins.of(label, bins, absorbed)
+    coarse = _COARSE * float(np.hypot(some.value["sigma"], some.value["sigma"]))
+    rows = [pair_statistics(one, tolerance=coarse) for one in some.draws(rng)]
     drawn = {name: np.array([row[name] for row in rows]) for name in STATISTICS}
-    centre = a.centre
-    calm = pair_statistics(centre, centre if second is None else b.centre, tolerance=coarse)
-    value = pair_statistics(a.mean, b.mean)
-    if second is None:
-        variance, error = 2 * a.variance, 2 * a.variance_error
-    else:
-        variance = a.variance + b.variance
-        error = float(np.hypot(a.variance_error, b.variance_error))
-    good = first.good if second is None else np.concatenate([first.good, second.good])
-    return _row(label, value, drawn, calm, variance, error, good)
+    calm = pair_statistics(some.centre, tolerance=coarse)
+    value = pair_statistics(some.mean)
+    variance, error = 2 * some.variance, 2 * some.variance_error
+    return _row(label, value, drawn, calm, variance, error, bins.good)
 
 
 @dataclass(frozen=True, eq=False)

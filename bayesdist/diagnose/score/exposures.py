@@ -21,7 +21,7 @@ from scipy.linalg import cho_solve
 from bayesdist.diagnose.clusters import add_over, sums_over
 from bayesdist.diagnose.score.directions import independent_directions, squares_of
 from bayesdist.diagnose.score.families import FAMILIES
-from bayesdist.diagnose.score.projection import Projection
+from bayesdist.diagnose.score.projection import Projection, weighted
 from bayesdist.diagnose.score.result import Outcome, outcome
 from bayesdist.diagnose.score.sample import Block
 from bayesdist.diagnose.significance import chi_square_of, hotelling_p
@@ -199,10 +199,10 @@ def _of_exposure(
     to_local = np.zeros((0 if local is None else len(local.index), n))
     area = np.array([1.0 / ((2 * i + 1) * (2 * j + 1)) for i, j in model.basis().terms])
     fields = [_fields(block, names, model.origin) for block in blocks]
-    parts = [projection.parts(block) for block in blocks]
+    parts = [block.parts(G) for block in blocks]
     for block, Z, (by_global, by_local) in zip(blocks, fields, parts, strict=True):
         F = projection.functions.polynomials(block.rows)
-        WZ = projection.weighted(F, block, Z)
+        WZ = weighted(F, sample.curvature[:, block.rows], Z)
         whole += np.einsum("akm,akn->mn", Z, WZ)
         columns = block.columns[: by_global.shape[2]]
         cross[:, columns] += np.einsum("akn,akm->nm", WZ, by_global)
@@ -228,7 +228,8 @@ def _of_exposure(
             at = np.searchsorted(local.index, block.columns[block.columns >= G])
             direct -= by_local @ own_gain[at]
         if meat is None:
-            others -= np.einsum("akm,akn->mn", direct, projection.weighted(F, block, direct))
+            pulled = weighted(F, sample.curvature[:, block.rows], direct)
+            others -= np.einsum("akm,akn->mn", direct, pulled)
         else:
             direct += through
         psi.append(projection.star_scores(F, block, direct))

@@ -78,14 +78,14 @@ def noise_tests(sample: ScoredSample) -> list[Outcome]:
     if sample.mag is not None:
         n_stars = int(squares.star.max(initial=0)) + 1
         parts["magnitude"] = _magnitudes(sample.mag[rows], n_stars)
-    parts["exposure"] = sample.codes("exposure")[rows]
+    parts["exposure"] = sample.exposure[rows]
     out = [_by_part(squares, FAMILIES[f"noise by {name}"], code) for name, code in parts.items()]
     return [one for one in (*out, _by_axis(squares)) if one is not None]
 
 
 def _cells(sample: ScoredSample, rows: Int) -> Int:
     """Codes (n,) of coarse cells of each chip."""
-    chip = sample.codes("chip")[rows]
+    chip = sample.chip[rows]
     code = np.zeros(len(rows), np.int64)
     for c in np.unique(chip):
         here = chip == c

@@ -20,7 +20,7 @@ from bayesdist.diagnose.score.regressors import Functions
 from bayesdist.diagnose.score.sample import Block, ScoredSample
 from bayesdist.infer.equations.priors import GaussianPriors
 
-__all__ = ["LARGEST_LEVERAGE", "Eliminated", "Projection", "projection_of"]
+__all__ = ["LARGEST_LEVERAGE", "Eliminated", "Projection", "projection_of", "weighted"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -112,7 +112,7 @@ class Projection:
 
         The parameters of the exposure follow them.
         """
-        by_global, by_local = _parts(block, self.n_global)
+        by_global, by_local = block.parts(self.n_global)
         n_own = by_global.shape[2]
         out = by_global @ by[block.columns[:n_own]]
         if by_local.shape[2]:
@@ -120,14 +120,6 @@ class Projection:
             at = np.searchsorted(one.index, block.columns[n_own:])
             out -= by_local @ (one.gain[at, : self.n_global] @ by)
         return np.asarray(out)
-
-    def parts(self, block: Block) -> tuple[Float, Float]:
-        """Derivatives (2, K, m) of a block's polynomial by global and by local parameters."""
-        return _parts(block, self.n_global)
-
-    def weighted(self, F: Float, block: Block, X: Float) -> Float:
-        """Moments of functions F (L, n) of a block's detections with their curvature, times X."""
-        return _weighted(F, self.sample.curvature[:, block.rows], X)
 
     def star_scores(self, F: Float, block: Block, coefficients: Float) -> Float:
         """Scores (n, q) of detections, by coefficients (2, L, q) of functions F (L, n)."""
@@ -148,7 +140,7 @@ class Projection:
         }
         out = np.zeros((2, len(sample)))
         for block in sample.blocks:
-            by_global, by_local = _parts(block, G)
+            by_global, by_local = block.parts(G)
             columns = block.columns[: by_global.shape[2]]
             phi = self.functions.polynomials(block.rows)
             joint = inverse[np.ix_(columns, columns)]
@@ -175,7 +167,7 @@ class Projection:
         `which` (n,) are from 0 to q - 1.
         """
         K, nuisance = self.sample.model.n_terms, self.nuisance[:, which]
-        by_global, by_local = _parts(block, self.n_global)
+        by_global, by_local = block.parts(self.n_global)
         n_own = by_global.shape[2]
         out = _added(block, self.n_added, K, which)
         out[:, :K] -= by_global @ nuisance[block.columns[:n_own]]
@@ -236,21 +228,21 @@ def _summed(functions: Functions, theta: Float, priors: GaussianPriors) -> Proje
         cross, own = np.zeros((len(index), m)), pull[index].copy()
         for block in blocks:
             F = functions.at(block.rows)
-            by_global, by_local = _parts(block, G)
+            by_global, by_local = block.parts(G)
             n_own = by_global.shape[2]
             added = 2 * (L - K) * block.chip + np.arange(2 * (L - K))
             columns = np.r_[block.columns[:n_own], G + added]
             X = np.zeros((2, L, len(columns)))
             X[:, :K, :n_own] = by_global
             X[..., n_own:] = _added(block, L - K, K, added)
-            WX = _weighted(F, sample.curvature[:, block.rows], X)
+            WX = weighted(F, sample.curvature[:, block.rows], X)
             R = F @ sample.score[:, block.rows].T  # (L, 2)
             information[np.ix_(columns, columns)] += _contracted(X, WX)
             score[columns] += _contracted(X, R.T[..., None])[:, 0]
             if by_local.shape[2]:
                 at = np.searchsorted(index, block.columns[n_own:])
                 cross[np.ix_(at, columns)] += _contracted(by_local, WX[:, :K])
-                Wl = _weighted(F[:K], sample.curvature[:, block.rows], by_local)
+                Wl = weighted(F[:K], sample.curvature[:, block.rows], by_local)
                 inner[np.ix_(at, at)] += _contracted(by_local, Wl)
                 own[at] += _contracted(by_local, R[:K].T[..., None])[:, 0]
         if len(index):
@@ -264,12 +256,6 @@ def _summed(functions: Functions, theta: Float, priors: GaussianPriors) -> Proje
     out = Projection(functions, exposures, information, score, priors.precision, theta)
     out.root  # noqa: B018 - raises here, where there is another way
     return out
-
-
-def _parts(block: Block, n_global: int) -> tuple[Float, Float]:
-    """Derivatives of a block's polynomial by global and by the exposure's parameters."""
-    n = int((block.columns < n_global).sum())
-    return block.derivative[..., :n], block.derivative[..., n:]
 
 
 def _added(block: Block, n_added: int, n_terms: int, which: Int) -> Float:
@@ -287,7 +273,7 @@ def _contracted(A: Float, B: Float) -> Float:
     return A.reshape(-1, A.shape[2]).T @ B.reshape(-1, B.shape[2])
 
 
-def _weighted(F: Float, curvature: Float, X: Float) -> Float:
+def weighted(F: Float, curvature: Float, X: Float) -> Float:
     """Moments of functions F (L, n) with the curvature (3, n), times X (2, L, m)."""
     uu, uv, vv = curvature
     Wuu = (F * uu) @ F.T

@@ -3,6 +3,7 @@ magnitude, colour and time."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -129,40 +130,42 @@ def functions_for(sample: ScoredSample) -> Functions:
         Regressors(order_family(total, n), len(polynomial_terms(total - 1)) + np.arange(total + 1))
         for total in range(n + 1, n + HIGHER + 1)
     ]
+    orders = np.concatenate([one.functions for one in regressors])
     factors: list[Factor] = []
     start = len(polynomial_terms(n + HIGHER))
-
-    def add(name: str, factor: Factor, least: float = INDEPENDENT) -> None:
-        nonlocal start
-        if np.std(factor.values) < CONSTANT:
-            return
-        factors.append(factor)
-        functions = start + np.arange(factor.n_terms)
+    for name, several, least in _questions(sample):
+        if all(np.std(one.values) < CONSTANT for one in several):
+            continue
+        functions = start + np.arange(sum(one.n_terms for one in several))
+        factors += several
+        start += len(functions)
         regressors.append(Regressors(FAMILIES[name], functions, least))
-        start += factor.n_terms
+        if name == EDGES:
+            beside = replace(FAMILIES[EDGES], name=EDGES_BESIDE_ORDERS)
+            regressors.append(Regressors(beside, functions, least, orders))
+    return Functions(sample, n + HIGHER, tuple(factors), tuple(regressors))
 
+
+def _questions(sample: ScoredSample) -> Iterator[tuple[str, list[Factor], float]]:
+    """Iterator over tests by name: factors of their functions, and what a direction must keep."""
     for name, values in (("magnitude", sample.mag), ("colour", sample.colour)):
         if values is not None:
-            add(name, Factor(_standing_out(values), LINEAR))
-    edges = [np.exp((s * Z - 1.0) / NEAR_EDGE) for Z in (sample.X, sample.Y) for s in (-1, 1)]
+            yield name, [Factor(_standing_out(values), LINEAR)], INDEPENDENT
     if len(sample) >= MIN_AT_EDGES:
-        factors += [Factor(one - one.mean(), 0) for one in edges]
-        orders = np.concatenate([one.functions for one in regressors[:HIGHER]])
-        alone = Regressors(FAMILIES[EDGES], start + np.arange(len(edges)))
-        beside = replace(alone.family, name=EDGES_BESIDE_ORDERS)
-        regressors += [alone, replace(alone, family=beside, beside=orders)]
-        start += len(edges)
+        edges = [np.exp((s * Z - 1.0) / NEAR_EDGE) for Z in (sample.X, sample.Y) for s in (-1, 1)]
+        yield EDGES, [Factor(one - one.mean(), 0) for one in edges], INDEPENDENT
     time, epoch = sample.model.time, sample.epoch
-    if epoch is not None and np.ptp(epoch) > SHORTEST:
-        # from -1 to 1
-        half = (2 * epoch - epoch.min() - epoch.max()) / np.ptp(epoch)
-        if sample.mag is not None:
-            add("magnitude in time", Factor(_standing_out(sample.mag) * half, LINEAR))
-        add("drift", Factor(half - half.mean(), LINEAR), OWN_OF_TIME)
-        if time is not None and len(np.unique(epoch)) > 2:
-            order = max([LINEAR, *(i + j for _, i, j in time.terms)])
-            add("curvature in time", Factor(_beyond_lines(half, time, epoch), order), OWN_OF_TIME)
-    return Functions(sample, n + HIGHER, tuple(factors), tuple(regressors))
+    if epoch is None or np.ptp(epoch) <= SHORTEST:
+        return
+    half = (2 * epoch - epoch.min() - epoch.max()) / np.ptp(epoch)  # from -1 to 1
+    if sample.mag is not None:
+        values = _standing_out(sample.mag) * half
+        yield "magnitude in time", [Factor(values, LINEAR)], INDEPENDENT
+    yield "drift", [Factor(half - half.mean(), LINEAR)], OWN_OF_TIME
+    if time is not None and len(np.unique(epoch)) > 2:
+        order = max([LINEAR, *(i + j for _, i, j in time.terms)])
+        factor = Factor(_beyond_lines(half, time, epoch), order)
+        yield "curvature in time", [factor], OWN_OF_TIME
 
 
 def _standing_out(values: Float) -> Float:

@@ -35,6 +35,11 @@ class Block:
     columns: Int  # (m,) parameters that the polynomial depends on, the global ones first
     derivative: Float  # (2, K, m) of the effective coefficients by them
 
+    def parts(self, n_global: int) -> tuple[Float, Float]:
+        """Derivatives (2, K, m) by global parameters, and by those of the exposure."""
+        n = int((self.columns < n_global).sum())
+        return self.derivative[..., :n], self.derivative[..., n:]
+
 
 @dataclass(frozen=True, eq=False)
 class ScoredSample:
@@ -56,7 +61,10 @@ class ScoredSample:
     # (N,) number of the star, from 0: detections of one star share the error of its reference
     # position
     star: Int
-    blocks: tuple[Block, ...]
+    # chip, exposure (N,): codes into the model's chips, and into the exposures of the data
+    chip: Int
+    exposure: Int
+    blocks: tuple[Block, ...] = ()  # none where nothing is asked of the model's derivatives
     motion: Float | None = None  # (2, N) proper motions along u and v, in the unit of u, v per year
     motion_sigma: Float | None = None  # (2, N) their standard errors, where the table has them
     # (2, N) fraction of the noise of each detection that the fit follows, along u and v; 0 where it
@@ -75,13 +83,6 @@ class ScoredSample:
     def whole_score(self) -> Float:
         """Score (2, N), given back what the fit has taken (Bell and McCaffrey 2002)."""
         return np.asarray(self.score / np.sqrt(1.0 - self.leverage))
-
-    def codes(self, name: str) -> Int:
-        """Codes (N,) of what the detections of a block have in common: 'chip', 'exposure'."""
-        out = np.empty(len(self), np.int64)
-        for block in self.blocks:
-            out[block.rows] = getattr(block, name)
-        return out
 
     def blocks_by(self, name: str) -> list[list[Block]]:
         """Blocks that have a code in common: 'exposure', 'frame_exposure'."""
@@ -129,6 +130,8 @@ def scored_sample(table: Matches, solution: Solution) -> ScoredSample:
         colour=None if table.colour is None else table.colour[rows],
         epoch=None if table.epoch is None else table.epoch[rows],
         star=np.unique(codes, return_inverse=True)[1],
+        chip=np.repeat(stars.groups.chip, np.diff(stars.starts)),
+        exposure=table.exposure[rows],
         blocks=_blocks(stars, table.exposure[rows], likelihood.theta),
         motion=_both(table.pm_u, table.pm_v, rows),
         motion_sigma=_both(table.sigma_pm_u, table.sigma_pm_v, rows),

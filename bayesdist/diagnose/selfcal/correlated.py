@@ -45,34 +45,28 @@ def selfcal_discrepancy(
     *,
     rng: np.random.Generator,
     priors: DiscrepancyPriors | None = None,
-    structure: bool = True,
-    exposures: bool = True,
-    n_draws: int = DRAWS,
 ) -> Discrepancy:
     """Discrepancy of a self-calibration at its mode, with priors on its size.
 
-    In the gauge of the solution: parameters that it fixes have no errors.  `structure` beyond the
-    model and deviations of single `exposures` can be left out.
+    In the gauge of the solution: parameters that it fixes have no errors.
     """
     priors, model = priors or DiscrepancyPriors(), solution.problem.model
     working = scores_of_detections(solution)
     flat = working.flattened(score_excess(solution, working))
     cov = solution.cov
     noise, ratio = _noise(solution, working)
-    facts: dict[str, object] = {"structure": [], "unit": model.unit, "noise_ratio": ratio}
 
     some = even_stars(solution.problem, MAX_DETECTIONS)
     problem, stars = solution.problem.of_stars(some), solution.stars[some]
     chosen = np.isin(solution.problem.star, some)
     flat, working = flat.at(chosen), working.at(chosen)
-    functions = _functions(problem) if structure else {}
+    functions = _functions(problem)
     counts = np.bincount(problem.groups.index, minlength=len(problem.groups))
     deviations = deviation_columns(
         model,
         solution.theta,
         problem.groups,
         counts.astype(float),
-        exposures=exposures,
         most=MAX_EXPOSURES,
     )
     columns = Columns(problem, solution.theta, functions, deviations)
@@ -84,19 +78,16 @@ def selfcal_discrepancy(
     taken = cov @ taken[:, D:] * all_of_them
 
     m = 2 * sum(f.n_known for f in functions.values())
-    theta, found = np.zeros((n_draws, D)), dict[int, ChipStructure]()
-    if functions:
-        found, theta, facts["structure"] = _structure(
-            solution, functions, (S[:m, :m], score[:m], taken[:, :m]), priors, n_draws, rng
-        )
+    found, theta, sizes = _structure(
+        solution, functions, (S[:m, :m], score[:m], taken[:, :m]), priors, rng
+    )
+    facts: dict[str, object] = {"structure": sizes, "unit": model.unit, "noise_ratio": ratio}
     linear = None
     if deviations is not None:
-        linear = deviation_draws(
-            deviations, S[m:, m:], score[m:], taken[:, m:], priors, n_draws, rng
-        )
+        linear = deviation_draws(deviations, S[m:, m:], score[m:], taken[:, m:], priors, DRAWS, rng)
         facts["exposures"] = linear.n_exposures
         facts["scatter"] = {k: float(np.median(v)) for k, v in linear.scatter.items()}
-    if exposures and model.frames != "affine" and not (linear and linear.scatter):
+    if model.frames != "affine" and not (linear and linear.scatter):
         facts["exposures_measured"] = False
     return Discrepancy(model, solution.theta, cov, noise, found, theta, linear, facts)
 
@@ -132,10 +123,9 @@ def _structure(
     functions: dict[int, StructureFunctions],
     sums: tuple[Float, Float, Float],
     priors: DiscrepancyPriors,
-    n: int,
     rng: np.random.Generator,
 ) -> tuple[dict[int, ChipStructure], Float, list[dict[str, object]]]:
-    """Structure by chip number, its effect on the parameters (n, D), and its sizes."""
+    """Structure by chip number, its effect on the parameters (DRAWS, D), and its sizes."""
     problem, model = solution.problem, solution.problem.model
     pixel = model.pixel_size(solution.theta)
     S, score, taken = sums
@@ -147,7 +137,7 @@ def _structure(
         higher_order=priors.higher_order * pixel,
         structure=priors.structure * pixel,
     )
-    drawn = posterior.draws(n, rng)
+    drawn = posterior.draws(DRAWS, rng)
     out, rows, known = dict[int, ChipStructure](), list[dict[str, object]](), []
     for k, (code, one) in enumerate(functions.items()):
         chip, pair = model.chips[code], drawn[2 * k : 2 * k + 2]

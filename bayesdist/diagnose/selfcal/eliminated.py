@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.correlated.deviations import DeviationColumns
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.selfcal.leverage import places_by_star
@@ -252,19 +253,16 @@ def without_parameters(solution: SelfCalibrationMode, N: Float, score: Float) ->
     return Remainder((S + S.T) / 2, score[D:] - through.T @ (root.T @ pull), gain)
 
 
-def star_sums(
-    columns: Columns, piece: Piece, scores: DetectionScores, pull: Float, precision: Float
-) -> StarSums:
-    """Sums over the detections of each star of a piece.
-
-    `pull` (S, q) is the gradient and `precision` (S, q, q) the precision of the stars' priors.
-    """
+def star_sums(columns: Columns, piece: Piece, scores: DetectionScores, stars: Float) -> StarSums:
+    """Sums over the detections of each star of a piece, the stars (S, q) where the scores are."""
+    priors = columns.problem.priors
+    precision = priors.precision[piece.stars]
+    pull = np.einsum("skq,sq->sk", precision, priors.centre[piece.stars] - stars[piece.stars])
     S, q = pull.shape
     S_H = np.swapaxes(piece.by_star, 1, 2) @ scores.curvature  # (n, q, 2)
-    own = np.array(precision)
-    np.add.at(own, piece.star, S_H @ piece.by_star)
-    b = -np.array(pull)
-    np.add.at(b, piece.star, np.einsum("naq,na->nq", piece.by_star, scores.gradient))
+    own = precision + sums_over(piece.star, S_H @ piece.by_star, S)
+    gradient = np.einsum("naq,na->nq", piece.by_star, scores.gradient)
+    b = sums_over(piece.star, gradient, S) - pull
     T = np.zeros((S * q, columns.sparse.stop))
     turned = S_H @ piece.frame
     for code, (here, values) in enumerate(piece.dense):
@@ -303,19 +301,15 @@ def eliminated(
         ]
     )
     other = np.zeros((len(inside), n))
-    prior = p.priors
-    pull = np.einsum("skq,sq->sk", prior.precision, prior.centre - stars)
     for piece in pieces(columns):
-        rows, s = piece.rows, piece.stars
-        known = pull[s], prior.precision[s]
-        here = scores.at(rows)
-        sums = star_sums(columns, piece, here, *known)
+        here = scores.at(piece.rows)
+        sums = star_sums(columns, piece, here, stars)
         add_products(total, columns, columns, piece, here.curvature)
         total -= sums.rows.T @ sums.rows
         score += _pulled(columns, piece, here.gradient) - sums.rows.T @ sums.right
         if working is not None:
-            here = working.at(rows)
-            sums = star_sums(columns, piece, here, *known)
+            here = working.at(piece.rows)
+            sums = star_sums(columns, piece, here, stars)
             add_products(other, narrow, columns, piece, here.curvature)
             other -= sums.rows[:, inside].T @ sums.rows
     if working is None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.diagnose.clusters import sums_over
 from bayesdist.infer.selfcal.calibrate import MOST_TAKEN
 from bayesdist.infer.selfcal.elimination import STARS, memberships
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
@@ -47,8 +48,8 @@ def star_blocks(solution: SelfCalibrationMode) -> Iterator[StarBlock]:
         to_pixels = np.linalg.inv(p.jacobians(theta, rows))
         w, star = weights[rows], p.star[rows] - first
         by_star = np.swapaxes(to_pixels @ places_by_star(p, rows), 1, 2)
-        own = np.array(p.priors.precision[first:last])
-        np.add.at(own, star, w[:, None, None] * by_star @ np.swapaxes(by_star, 1, 2))
+        curvature = w[:, None, None] * by_star @ np.swapaxes(by_star, 1, 2)
+        own = p.priors.precision[first:last] + sums_over(star, curvature, last - first)
         roots = _inverse_roots(own)
         residual = np.einsum("nij,nj->ni", to_pixels, residuals[rows])
         ties = w[:, None, None] * (roots[star] @ by_star)

@@ -32,12 +32,10 @@ def sandwich(solution: SelfCalibrationMode, scores: DetectionScores) -> Float:
     inside = np.empty_like(root)
     inside[columns.order] = root
     meat = np.array(solution.prior.precision)
-    pull = np.einsum("skq,sq->sk", p.priors.precision, p.priors.centre - solution.stars)
     for piece in pieces(columns):
         here = scores.at(piece.rows)
-        known = pull[piece.stars], p.priors.precision[piece.stars]
-        sums = star_sums(columns, piece, here, *known)
-        S, q = known[0].shape
+        sums = star_sums(columns, piece, here, solution.stars)
+        S, q = piece.stars.stop - piece.stars.start, p.n_star
         moved = _displacements(columns, piece, inside)
         whole = np.einsum("nab,naf,nbf->n", here.curvature, moved, moved, optimize=True)
         leverage = np.bincount(piece.star, whole, S)

@@ -8,7 +8,6 @@ take up cannot be tested: directions in which known stars would say much more ar
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from bayesdist.diagnose.score.families import FAMILIES, Family, order_family
 from bayesdist.diagnose.score.motions import SHORTEST, StarResiduals, motion_outcome
 from bayesdist.diagnose.score.noise import noise_tests
 from bayesdist.diagnose.score.result import Outcome, ScoreTest, corrected, outcome
-from bayesdist.diagnose.score.sample import Block, ScoredSample
+from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.selfcal.columns import AddedColumns, pointing_terms
 from bayesdist.diagnose.selfcal.correlated import MAX_EXPOSURES
 from bayesdist.diagnose.selfcal.eliminated import (
@@ -70,17 +69,8 @@ def selfcal_score_tests(
 ) -> tuple[ScoreTest, ...]:
     """Targeted tests of a self-calibration for what its model lacks, and for its noise.
 
-    A test is left out where the data cannot be asked.
-
-    Parameters
-    ----------
-    solution : SelfCalibrationMode
-    mag, epoch : ndarray, shape (N,), optional
-        Of each detection of its problem; decimal years.
-
-    Returns
-    -------
-    tuple of ScoreTest
+    A test is left out where the data cannot be asked.  `mag` and `epoch` (N,) are those of each
+    detection of its problem, the latter in decimal years.
     """
     whole = solution.problem
     some = even_stars(whole, MAX_DETECTIONS)
@@ -112,12 +102,11 @@ def _summed(
     p, scores = columns.problem, scores_of_detections(solution).at(rows)
     n, D = columns.sparse.stop, columns.n_params
     known, taken, square = (np.zeros((n, n)) for _ in range(3))
-    prior, score, psi = p.priors, np.zeros(n), []
-    pull = np.einsum("skq,sq->sk", prior.precision, prior.centre - stars)
+    score, psi = np.zeros(n), []
     unit = np.broadcast_to(np.eye(2), (len(p), 2, 2))
     for piece in pieces(columns):
-        here, s = scores.at(piece.rows), piece.stars
-        sums = star_sums(columns, piece, here, pull[s], prior.precision[s])
+        here = scores.at(piece.rows)
+        sums = star_sums(columns, piece, here, stars)
         taken += sums.rows.T @ sums.rows
         score -= sums.rows.T @ sums.right
         add_products(known, columns, columns, piece, here.curvature)
@@ -194,45 +183,29 @@ def _noise_sample(
     """
     whole, theta, model = solution.problem, solution.theta, solution.problem.model
     p, pixel = whole.of_stars(some), model.pixel_size(theta)
-    order = np.argsort(p.groups.index, kind="stable")
-    group = p.groups.index[order]
+    group = p.groups.index
     scores = scores_of_detections(solution).at(rows)
     J = p.jacobians(theta, slice(0, len(p)))
-    g = np.einsum("nab,na->nb", J, scores.gradient)[order] / pixel
-    H = (np.swapaxes(J, 1, 2) @ scores.curvature @ J)[order] / pixel**2
+    g = np.einsum("nab,na->nb", J, scores.gradient) / pixel
+    H = np.swapaxes(J, 1, 2) @ scores.curvature @ J / pixel**2
     r = (p.places(theta) - p.star_places(solution.stars[some]))[..., None]
-    residual = np.linalg.solve(J, r)[order, :, 0] * pixel
-    variance = (p.var[order] + solution.mixture.jitter**2) * pixel**2
-    member = memberships(whole, theta, solution.mixture, solution.stars)[rows][order]
-    starts = np.searchsorted(group, np.arange(len(p.groups) + 1))
-    jacobian, effective = p.effective_jacobian(theta), p.effective(theta)
-    blocks = tuple(
-        Block(
-            slice(int(a), int(b)),
-            int(p.groups.chip[k]),
-            int(p.groups.exposure[k]),
-            int(p.groups.exposure[k]),
-            model.frame(theta, int(p.groups.exposure[k]))[0],
-            effective[k],
-            *jacobian[k],
-        )
-        for k, (a, b) in enumerate(pairwise(starts))
-        if b > a
-    )
-    taken = taken_by_stars(solution)[rows][order]
+    residual = np.linalg.solve(J, r)[:, :, 0] * pixel
+    variance = (p.var + solution.mixture.jitter**2) * pixel**2
+    taken = taken_by_stars(solution)[rows]
     return ScoredSample(
         model=model,
-        X=p.X[order],
-        Y=p.Y[order],
+        X=p.X,
+        Y=p.Y,
         score=g.T,
         curvature=np.stack([H[:, 0, 0], H[:, 0, 1], H[:, 1, 1]]),
         residual=np.asarray(residual.T, float),
         variance=np.stack([variance, variance]),
-        inlier=member,
-        mag=None if mag is None else mag[rows][order],
+        inlier=memberships(whole, theta, solution.mixture, solution.stars)[rows],
+        mag=None if mag is None else mag[rows],
         colour=None,
         epoch=None,
-        star=p.star[order],
-        blocks=blocks,
+        star=p.star,
+        chip=p.groups.chip[group],
+        exposure=p.groups.exposure[group],
         leverage=np.stack([taken, taken]),
     )

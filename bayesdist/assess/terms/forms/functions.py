@@ -107,7 +107,8 @@ class FunctionField(ErrorField):
     @cached_property
     def _parts(self) -> list[tuple[NDArray[np.floating], NDArray[np.floating] | None]]:
         """Coefficients with functions (N, m) of each chip, or values where these are many."""
-        at, out = self.domain, []
+        at = self.domain
+        out: list[tuple[NDArray[np.floating], NDArray[np.floating] | None]] = []
         for chip, rows in at.by_chip():
             x, y = at.x[rows], at.y[rows]
             own = self.of.of(chip)
@@ -134,11 +135,14 @@ class FunctionField(ErrorField):
 
     def _stated(self, covariance: Mapping[int | None, Float]) -> Float:
         at, functions = self.domain, self.of.functions
-        phi = {chip: functions(chip, at.x[rows], at.y[rows]) for chip, rows in at.by_chip()}
-        by_chip = {chip: covariance.get(chip, covariance.get(None)) for chip in phi}
+        phi = {
+            chip: np.asarray(functions(chip, at.x[rows], at.y[rows]), float)
+            for chip, rows in at.by_chip()
+        }
 
         def squares(values: Float, chip: int) -> Float:
-            return np.einsum("nk,akl,nl->na", values, by_chip[chip], values)
+            own = covariance[chip if chip in covariance else None]
+            return np.asarray(np.einsum("nk,akl,nl->na", values, own, values))
 
         pairs = at.pairs()
         if pairs is None:

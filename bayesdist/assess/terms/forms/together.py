@@ -73,17 +73,15 @@ class TogetherField(ErrorField):
     def errors(self, draws: slice, scale: Scale = {}) -> Float:  # noqa: B006
         """The joint error (d, N, 2), each row multiplied by its factor."""
         if self.whole is None:
-            out = 0.0
-            for part in self._added:
-                out = out + part.errors(draws, scale)
+            out = np.asarray(sum(_not_noise(part.errors(draws, scale)) for part in self._added))
         else:
-            out = self.whole.errors(draws, {})
+            out = _not_noise(self.whole.errors(draws, {}))
             for part in self._added:
                 sizes = [scale[row.name] for row in part.rows if row.name in scale]
                 if sizes:
-                    out = out - (1.0 - sizes[0]) * part.errors(draws, {})
+                    out = out - (1.0 - sizes[0]) * _not_noise(part.errors(draws, {}))
         factor = self._factor(scale)
-        return np.asarray(out if factor is None else factor * out)
+        return out if factor is None else factor * out
 
     def _factor(self, scale: Scale) -> Float | None:
         """Factor (N, 2) of the joint error where rows shrink that it holds."""
@@ -134,3 +132,9 @@ class TogetherField(ErrorField):
 
     def _part(self, name: str) -> ErrorField:
         return next(p for p in self.parts if name in [row.name for row in p.rows])
+
+
+def _not_noise(errors: Float | None) -> Float:
+    """Errors of a part; of what is independent from position to position there is no joint one."""
+    assert errors is not None
+    return errors

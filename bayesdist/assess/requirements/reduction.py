@@ -10,14 +10,14 @@ from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.requirements.requirement import Requirement
 
-__all__ = ["Remedy", "find_remedy"]
+__all__ = ["RequiredReduction", "required_reduction"]
 
 DRAWS = 1000  # a factor is wanted to a percent or two
 STEPS = 9  # halvings of the interval in which the factor lies
 
 
 @dataclass(frozen=True)
-class Remedy:
+class RequiredReduction:
     """Error term that would have to shrink."""
 
     # where one term can do it alone, that which has to shrink least; else the largest one
@@ -30,7 +30,7 @@ class Remedy:
 
     @property
     def sentence(self) -> str:
-        """The remedy in words."""
+        """The reduction in words."""
         if not self.enough:
             return (
                 f"no term can do it alone: the largest, {self.term} ({self.now:.3g} {self.unit} "
@@ -42,9 +42,9 @@ class Remedy:
         )
 
 
-def find_remedy(
+def required_reduction(
     errors: DrawnErrors, requirement: Requirement, domain: EvaluationDomain, factor: float
-) -> Remedy:
+) -> RequiredReduction:
     """The term of which the least shrinking meets a requirement.
 
     Each term by itself is multiplied by a number between 0 and 1, with the same draws throughout.
@@ -72,7 +72,7 @@ def find_remedy(
                 low, high = (middle, high) if met(name, middle) else (low, middle)
             alone[name] = low
     if not alone:
-        return Remedy(largest, 0.0, sizes[largest], 0.0, False, requirement.unit)
+        return RequiredReduction(largest, 0.0, sizes[largest], 0.0, False, requirement.unit)
     best = max(alone, key=lambda name: alone[name])
     now = sizes[best]
-    return Remedy(best, alone[best], now, alone[best] * now, True, requirement.unit)
+    return RequiredReduction(best, alone[best], now, alone[best] * now, True, requirement.unit)
