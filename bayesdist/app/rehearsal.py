@@ -10,7 +10,7 @@ from bayesdist.app.periods import check_pairs
 from bayesdist.app.results import Results
 from bayesdist.assess import star_sample
 from bayesdist.assess.terms.centroid import centroid_errors
-from bayesdist.diagnose.residuals.centroid import centroid_scatter
+from bayesdist.diagnose.residuals.sample import centroid_scatter
 
 __all__ = ["rehearse", "rehearse_solution"]
 

@@ -20,7 +20,6 @@ from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_val
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, time_variation
 from bayesdist.diagnose.residuals.binned import BinnedSums
-from bayesdist.diagnose.residuals.centroid import centroid_scatter
 from bayesdist.diagnose.residuals.coverage import Coverage, coverage_of
 from bayesdist.diagnose.residuals.epoch_shift import EpochShift, epoch_shift
 from bayesdist.diagnose.residuals.majority import majority_sentence
@@ -32,7 +31,7 @@ from bayesdist.diagnose.residuals.misfit import (
     partitions_for,
     worst_misfit,
 )
-from bayesdist.diagnose.residuals.sample import StarSample, star_sample
+from bayesdist.diagnose.residuals.sample import StarSample, centroid_scatter, star_sample
 from bayesdist.diagnose.residuals.star_sums import StarSums, flagged_by_exposure, star_sums
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.diagnose.score.tests import score_tests

@@ -3,8 +3,7 @@ import pytest
 
 from bayesdist.assess.terms.centroid import centroid_errors
 from bayesdist.data import Matches
-from bayesdist.diagnose.residuals.centroid import centroid_scatter
-from bayesdist.diagnose.residuals.sample import StarSample
+from bayesdist.diagnose.residuals.sample import StarSample, centroid_scatter
 from bayesdist.errors import InputError
 
 

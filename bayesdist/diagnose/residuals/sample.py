@@ -1,4 +1,4 @@
-"""Some of the stars with residuals and probabilities: for figures that draw single stars."""
+"""Some of the stars with residuals and probabilities, and their scatter by magnitude."""
 
 from __future__ import annotations
 
@@ -7,17 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
 from bayesdist.data.matches import Matches
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.posterior.memberships import memberships_of
 from bayesdist.infer.stars.stars import in_table_order, prepare
 
-__all__ = ["SAMPLE", "StarSample", "star_sample"]
+__all__ = ["SAMPLE", "StarSample", "centroid_scatter", "star_sample"]
 
 Float = NDArray[np.float64]
 
 SAMPLE = 200_000  # stars that show what all of them look like
+MIN_STARS = 50  # stars whose scatter says anything by magnitude
+CERTAIN = 0.5  # probability of a false match from which on a star is left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,3 +99,22 @@ def star_sample(
         posterior_residual=None if posterior is None else residual(posterior),
         outlier_probability=None if said is None else said.outlier_probability,
     )
+
+
+def centroid_scatter(stars: StarSample, *, n_params: int = 0) -> MagnitudeErrors | None:
+    """Scatter of the residuals by magnitude.
+
+    Of stars with a posterior the likely false matches are left out, else what the fit rejected;
+    `n_params` are the parameters of the fit to all stars. None where the stars have no magnitudes,
+    or too few of them.
+    """
+    mag = stars.table.mag
+    if mag is None:
+        return None
+    good = np.isfinite(mag) & (
+        stars.used if stars.outlier_probability is None else stars.outlier_probability < CERTAIN
+    )
+    if good.sum() < MIN_STARS:
+        return None
+    share = round(n_params * len(stars) / max(stars.n_total, 1))
+    return estimate(mag[good], *stars.residual[good].T, n_params=share)

@@ -19,6 +19,7 @@ from bayesdist.infer.posterior.memberships import averaged_draws
 from bayesdist.infer.stars.likelihood import Clip, star_averages
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars
+from bayesdist.infer.stars.sums import Sums
 
 __all__ = ["ExposureSums", "StarSums", "flagged_by_exposure", "star_sums"]
 
@@ -28,7 +29,7 @@ Bins = tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
-class ExposureSums:
+class ExposureSums(Sums):
     """Counts and residuals of each exposure.
 
     Parameters
@@ -44,10 +45,6 @@ class ExposureSums:
     uu: Float
     vv: Float
 
-    def __add__(self, other: ExposureSums) -> ExposureSums:
-        names = ("n", "n_used", "uu", "vv")
-        return ExposureSums(*(getattr(self, n) + getattr(other, n) for n in names))
-
     @property
     def rms(self) -> tuple[Float, Float]:
         """Rms residuals in u and in v of the stars used; NaN where there are none."""
@@ -56,7 +53,7 @@ class ExposureSums:
 
 
 @dataclass(frozen=True, eq=False)
-class StarSums:
+class StarSums(Sums):
     """Sums over stars at a solution.
 
     Parameters
@@ -70,10 +67,6 @@ class StarSums:
 
     binned: Mapping[tuple[int, Bins], BinnedSums]
     exposures: ExposureSums
-
-    def __add__(self, other: StarSums) -> StarSums:
-        binned = {key: sums + other.binned[key] for key, sums in self.binned.items()}
-        return StarSums(binned, self.exposures + other.exposures)
 
 
 def star_sums(
