@@ -34,7 +34,11 @@ def full() -> bool:
 
 # A run compiles the kernels that most tests need, and the files beside it none: a machine that has
 # none of them yet compiles once, not in each process.  What takes long is not left for the end.
-FIRST = ("tests/app/test_run.py", "tests/data/", "tests/model/", "tests/wise/", "tests/report/")
+FIRST = (
+    "tests/app/test_run.py",
+    *("tests/data/", "tests/model/", "tests/wise/", "tests/report/"),
+    *("tests/campaign/", "tests/test_new_instrument.py", "tests/test_docs.py"),
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

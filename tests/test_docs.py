@@ -77,7 +77,9 @@ def test_the_tutorial_in_python_runs(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_hst1pass_tutorial_runs_on_real_lists(tmp_path, monkeypatch, data_dir):
+def test_the_hst1pass_tutorial_runs_on_real_lists(tmp_path, monkeypatch, data_dir, full):
+    if not full:
+        pytest.skip("half a minute of processor time: set BAYESDIST_FULL=1")
     monkeypatch.chdir(tmp_path)
     Path("lists").symlink_to(data_dir / "hst1pass_uvis")
     run_page(DOCS / "tutorial_hst1pass.md")
@@ -284,7 +286,10 @@ def test_the_reference_names_all_that_is_public():
             assert not callable(member) or member.__doc__, f"{name}.{public}"
 
 
-def test_the_site_is_built_without_warnings_and_needs_no_network(tmp_path):
+@pytest.mark.slow
+def test_the_site_is_built_without_warnings_and_needs_no_network(tmp_path, full):
+    if not full:
+        pytest.skip("half a minute; `make docs` builds it, too: set BAYESDIST_FULL=1")
     for package in SITE:
         pytest.importorskip(package, reason=f"{package} is not installed: pip install '.[docs]'")
     done = subprocess.run(

@@ -38,16 +38,20 @@ class Finished:
 
 @pytest.fixture(scope="package", autouse=True)
 def sketched(full) -> Iterator[None]:
-    """Figures of reports are made but not drawn, unless all is run in full.
+    """Figures of reports are made but not drawn, and corner plots not made, unless run in full.
 
-    Drawing takes most of the time of a small run.  Figures as they look are the subject of
+    That takes most of the time of a small run.  Figures as they look are the subject of
     tests/report, and programs of their own (the demo, the examples) draw them here, too.
     """
     with pytest.MonkeyPatch.context() as patch:
         if not full:
+            from matplotlib.figure import Figure
+
             from bayesdist.report import drawing
+            from bayesdist.report.sections.run import posterior
 
             patch.setattr(drawing, "render", _sketch)
+            patch.setattr(posterior, "corner_figure", lambda *_, **__: Figure())
         yield
 
 

@@ -61,6 +61,7 @@ def test_a_layout_goes_from_init_to_check(tmp_path, name):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_report")
 @pytest.mark.parametrize("name", RUN)
 def test_a_layout_runs(tmp_path, name):
     """Calibrated positions agree with the truth that no file holds."""

@@ -32,7 +32,7 @@ def in_circles(n=1500, about=(0.03, -0.02)):
     return table[np.asarray(distance) < RADIUS], truth
 
 
-def test_a_run_knows_of_the_circle(tmp_path):
+def test_a_run_knows_of_the_circle(tmp_path, no_report):
     table, truth = in_circles()
     outliers = {"model": "none", "match_radius": RADIUS}
     config = write_job(tmp_path, table, outliers=outliers)

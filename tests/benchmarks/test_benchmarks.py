@@ -161,7 +161,9 @@ def test_goes_on_where_scamp_is_missing(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def quick(tmp_path_factory):
+def quick(tmp_path_factory, full):
+    if not full:
+        pytest.skip("all parts take a minute of processor time: set BAYESDIST_FULL=1")
     pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
     folder = tmp_path_factory.mktemp("bench")
     figures = folder / "figures"
@@ -169,6 +171,7 @@ def quick(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_json_and_markdown_are_complete(quick):
     bench = json.loads((quick / "bench.json").read_text(encoding="utf-8"))
     assert set(bench["parts"]) == set(program.PARTS)
@@ -212,6 +215,7 @@ def test_json_and_markdown_are_complete(quick):
     assert (quick / "figures" / "scaling.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_all_samplers_sample_one_posterior(quick):
     bench = json.loads((quick / "bench.json").read_text(encoding="utf-8"))
     others = [r for r in bench["parts"]["samplers"]["rows"] if r["sampler"] != "bayesdist"]
@@ -226,5 +230,8 @@ def test_only_the_parts_that_are_asked_for(tmp_path):
     program.main(["--quick", "--only", "linear", "--output", str(tmp_path)])
     bench = json.loads((tmp_path / "bench.json").read_text(encoding="utf-8"))
     assert list(bench["parts"]) == ["linear"]
+    (linear,) = bench["parts"]["linear"]["rows"]
+    assert linear["coefficients_differ"] < 1e-6
+    assert (tmp_path / "bench.md").read_text(encoding="utf-8") == to_markdown(bench)
     with pytest.raises(SystemExit):
         program.main(["--only", "nothing"])

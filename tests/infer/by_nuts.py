@@ -1,4 +1,4 @@
-"""Draws of a density by NumPyro's NUTS, which knows nothing of ours."""
+"""A density written down for NumPyro: draws by its NUTS, or a check of the draws that we have."""
 
 from __future__ import annotations
 
@@ -39,3 +39,39 @@ def nuts_draws(
         )
         mcmc.run(jax.random.PRNGKey(seed))
     return {k: np.asarray(v) for k, v in mcmc.get_samples(group_by_chain=by_chain).items()}
+
+
+def spread_draws(posterior, n: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Draws (n, D) of a posterior as far from one another as can be, and those of the mixture."""
+    flat = posterior.flat
+    rows = np.linspace(0, len(flat) - 1, n).astype(int)
+    return flat[rows], {name: v.ravel()[rows] for name, v in posterior.hyper.items()}
+
+
+def stein_pulls(
+    density: Callable[[], None], draws: Mapping[str, np.ndarray], *, at_once: int = 100
+) -> np.ndarray:
+    """Pulls (p, 1 + p) of Stein's identities, of independent draws (n, ...) of all p parameters.
+
+    Where draws x have a density whose logarithm has the gradient g, the mean of g is 0, and that
+    of (x - mean) g' is -1: with the precision of n draws that shows wrong means, variances and
+    correlations, and asks for no other sampler.
+    """
+    import jax
+    from jax.flatten_util import ravel_pytree
+    from numpyro.infer.util import log_density
+
+    start = {name: np.asarray(rows)[0] for name, rows in draws.items()}
+    flat = [np.asarray(rows).reshape(len(rows), -1) for _, rows in sorted(draws.items())]
+    x = np.concatenate(flat, axis=1)
+    unravel = ravel_pytree(start)[1]
+    gradient = jax.jit(jax.vmap(jax.grad(lambda v: log_density(density, (), {}, unravel(v))[0])))
+    chunks = np.split(x[: len(x) // at_once * at_once], len(x) // at_once)
+    g = np.concatenate([np.asarray(gradient(chunk)) for chunk in chunks])
+    # uncorrelated coordinates of unit variance
+    x = x[: len(g)]
+    root = np.linalg.cholesky(np.cov(x.T))
+    away, g = np.linalg.solve(root, (x - x.mean(axis=0)).T).T, g @ root
+    terms = np.concatenate([g[:, :, None], g[:, :, None] * away[:, None, :]], axis=2)
+    expected = np.concatenate([np.zeros((x.shape[1], 1)), -np.eye(x.shape[1])], axis=1)
+    return (terms.mean(axis=0) - expected) / (terms.std(axis=0) / np.sqrt(len(g)))

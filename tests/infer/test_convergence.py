@@ -100,6 +100,20 @@ def test_a_frozen_parameter_has_no_effective_draws():
     assert found.ess_bulk[1] < 10 and found.ess_tail[1] < 10
 
 
+@pytest.mark.parametrize("coupled", [False, True])
+def test_many_walkers_do_not_make_up_for_walkers_that_never_move(coupled):
+    still = np.random.default_rng(4).normal(size=(4, 1, 300, 3))
+    found = judged(np.broadcast_to(still, (4, 50, 300, 3)), coupled=coupled)
+    assert not found.converged and found.ess_bulk_min > 400
+    (reason,) = found.reasons
+    assert reason.startswith("a walker has made 0.") and "must have made at least 5" in reason
+
+
+def test_few_walkers_that_mix_are_converged():
+    found = judged(np.random.default_rng(5).normal(size=(4, 50, 16, 3)))
+    assert found.converged, found.reasons
+
+
 def test_too_few_draws():
     found = judged(ar1((E, 60, 4, 3), 0.8, seed=9))  # 960 draws worth about 107
     assert not found.converged

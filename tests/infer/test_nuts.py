@@ -1,4 +1,4 @@
-"""The same posterior by another sampler: NumPyro's NUTS, on a density written down anew."""
+"""The posterior against a density written down anew, and draws of that by NumPyro's NUTS."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from bayesdist.data import match_table, read_matches, read_matchup
 from bayesdist.infer import OutlierMixture, build_model, fit_by_magnitude, fit_linear, sample
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
-from tests.infer.by_nuts import nuts_draws
+from tests.infer.by_nuts import nuts_draws, spread_draws, stein_pulls
 
 pytestmark = pytest.mark.slow
 numpyro = pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
 
 
-def _nuts(matches, fit, draws: int, seed: int):
-    """Draws of theta, j, logit f and log s_out from NUTS.
+def _density(matches, fit):
+    """Density of z, log j, logit f and log s; theta is the fit's mean + L z.
 
-    Of j, not of its logarithm: where j may be zero that has a tail which nobody's draws settle.
+    Of the logarithm of j, and draws are compared by j itself: where that may be zero its
+    logarithm has a tail which nobody's draws settle.
     """
     import jax
     import jax.numpy as jnp
@@ -33,7 +34,7 @@ def _nuts(matches, fit, draws: int, seed: int):
     phi = jnp.array(np.stack([V[:, i, j] for i, j in model.basis().terms], axis=1))
     u, v = jnp.array(matches.u), jnp.array(matches.v)
     s2u, s2v = jnp.array(matches.sigma_u**2), jnp.array(matches.sigma_v**2)
-    scale = float(np.median(np.concatenate([matches.sigma_u, matches.sigma_v])))
+    scale = _scale(matches)
     root = jnp.array(np.linalg.cholesky(fit.cov))
     K = model.n_terms
 
@@ -61,14 +62,11 @@ def _nuts(matches, fit, draws: int, seed: int):
         numpyro.factor("posterior", prior + jnp.logaddexp(good, bad).sum())
         numpyro.deterministic("theta", theta)
 
-    start = {
-        "z": np.zeros(2 * K),
-        "log_j": np.log(0.3 * scale),
-        "logit_f": -3.0,
-        "log_s": np.log(10 * scale),
-    }
-    got = nuts_draws(density, start, draws, seed)
-    return np.column_stack([got["theta"], np.exp(got["log_j"]), got["logit_f"], got["log_s_out"]])
+    return density
+
+
+def _scale(matches) -> float:
+    return float(np.median(np.concatenate([matches.sigma_u, matches.sigma_v])))
 
 
 def _ours(posterior):
@@ -97,19 +95,61 @@ def _hst1pass(data_dir):
     return table, fit
 
 
-@pytest.mark.parametrize("case", ["simulated", "errors exact (j = 0)", "real hst1pass exposure"])
+def test_draws_of_another_density_are_seen(rng):
+    """Means off by a tenth of a standard deviation, or widths by a tenth."""
+
+    def density():
+        numpyro.sample("x", numpyro.distributions.Normal(np.zeros(3), 1.0).to_event(1))
+
+    draws = rng.standard_normal((3000, 3))
+    right, off, wide = (
+        np.abs(stein_pulls(density, {"x": x})).max() for x in (draws, draws + 0.1, 1.1 * draws)
+    )
+    assert right < 4 < min(off, wide)
+
+
+CASES = ["simulated", "errors exact (j = 0)", "real hst1pass exposure"]
+
+
+def _case(name: str, n: int, request):
+    """Matches and their fit."""
+    if name.startswith("real"):
+        return _hst1pass(request.getfixturevalue("data_dir"))
+    return _simulated(0.02 if name == "simulated" else 0.0, n)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_draws_are_of_the_density(case, request):
+    matches, fit = _case(case, 600, request)
+    posterior = sample(fit, matches, outliers=OutlierMixture(), target_ess=4000, seed=5)
+    assert posterior.convergence.converged
+    some, h = spread_draws(posterior, 3000)
+    draws = {
+        "z": np.linalg.solve(np.linalg.cholesky(fit.cov), (some - fit.mean).T).T,
+        "log_j": np.log(h["j"]),
+        "logit_f": np.log(h["f"]) - np.log1p(-h["f"]),
+        "log_s": 0.5 * np.log(h["s_out"] ** 2 - h["j"] ** 2 - _scale(matches) ** 2),
+    }
+    assert np.abs(stein_pulls(_density(matches, fit), draws)).max() < 4.5
+
+
+@pytest.mark.parametrize("case", CASES)
 def test_agrees_with_nuts(case, full, request, capsys):
-    if case == "simulated" and not full:
-        pytest.skip("the other two are run: set BAYESDIST_FULL=1")
-    if case.startswith("real"):
-        matches, fit = _hst1pass(request.getfixturevalue("data_dir"))
-    else:
-        matches, fit = _simulated(0.02 if case == "simulated" else 0.0, 2000 if full else 600)
+    if not full:
+        pytest.skip("NUTS takes minutes: set BAYESDIST_FULL=1")
+    matches, fit = _case(case, 2000, request)
     # Standard deviations within 3 % ask for some 10^4 effective draws on either side.
     posterior = sample(fit, matches, outliers=OutlierMixture(), target_ess=30_000, seed=5)
     assert posterior.convergence.converged
     ours = _ours(posterior)
-    nuts = _nuts(matches, fit, 12000 if full else 10000, seed=3)
+    start = {
+        "z": np.zeros(fit.model.n_params),
+        "log_j": np.log(0.3 * _scale(matches)),
+        "logit_f": -3.0,
+        "log_s": np.log(10 * _scale(matches)),
+    }
+    got = nuts_draws(_density(matches, fit), start, 12_000, seed=3)
+    nuts = np.column_stack([got["theta"], np.exp(got["log_j"]), got["logit_f"], got["log_s_out"]])
     sd = nuts.std(axis=0)
     shift = np.abs(ours.mean(axis=0) - nuts.mean(axis=0)) / sd
     ratio = ours.std(axis=0) / sd

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from bayesdist.errors import InputError
-from bayesdist.infer import Rejection, fit_linear, residuals
+from bayesdist.infer import Rejection, fit_linear, residuals, sample
 from bayesdist.infer.solution import Solution, TransformedSolution, likelihood_of
 from bayesdist.infer.stars.stars import in_table_order, prepare
 from bayesdist.infer.transforms import without_frames
+from bayesdist.model import Chip, DistortionModel
+from bayesdist.simulate import simulate_matches
 
 from .support import simulated
 
@@ -74,3 +76,22 @@ def test_only_fits_and_posteriors_have_a_likelihood(fitted):
     for one in forms(fit)[1:3]:
         with pytest.raises(InputError, match="does not say how it was fitted"):
             likelihood_of(one)
+
+
+def test_solutions_say_what_they_are_in_a_line() -> None:
+    model = DistortionModel(2, (Chip(1, "WFC1", (1000.0, 800.0), (500.5, 400.5)),))
+    theta = np.zeros(model.n_params)
+    matches, _ = simulate_matches(
+        model, theta, 200, rng=np.random.default_rng(2), sigma=0.02, outlier_scale=0.5
+    )
+    fit = fit_linear(matches, model)
+    text = repr(fit)
+    for part in ("order 2", "1 chip (WFC1)", "12 parameters", f"{fit.n_used} of 200 stars",
+                 f"chi2/dof {fit.chi2:.5g}/{fit.dof}"):  # fmt: skip
+        assert part in text
+    posterior = sample(fit, matches)
+    said = repr(posterior)
+    for part in ("order 2", "200 stars", "converged", "R-hat", f"{len(posterior.flat)} draws"):
+        assert part in said
+    for line in (text, said):
+        assert "\n" not in line and len(line) < 250 and "array" not in line

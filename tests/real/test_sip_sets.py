@@ -68,10 +68,13 @@ def test_both_directions_are_those_of_astropy(sets) -> None:
         assert_allclose(np.stack(one.sip.inverse(U, V)), back, atol=EXACT, rtol=0)
 
 
-def test_written_headers_come_back_and_astropy_reads_them(sets, tmp_path) -> None:
+def test_written_headers_come_back_and_astropy_reads_them(sets, tmp_path, full) -> None:
+    """All sets, or one in five and the odd orders."""
     x, y = random_pixels(SIZE, 100)
     path = tmp_path / "tess.hdr"
     for number, one in enumerate(sets):
+        if not full and number % 5 and one.sip.order[0] <= 5:
+            continue
         write_sip(one.sip, path)
         back = read_sip(path)
         for name in ("crpix", "crval", "ctype", "order", "a", "b", "inverse_order", "ap", "bp",

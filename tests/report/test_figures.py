@@ -289,8 +289,14 @@ def test_a_map_without_variation_or_vectors_is_drawn(converged):
     still = replace(v, du=0.0 * v.du, dv=0.0 * v.dv)
     chip = replace(converged.chips[0], formal_map=flat, posterior_map=None, displacement=still)
     run = replace(converged, chips=(chip,))
-    for fig in figures_of(run, "uncertainty_radius", "distortion").values():
+    drawn = figures_of(run, "uncertainty_radius", "distortion")
+    for fig in drawn.values():
         fig.canvas.draw()
+    (contours,) = drawn["uncertainty_radius"].axes[0].collections
+    low, high = contours.get_clim()
+    assert low < 0.01 * np.sqrt(2) < high
+    (arrows,) = drawn["distortion"].axes[0].collections
+    assert not arrows.U.any() and not arrows.V.any()
 
 
 def test_the_callers_matplotlib_is_left_alone(converged, tmp_path):

@@ -477,8 +477,7 @@ def test_the_search_ends_at_the_same_mode_from_afar(along):
 # -- next to no false matches -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("n", [2_000, 100_000])
+@pytest.mark.parametrize(("n", "seed"), [*((2_000, k) for k in range(6)), (100_000, 0)])
 def test_clean_tables_have_a_good_proposal(n, seed):
     """Right errors, no false match: fraction and scale of the outliers are a curved ridge.
 

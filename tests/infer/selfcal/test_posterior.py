@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import pytest
 from numpy.polynomial.legendre import legder, legval, legvander
@@ -11,6 +9,7 @@ from numpy.polynomial.legendre import legder, legval, legvander
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal import sample_selfcal
 from bayesdist.infer.selfcal.mode import solve
+from tests.infer.by_nuts import nuts_draws
 from tests.infer.selfcal.fields import SIZE, field, problem_of
 
 pytestmark = pytest.mark.slow
@@ -88,15 +87,7 @@ def _nuts(simulated, problem, solution, draws, seed):
         "log_j": np.log(0.3 * scale),
         "logit_f": -3.0,
     }
-    kernel = numpyro.infer.NUTS(density, init_strategy=numpyro.infer.init_to_value(values=start))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        mcmc = numpyro.infer.MCMC(
-            kernel, num_warmup=600, num_samples=draws, num_chains=4, chain_method="vectorized",
-            progress_bar=False,
-        )  # fmt: skip
-        mcmc.run(jax.random.PRNGKey(seed))
-    got = mcmc.get_samples()
+    got = nuts_draws(density, start, draws, seed, warmup=400)
     return np.column_stack([got["theta"], np.exp(got["log_j"]), got["logit_f"]])
 
 
@@ -111,7 +102,7 @@ def test_agrees_with_nuts(full, capsys):
     h = {k: v.ravel() for k, v in posterior.hyper.items()}
     logit = np.log(h["f"]) - np.log1p(-h["f"])
     ours = np.column_stack([posterior.flat[:, free], h["j"], logit])
-    nuts = _nuts(simulated, solution.problem, solution, 6000 if full else 1500, seed=2)
+    nuts = _nuts(simulated, solution.problem, solution, 6000 if full else 800, seed=2)
     sd = nuts.std(axis=0)
     shift = np.abs(ours.mean(axis=0) - nuts.mean(axis=0)) / sd
     ratio = ours.std(axis=0) / sd
