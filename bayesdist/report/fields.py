@@ -44,6 +44,7 @@ def contour_levels(values: ArrayLike, n: int = 10) -> Float:
     return np.asarray(locator.tick_values(low, high), float)
 
 
+@figure_style()
 def scalar_map(
     panels: Panels,
     grids: Sequence[Grid | None],
@@ -68,33 +69,32 @@ def scalar_map(
     norms: Sequence[Normalize | None] = (
         [norm] * len(places) if norm is None or isinstance(norm, Normalize) else norm
     )
-    with figure_style():
-        for (k, ax), grid, one in zip(places, grids, norms, strict=True):
-            if grid is None:
-                continue
-            px, py = panels.offset(k)
-            if levels is not None:
-                drawn[ax] = _contours(ax, grid, (px, py), levels, labelled=labelled)
-            else:
-                drawn[ax] = _cells(ax, grid, (px, py), one, cmap)
-            if grid.ring is not None:
-                at = np.add(grid.ring, (px, py))
-                for color, width, order in (("white", 2.2, 5), (INK, 1.0, 6)):
-                    ring = {"ms": 5, "mfc": "none", "clip_on": False, "zorder": order}
-                    ax.plot(*at, "o", mec=color, mew=width, **ring)
-        for ax, title in zip(panels.all_axes, titles, strict=True):
-            ax.set_title(title)
-        if not label or not drawn:
-            return
-        look = {"label": label, "fraction": 0.05, "pad": 0.02}
-        if levels is not None or single:
-            last = list(drawn.values())[-1]
-            beyond = {} if levels is not None else {"extend": _extend(grids, last.norm)}
-            panels.figure.colorbar(last, ax=panels.all_axes, **look, **beyond)
+    for (k, ax), grid, one in zip(places, grids, norms, strict=True):
+        if grid is None:
+            continue
+        px, py = panels.offset(k)
+        if levels is not None:
+            drawn[ax] = _contours(ax, grid, (px, py), levels, labelled=labelled)
         else:
-            for ax, image in drawn.items():
-                extend = _extend([grids[panels.all_axes.index(ax)]], image.norm)
-                panels.figure.colorbar(image, ax=ax, **look, extend=extend)
+            drawn[ax] = _cells(ax, grid, (px, py), one, cmap)
+        if grid.ring is not None:
+            at = np.add(grid.ring, (px, py))
+            for color, width, order in (("white", 2.2, 5), (INK, 1.0, 6)):
+                ring = {"ms": 5, "mfc": "none", "clip_on": False, "zorder": order}
+                ax.plot(*at, "o", mec=color, mew=width, **ring)
+    for ax, title in zip(panels.all_axes, titles, strict=True):
+        ax.set_title(title)
+    if not label or not drawn:
+        return
+    look = {"label": label, "fraction": 0.05, "pad": 0.02}
+    if levels is not None or single:
+        last = list(drawn.values())[-1]
+        beyond = {} if levels is not None else {"extend": _extend(grids, last.norm)}
+        panels.figure.colorbar(last, ax=panels.all_axes, **look, **beyond)
+    else:
+        for ax, image in drawn.items():
+            extend = _extend([grids[panels.all_axes.index(ax)]], image.norm)
+            panels.figure.colorbar(image, ax=ax, **look, extend=extend)
 
 
 def _contours(

@@ -29,6 +29,7 @@ UNBOUNDED = "#E8ECF0"
 FIRST = PALETTE["vermilion"]
 
 
+@figure_style()
 def pattern_maps(found: Sequence[PlannedPattern]) -> Figure:
     """Footprints on one scale, each with its radial uncertainty on one colour scale."""
     bounded = [one.radii(kind) for one in found for kind in SHOWN if one.maps[kind] is not None]
@@ -36,22 +37,21 @@ def pattern_maps(found: Sequence[PlannedPattern]) -> Figure:
     norm = LogNorm(max(values.min(), 1e-4 * values.max()), values.max() * (1 + 1e-9))
     outlines = [_outlines(one) for one in found]
     limits = _limits(np.concatenate([o for of_one in outlines for o in of_one]))
-    with figure_style():
-        fig = new_figure(WIDTH, ROW * len(found) + 0.5, layout="compressed")
-        axes = fig.subplots(len(found), 1 + len(SHOWN), squeeze=False)
-        filled: list[QuadMesh] = []
-        for k, (row, one, of_one) in enumerate(zip(axes, found, outlines, strict=True)):
-            last = k == len(found) - 1
-            _footprint(row[0], one, of_one, limits, last)
-            row[0].set_title(
-                f"first exposure in orange\n{one.pattern.name}" if not k else one.pattern.name
-            )
-            for ax, kind in zip(row[1:], SHOWN, strict=True):
-                filled += _map(ax, one, kind, norm, last)
-                if not k:
-                    ax.set_title(f"{kind}, rms\n{ax.get_title(loc='left')}")
-        label = "radius (1 σ) [pix]"
-        fig.colorbar(filled[0], ax=list(axes[:, 1:].ravel()), label=label, fraction=0.05, pad=0.02)
+    fig = new_figure(WIDTH, ROW * len(found) + 0.5, layout="compressed")
+    axes = fig.subplots(len(found), 1 + len(SHOWN), squeeze=False)
+    filled: list[QuadMesh] = []
+    for k, (row, one, of_one) in enumerate(zip(axes, found, outlines, strict=True)):
+        last = k == len(found) - 1
+        _footprint(row[0], one, of_one, limits, last)
+        row[0].set_title(
+            f"first exposure in orange\n{one.pattern.name}" if not k else one.pattern.name
+        )
+        for ax, kind in zip(row[1:], SHOWN, strict=True):
+            filled += _map(ax, one, kind, norm, last)
+            if not k:
+                ax.set_title(f"{kind}, rms\n{ax.get_title(loc='left')}")
+    label = "radius (1 σ) [pix]"
+    fig.colorbar(filled[0], ax=list(axes[:, 1:].ravel()), label=label, fraction=0.05, pad=0.02)
     return fig
 
 

@@ -95,7 +95,7 @@ _RC = {
 
 @contextmanager
 def figure_style() -> Iterator[None]:
-    """Context with the style; the caller's settings come back after it."""
+    """Context, or decorator of a function, with the style; the caller's settings come back."""
     with matplotlib.rc_context(_RC):
         yield
 

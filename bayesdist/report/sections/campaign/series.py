@@ -22,7 +22,7 @@ from bayesdist.report.sections.campaign.terms import (
     name_of_term,
     terms_of,
 )
-from bayesdist.report.style import CYCLE, GUIDE, INK, WIDTH, figure_style, new_figure
+from bayesdist.report.style import CYCLE, GUIDE, INK, WIDTH, new_figure
 
 if TYPE_CHECKING:
     from bayesdist.report.campaign import LinearSeries
@@ -63,14 +63,13 @@ def series(r: ReportInput, which: tuple[str, int]) -> Plot:
     with_roll = bool(np.isfinite(series.pa_v3).any())
     beside = 2 if with_roll else 1
     ratios = ((2.0, 1.0) if with_roll else (2.0,)) * len(courses)
-    with figure_style():
-        fig = new_figure(WIDTH, 5.7)
-        grid = fig.subplots(3, beside * len(courses), squeeze=False, width_ratios=ratios)
-        for k, course in enumerate(courses):
-            panels = grid[:, beside * k : beside * (k + 1)]
-            _draw_course(panels, series, course, unit)
-        handles, labels = grid[1, 0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper left", ncols=len(labels), handlelength=1.6)
+    fig = new_figure(WIDTH, 5.7)
+    grid = fig.subplots(3, beside * len(courses), squeeze=False, width_ratios=ratios)
+    for k, course in enumerate(courses):
+        panels = grid[:, beside * k : beside * (k + 1)]
+        _draw_course(panels, series, course, unit)
+    handles, labels = grid[1, 0].get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside upper left", ncols=len(labels), handlelength=1.6)
     length_unit = unit if courses[0].is_constant else ""
 
     def size(value: float | None) -> str:

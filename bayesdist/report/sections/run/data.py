@@ -13,7 +13,7 @@ from bayesdist.numbers import MISSING, count, display_scale, number
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import INK, PALETTE, SEQUENTIAL, WIDTH, figure_style, new_figure
+from bayesdist.report.style import INK, PALETTE, SEQUENTIAL, WIDTH, new_figure
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing, short_paths
 
 if TYPE_CHECKING:
@@ -161,36 +161,33 @@ def _density(
     scale = display_scale(unit, reach)
     low, high = np.quantile(mag, [0.002, 0.998])  # a few very bright stars must not fill the plot
     pad = 0.02 * max(high - low, 0.1)
-    with figure_style():
-        fig = new_figure(WIDTH, 3.2)
-        axes = fig.subplots(1, 2, sharey=True)
-        for ax, axis, values in zip(axes, "uv", residual.T, strict=True):
-            inside = (np.abs(values) <= reach) & (
-                np.abs(2 * mag - low - high) <= high - low + 2 * pad
-            )
-            hexagons = ax.hexbin(
-                mag[inside],
-                values[inside] * scale.factor,
-                gridsize=(45, 30),
-                extent=(low - pad, high + pad, -reach * scale.factor, reach * scale.factor),
-                mincnt=1,
-                norm=LogNorm(vmin=1),
-                cmap=SEQUENTIAL,
-                linewidths=0.1,
-            )
-            if errors is not None:
-                grid = np.linspace(low - pad, high + pad, 200)
-                sigma = np.asarray(errors.at(grid)["uv".index(axis)]) * scale.factor
-                for edge in (-sigma, sigma):
-                    ax.plot(grid, edge, color="white", lw=2.6)
-                    ax.plot(grid, edge, color=PALETTE["vermilion"], lw=1.3)
-            ax.axhline(0.0, color=INK, lw=0.5)
-            ax.set_xlim(low - pad, high + pad)
-            ax.set_ylim(-reach * scale.factor, reach * scale.factor)
-            ax.set_title(f"{axis}: {int((~inside).sum())} of {values.size} {shown} lie outside")
-            ax.set_xlabel("magnitude [mag]")
-        axes[0].set_ylabel(f"residual [{scale.unit}]")
-        fig.colorbar(hexagons, ax=axes, label=f"{shown} per hexagon", fraction=0.04, pad=0.01)
+    fig = new_figure(WIDTH, 3.2)
+    axes = fig.subplots(1, 2, sharey=True)
+    for ax, axis, values in zip(axes, "uv", residual.T, strict=True):
+        inside = (np.abs(values) <= reach) & (np.abs(2 * mag - low - high) <= high - low + 2 * pad)
+        hexagons = ax.hexbin(
+            mag[inside],
+            values[inside] * scale.factor,
+            gridsize=(45, 30),
+            extent=(low - pad, high + pad, -reach * scale.factor, reach * scale.factor),
+            mincnt=1,
+            norm=LogNorm(vmin=1),
+            cmap=SEQUENTIAL,
+            linewidths=0.1,
+        )
+        if errors is not None:
+            grid = np.linspace(low - pad, high + pad, 200)
+            sigma = np.asarray(errors.at(grid)["uv".index(axis)]) * scale.factor
+            for edge in (-sigma, sigma):
+                ax.plot(grid, edge, color="white", lw=2.6)
+                ax.plot(grid, edge, color=PALETTE["vermilion"], lw=1.3)
+        ax.axhline(0.0, color=INK, lw=0.5)
+        ax.set_xlim(low - pad, high + pad)
+        ax.set_ylim(-reach * scale.factor, reach * scale.factor)
+        ax.set_title(f"{axis}: {int((~inside).sum())} of {values.size} {shown} lie outside")
+        ax.set_xlabel("magnitude [mag]")
+    axes[0].set_ylabel(f"residual [{scale.unit}]")
+    fig.colorbar(hexagons, ax=axes, label=f"{shown} per hexagon", fraction=0.04, pad=0.01)
     return fig
 
 

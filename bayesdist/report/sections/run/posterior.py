@@ -26,7 +26,7 @@ from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.corners import Column, corner_figure
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import CYCLE, HYPER_LABELS, INK, WIDTH, figure_style, new_figure
+from bayesdist.report.style import CYCLE, HYPER_LABELS, INK, WIDTH, new_figure
 from bayesdist.report.texttable import TextTable
 
 if TYPE_CHECKING:
@@ -237,21 +237,20 @@ def traces(r: ReportInput) -> Plot:
             fraction = key == "f"
             values = np.asarray(posterior.hyper[key], float) * (100.0 if fraction else 1.0)
             rows.append((HYPER_LABELS[key], "%" if fraction else posterior.model.unit, values))
-    with figure_style():
-        fig = new_figure(WIDTH, 1.0 * len(rows) + 0.7)
-        axes = fig.subplots(
-            len(rows), 2, sharey="row", sharex="col", width_ratios=(4, 1), squeeze=False
-        )
-        for (trace, density), (label, unit, values) in zip(axes, rows, strict=True):
-            scale = display_scale(unit, values)
-            _trace_row(trace, density, _by_walker(values * scale.factor, posterior))
-            trace.set_ylabel(f"{label}\n[{scale.unit or 'no unit'}]", fontsize=7.5)
-            trace.yaxis.set_major_locator(MaxNLocator(4))
-        axes[-1, 0].set_xlabel("step after warm-up [count]")
-        axes[-1, 1].set_xlabel("density [relative]")
-        fig.align_ylabels(axes[:, 0])
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper left", ncols=len(labels))
+    fig = new_figure(WIDTH, 1.0 * len(rows) + 0.7)
+    axes = fig.subplots(
+        len(rows), 2, sharey="row", sharex="col", width_ratios=(4, 1), squeeze=False
+    )
+    for (trace, density), (label, unit, values) in zip(axes, rows, strict=True):
+        scale = display_scale(unit, values)
+        _trace_row(trace, density, _by_walker(values * scale.factor, posterior))
+        trace.set_ylabel(f"{label}\n[{scale.unit or 'no unit'}]", fontsize=7.5)
+        trace.yaxis.set_major_locator(MaxNLocator(4))
+    axes[-1, 0].set_xlabel("step after warm-up [count]")
+    axes[-1, 1].set_xlabel("density [relative]")
+    fig.align_ylabels(axes[:, 0])
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside upper left", ncols=len(labels))
     return Plot(
         fig,
         "Chains",

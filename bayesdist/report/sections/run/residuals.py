@@ -25,7 +25,7 @@ from bayesdist.report.context import ReportInput
 from bayesdist.report.mosaic import Mosaic
 from bayesdist.report.panels import ChipPanels, Panels
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure, nice_below
+from bayesdist.report.style import PALETTE, WIDTH, new_figure, nice_below
 
 if TYPE_CHECKING:
     from bayesdist.assess import BinnedResiduals
@@ -157,25 +157,24 @@ def _histograms(
     core = min(6.0 * width, 4.0 * widest)
     tail = max(float(np.abs(residual).max()), 1.2 * core) * 1.02
     everything = "whole sample" if sampled else f"all {things}"
-    with figure_style():
-        fig = new_figure(WIDTH, 4.9)
-        axes = fig.subplots(2, 2, sharey="row")
-        for column, (axis, curve) in enumerate(zip("uv", curves, strict=True)):
-            for row, (reach, bins) in enumerate(((core, 81), (tail, 121))):
-                ax = axes[row, column]
-                scale = display_scale(unit, reach)
-                _histogram(ax, residual[:, column], curve, reach, bins, scale.factor, things)
-                ax.set_xlabel(f"residual in {axis} [{scale.unit}]")
-            axes[0, column].set_title(f"{axis}: core")
-            axes[1, column].set_title(f"{axis}: {everything}, logarithmic")
-            axes[1, column].set_yscale("log")
-        # curves fall far below one star: the axis is not for them
-        most = [np.histogram(r, np.linspace(-tail, tail, 122))[0].max() for r in residual.T]
-        axes[1, 0].set_ylim(0.5, 2.0 * max(*most, 1))
-        for ax in axes[:, 0]:
-            ax.set_ylabel(f"{things} of the sample per bin" if sampled else f"{things} per bin")
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper left", ncols=len(labels))
+    fig = new_figure(WIDTH, 4.9)
+    axes = fig.subplots(2, 2, sharey="row")
+    for column, (axis, curve) in enumerate(zip("uv", curves, strict=True)):
+        for row, (reach, bins) in enumerate(((core, 81), (tail, 121))):
+            ax = axes[row, column]
+            scale = display_scale(unit, reach)
+            _histogram(ax, residual[:, column], curve, reach, bins, scale.factor, things)
+            ax.set_xlabel(f"residual in {axis} [{scale.unit}]")
+        axes[0, column].set_title(f"{axis}: core")
+        axes[1, column].set_title(f"{axis}: {everything}, logarithmic")
+        axes[1, column].set_yscale("log")
+    # curves fall far below one star: the axis is not for them
+    most = [np.histogram(r, np.linspace(-tail, tail, 122))[0].max() for r in residual.T]
+    axes[1, 0].set_ylim(0.5, 2.0 * max(*most, 1))
+    for ax in axes[:, 0]:
+        ax.set_ylabel(f"{things} of the sample per bin" if sampled else f"{things} per bin")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside upper left", ncols=len(labels))
     return fig
 
 
