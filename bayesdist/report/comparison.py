@@ -16,7 +16,7 @@ from bayesdist.numbers import size_of
 from bayesdist.report.arrows import Arrows, vector_map
 from bayesdist.report.mosaic import Mosaic
 from bayesdist.report.panels import ChipPanels
-from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure, nice_below
+from bayesdist.report.style import COLORBAR, PALETTE, WIDTH, figure_style, new_figure, nice_below
 
 if TYPE_CHECKING:
     from bayesdist.assess.comparison.compare import Comparison
@@ -82,8 +82,7 @@ def difference_vectors(
             shades,
             ax=panels.all_axes,
             label="significance of each place by itself [σ]",
-            fraction=0.05,
-            pad=0.02,
+            **COLORBAR,
         )
     return panels.figure
 
@@ -106,9 +105,9 @@ def change_over_time(first: Float, gain: Float, dof: int, p_value: float | None)
     ax.set_ylim(0, 1.1 * max(float(gain.max()), float(high)))
     ax.set_xlabel("a change from this date on [yr]")
     ax.set_ylabel(f"chi-square it takes up ({dof} d.o.f.)")
-    told = ""
+    note = ""
     if p_value is not None:
         p = "p < 1e-12" if p_value < 1e-12 else f"p = {p_value:.2g}"
-        told = f"; {p} for the largest of {len(gain)}"
-    ax.set_title(f"band: where 95 % of single dates lie by chance{told}")
+        note = f"; {p} for the largest of {len(gain)}"
+    ax.set_title(f"band: where 95 % of single dates lie by chance{note}")
     return fig

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RectBivariateSpline
 
 from bayesdist.report.panels import Panels
-from bayesdist.report.style import INK, SEQUENTIAL, figure_style
+from bayesdist.report.style import COLORBAR, INK, SEQUENTIAL, figure_style
 
 __all__ = ["Grid", "contour_levels", "scalar_map"]
 
@@ -86,7 +86,7 @@ def scalar_map(
         ax.set_title(title)
     if not label or not drawn:
         return
-    look = {"label": label, "fraction": 0.05, "pad": 0.02}
+    look = {"label": label, **COLORBAR}
     if levels is not None or single:
         last = list(drawn.values())[-1]
         beyond = {} if levels is not None else {"extend": _extend(grids, last.norm)}

@@ -9,7 +9,15 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bayesdist.report.style import CYCLE, INK, WIDTH, figure_style, new_figure
+from bayesdist.report.style import (
+    CYCLE,
+    INK,
+    WIDTH,
+    figure_style,
+    guide_lines,
+    legend_above,
+    new_figure,
+)
 
 __all__ = ["FilterTerm", "filters_figure"]
 
@@ -69,9 +77,7 @@ def filters_figure(term: str, courses: Sequence[FilterTerm], breaks: Sequence[fl
         sign = "−" if reference >= 0 else "+"
         ax.set_ylabel(f"${term}$ {sign} {abs(reference):.10g} [10⁻⁶]")
         ax.set_title(f"{chip}, drift taken out" if chip else "drift taken out")
-        ax.grid(True, lw=0.4, color="#E3E8ED")
-        ax.set_axisbelow(True)
+        guide_lines(ax)
     panels[-1].set_xlabel("epoch [yr]")
-    handles, labels = panels[0].get_legend_handles_labels()
-    fig.legend(handles, labels, loc="outside upper left", ncols=len(labels))
+    legend_above(fig, panels[0])
     return fig

@@ -53,15 +53,15 @@ class ChipPanels(Panels):
         rows = 1 + max(place[0] for place in mosaic.legible_places)
         aspect = mosaic.largest[1] / mosaic.largest[0]
         # maps of a chip are side by side; of a wide detector, or chip, one above the other
-        beside = columns == 1 if mosaic.several else aspect >= WIDE
-        down, across = (rows, maps) if beside else (maps * rows, columns)
+        side_by_side = columns == 1 if mosaic.several else aspect >= WIDE
+        down, across = (rows, maps) if side_by_side else (maps * rows, columns)
         width = WIDTH if across > 1 or aspect < WIDE else 0.66 * WIDTH
         margin = 0.75 + 0.55 * (across - 1) + (0.8 if colorbar else 0.0)
         height = down * (min((width - margin) / across * aspect, TALLEST_PANEL) + 0.8)
         figure = new_figure(width, height, layout="compressed")
         grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
         axes = [
-            [grid[row, k] if beside else grid[k * rows + row, column] for k in range(maps)]
+            [grid[row, k] if side_by_side else grid[k * rows + row, column] for k in range(maps)]
             for row, column in mosaic.legible_places
         ]
         super().__init__(figure, axes, mosaic.names if mosaic.several else ("",))
@@ -161,9 +161,9 @@ class OneArray(Panels):
             corner = px + 0.5, py + 0.5
             ax.add_patch(Rectangle(corner, nx, ny, fill=False, lw=0.7, ec=OUTLINE, zorder=4))
             if named:
-                beside = ax.get_yaxis_transform()
+                at_edge = ax.get_yaxis_transform()
                 words = {"rotation": 270, "ha": "left", "va": "center", "fontsize": 7.5}
-                ax.text(1.012, py + ny / 2, f"chip {number}", transform=beside, **words)
+                ax.text(1.012, py + ny / 2, f"chip {number}", transform=at_edge, **words)
 
 
 def chip_axes(ax: Axes, size: Size, *, margin: float = 0.0) -> None:

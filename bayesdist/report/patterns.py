@@ -12,7 +12,15 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bayesdist.model.grid import mesh, outline_pixels
-from bayesdist.report.style import INK, PALETTE, SEQUENTIAL, WIDTH, figure_style, new_figure
+from bayesdist.report.style import (
+    COLORBAR,
+    INK,
+    PALETTE,
+    SEQUENTIAL,
+    WIDTH,
+    figure_style,
+    new_figure,
+)
 
 if TYPE_CHECKING:
     from matplotlib.collections import QuadMesh
@@ -51,7 +59,7 @@ def pattern_maps(found: Sequence[PlannedPattern]) -> Figure:
             if not k:
                 ax.set_title(f"{kind}, rms\n{ax.get_title(loc='left')}")
     label = "radius (1 σ) [pix]"
-    fig.colorbar(filled[0], ax=list(axes[:, 1:].ravel()), label=label, fraction=0.05, pad=0.02)
+    fig.colorbar(filled[0], ax=list(axes[:, 1:].ravel()), label=label, **COLORBAR)
     return fig
 
 

@@ -9,15 +9,18 @@ import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatterSciNotation, ScalarFormatter
 from numpy.typing import NDArray
 
 __all__ = [
+    "COLORBAR",
     "CYCLE",
     "GUIDE",
     "HYPER_LABELS",
@@ -29,6 +32,8 @@ __all__ = [
     "SEQUENTIAL",
     "WIDTH",
     "figure_style",
+    "guide_lines",
+    "legend_above",
     "new_figure",
     "nice_below",
     "plain_ticks",
@@ -60,6 +65,7 @@ PALE = "#A9B4C0"  # vectors that may be noise alone, and stars in the background
 OUTLINE = "#9AA5B1"  # of chips, and lines at zero
 GUIDE = "#E3E8ED"  # lines of a grid behind data
 HYPER_LABELS = {"f": "f", "j": "j", "s_out": r"$s_\mathrm{out}$"}
+COLORBAR = {"fraction": 0.05, "pad": 0.02}  # next to maps
 WIDTH = 7.2  # inches: the text width of an A4 or Letter page
 
 _RC = {
@@ -105,6 +111,18 @@ def new_figure(width: float, height: float, *, layout: str = "constrained") -> F
     fig = Figure(figsize=(width, height), layout=layout)
     FigureCanvasAgg(fig)
     return fig
+
+
+def legend_above(figure: Figure, ax: Axes, **look: Any) -> None:
+    """Draw the legend of one panel above all panels, in one row."""
+    handles, labels = ax.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=len(labels), **look)
+
+
+def guide_lines(ax: Axes) -> None:
+    """Draw lines of a grid behind the data."""
+    ax.grid(True, lw=0.4, color=GUIDE)
+    ax.set_axisbelow(True)
 
 
 def nice_below(value: float) -> float:

@@ -173,6 +173,20 @@ class IdcTab:
             numbers = {max(int(n), 1) for n in self.rows["DETCHIP"]}
         return tuple(sorted(numbers, key=lambda n: (n != _REFERENCE, n)))
 
+    @cached_property
+    def stated_chips(self) -> tuple[int, ...]:
+        """Chip numbers of DETCHIP; none where rows serve every chip."""
+        if "DETCHIP" not in self.columns:
+            return ()
+        return tuple(sorted({int(n) for n in self.rows["DETCHIP"] if n > 0}))
+
+    @cached_property
+    def directions(self) -> NDArray[np.str_]:
+        """DIRECTION of every row, in capitals; FORWARD where there is no such column."""
+        if "DIRECTION" not in self.columns:
+            return np.full(len(self.rows), "FORWARD")
+        return np.char.upper(np.char.strip(self.rows["DIRECTION"]))
+
     # -- one row ---------------------------------------------------------------------------------
 
     def row(
@@ -234,11 +248,9 @@ class IdcTab:
             0-based; empty where no row fits.
         """
         rows, columns = self.rows, self.columns
-        keep = np.ones(len(rows), bool)
+        keep = self.directions == direction.upper()
         if "DETCHIP" in columns:
             keep &= np.isin(rows["DETCHIP"].astype(int), (chip, _ANY_CHIP))
-        if "DIRECTION" in columns:
-            keep &= np.char.upper(np.char.strip(rows["DIRECTION"])) == direction.upper()
         if filter is not None:
             asked = _filters([filter] if isinstance(filter, str) else filter)
             keep &= np.array([_fits(asked, _filters(names)) for names in self.filters()], bool)

@@ -19,6 +19,7 @@ from bayesdist.report.style import (
     PALETTE,
     SEQUENTIAL,
     WIDTH,
+    guide_lines,
     new_figure,
 )
 from bayesdist.report.texttable import TextTable, listing
@@ -211,8 +212,7 @@ def matching(r: ReportInput) -> Plot:
         ax.plot(epoch, values, "o", ms=3.2, mec="none", color=PALETTE[color])
         ax.set_ylabel(label)
         ax.margins(y=0.15)
-        ax.grid(True, lw=0.4, color=GUIDE)
-        ax.set_axisbelow(True)
+        guide_lines(ax)
     axes[1].set_ylim(bottom=-0.05 * max(axes[1].get_ylim()[1], 1.0))
     axes[2].set_ylim(bottom=0)
     axes[2].set_xlabel("epoch [yr]")

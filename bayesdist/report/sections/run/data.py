@@ -35,8 +35,8 @@ def data_tables(r: ReportInput) -> tuple[TextTable, ...]:
     pairs = {
         "Sources": ", ".join(short_paths(m.sources)),
         "Rows read": count(m.n_rows),
-        words.all_things.capitalize(): count(r.stars.n_total),
-        f"Used by the {words.chooser}": count(fit.n_used),
+        words.all_rows.capitalize(): count(r.stars.n_total),
+        f"Used by the {words.rejection}": count(fit.n_used),
         "Unit of u, v": m.unit,
         "Exposures": count(np.count_nonzero(r.exposures.n)),
         "Filters": ", ".join(f for f in m.filter_names if f) or MISSING,
@@ -45,22 +45,22 @@ def data_tables(r: ReportInput) -> tuple[TextTable, ...]:
         pairs[f"Epochs [yr]{partial}"] = f"{np.min(m.epoch):.2f} to {np.max(m.epoch):.2f}"
     if m.mag is not None and np.isfinite(m.mag).any():
         pairs[f"Magnitudes{partial}"] = f"{np.nanmin(m.mag):.2f} to {np.nanmax(m.mag):.2f}"
-    pairs[f"Errors of the {words.things}"] = (
+    pairs[f"Errors of the {words.rows}"] = (
         "by magnitude, see below"
         if r.magnitude_errors is not None
         else str(r.setting("data", "sigma", "as given"))
     )
     reasons = [(f"{k} (reading)", count(v)) for k, v in m.rejected.items()]
-    reasons += [(f"{k} ({words.chooser})", count(v)) for k, v in fit.rejected.items()]
+    reasons += [(f"{k} ({words.rejection})", count(v)) for k, v in fit.rejected.items()]
     rejected = TextTable(
         "Rows left out, by reason",
         ("Reason", "Rows"),
         tuple(reasons) or (("none", "0"),),
-        note=f"The posterior uses all {words.all_things}: the mixture takes the place of rejection."
+        note=f"The posterior uses all {words.all_rows}: the mixture takes the place of rejection."
         if r.posterior is not None
         else "",
     )
-    note = f"Figures and tables of single {words.things} show {r.sample}." if partial else ""
+    note = f"Figures and tables of single {words.rows} show {r.sample}." if partial else ""
     out = [listing("Input", pairs, note), rejected]
     if r.magnitude_errors is not None:
         out.append(_magnitude_table(r))
@@ -81,7 +81,7 @@ def _magnitude_table(r: ReportInput) -> TextTable:
         "Errors by magnitude, estimated from the residuals",
         (
             "Magnitude",
-            r.words.things.capitalize(),
+            r.words.rows.capitalize(),
             f"σ u [{scale.unit}]",
             f"σ v [{scale.unit}]",
         ),
@@ -109,7 +109,7 @@ def _exposure_table(r: ReportInput) -> TextTable:
         "Exposures",
         (
             "Exposure",
-            r.words.things.capitalize(),
+            r.words.rows.capitalize(),
             "Used",
             f"rms u [{scale.unit}]",
             f"rms v [{scale.unit}]",
@@ -125,11 +125,11 @@ def _exposure_table(r: ReportInput) -> TextTable:
 def residuals_by_magnitude(r: ReportInput) -> Plot:
     """Density of the residuals against magnitude, with the errors assigned to each magnitude."""
     words, known = r.words, _magnitudes(r)
-    text = f"Residuals grow towards faint stars; colour counts {words.things}."
+    text = f"Residuals grow towards faint stars; colour counts {words.rows}."
     if r.magnitude_errors is not None:
+        more = ", or somewhat more, because the stars were fitted to them" if words.leverage else ""
         text += " The lines are ±1 σ as assigned to each magnitude: about two thirds of the"
-        text += f" {words.things} lie between them"
-        text += ", or somewhat more, because the stars were fitted to them." if words.taken else "."
+        text += f" {words.rows} lie between them{more}."
     if r.sample:
         text += f" Drawn from {r.sample}."
     assert r.stars.table.mag is not None
@@ -139,7 +139,7 @@ def residuals_by_magnitude(r: ReportInput) -> Plot:
             r.stars.residual[known],
             unit=r.unit,
             errors=r.magnitude_errors,
-            shown=f"sampled {words.things}" if r.stars.partial else words.things,
+            shown=f"sampled {words.rows}" if r.stars.partial else words.rows,
         ),
         "Residuals against magnitude",
         text,
