@@ -189,8 +189,7 @@ def _draw(
         ax.plot(x, y, ".", ms=1.2, color=PALE, zorder=2)
     if arrows.ring is not None:
         at = np.add(arrows.ring, offset)
-        ring = {"ms": 5, "mfc": "none", "mec": PALETTE["vermilion"], "mew": 1.3, "zorder": 5}
-        ax.plot(*at, "o", **ring)
+        ax.plot(*at, "o", ms=5, mfc="none", mec=PALETTE["vermilion"], mew=1.3, zorder=5)
 
 
 def _arrows(
@@ -274,7 +273,7 @@ def cross_map(
     places = [(column, ax) for several in panels.axes for column, ax in enumerate(several)]
     scales, keys = (np.broadcast_to(np.asarray(a, float), len(maps)) for a in (magnification, key))
     for (column, ax), one, title, M, length in zip(places, maps, titles, scales, keys, strict=True):
-        segments = _crosses(one, float(M), every)
+        segments = list(_crosses(one, float(M), every))
         ax.add_collection(LineCollection(segments, colors=CYCLE[column], linewidths=0.8))
         ax.set_title(title, pad=20)
         # one key serves all panels, but a panel that is cut out must state its scale too

@@ -75,8 +75,8 @@ def difference_vectors(
     for c, (ax,) in zip(found, panels.axes, strict=True):
         if not shaded or c.chi2 is None:
             continue
-        look = {"levels": LEVELS, "cmap": _SHADES, "extend": "max", "zorder": 1}
-        shades = ax.contourf(c.x, c.y, gaussian_sigmas(c.chi2), **look)
+        sigmas = gaussian_sigmas(c.chi2)
+        shades = ax.contourf(c.x, c.y, sigmas, LEVELS, cmap=_SHADES, extend="max", zorder=1)
     if shaded:
         panels.figure.colorbar(
             shades,

@@ -81,18 +81,25 @@ def corner_figure(columns: Sequence[Column], *, formal: Float | None = None) -> 
 
 def _draw_single(ax: Axes, draws: Float, limits: Float) -> None:
     """Draw a histogram of one quantity."""
-    edges = np.linspace(*limits, BINS + 1)
-    height, _, _ = ax.hist(draws, edges, histtype="step", density=True, color=_COLOR, lw=1.0)
+    edges = _edges(limits)
+    height, _, _ = ax.hist(
+        draws, edges.tolist(), histtype="step", density=True, color=_COLOR, lw=1.0
+    )
     for value in np.quantile(draws, _QUANTILES):
         ax.axvline(value, ls="dashed", color=_COLOR)
     ax.set(xlim=limits, ylim=(0, 1.1 * np.max(height)))
     ax.yaxis.set_major_locator(NullLocator())
 
 
+def _edges(limits: Float) -> Float:
+    low, high = limits
+    return np.linspace(low, high, BINS + 1)
+
+
 def _draw_pair(ax: Axes, draws: Float, limits: Float) -> None:
     """Draw contours of the smoothed density of two quantities (N, 2)."""
-    edges = [np.linspace(*ends, BINS + 1) for ends in limits]
-    counts, _, _ = np.histogram2d(*draws.T, bins=edges)
+    edges = [_edges(ends) for ends in limits]
+    counts, _, _ = np.histogram2d(draws[:, 0], draws[:, 1], bins=edges)
     density = gaussian_filter(counts, 1.0)
     levels = _levels(density)
     # two cells more on each side close the contours at the edges
@@ -136,7 +143,8 @@ def _draw_gaussian(panels: NDArray[np.object_], cov: Float) -> None:
     circle = np.stack([np.cos(turn), np.sin(turn)])
     for row in range(len(panels)):
         own = panels[row, row]
-        at = np.linspace(*own.get_xlim(), 200)
+        low, high = own.get_xlim()
+        at = np.linspace(low, high, 200)
         density = np.exp(-0.5 * at**2 / cov[row, row]) / np.sqrt(2.0 * np.pi * cov[row, row])
         own.plot(at, density, **style)
         own.set_ylim(0, max(own.get_ylim()[1], 1.1 * density.max()))

@@ -80,8 +80,9 @@ def scalar_map(
         if grid.ring is not None:
             at = np.add(grid.ring, (px, py))
             for color, width, order in (("white", 2.2, 5), (INK, 1.0, 6)):
-                ring = {"ms": 5, "mfc": "none", "clip_on": False, "zorder": order}
-                ax.plot(*at, "o", mec=color, mew=width, **ring)
+                ax.plot(
+                    *at, "o", ms=5, mfc="none", mec=color, mew=width, clip_on=False, zorder=order
+                )
     for ax, title in zip(panels.all_axes, titles, strict=True):
         ax.set_title(title)
     if not label or not drawn:
@@ -89,12 +90,13 @@ def scalar_map(
     look = {"label": label, **COLORBAR}
     if levels is not None or single:
         last = list(drawn.values())[-1]
-        beyond = {} if levels is not None else {"extend": _extend(grids, last.norm)}
-        panels.figure.colorbar(last, ax=panels.all_axes, **look, **beyond)
+        if levels is None:
+            look["extend"] = _extend(grids, last.get_clim())
+        panels.figure.colorbar(last, ax=panels.all_axes, **look)
     else:
         for ax, image in drawn.items():
-            extend = _extend([grids[panels.all_axes.index(ax)]], image.norm)
-            panels.figure.colorbar(image, ax=ax, **look, extend=extend)
+            look["extend"] = _extend([grids[panels.all_axes.index(ax)]], image.get_clim())
+            panels.figure.colorbar(image, ax=ax, **look)
 
 
 def _contours(
@@ -140,9 +142,9 @@ def _cells(
     return image
 
 
-def _extend(grids: Sequence[Grid | None], norm: Normalize) -> str:
+def _extend(grids: Sequence[Grid | None], limits: tuple[float, float]) -> str:
     """Sides of the colour bar beyond which there are values."""
-    assert norm.vmin is not None and norm.vmax is not None
+    low, high = limits
     values = np.concatenate([g.values[np.isfinite(g.values)] for g in grids if g is not None])
-    below, above = (values < norm.vmin).any(), (values > norm.vmax).any()
+    below, above = (values < low).any(), (values > high).any()
     return {(0, 0): "neither", (1, 0): "min", (0, 1): "max"}.get((int(below), int(above)), "both")

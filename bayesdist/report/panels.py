@@ -162,8 +162,8 @@ class OneArray(Panels):
             ax.add_patch(Rectangle(corner, nx, ny, fill=False, lw=0.7, ec=OUTLINE, zorder=4))
             if named:
                 at_edge = ax.get_yaxis_transform()
-                words = {"rotation": 270, "ha": "left", "va": "center", "fontsize": 7.5}
-                ax.text(1.012, py + ny / 2, f"chip {number}", transform=at_edge, **words)
+                text = ax.text(1.012, py + ny / 2, f"chip {number}", transform=at_edge)
+                text.set(rotation=270, ha="left", va="center", fontsize=7.5)
 
 
 def chip_axes(ax: Axes, size: Size, *, margin: float = 0.0) -> None:

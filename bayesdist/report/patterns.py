@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -108,7 +108,7 @@ def _map(ax: Axes, one: PlannedPattern, kind: str, norm: LogNorm, last: bool) ->
     for m in maps or ():
         x, y = mesh(m.x, m.y)
         u, v = model.predict(theta, x, y, exposure=0, chip=m.chip).T.reshape(2, len(m.y), len(m.x))
-        look = {"cmap": SEQUENTIAL, "shading": "gouraud", "rasterized": True}
+        look: dict[str, Any] = {"cmap": SEQUENTIAL, "shading": "gouraud", "rasterized": True}
         filled.append(ax.pcolormesh(u, v, m.radius, norm=norm, **look))
     (x0, y0), (x1, y1) = _limits(np.concatenate(outlines))
     ax.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal")

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.ticker import ScalarFormatter
+from numpy.typing import NDArray
 
 from bayesdist.numbers import count, number, percent, size_of
 from bayesdist.report.contents import REPORT
@@ -261,7 +262,7 @@ def footprints(r: ReportInput) -> Plot:
     bar.ax.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
     ax.tick_params(colors=INK)
     n = len(field.outlines) // len(c.chips)
-    rolls = np.ma.filled(np.ma.asarray(c.matching["pa_v3"], float), np.nan)
+    rolls: NDArray[np.float64] = np.ma.filled(np.ma.asarray(c.matching["pa_v3"], float), np.nan)
     text = (
         f"Outlines of the chips of {count(n)} exposures over the catalogue, coloured by date; the"
         " first, the middle and the last one are drawn strong."

@@ -46,7 +46,13 @@ _KIND_COLORS = {
 }
 # one above the other, as both axes are often equal
 _AXIS_MARKERS = {"u": ("o", -0.15), "v": ("s", 0.15)}
-_MARKER_STYLE = {"ms": 5.5, "color": PALETTE["yellow"], "mec": INK, "mew": 0.7, "zorder": 4}
+_MARKER_STYLE: dict[str, Any] = {
+    "ms": 5.5,
+    "color": PALETTE["yellow"],
+    "mec": INK,
+    "mew": 0.7,
+    "zorder": 4,
+}
 
 
 def is_total(row: Mapping[str, str | float]) -> bool:
@@ -198,5 +204,5 @@ def budget_dominating(r: ReportInput) -> Plot:
     )
 
 
-def _shortened(name: str, width: int = 40) -> str:
-    return name if len(name) <= width else name[: width - 1] + "…"
+def _shortened(name: str) -> str:
+    return name if len(name) <= 40 else name[:39] + "…"

@@ -51,7 +51,7 @@ def margin_table(r: ReportInput) -> TextTable:
         spread = (m.interval[1] - m.interval[0]) / 4
         cells = (
             rounded(m.value, spread),
-            interval(*m.interval, spread),
+            interval(m.interval[0], m.interval[1], spread),
             f"{rounded(m.margin, spread)} ({percent(m.percent / 100, 2)})",
             f"{number(m.probability_met)} ± {number(m.mc_error, 2)}",
         )

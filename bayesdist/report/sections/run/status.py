@@ -10,9 +10,8 @@ from bayesdist.checks import Check
 from bayesdist.numbers import number, rounded, with_mas
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
-from bayesdist.report.sections.checks import check_cells
 from bayesdist.report.sections.run.margins import VERDICT_LEVELS
-from bayesdist.report.texttable import TextTable
+from bayesdist.report.texttable import TextTable, check_cells
 
 __all__ = [
     "Verdict",
