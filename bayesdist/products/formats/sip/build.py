@@ -15,6 +15,7 @@ from bayesdist.calibration.plane import ARCSEC
 from bayesdist.calibration.sky import reprojected
 from bayesdist.errors import InputError
 from bayesdist.infer.solution import Solution
+from bayesdist.model import DistortionModel
 from bayesdist.products.formats.common.cards import (
     convergence_cards,
     number_card,
@@ -105,19 +106,8 @@ def sip_from_solution(
     calibration = as_calibration(solution)
     if tangent_point is None:
         tangent_point = calibration.plane.point
-    if linear not in ("cd", "sip"):
-        raise InputError(
-            f"linear is {linear!r}", where="products.sip.linear", do="choose 'cd' or 'sip'"
-        )
-    if scale_arcsec is not None and not (np.isfinite(scale_arcsec) and scale_arcsec > 0):
-        raise InputError(f"scale is {scale_arcsec} arcsec per pixel", do="give a positive number")
     model = calibration.model
-    if model.time is not None and epoch is None:
-        raise InputError(
-            "a SIP header holds for one epoch, and the model depends on time",
-            where="products.sip.epoch",
-            do="give an epoch in decimal years",
-        )
+    _check_options(model, linear, epoch, scale_arcsec, tangent_point, origin)
     number = calibration.numbers[0] if chip is None else chip
     one = calibration.chip(number, epoch, origin="stated")
     poly = one.monomials()
@@ -125,12 +115,6 @@ def sip_from_solution(
     unit_arcsec = ARCSEC[model.unit] if model.unit != "pix" else (scale_arcsec or 1.0)
     sky = None
     if tangent_point is not None:
-        if model.unit == "pix" or origin is not None:
-            raise InputError(
-                "a tangent point is given beside u, v in pixels or an origin of one's own",
-                where="tangent_point",
-                do="leave one of them out",
-            )
         sky = reprojected(one, unit_arcsec, tangent_point, crval, SIP_ORDERS[0])
         poly, crval = sky.poly, sky.crval
     order = max(SIP_ORDERS[0], *(i + j for i, j in poly.terms))  # readers ignore order 1
@@ -187,6 +171,35 @@ def sip_from_solution(
         bp=bp,
     )
     return replace(sip, closure=worst_closure(sip, size))
+
+
+def _check_options(
+    model: DistortionModel,
+    linear: str,
+    epoch: float | None,
+    scale_arcsec: float | None,
+    tangent_point: tuple[float, float] | None,
+    origin: tuple[float, float] | None,
+) -> None:
+    """Refuse options that contradict each other or the model."""
+    if linear not in ("cd", "sip"):
+        raise InputError(
+            f"linear is {linear!r}", where="products.sip.linear", do="choose 'cd' or 'sip'"
+        )
+    if scale_arcsec is not None and not (np.isfinite(scale_arcsec) and scale_arcsec > 0):
+        raise InputError(f"scale is {scale_arcsec} arcsec per pixel", do="give a positive number")
+    if model.time is not None and epoch is None:
+        raise InputError(
+            "a SIP header holds for one epoch, and the model depends on time",
+            where="products.sip.epoch",
+            do="give an epoch in decimal years",
+        )
+    if tangent_point is not None and (model.unit == "pix" or origin is not None):
+        raise InputError(
+            "a tangent point is given beside u, v in pixels or an origin of one's own",
+            where="tangent_point",
+            do="leave one of them out",
+        )
 
 
 def _inverse_order(asked: int | None, order: int) -> int:
