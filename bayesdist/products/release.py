@@ -146,26 +146,16 @@ def write_release(
     made: dict[str, IdcTab] = {}
     lost: dict[str, tuple[Loss, ...]] = {}
     for period in periods:
-        rows: dict[Filter, Calibration] = {}
-        left: dict[Filter, tuple[Loss, ...]] = {}
-        for filter, one in turned.items():
-            rows[filter], left[filter] = storable(
-                one,
-                years=period.years,
-                segment=period.segment,
-                limit_mas=limit_mas,
-                like=next(iter(rows.values()), None),
-            )
+        rows, left = _stored(turned, period, limit_mas)
         lost[period.name] = tuple(entry for some in left.values() for entry in some)
         notes = [
             f"{filter}: {entry}." if len(rows) > 1 else f"{entry}."
             for filter, some in left.items()
             for entry in some
         ]
-        for stand_in, other in stand_ins.items():
-            rows[stand_in] = rows[other]
+        served = {stand_in: rows[other] for stand_in, other in stand_ins.items()}
         made[period.name] = idctab_from_solution(
-            rows,
+            rows | served,
             instrument=instrument,
             detector=detector,
             scale_arcsec=scale_arcsec,
@@ -183,10 +173,9 @@ def write_release(
         )
 
     folder = made_folder(folder)
-    idctabs = {}
-    for period_name, tab in made.items():
-        idctabs[period_name] = folder / f"{name}_{period_name}_idc.fits"
-        write_idctab(tab, idctabs[period_name])
+    idctabs = {period: folder / f"{name}_{period}_idc.fits" for period in made}
+    for period_name, path in idctabs.items():
+        write_idctab(made[period_name], path)
     first = periods[0]
     common: dict[str, Any] = {
         "description": description,
@@ -214,6 +203,23 @@ def write_release(
             **common,
         )
     return Release(idctabs, d2im, npol, lost)
+
+
+def _stored(
+    calibrations: Mapping[str, Calibration], period: Period, limit_mas: float
+) -> tuple[dict[Filter, Calibration], dict[Filter, tuple[Loss, ...]]]:
+    """Calibrations of a period with the first one's drift, and the drifts left out, by filter."""
+    rows: dict[Filter, Calibration] = {}
+    lost: dict[Filter, tuple[Loss, ...]] = {}
+    for filter, one in calibrations.items():
+        rows[filter], lost[filter] = storable(
+            one,
+            years=period.years,
+            segment=period.segment,
+            limit_mas=limit_mas,
+            like=next(iter(rows.values()), None),
+        )
+    return rows, lost
 
 
 def _check(

@@ -143,6 +143,7 @@ def magnification_of(step: float, length: float) -> float:
     return nice_below(step / length) if length > 1e-10 * step else 1.0
 
 
+@figure_style()
 def vector_map(
     panels: Panels,
     chips: Sequence[Arrows | None],
@@ -161,19 +162,18 @@ def vector_map(
     points away, 17 and more to be above the key.  `fine` is for small panels.
     """
     keys: dict[Axes, float] = {}
-    with figure_style():
-        for k, (arrows, one) in enumerate(
-            zip(chips, np.broadcast_to(np.asarray(key, float), len(chips)), strict=True)
-        ):
-            if arrows is None:
-                continue
-            ax = panels.axes[k][0]
-            _draw(ax, arrows, panels.offset(k), magnification, fine=fine)
-            keys.setdefault(ax, float(one))
-        for ax, title in zip(panels.all_axes, titles, strict=True):
-            ax.set_title(title, pad=pad)
-        for ax, length in keys.items():
-            _key(ax, length, magnification=magnification, unit=unit)
+    for k, (arrows, one) in enumerate(
+        zip(chips, np.broadcast_to(np.asarray(key, float), len(chips)), strict=True)
+    ):
+        if arrows is None:
+            continue
+        ax = panels.axes[k][0]
+        _draw(ax, arrows, panels.offset(k), magnification, fine=fine)
+        keys.setdefault(ax, float(one))
+    for ax, title in zip(panels.all_axes, titles, strict=True):
+        ax.set_title(title, pad=pad)
+    for ax, length in keys.items():
+        _key(ax, length, magnification=magnification, unit=unit)
 
 
 def _draw(
@@ -189,8 +189,7 @@ def _draw(
         ax.plot(x, y, ".", ms=1.2, color=PALE, zorder=2)
     if arrows.ring is not None:
         at = np.add(arrows.ring, offset)
-        ring = {"ms": 5, "mfc": "none", "mec": PALETTE["vermilion"], "mew": 1.3, "zorder": 5}
-        ax.plot(*at, "o", **ring)
+        ax.plot(*at, "o", ms=5, mfc="none", mec=PALETTE["vermilion"], mew=1.3, zorder=5)
 
 
 def _arrows(
@@ -256,6 +255,7 @@ def _key(ax: Axes, length: float, *, magnification: float, unit: str) -> None:
 # -- crosses --------------------------------------------------------------------------------------
 
 
+@figure_style()
 def cross_map(
     panels: Panels,
     maps: Sequence[UncertaintyMap],
@@ -272,15 +272,12 @@ def cross_map(
     """
     places = [(column, ax) for several in panels.axes for column, ax in enumerate(several)]
     scales, keys = (np.broadcast_to(np.asarray(a, float), len(maps)) for a in (magnification, key))
-    with figure_style():
-        for (column, ax), one, title, M, length in zip(
-            places, maps, titles, scales, keys, strict=True
-        ):
-            segments = _crosses(one, float(M), every)
-            ax.add_collection(LineCollection(segments, colors=CYCLE[column], linewidths=0.8))
-            ax.set_title(title, pad=20)
-            # one key serves all panels, but a panel that is cut out must state its scale too
-            _key(ax, float(length), magnification=float(M), unit=one.unit)
+    for (column, ax), one, title, M, length in zip(places, maps, titles, scales, keys, strict=True):
+        segments = list(_crosses(one, float(M), every))
+        ax.add_collection(LineCollection(segments, colors=CYCLE[column], linewidths=0.8))
+        ax.set_title(title, pad=20)
+        # one key serves all panels, but a panel that is cut out must state its scale too
+        _key(ax, float(length), magnification=float(M), unit=one.unit)
 
 
 def _crosses(m: UncertaintyMap, magnification: float, every: int) -> Float:

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.model import Chip, LookupTable
+
 if TYPE_CHECKING:
     from astropy.table import Table
 
     from bayesdist.assess import BinnedResiduals
     from bayesdist.data import MagnitudeErrors
     from bayesdist.diagnose.overlap import OverlapTest
-from bayesdist.model import Chip, LookupTable
 
 __all__ = [
     "CampaignResults",

@@ -16,7 +16,7 @@ from bayesdist.numbers import size_of
 from bayesdist.report.arrows import Arrows, vector_map
 from bayesdist.report.mosaic import Mosaic
 from bayesdist.report.panels import ChipPanels
-from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure, nice_below
+from bayesdist.report.style import COLORBAR, PALETTE, WIDTH, figure_style, new_figure, nice_below
 
 if TYPE_CHECKING:
     from bayesdist.assess.comparison.compare import Comparison
@@ -43,6 +43,7 @@ def gaussian_sigmas(chi2: Float) -> Float:
     return np.asarray(norm.isf(p / 2))
 
 
+@figure_style()
 def difference_vectors(
     found: Sequence[Comparison], *, names: tuple[str, str] = ("A", "B")
 ) -> Figure:
@@ -71,23 +72,22 @@ def difference_vectors(
     ]
     key = nice_below(largest / 1.5)
     vector_map(panels, chips, titles, magnification=M, key=key, pad=20)
-    with figure_style():
-        for c, (ax,) in zip(found, panels.axes, strict=True):
-            if not shaded or c.chi2 is None:
-                continue
-            look = {"levels": LEVELS, "cmap": _SHADES, "extend": "max", "zorder": 1}
-            shades = ax.contourf(c.x, c.y, gaussian_sigmas(c.chi2), **look)
-        if shaded:
-            panels.figure.colorbar(
-                shades,
-                ax=panels.all_axes,
-                label="significance of each place by itself [σ]",
-                fraction=0.05,
-                pad=0.02,
-            )
+    for c, (ax,) in zip(found, panels.axes, strict=True):
+        if not shaded or c.chi2 is None:
+            continue
+        sigmas = gaussian_sigmas(c.chi2)
+        shades = ax.contourf(c.x, c.y, sigmas, LEVELS, cmap=_SHADES, extend="max", zorder=1)
+    if shaded:
+        panels.figure.colorbar(
+            shades,
+            ax=panels.all_axes,
+            label="significance of each place by itself [σ]",
+            **COLORBAR,
+        )
     return panels.figure
 
 
+@figure_style()
 def change_over_time(first: Float, gain: Float, dof: int, p_value: float | None) -> Figure:
     """Figure of the chi-square gains of a change from each first date (P,), in decimal years.
 
@@ -96,19 +96,18 @@ def change_over_time(first: Float, gain: Float, dof: int, p_value: float | None)
     """
     first, gain = np.asarray(first, float), np.asarray(gain, float)
     low, high = chi_square.ppf([0.025, 0.975], dof)
-    with figure_style():
-        fig = new_figure(WIDTH, 2.8)
-        ax = fig.subplots()
-        ax.axhspan(low, high, color=PALETTE["sky"], alpha=0.3, lw=0, zorder=0)
-        ax.plot(first, gain, "o-", ms=4, color=PALETTE["blue"])
-        best = int(gain.argmax())
-        ax.plot(first[best], gain[best], "o", ms=9, mfc="none", mec=PALETTE["vermilion"], mew=1.3)
-        ax.set_ylim(0, 1.1 * max(float(gain.max()), float(high)))
-        ax.set_xlabel("a change from this date on [yr]")
-        ax.set_ylabel(f"chi-square it takes up ({dof} d.o.f.)")
-        told = ""
-        if p_value is not None:
-            p = "p < 1e-12" if p_value < 1e-12 else f"p = {p_value:.2g}"
-            told = f"; {p} for the largest of {len(gain)}"
-        ax.set_title(f"band: where 95 % of single dates lie by chance{told}")
+    fig = new_figure(WIDTH, 2.8)
+    ax = fig.subplots()
+    ax.axhspan(low, high, color=PALETTE["sky"], alpha=0.3, lw=0, zorder=0)
+    ax.plot(first, gain, "o-", ms=4, color=PALETTE["blue"])
+    best = int(gain.argmax())
+    ax.plot(first[best], gain[best], "o", ms=9, mfc="none", mec=PALETTE["vermilion"], mew=1.3)
+    ax.set_ylim(0, 1.1 * max(float(gain.max()), float(high)))
+    ax.set_xlabel("a change from this date on [yr]")
+    ax.set_ylabel(f"chi-square it takes up ({dof} d.o.f.)")
+    note = ""
+    if p_value is not None:
+        p = "p < 1e-12" if p_value < 1e-12 else f"p = {p_value:.2g}"
+        note = f"; {p} for the largest of {len(gain)}"
+    ax.set_title(f"band: where 95 % of single dates lie by chance{note}")
     return fig

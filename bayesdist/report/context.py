@@ -94,34 +94,34 @@ class SelfcalResults:
 
 
 @dataclass(frozen=True)
-class Words:
-    """Terminology of a report."""
+class Terminology:
+    """Names by which a report calls what differs between the kinds of runs."""
 
-    things: str  # name of the rows that are fitted
-    all_things: str  # name of these as they come into the fit
-    false: str  # name of false rows
-    chooser: str  # name of the rejection; sampling rejects nothing
-    fit: str  # name of the fit before sampling
-    holder: str  # name of the constraint on parameters that the data do not constrain
-    taken: str = ""  # clause on why residuals are smaller than errors; else empty
+    rows: str  # that are fitted
+    all_rows: str  # as they come into the fit
+    false_rows: str
+    rejection: str  # sampling rejects nothing
+    fit: str  # before sampling
+    constraint: str  # on parameters that the data do not constrain
+    leverage: str = ""  # clause on why residuals are smaller than errors; else empty
 
 
-MATCHED = Words(
-    things="stars",
-    all_things="matched stars",
-    false="false matches",
-    chooser="least-squares fit",
+MATCHED = Terminology(
+    rows="stars",
+    all_rows="matched stars",
+    false_rows="false matches",
+    rejection="least-squares fit",
     fit="linear fit",
-    holder="a prior",
+    constraint="a prior",
 )
-DETECTED = Words(
-    things="detections",
-    all_things="detections of stars",
-    false="false detections",
-    chooser="limits of residuals",
+DETECTED = Terminology(
+    rows="detections",
+    all_rows="detections of stars",
+    false_rows="false detections",
+    rejection="limits of residuals",
     fit="solution",
-    holder="the gauge",
-    taken=", less what the fitted stars take of them",
+    constraint="the gauge",
+    leverage=", less what the fitted stars take of them",
 )
 
 
@@ -169,7 +169,7 @@ class ReportInput:
         return warnings_of(self.checks)
 
     @property
-    def words(self) -> Words:
+    def words(self) -> Terminology:
         """Terminology for the kind of run."""
         return MATCHED if self.selfcal is None else DETECTED
 
@@ -179,7 +179,7 @@ class ReportInput:
         if not self.stars.partial:
             return ""
         some, every = count(len(self.stars)), count(self.stars.n_total)
-        return f"a sample of {some} of {every} {self.words.things}"
+        return f"a sample of {some} of {every} {self.words.rows}"
 
     @property
     def provisional(self) -> bool:
@@ -212,6 +212,11 @@ class ReportInput:
     def on_chip(self, chip: Chip) -> str:
         """' of WFC1' where there are several chips, else nothing."""
         return f" of {chip.name}" if self.several else ""
+
+    def position(self, pixel: tuple[float, float], chip: int) -> str:
+        """'(508, 509)', with the name of the chip where there are several."""
+        where = next(c.chip for c in self.chips if c.chip.number == chip)
+        return "({:.0f}, {:.0f})".format(*pixel) + self.on_chip(where)
 
     @property
     def held(self) -> frozenset[str]:

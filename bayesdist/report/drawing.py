@@ -55,6 +55,7 @@ class Drawing:
     alt: str = ""
 
 
+@figure_style()  # mathematical text and ticks read the settings only when drawn
 def render(plot: Plot) -> Drawing:
     """Figure as PNG and as PDF with text as letters; equal figures give equal files."""
     canvas, box = _laid_out(plot.figure)
@@ -94,6 +95,7 @@ def _drawn(item: Item) -> Drawing:
     return render(item.made(_received[0]))
 
 
+@figure_style()
 def png_of(figure: Figure) -> bytes:
     """PNG file of 256 colours of a figure: a third of the size, without a visible difference."""
     return _png(figure, *_laid_out(figure))
@@ -101,21 +103,19 @@ def png_of(figure: Figure) -> bytes:
 
 def _laid_out(figure: Figure) -> tuple[FigureCanvasAgg, Bbox]:
     """Area of a figure that is drawn on, in inches, with room around it, after its only layout."""
-    with figure_style():  # mathematical text and ticks read the settings only when drawn
-        plain_ticks(figure)
-        figure.set_dpi(DPI)
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        _settle(figure)
-        return canvas, figure.get_tightbbox().padded(PAD)
+    plain_ticks(figure)
+    figure.set_dpi(DPI)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    _settle(figure)
+    return canvas, figure.get_tightbbox().padded(PAD)
 
 
 def _png(figure: Figure, canvas: FigureCanvasAgg, box: Bbox) -> bytes:
     page = Bbox.from_bounds(0, 0, *figure.get_size_inches())
     if not (page.contains(*box.min) and page.contains(*box.max)):  # artists outside as well
         buffer = io.BytesIO()
-        with figure_style():
-            figure.savefig(buffer, format="png", dpi=DPI, bbox_inches=box)
+        figure.savefig(buffer, format="png", dpi=DPI, bbox_inches=box)
         image = Image.open(buffer).convert("RGB")
     else:
         image = Image.fromarray(_cut(np.asarray(canvas.buffer_rgba()), box))
@@ -127,10 +127,7 @@ def _png(figure: Figure, canvas: FigureCanvasAgg, box: Bbox) -> bytes:
 
 def _pdf(figure: Figure, box: Bbox) -> bytes:
     buffer = io.BytesIO()
-    with figure_style():
-        figure.savefig(
-            buffer, format="pdf", dpi=DPI, bbox_inches=box, metadata={"CreationDate": None}
-        )
+    figure.savefig(buffer, format="pdf", dpi=DPI, bbox_inches=box, metadata={"CreationDate": None})
     return buffer.getvalue()
 
 

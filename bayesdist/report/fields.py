@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RectBivariateSpline
 
 from bayesdist.report.panels import Panels
-from bayesdist.report.style import INK, SEQUENTIAL, figure_style
+from bayesdist.report.style import COLORBAR, INK, SEQUENTIAL, figure_style
 
 __all__ = ["Grid", "contour_levels", "scalar_map"]
 
@@ -44,6 +44,7 @@ def contour_levels(values: ArrayLike, n: int = 10) -> Float:
     return np.asarray(locator.tick_values(low, high), float)
 
 
+@figure_style()
 def scalar_map(
     panels: Panels,
     grids: Sequence[Grid | None],
@@ -68,33 +69,34 @@ def scalar_map(
     norms: Sequence[Normalize | None] = (
         [norm] * len(places) if norm is None or isinstance(norm, Normalize) else norm
     )
-    with figure_style():
-        for (k, ax), grid, one in zip(places, grids, norms, strict=True):
-            if grid is None:
-                continue
-            px, py = panels.offset(k)
-            if levels is not None:
-                drawn[ax] = _contours(ax, grid, (px, py), levels, labelled=labelled)
-            else:
-                drawn[ax] = _cells(ax, grid, (px, py), one, cmap)
-            if grid.ring is not None:
-                at = np.add(grid.ring, (px, py))
-                for color, width, order in (("white", 2.2, 5), (INK, 1.0, 6)):
-                    ring = {"ms": 5, "mfc": "none", "clip_on": False, "zorder": order}
-                    ax.plot(*at, "o", mec=color, mew=width, **ring)
-        for ax, title in zip(panels.all_axes, titles, strict=True):
-            ax.set_title(title)
-        if not label or not drawn:
-            return
-        look = {"label": label, "fraction": 0.05, "pad": 0.02}
-        if levels is not None or single:
-            last = list(drawn.values())[-1]
-            beyond = {} if levels is not None else {"extend": _extend(grids, last.norm)}
-            panels.figure.colorbar(last, ax=panels.all_axes, **look, **beyond)
+    for (k, ax), grid, one in zip(places, grids, norms, strict=True):
+        if grid is None:
+            continue
+        px, py = panels.offset(k)
+        if levels is not None:
+            drawn[ax] = _contours(ax, grid, (px, py), levels, labelled=labelled)
         else:
-            for ax, image in drawn.items():
-                extend = _extend([grids[panels.all_axes.index(ax)]], image.norm)
-                panels.figure.colorbar(image, ax=ax, **look, extend=extend)
+            drawn[ax] = _cells(ax, grid, (px, py), one, cmap)
+        if grid.ring is not None:
+            at = np.add(grid.ring, (px, py))
+            for color, width, order in (("white", 2.2, 5), (INK, 1.0, 6)):
+                ax.plot(
+                    *at, "o", ms=5, mfc="none", mec=color, mew=width, clip_on=False, zorder=order
+                )
+    for ax, title in zip(panels.all_axes, titles, strict=True):
+        ax.set_title(title)
+    if not label or not drawn:
+        return
+    look = {"label": label, **COLORBAR}
+    if levels is not None or single:
+        last = list(drawn.values())[-1]
+        if levels is None:
+            look["extend"] = _extend(grids, last.get_clim())
+        panels.figure.colorbar(last, ax=panels.all_axes, **look)
+    else:
+        for ax, image in drawn.items():
+            look["extend"] = _extend([grids[panels.all_axes.index(ax)]], image.get_clim())
+            panels.figure.colorbar(image, ax=ax, **look)
 
 
 def _contours(
@@ -140,9 +142,9 @@ def _cells(
     return image
 
 
-def _extend(grids: Sequence[Grid | None], norm: Normalize) -> str:
+def _extend(grids: Sequence[Grid | None], limits: tuple[float, float]) -> str:
     """Sides of the colour bar beyond which there are values."""
-    assert norm.vmin is not None and norm.vmax is not None
+    low, high = limits
     values = np.concatenate([g.values[np.isfinite(g.values)] for g in grids if g is not None])
-    below, above = (values < norm.vmin).any(), (values > norm.vmax).any()
+    below, above = (values < low).any(), (values > high).any()
     return {(0, 0): "neither", (1, 0): "min", (0, 1): "max"}.get((int(below), int(above)), "both")

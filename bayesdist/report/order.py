@@ -21,18 +21,18 @@ _NEAR = 10.0  # log density within which the right-hand axis is linear
 _APART = 0.12  # of an order, by which markers of one order are apart
 
 
+@figure_style()
 def order_comparison(found: OrderSelection) -> Figure:
     """Figure with surfaces on the left, held-out stars and regions on the right."""
-    with figure_style():
-        fig = new_figure(WIDTH, 3.1)
-        left, right = fig.subplots(1, 2)
-        _surfaces(left, found)
-        _held_out(right, found)
-        for ax in (left, right):
-            ax.axvspan(found.order - 0.35, found.order + 0.35, color="#E8ECF0", zorder=0)
-            ax.set_xlabel("order of the polynomial (chosen one shaded)")
-            ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-            ax.set_xlim(found.orders[0] - 0.6, found.orders[-1] + 0.6)
+    fig = new_figure(WIDTH, 3.1)
+    left, right = fig.subplots(1, 2)
+    _surfaces(left, found)
+    _held_out(right, found)
+    for ax in (left, right):
+        ax.axvspan(found.order - 0.35, found.order + 0.35, color="#E8ECF0", zorder=0)
+        ax.set_xlabel("order of the polynomial (chosen one shaded)")
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        ax.set_xlim(found.orders[0] - 0.6, found.orders[-1] + 0.6)
     return fig
 
 

@@ -46,22 +46,22 @@ class ChipPanels(Panels):
     `colorbar` leaves room for one common colour bar.
     """
 
+    @figure_style()
     def __init__(self, mosaic: Mosaic, maps: int = 1, *, colorbar: bool = False) -> None:
         self.mosaic = mosaic
         columns = 1 + max(place[1] for place in mosaic.legible_places)
         rows = 1 + max(place[0] for place in mosaic.legible_places)
         aspect = mosaic.largest[1] / mosaic.largest[0]
         # maps of a chip are side by side; of a wide detector, or chip, one above the other
-        beside = columns == 1 if mosaic.several else aspect >= WIDE
-        down, across = (rows, maps) if beside else (maps * rows, columns)
+        side_by_side = columns == 1 if mosaic.several else aspect >= WIDE
+        down, across = (rows, maps) if side_by_side else (maps * rows, columns)
         width = WIDTH if across > 1 or aspect < WIDE else 0.66 * WIDTH
         margin = 0.75 + 0.55 * (across - 1) + (0.8 if colorbar else 0.0)
         height = down * (min((width - margin) / across * aspect, TALLEST_PANEL) + 0.8)
-        with figure_style():
-            figure = new_figure(width, height, layout="compressed")
-            grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
+        figure = new_figure(width, height, layout="compressed")
+        grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
         axes = [
-            [grid[row, k] if beside else grid[k * rows + row, column] for k in range(maps)]
+            [grid[row, k] if side_by_side else grid[k * rows + row, column] for k in range(maps)]
             for row, column in mosaic.legible_places
         ]
         super().__init__(figure, axes, mosaic.names if mosaic.several else ("",))
@@ -89,6 +89,7 @@ class ArrayPanels(Panels):
     bar.
     """
 
+    @figure_style()
     def __init__(
         self, sizes: Mapping[str, Size], *, columns: int = 2, colorbar: bool = False
     ) -> None:
@@ -98,9 +99,8 @@ class ArrayPanels(Panels):
         width = WIDTH if columns > 1 else 0.66 * WIDTH
         panel = (width - 0.75 - 0.5 * (columns - 1) - (0.8 if colorbar else 0.0)) / columns
         aspect = max(ny / nx for nx, ny in self.sizes)
-        with figure_style():
-            figure = new_figure(width, rows * (panel * aspect + 0.72), layout="compressed")
-            grid = figure.subplots(rows, columns, squeeze=False).ravel()
+        figure = new_figure(width, rows * (panel * aspect + 0.72), layout="compressed")
+        grid = figure.subplots(rows, columns, squeeze=False).ravel()
         for ax in grid[len(sizes) :]:
             ax.remove()
         super().__init__(figure, [[ax] for ax in grid[: len(sizes)]], tuple(sizes))
@@ -126,6 +126,7 @@ class OneArray(Panels):
     `margin` is the room beyond the array in pixels; `colorbar` leaves room for a colour bar.
     """
 
+    @figure_style()
     def __init__(
         self,
         sizes: Mapping[int, Size],
@@ -141,12 +142,11 @@ class OneArray(Panels):
         width = 0.8 * WIDTH
         room = 0.8 + (0.7 if colorbar else 0.0)
         aspect = float((high[1] - low[1]) / (high[0] - low[0]))
-        with figure_style():
-            figure = new_figure(width, (width - room) * min(aspect, 1.6) + 0.9, layout="compressed")
-            ax = figure.subplots()
-            ax.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-            ax.set(xlabel="x [pix]", ylabel="y [pix]")
-            self._outline(ax, sizes)
+        figure = new_figure(width, (width - room) * min(aspect, 1.6) + 0.9, layout="compressed")
+        ax = figure.subplots()
+        ax.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        ax.set(xlabel="x [pix]", ylabel="y [pix]")
+        self._outline(ax, sizes)
         super().__init__(figure, [[ax]] * len(sizes), [""] * len(sizes))
 
     def offset(self, chip: int) -> tuple[float, float]:
@@ -161,9 +161,9 @@ class OneArray(Panels):
             corner = px + 0.5, py + 0.5
             ax.add_patch(Rectangle(corner, nx, ny, fill=False, lw=0.7, ec=OUTLINE, zorder=4))
             if named:
-                beside = ax.get_yaxis_transform()
-                words = {"rotation": 270, "ha": "left", "va": "center", "fontsize": 7.5}
-                ax.text(1.012, py + ny / 2, f"chip {number}", transform=beside, **words)
+                at_edge = ax.get_yaxis_transform()
+                text = ax.text(1.012, py + ny / 2, f"chip {number}", transform=at_edge)
+                text.set(rotation=270, ha="left", va="center", fontsize=7.5)
 
 
 def chip_axes(ax: Axes, size: Size, *, margin: float = 0.0) -> None:

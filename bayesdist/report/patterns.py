@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,7 +12,15 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bayesdist.model.grid import mesh, outline_pixels
-from bayesdist.report.style import INK, PALETTE, SEQUENTIAL, WIDTH, figure_style, new_figure
+from bayesdist.report.style import (
+    COLORBAR,
+    INK,
+    PALETTE,
+    SEQUENTIAL,
+    WIDTH,
+    figure_style,
+    new_figure,
+)
 
 if TYPE_CHECKING:
     from matplotlib.collections import QuadMesh
@@ -29,6 +37,7 @@ UNBOUNDED = "#E8ECF0"
 FIRST = PALETTE["vermilion"]
 
 
+@figure_style()
 def pattern_maps(found: Sequence[PlannedPattern]) -> Figure:
     """Footprints on one scale, each with its radial uncertainty on one colour scale."""
     bounded = [one.radii(kind) for one in found for kind in SHOWN if one.maps[kind] is not None]
@@ -36,22 +45,21 @@ def pattern_maps(found: Sequence[PlannedPattern]) -> Figure:
     norm = LogNorm(max(values.min(), 1e-4 * values.max()), values.max() * (1 + 1e-9))
     outlines = [_outlines(one) for one in found]
     limits = _limits(np.concatenate([o for of_one in outlines for o in of_one]))
-    with figure_style():
-        fig = new_figure(WIDTH, ROW * len(found) + 0.5, layout="compressed")
-        axes = fig.subplots(len(found), 1 + len(SHOWN), squeeze=False)
-        filled: list[QuadMesh] = []
-        for k, (row, one, of_one) in enumerate(zip(axes, found, outlines, strict=True)):
-            last = k == len(found) - 1
-            _footprint(row[0], one, of_one, limits, last)
-            row[0].set_title(
-                f"first exposure in orange\n{one.pattern.name}" if not k else one.pattern.name
-            )
-            for ax, kind in zip(row[1:], SHOWN, strict=True):
-                filled += _map(ax, one, kind, norm, last)
-                if not k:
-                    ax.set_title(f"{kind}, rms\n{ax.get_title(loc='left')}")
-        label = "radius (1 σ) [pix]"
-        fig.colorbar(filled[0], ax=list(axes[:, 1:].ravel()), label=label, fraction=0.05, pad=0.02)
+    fig = new_figure(WIDTH, ROW * len(found) + 0.5, layout="compressed")
+    axes = fig.subplots(len(found), 1 + len(SHOWN), squeeze=False)
+    filled: list[QuadMesh] = []
+    for k, (row, one, of_one) in enumerate(zip(axes, found, outlines, strict=True)):
+        last = k == len(found) - 1
+        _footprint(row[0], one, of_one, limits, last)
+        row[0].set_title(
+            f"first exposure in orange\n{one.pattern.name}" if not k else one.pattern.name
+        )
+        for ax, kind in zip(row[1:], SHOWN, strict=True):
+            filled += _map(ax, one, kind, norm, last)
+            if not k:
+                ax.set_title(f"{kind}, rms\n{ax.get_title(loc='left')}")
+    label = "radius (1 σ) [pix]"
+    fig.colorbar(filled[0], ax=list(axes[:, 1:].ravel()), label=label, **COLORBAR)
     return fig
 
 
@@ -100,7 +108,7 @@ def _map(ax: Axes, one: PlannedPattern, kind: str, norm: LogNorm, last: bool) ->
     for m in maps or ():
         x, y = mesh(m.x, m.y)
         u, v = model.predict(theta, x, y, exposure=0, chip=m.chip).T.reshape(2, len(m.y), len(m.x))
-        look = {"cmap": SEQUENTIAL, "shading": "gouraud", "rasterized": True}
+        look: dict[str, Any] = {"cmap": SEQUENTIAL, "shading": "gouraud", "rasterized": True}
         filled.append(ax.pcolormesh(u, v, m.radius, norm=norm, **look))
     (x0, y0), (x1, y1) = _limits(np.concatenate(outlines))
     ax.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal")

@@ -9,6 +9,8 @@ from typing import Any, Literal, TypeVar
 
 from matplotlib.figure import Figure
 
+from bayesdist.report.style import figure_style
+
 __all__ = ["Entry", "Item", "Plot", "Registry", "Section"]
 
 Make = TypeVar("Make", bound=Callable[..., Any])
@@ -96,7 +98,7 @@ class Registry:
         each: Callable[[Any], Mapping[str, Any]] | None = None,
         printed: bool | When | Literal["first"] = False,
     ) -> Callable[[Make], Make]:
-        """Decorator of a function that makes a `Plot`; parameters as of `Entry`."""
+        """Decorator of a function that makes a `Plot`, in our style; parameters as of `Entry`."""
         options = {"needs": needs, "when": when, "each": each, "printed": printed}
         return self._decorator(section, "figure", options)
 
@@ -117,8 +119,9 @@ class Registry:
             name = make.__name__
             if any(entry.name == name and entry.kind == kind for entry in self._entries):
                 raise ValueError(f"{self.name}: two entries are called {name}")
-            self._entries.append(Entry(name, section, kind, make, **options))
-            return make
+            styled = figure_style()(make) if kind == "figure" else make
+            self._entries.append(Entry(name, section, kind, styled, **options))
+            return styled
 
         return register
 

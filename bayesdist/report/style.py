@@ -9,15 +9,19 @@ import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.rcsetup import cycler
 from matplotlib.ticker import LogFormatterSciNotation, ScalarFormatter
 from numpy.typing import NDArray
 
 __all__ = [
+    "COLORBAR",
     "CYCLE",
     "GUIDE",
     "HYPER_LABELS",
@@ -29,6 +33,8 @@ __all__ = [
     "SEQUENTIAL",
     "WIDTH",
     "figure_style",
+    "guide_lines",
+    "legend_above",
     "new_figure",
     "nice_below",
     "plain_ticks",
@@ -60,9 +66,10 @@ PALE = "#A9B4C0"  # vectors that may be noise alone, and stars in the background
 OUTLINE = "#9AA5B1"  # of chips, and lines at zero
 GUIDE = "#E3E8ED"  # lines of a grid behind data
 HYPER_LABELS = {"f": "f", "j": "j", "s_out": r"$s_\mathrm{out}$"}
+COLORBAR: dict[str, Any] = {"fraction": 0.05, "pad": 0.02}  # next to maps
 WIDTH = 7.2  # inches: the text width of an A4 or Letter page
 
-_RC = {
+_RC: Any = {
     "font.family": "DejaVu Sans",  # ships with matplotlib: the same page on every machine
     "font.size": 8.5,
     "axes.titlesize": 8.5,
@@ -71,7 +78,7 @@ _RC = {
     "axes.linewidth": 0.7,
     "axes.edgecolor": INK,
     "axes.labelcolor": INK,
-    "axes.prop_cycle": matplotlib.cycler(color=CYCLE),
+    "axes.prop_cycle": cycler(color=CYCLE),
     "axes.formatter.useoffset": False,
     "axes.formatter.use_mathtext": False,  # see `plain_ticks`
     "axes.formatter.limits": (-4, 5),
@@ -95,16 +102,28 @@ _RC = {
 
 @contextmanager
 def figure_style() -> Iterator[None]:
-    """Context with the style; the caller's settings come back after it."""
+    """Context, or decorator of a function, with the style; the caller's settings come back."""
     with matplotlib.rc_context(_RC):
         yield
 
 
-def new_figure(width: float, height: float, *, layout: str = "constrained") -> Figure:
+def new_figure(width: float, height: float, *, layout: Any = "constrained") -> Figure:
     """Empty figure (inches) that belongs to no window and to no pyplot state."""
     fig = Figure(figsize=(width, height), layout=layout)
     FigureCanvasAgg(fig)
     return fig
+
+
+def legend_above(figure: Figure, ax: Axes, **look: Any) -> None:
+    """Draw the legend of one panel above all panels, in one row."""
+    handles, labels = ax.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=len(labels), **look)
+
+
+def guide_lines(ax: Axes) -> None:
+    """Draw lines of a grid behind the data."""
+    ax.grid(True, lw=0.4, color=GUIDE)
+    ax.set_axisbelow(True)
 
 
 def nice_below(value: float) -> float:
@@ -160,9 +179,9 @@ def plain_ticks(figure: Figure) -> None:
                 elif type(now) is LogFormatterSciNotation:
                     put(
                         _Powers(
-                            now._base,
+                            now._base,  # type: ignore[attr-defined]
                             labelOnlyBase=now.labelOnlyBase,
                             minor_thresholds=now.minor_thresholds,
-                            linthresh=now._linthresh,
+                            linthresh=now._linthresh,  # type: ignore[attr-defined]
                         )
                     )

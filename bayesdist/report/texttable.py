@@ -7,7 +7,10 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import PurePath
 
-__all__ = ["MAX_ROWS", "Level", "TextTable", "further", "listing", "short_paths"]
+from bayesdist.checks import Check
+from bayesdist.numbers import MISSING, number
+
+__all__ = ["MAX_ROWS", "Level", "TextTable", "check_cells", "further", "listing", "short_paths"]
 
 _FEW_ROWS, _FEW_LETTERS = 16, 100  # of a table that leaves room next to it
 MAX_ROWS = 60  # of frames and exposures; hundreds of them belong in the files
@@ -67,6 +70,12 @@ def listing(
     rows = tuple(pairs.items())
     words = (0, 1)
     return TextTable(caption, ("", ""), rows, words, note, detail=detail, leading=leading)
+
+
+def check_cells(check: Check) -> tuple[str, str, Level]:
+    """Value, limit and outcome of a check, as cells of a table."""
+    found = check.value if isinstance(check.value, str) else number(check.value)
+    return found, check.limit or MISSING, Level(check.level)
 
 
 def further(n: int) -> str:

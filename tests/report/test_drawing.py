@@ -96,22 +96,33 @@ def test_numbers_are_those_of_matplotlib(limits, scale):
 # -- several processes ----------------------------------------------------------------------------
 
 
+SOME = ("margins", "pixel_area", "residual_vectors")
+
+
+class Few:
+    """Some of the figures of the report."""
+
+    @staticmethod
+    def items(results, kind):
+        return tuple(item for item in REPORT.items(results, kind) if item.name in SOME)
+
+
 @pytest.fixture(scope="module")
 def alone(converged):
-    return drawing.draw_all(REPORT, converged)
+    return drawing.draw_all(Few, converged)
 
 
 def test_several_processes_draw_what_one_draws(converged, alone, monkeypatch):
     monkeypatch.setattr(drawing, "MIN_FIGURES_SHARED", 1)
     monkeypatch.setattr(drawing, "render", lambda plot: pytest.fail("it was drawn here"))
-    both = drawing.draw_all(REPORT, converged, processes=2)
+    both = drawing.draw_all(Few, converged, processes=2)
     assert list(both) == list(alone) and both == alone
 
 
 def test_processes_that_fail_are_made_up_for(converged, alone, monkeypatch, caplog):
     monkeypatch.setattr(drawing, "MIN_FIGURES_SHARED", 1)
     monkeypatch.setattr(drawing, "_receive", _end)
-    assert drawing.draw_all(REPORT, converged, processes=2) == alone
+    assert drawing.draw_all(Few, converged, processes=2) == alone
     assert "drawn by one process" in caplog.text
 
 
@@ -121,7 +132,7 @@ def _end(results):
 
 
 def test_words_come_with_the_files(plots, alone):
-    assert list(alone) == list(plots)
+    assert sorted(alone) == sorted(SOME)
     for name, one in alone.items():
         words = plots[name].title, plots[name].text, plots[name].alt
         assert (one.title, one.text, one.alt) == words and all(words)

@@ -7,9 +7,16 @@ from importlib import import_module
 
 from bayesdist.mission import missions
 from bayesdist.report.contents import REPORT
-from bayesdist.report.sections import explorer
-from bayesdist.report.sections.campaign import lines, lookup, matching, release, selfcal, series
-from bayesdist.report.sections.run import (
+from bayesdist.report.sections import explorer  # noqa: F401
+from bayesdist.report.sections.campaign import (  # noqa: F401
+    lines,
+    lookup,
+    matching,
+    release,
+    selfcal,
+    series,
+)
+from bayesdist.report.sections.run import (  # noqa: F401
     budget,
     coefficients,
     data,
@@ -24,28 +31,7 @@ from bayesdist.report.sections.run import (
     status,
 )
 
-__all__ = [
-    "REPORT",
-    "budget",
-    "coefficients",
-    "data",
-    "explorer",
-    "fit",
-    "holdout",
-    "lines",
-    "lookup",
-    "maps",
-    "margins",
-    "matching",
-    "periods",
-    "posterior",
-    "provenance",
-    "release",
-    "residuals",
-    "selfcal",
-    "series",
-    "status",
-]
+__all__ = ["REPORT"]
 
 for _mission in missions().values():
     if _mission.report:

@@ -10,7 +10,16 @@ from astropy.io import fits
 
 from bayesdist.infer.solution import Solution
 
-__all__ = ["card_images", "header_of", "holds_wcs", "keyword_of", "number_card", "text_card"]
+__all__ = [
+    "card_images",
+    "convergence_cards",
+    "header_of",
+    "holds_wcs",
+    "keyword_of",
+    "number_card",
+    "text_card",
+    "wrapped_cards",
+]
 
 # Without one of these nothing ties pixels to a world.
 _NEEDED = re.compile(r"(CTYPE|CRVAL)\d+[A-Z]?$|A_ORDER$|(T?CTYP|TCTY|TCRVL|TCRV)\d+[A-Z]?$")
@@ -33,12 +42,18 @@ def text_card(keyword: str, value: str, comment: str = "") -> str:
     return fits.Card(keyword, value, comment).image
 
 
+def wrapped_cards(keyword: str, lines: Iterable[str], width: int = 70) -> list[str]:
+    """Cards of a COMMENT or HISTORY, as many as each line takes; an empty line is one card."""
+    return [text_card(keyword, part) for line in lines for part in wrap(line, width) or [""]]
+
+
 def convergence_cards(solution: Solution) -> list[str]:
     """Cards that tell if the posterior behind a product has converged; none for a linear fit."""
     convergence = solution.convergence
     if convergence is None:
         return []
-    notes = [text_card("COMMENT", line) for line in wrap(solution.approximation, 70)]
+    approximation = solution.approximation
+    notes = wrapped_cards("COMMENT", [approximation] if approximation else [])
     if convergence.converged:
         return [text_card("BDCONV", "YES", "has the sampler converged?"), *notes]
     return [

@@ -24,6 +24,8 @@ import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import ArrayLike, NDArray
 
+from bayesdist.errors import DegenerateError
+
 __all__ = [
     "Coefficients",
     "coefficient_matrix",
@@ -31,12 +33,16 @@ __all__ = [
     "idctab_column",
     "idctab_powers",
     "largest_magnitude",
+    "propagated_sigma",
+    "require_regular",
     "sip_keyword",
     "sip_powers",
 ]
 
 Float = NDArray[np.float64]
 Coefficients = Mapping[tuple[int, int], float]
+
+SINGULAR = 1e-12  # determinant over the largest coefficient squared
 
 _IDCTAB = re.compile(r"(CX|CY|A|B)(\d)(\d)")
 _SIP = re.compile(r"(A|B|AP|BP|AE|BE)_(\d)_(\d)")
@@ -90,6 +96,21 @@ def evaluate(
     """Values of a polynomial, without terms above the total `order`."""
     x, y = np.asarray(x, float), np.asarray(y, float)
     return polynomial.polyval2d(x, y, coefficient_matrix(coefficients, order))
+
+
+def propagated_sigma(jacobian: Float, cov: Float) -> Float:
+    """Standard deviations (K,) of numbers by their derivatives (K, P) and a covariance (P, P)."""
+    variance = np.einsum("kl,lm,km->k", jacobian, cov, jacobian, optimize=True)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))  # -1e-40 is a rounded zero
+
+
+def require_regular(linear: Float, chip: int) -> None:
+    """Refuse (DegenerateError) a linear part (2, 2) of a chip that is singular."""
+    if abs(np.linalg.det(linear)) <= SINGULAR * np.abs(linear).max() ** 2:
+        raise DegenerateError(
+            f"the linear part of chip {chip} is singular",
+            do="check that the stars cover the detector in x and in y",
+        )
 
 
 def largest_magnitude(

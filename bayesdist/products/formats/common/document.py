@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from astropy.io import fits
 from pydantic import BaseModel, ConfigDict
 
 from bayesdist.calibration.calibration import Calibration
@@ -27,6 +28,8 @@ __all__ = [
     "Format",
     "FormatSettings",
     "finding_lines",
+    "identity_lines",
+    "missing_identity",
     "repeated_values",
 ]
 
@@ -57,6 +60,18 @@ def repeated_values(coefficients: Mapping[str, float]) -> list[tuple[str, ...]]:
         if value != 0:
             groups.setdefault(abs(value), []).append(name)
     return [tuple(names) for names in groups.values() if len(names) > 1]
+
+
+def identity_lines(header: fits.Header) -> list[str]:
+    """Lines of text on the keywords by which a reference file is known."""
+    return [f"  {k:<9} {header[k]}" for k in ("DESCRIP", "USEAFTER", "PEDIGREE") if k in header]
+
+
+def missing_identity(header: fits.Header) -> list[Finding]:
+    """Findings on the keywords that a reference file should have."""
+    message = "is missing; reference files of the observatory have it"
+    keywords = ("USEAFTER", "PEDIGREE", "FILETYPE", "DESCRIP")
+    return [Finding("note", keyword, message) for keyword in keywords if keyword not in header]
 
 
 def finding_lines(findings: Sequence[Finding]) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from textwrap import wrap
 
 import numpy as np
 from astropy.io import fits
@@ -13,7 +12,12 @@ from bayesdist.calibration.calibration import Calibration, as_calibration
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import InputError
 from bayesdist.infer.solution import Solution
-from bayesdist.products.formats.common.cards import convergence_cards, number_card, text_card
+from bayesdist.products.formats.common.cards import (
+    convergence_cards,
+    number_card,
+    text_card,
+    wrapped_cards,
+)
 from bayesdist.products.formats.common.content import hdus_of
 from bayesdist.products.formats.idctab.cards import closure_cards, provenance_cards, tdd_cards
 from bayesdist.products.formats.idctab.hdus import Piece, coefficient_hdu, covariance_hdu, sigma_hdu
@@ -157,7 +161,7 @@ def idctab_from_solution(
         *provenance_cards(pieces[0].fitted, vafactor, first),
         *closure_cards(pieces),
         *convergence_cards(first.solution),
-        *(text_card("HISTORY", part) for line in history for part in wrap(line, 72) or [""]),
+        *wrapped_cards("HISTORY", history, 72),
     ]:
         primary.header.append(fits.Card.fromstring(card), end=True)
     hdus = [

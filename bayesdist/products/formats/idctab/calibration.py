@@ -113,8 +113,6 @@ def _undated(tab: IdcTab, *, drifts: bool) -> str:
 
 def _inverse(tab: IdcTab, number: int, names: Filters) -> ExplicitInverse | None:
     """INVERSE row of a chip, where there is one."""
-    if "DIRECTION" not in tab.columns:
-        return None
     found = tab.matching_rows(number, names, "INVERSE")
     if not found.size:
         return None

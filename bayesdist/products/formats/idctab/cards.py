@@ -13,13 +13,12 @@ BDCLOS_c            worst closure of the INVERSE rows of chip c
 from __future__ import annotations
 
 from collections.abc import Sequence
-from textwrap import wrap
 
 import numpy as np
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import Orientation
-from bayesdist.products.formats.common.cards import number_card, text_card
+from bayesdist.products.formats.common.cards import number_card, text_card, wrapped_cards
 from bayesdist.products.formats.idctab.hdus import Piece
 from bayesdist.products.formats.idctab.numbers import ChipNumbers
 
@@ -73,8 +72,7 @@ def _orientation_cards(orientation: Orientation, vafactor: float) -> list[str]:
         number_card("BDAGRRMS", orientation.agreement.rms, "[mas] rms distance to reference"),
         number_card("BDAGRMAX", orientation.agreement.worst, "[mas] largest distance"),
     ]
-    source = wrap(f"V2/V3: {orientation.source}", 72)
-    return cards + [text_card("HISTORY", line) for line in source]
+    return cards + wrapped_cards("HISTORY", [f"V2/V3: {orientation.source}"], 72)
 
 
 def closure_cards(pieces: Sequence[Piece]) -> list[str]:

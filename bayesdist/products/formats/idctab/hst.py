@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from bayesdist.errors import InputError
 
-__all__ = ["combination_of", "parity_of"]
+__all__ = ["combination_of", "parity_of", "serves"]
 
 _PARITY = {
     ("ACS", "WFC"): (1, -1),
@@ -61,3 +61,20 @@ def combination_of(filter: str | tuple[str, ...], instrument: str) -> tuple[str,
         where="filters",
         do='name both wheels, as ("F606W", "CLEAR2L")',
     )
+
+
+def serves(row: tuple[str, ...], asked: tuple[str, ...]) -> bool:
+    """True where a row of an IDCTAB with these filters serves those asked for, as for stwcs.
+
+    Every CLEAR is the same; a row without filters serves all.
+    """
+    if not row:
+        return True
+    row, asked = (
+        tuple("CLEAR" if "CLEAR" in name.upper() else name.strip() for name in names)
+        for names in (row, asked)
+    )
+    if len(asked) == len(row):
+        return asked == row
+    others = [name for name in row if name not in asked]
+    return set(asked) - {"CLEAR"} <= set(row) and all(name in ("CLEAR", "N/A") for name in others)

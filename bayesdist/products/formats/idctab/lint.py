@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 from bayesdist.products.formats.common.coefficients import idctab_column, idctab_powers
-from bayesdist.products.formats.common.document import Finding, repeated_values
+from bayesdist.products.formats.common.document import Finding, missing_identity, repeated_values
 from bayesdist.products.formats.idctab.hst import parity_of
 from bayesdist.products.formats.idctab.table import FILTER_COLUMNS, IdcTab
 
@@ -51,9 +51,7 @@ def _not_finite(tab: IdcTab) -> list[Finding]:
 
 def _header(tab: IdcTab) -> Iterator[Finding]:
     header = tab.header
-    for keyword in ("USEAFTER", "PEDIGREE", "FILETYPE", "DESCRIP"):
-        if keyword not in header:
-            yield Finding("note", keyword, "is missing; reference files of the observatory have it")
+    yield from missing_identity(header)
     if not tab.detector:
         yield Finding("warning", "DETECTOR", "is missing: stwcs then reads no time-dependent terms")
     elif tab.tdd and not tab.is_acs_wfc:
@@ -87,7 +85,7 @@ def _time(tab: IdcTab) -> Iterator[Finding]:
     elif "TDD_DATE" not in tab.tdd:
         yield Finding("error", "TDD_DATE", "is missing, and stwcs stops without it")
     if scheme == "2015":
-        for chip in _chip_numbers(tab):
+        for chip in tab.stated_chips or (1,):
             if f"TDD_CTB{chip}" not in tab.tdd:
                 yield Finding(
                     "error", f"TDD_CTB{chip}", "is missing, and stwcs stops at that chip without it"
@@ -105,18 +103,10 @@ def _time(tab: IdcTab) -> Iterator[Finding]:
             )
 
 
-def _chip_numbers(tab: IdcTab) -> list[int]:
-    if "DETCHIP" not in tab.columns:
-        return [1]
-    return sorted({int(c) for c in tab.rows["DETCHIP"] if c > 0})
-
-
 def _table(tab: IdcTab) -> Iterator[Finding]:
     rows, columns = tab.rows, tab.columns
-    if "DIRECTION" in columns:
-        directions = np.char.upper(np.char.strip(rows["DIRECTION"]))
-        if not (directions == "FORWARD").any():
-            yield Finding("error", "DIRECTION", "there is no FORWARD row")
+    if not (tab.directions == "FORWARD").any():
+        yield Finding("error", "DIRECTION", "there is no FORWARD row")
     for axis in "XY":
         n, ref = rows[f"{axis}SIZE"].astype(float), rows[f"{axis}REF"].astype(float)
         outside = np.flatnonzero((ref < 0.5) | (ref > n + 0.5))
@@ -225,10 +215,7 @@ def _coefficients(tab: IdcTab) -> Iterator[Finding]:
 
 def _forward(tab: IdcTab) -> NDArray[np.intp]:
     """Indices of the rows whose coefficients are arcseconds from pixels."""
-    if "DIRECTION" not in tab.columns:
-        return np.arange(len(tab.rows))
-    directions = np.char.upper(np.char.strip(tab.rows["DIRECTION"]))
-    return np.flatnonzero(directions != "INVERSE")
+    return np.flatnonzero(tab.directions != "INVERSE")
 
 
 def _repeated_values(tab: IdcTab) -> Iterator[Finding]:
@@ -252,8 +239,7 @@ def _chips(tab: IdcTab) -> Iterator[Finding]:
     """Finding on the positions of ACS/WFC's chips: chip 1 is above chip 2 in y, so at lower V3."""
     if not tab.is_acs_wfc or "V3REF" not in tab.columns:
         return
-    numbers = _chip_numbers(tab)
-    if 2 not in numbers:
+    if 2 not in tab.stated_chips:
         yield Finding("warning", "DETCHIP", "there is no chip 2, to which stwcs refers both chips")
     keys = tab.filters()
     lower = {keys[k]: tab.rows["V3REF"][k] for k in tab.matching_rows(2)[::-1]}

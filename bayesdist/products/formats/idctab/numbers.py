@@ -17,9 +17,13 @@ from numpy.typing import NDArray
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.inverse import fitted_inverse
-from bayesdist.errors import DegenerateError, InputError
+from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.products.formats.common.coefficients import idctab_column
+from bayesdist.products.formats.common.coefficients import (
+    idctab_column,
+    propagated_sigma,
+    require_regular,
+)
 from bayesdist.products.formats.idctab.drift import RATES
 
 __all__ = [
@@ -33,7 +37,6 @@ __all__ = [
 
 Float = NDArray[np.float64]
 
-SINGULAR = 1e-12  # of the largest coefficient squared
 INVERSE_NODES = 33  # points of each axis of the fit
 
 
@@ -114,12 +117,7 @@ def chip_numbers(
     basis = model.basis(chip)
     values = basis.to_monomials(coefficients)
     by = np.einsum("kl,ald->akd", basis.monomial_matrix, jacobian.reshape(2, basis.n_terms, -1))
-    linear = values[:, 1:3]
-    if abs(np.linalg.det(linear)) <= SINGULAR * np.abs(linear).max() ** 2:
-        raise DegenerateError(
-            f"the linear part of chip {chip} is singular",
-            do="check that the stars cover the detector in x and in y",
-        )
+    require_regular(values[:, 1:3], chip)
     constant = values[:, 0] * factor
     listed: list[tuple[str, float, Float]] = [
         (name, zero[a] + parity[a] * constant[a], parity[a] * by[a, 0] * factor)
@@ -186,8 +184,7 @@ def chip_inverse(calibration: Calibration, chip: int, factor: float) -> ChipInve
         ) from error
     sigma = np.zeros(2 * len(inverse.x_terms))
     if one.cov is not None and inverse.jacobian is not None:
-        by = inverse.jacobian
-        sigma = np.sqrt(np.maximum(np.einsum("kl,lm,km->k", by, one.cov, by, optimize=True), 0.0))
+        sigma = propagated_sigma(inverse.jacobian, one.cov)
     columns, values = [], []
     for axis, (prefix, terms) in enumerate((("CX", inverse.x_terms), ("CY", inverse.y_terms))):
         for (i, j), value in terms.items():

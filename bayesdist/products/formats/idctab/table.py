@@ -33,6 +33,7 @@ from bayesdist.model import polynomial_terms
 from bayesdist.products.formats.common.coefficients import evaluate, idctab_column
 from bayesdist.products.formats.common.content import Hdu, read_hdus, write_hdus
 from bayesdist.products.formats.idctab.drift import drift, scheme_of
+from bayesdist.products.formats.idctab.hst import serves
 
 __all__ = ["FILTER_COLUMNS", "IdcTab", "read_idctab", "write_idctab"]
 
@@ -173,6 +174,20 @@ class IdcTab:
             numbers = {max(int(n), 1) for n in self.rows["DETCHIP"]}
         return tuple(sorted(numbers, key=lambda n: (n != _REFERENCE, n)))
 
+    @cached_property
+    def stated_chips(self) -> tuple[int, ...]:
+        """Chip numbers of DETCHIP; none where rows serve every chip."""
+        if "DETCHIP" not in self.columns:
+            return ()
+        return tuple(sorted({int(n) for n in self.rows["DETCHIP"] if n > 0}))
+
+    @cached_property
+    def directions(self) -> NDArray[np.str_]:
+        """DIRECTION of every row, in capitals; FORWARD where there is no such column."""
+        if "DIRECTION" not in self.columns:
+            return np.full(len(self.rows), "FORWARD")
+        return np.char.upper(np.char.strip(self.rows["DIRECTION"]))
+
     # -- one row ---------------------------------------------------------------------------------
 
     def row(
@@ -234,14 +249,12 @@ class IdcTab:
             0-based; empty where no row fits.
         """
         rows, columns = self.rows, self.columns
-        keep = np.ones(len(rows), bool)
+        keep = self.directions == direction.upper()
         if "DETCHIP" in columns:
             keep &= np.isin(rows["DETCHIP"].astype(int), (chip, _ANY_CHIP))
-        if "DIRECTION" in columns:
-            keep &= np.char.upper(np.char.strip(rows["DIRECTION"])) == direction.upper()
         if filter is not None:
-            asked = _filters([filter] if isinstance(filter, str) else filter)
-            keep &= np.array([_fits(asked, _filters(names)) for names in self.filters()], bool)
+            asked = (filter,) if isinstance(filter, str) else tuple(filter)
+            keep &= np.array([serves(names, asked) for names in self.filters()], bool)
         return np.flatnonzero(keep)
 
     def filters(self) -> list[tuple[str, ...]]:
@@ -380,21 +393,6 @@ class IdcTab:
             for c in self.coefficients_of_row(row)
         )
         return x + float(record["XREF"]), y + float(record["YREF"])
-
-
-def _filters(names: Sequence[str]) -> tuple[str, ...]:
-    """Names as stwcs compares them: every CLEAR is the same."""
-    return tuple("CLEAR" if "CLEAR" in n.upper() else n.strip() for n in names)
-
-
-def _fits(asked: tuple[str, ...], row: tuple[str, ...]) -> bool:
-    """True where a row's filters are those asked for; a table without filter columns serves all."""
-    if not row:
-        return True
-    if len(asked) == len(row):
-        return asked == row
-    clear = [name for name in row if name not in asked]
-    return set(asked) - {"CLEAR"} <= set(row) and all(name in ("CLEAR", "N/A") for name in clear)
 
 
 def read_idctab(path: str | os.PathLike[str]) -> IdcTab:

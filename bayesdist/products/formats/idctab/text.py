@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bayesdist.products.formats.common.coefficients import idctab_column, largest_magnitude
-from bayesdist.products.formats.common.document import finding_lines
+from bayesdist.products.formats.common.document import finding_lines, identity_lines
 from bayesdist.products.formats.idctab.lint import lint_idctab
 from bayesdist.products.formats.idctab.table import FILTER_COLUMNS, IdcTab
 
@@ -27,7 +27,7 @@ def describe_idctab(tab: IdcTab) -> list[str]:
         f"{tab.name}: IDCTAB of {tab.instrument}/{tab.detector or '(no DETECTOR)'}, "
         f"order {tab.norder}, {len(tab.rows)} rows",
     ]
-    lines += [f"  {k:<9} {header[k]}" for k in ("DESCRIP", "USEAFTER", "PEDIGREE") if k in header]
+    lines += identity_lines(header)
     lines.append(f"  time      {_SCHEMES[tab.tdd_scheme]}")
     lines += [f"            {k} = {v:.10g}" for k, v in tab.tdd.items()]
     filters = sorted({" ".join(f) for f in tab.filters()} - {""})
@@ -67,7 +67,7 @@ def _row_text(tab: IdcTab, row: int) -> list[str]:
     geometry = [n for n in ("XSIZE", "YSIZE", "XREF", "YREF", "V2REF", "V3REF", "SCALE", "THETA")
                 if n in tab.columns]  # fmt: skip
     lines.append("    " + "  ".join(f"{n} {float(record[n]):.10g}" for n in geometry))
-    inverse = "DIRECTION" in tab.columns and str(record["DIRECTION"]).strip().upper() == "INVERSE"
+    inverse = tab.directions[row] == "INVERSE"
     if not inverse:
         lines.append(f"    non-linear part: {_non_linear(tab, row)} px at most")
     sigma = tab.sigma

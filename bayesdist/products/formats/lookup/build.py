@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from textwrap import wrap
 
 import numpy as np
 from astropy.io import fits
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 from bayesdist.model.lookup import LookupTable
-from bayesdist.products.formats.common.cards import number_card, text_card
+from bayesdist.products.formats.common.cards import number_card, text_card, wrapped_cards
 from bayesdist.products.formats.common.content import hdus_of
 from bayesdist.products.formats.lookup.file import AXES, LookupFile
 
@@ -142,7 +141,7 @@ def optional_cards(useafter: str | None, pedigree: str | None, history: Sequence
     return [
         *([text_card("USEAFTER", useafter)] if useafter else []),
         *([text_card("PEDIGREE", pedigree)] if pedigree else []),
-        *(text_card("HISTORY", piece) for line in history for piece in wrap(line, 70) or [""]),
+        *wrapped_cards("HISTORY", history),
     ]
 
 

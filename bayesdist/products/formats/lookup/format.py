@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bayesdist.products.formats.common.content import Content
-from bayesdist.products.formats.common.document import Format, finding_lines
+from bayesdist.products.formats.common.document import Format, finding_lines, identity_lines
 from bayesdist.products.formats.lookup.file import AXES, LookupFile
 from bayesdist.products.formats.lookup.lint import lint_lookup_file
 
@@ -30,7 +30,7 @@ def _describe(file: LookupFile) -> list[str]:
         f"{file.name}: {kind} of {file.instrument or '(no INSTRUME)'}/"
         f"{file.detector or '(no DETECTOR)'}, {len(file.chips)} chip(s)",
     ]
-    lines += [f"  {k:<9} {header[k]}" for k in ("DESCRIP", "USEAFTER", "PEDIGREE") if k in header]
+    lines += identity_lines(header)
     if file.filters:
         lines.append(f"  filters   {' '.join(file.filters)}")
     if "BDNPLERR" in header:

@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from bayesdist.products.formats.common.document import Finding
+from bayesdist.products.formats.common.document import Finding, missing_identity
 from bayesdist.products.formats.lookup.file import AXES, LookupFile
 from bayesdist.products.formats.lookup.plane import Plane
 
@@ -38,9 +38,7 @@ def _header(file: LookupFile) -> Iterator[Finding]:
     for keyword in ("INSTRUME", "DETECTOR"):
         if keyword not in file.header:
             yield Finding("error", keyword, "is missing, and stwcs stops without it")
-    for keyword in ("USEAFTER", "PEDIGREE", "FILETYPE", "DESCRIP"):
-        if keyword not in file.header:
-            yield Finding("note", keyword, "is missing; reference files of the observatory have it")
+    yield from missing_identity(file.header)
     if file.kind == "npol" and not file.filters:
         yield Finding(
             "warning", "FILTER1", "is missing: the file does not say what filter it is of"

@@ -110,7 +110,7 @@ def write_npol(
             )
     chosen = one_per_chip(tables, where)
     have = {t.chip for t in chosen}
-    for chip in _chips(idctab):
+    for chip in idctab.stated_chips:
         if chip not in have:
             like = chosen[0]
             zeros = np.zeros((2, *like.shape))
@@ -194,13 +194,6 @@ def filter_name(file: LookupFile) -> str:
 
 def _one_name(filters: Sequence[str]) -> str:
     return "+".join(n for n in filters if "CLEAR" not in n.upper()) or filters[0]
-
-
-def _chips(idctab: IdcTab) -> list[int]:
-    """Chips of an IDCTAB; none where its rows serve any chip."""
-    if "DETCHIP" not in idctab.columns:
-        return []
-    return sorted({int(c) for c in idctab.rows["DETCHIP"] if c > 0})
 
 
 class _Local:

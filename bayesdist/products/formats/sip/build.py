@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from textwrap import wrap
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +13,20 @@ from bayesdist.calibration.chip_map import Monomials
 from bayesdist.calibration.inverse import fit_inverse
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.calibration.sky import reprojected
-from bayesdist.errors import DegenerateError, InputError
+from bayesdist.errors import InputError
 from bayesdist.infer.solution import Solution
-from bayesdist.products.formats.common.cards import convergence_cards, number_card, text_card
-from bayesdist.products.formats.common.coefficients import largest_magnitude
+from bayesdist.model import DistortionModel
+from bayesdist.products.formats.common.cards import (
+    convergence_cards,
+    number_card,
+    text_card,
+    wrapped_cards,
+)
+from bayesdist.products.formats.common.coefficients import (
+    largest_magnitude,
+    propagated_sigma,
+    require_regular,
+)
 from bayesdist.products.formats.sip.families import offset_ranges
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader, worst_closure
 
@@ -97,32 +106,15 @@ def sip_from_solution(
     calibration = as_calibration(solution)
     if tangent_point is None:
         tangent_point = calibration.plane.point
-    if linear not in ("cd", "sip"):
-        raise InputError(
-            f"linear is {linear!r}", where="products.sip.linear", do="choose 'cd' or 'sip'"
-        )
-    if scale_arcsec is not None and not (np.isfinite(scale_arcsec) and scale_arcsec > 0):
-        raise InputError(f"scale is {scale_arcsec} arcsec per pixel", do="give a positive number")
     model = calibration.model
-    if model.time is not None and epoch is None:
-        raise InputError(
-            "a SIP header holds for one epoch, and the model depends on time",
-            where="products.sip.epoch",
-            do="give an epoch in decimal years",
-        )
+    _check_options(model, linear, epoch, scale_arcsec, tangent_point, origin)
     number = calibration.numbers[0] if chip is None else chip
     one = calibration.chip(number, epoch, origin="stated")
     poly = one.monomials()
-    _check_linear(poly, number)
+    require_regular(poly.linear, number)
     unit_arcsec = ARCSEC[model.unit] if model.unit != "pix" else (scale_arcsec or 1.0)
     sky = None
     if tangent_point is not None:
-        if model.unit == "pix" or origin is not None:
-            raise InputError(
-                "a tangent point is given beside u, v in pixels or an origin of one's own",
-                where="tangent_point",
-                do="leave one of them out",
-            )
         sky = reprojected(one, unit_arcsec, tangent_point, crval, SIP_ORDERS[0])
         poly, crval = sky.poly, sky.crval
     order = max(SIP_ORDERS[0], *(i + j for i, j in poly.terms))  # readers ignore order 1
@@ -149,8 +141,10 @@ def sip_from_solution(
         number, linear, epoch if model.time is not None else None, model.unit, scale_arcsec
     )
     cards += _sky_cards(tangent_point, crval)
-    cards += tuple(text_card("COMMENT", part) for note in notes for part in wrap(note, 70))
-    cards += tuple(convergence_cards(calibration.solution))
+    cards += (
+        *wrapped_cards("COMMENT", filter(None, notes)),
+        *convergence_cards(calibration.solution),
+    )
     size = (int(poly.basis.size[0]), int(poly.basis.size[1]))
     sip = SipHeader(
         crpix=poly.basis.reference_pixel,
@@ -179,12 +173,32 @@ def sip_from_solution(
     return replace(sip, closure=worst_closure(sip, size))
 
 
-def _check_linear(poly: Monomials, chip: int) -> None:
-    linear = poly.linear
-    if abs(np.linalg.det(linear)) <= 1e-12 * np.abs(linear).max() ** 2:
-        raise DegenerateError(
-            f"the linear part of chip {chip} is singular",
-            do="check that the stars cover the detector in x and in y",
+def _check_options(
+    model: DistortionModel,
+    linear: str,
+    epoch: float | None,
+    scale_arcsec: float | None,
+    tangent_point: tuple[float, float] | None,
+    origin: tuple[float, float] | None,
+) -> None:
+    """Refuse options that contradict each other or the model."""
+    if linear not in ("cd", "sip"):
+        raise InputError(
+            f"linear is {linear!r}", where="products.sip.linear", do="choose 'cd' or 'sip'"
+        )
+    if scale_arcsec is not None and not (np.isfinite(scale_arcsec) and scale_arcsec > 0):
+        raise InputError(f"scale is {scale_arcsec} arcsec per pixel", do="give a positive number")
+    if model.time is not None and epoch is None:
+        raise InputError(
+            "a SIP header holds for one epoch, and the model depends on time",
+            where="products.sip.epoch",
+            do="give an epoch in decimal years",
+        )
+    if tangent_point is not None and (model.unit == "pix" or origin is not None):
+        raise InputError(
+            "a tangent point is given beside u, v in pixels or an origin of one's own",
+            where="tangent_point",
+            do="leave one of them out",
         )
 
 
@@ -230,9 +244,7 @@ def _sigma(by: Float, poly: Monomials) -> Float:
     """Standard deviations (2, K) behind a linear map of the coefficients."""
     if poly.cov is None:
         return np.zeros(poly.values.shape)
-    variance = np.einsum("kl,lm,km->k", by, poly.cov, by, optimize=True)
-    # a variance of -1e-40 is a rounded zero
-    return np.sqrt(np.maximum(variance, 0.0)).reshape(2, -1)
+    return propagated_sigma(by, poly.cov).reshape(2, -1)
 
 
 def _origin(poly: Monomials, unit: str) -> tuple[float, float]:

@@ -16,7 +16,7 @@ from bayesdist.data.sky.tangent import tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.products.formats.common.document import Finding
 
-__all__ = ["Words", "first_line", "pv_keywords", "sky_words"]
+__all__ = ["HeaderText", "add_sky_lines", "first_line", "pv_keywords"]
 
 _NODES = 9  # points of each axis that are projected to the sky and back
 _PV_OF_TAN = 5  # more than the standard gives a TAN: SCAMP's older headers, which are TPV
@@ -24,22 +24,22 @@ _BACK = 1e-3  # of a pixel: largest closure error of points that count as recove
 
 
 @dataclass
-class Words:
+class HeaderText:
     """Lines of text on one header, and its findings."""
 
     lines: list[str] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
 
-    def doubt(self, level: str, where: str, message: str) -> None:
+    def add_finding(self, level: str, where: str, message: str) -> None:
         """Add a finding."""
         self.findings.append(Finding(level, where, message))
 
 
 def first_line(error: Exception) -> str:
     """First line of an error of astropy.wcs, without wcslib's own heading."""
-    text = [line.strip() for line in str(error).splitlines() if line.strip()]
-    told = [line for line in text if not line.startswith("ERROR ")] or text
-    return (told[0] if told else type(error).__name__).rstrip(".")
+    every = [line.strip() for line in str(error).splitlines() if line.strip()]
+    lines = [line for line in every if not line.startswith("ERROR ")] or every
+    return (lines[0] if lines else type(error).__name__).rstrip(".")
 
 
 def pv_keywords(header: fits.Header, key: str) -> list[str]:
@@ -47,7 +47,9 @@ def pv_keywords(header: fits.Header, key: str) -> list[str]:
     return [k for k in header if re.fullmatch(rf"PV\d+_\d+{key}", k)]
 
 
-def sky_words(wcs: WCS, header: fits.Header, size: tuple[int, int] | None, words: Words) -> None:
+def add_sky_lines(
+    wcs: WCS, header: fits.Header, size: tuple[int, int] | None, text: HeaderText
+) -> None:
     """Position on the sky, scale, parity and distortion, and the closure of pixels."""
     key = wcs.wcs.alt.strip()
     where = f"WCS {key}".strip()
@@ -59,28 +61,28 @@ def sky_words(wcs: WCS, header: fits.Header, size: tuple[int, int] | None, words
     ra, dec = _world(celestial, steps)
     if not np.isfinite([ra, dec]).all():
         middle = "the centre of the image" if size else "CRPIX"
-        words.doubt("warning", where, f"astropy.wcs has no sky position at {middle}")
-        _distortion(celestial, header, size, words, where)
+        text.add_finding("warning", where, f"astropy.wcs has no sky position at {middle}")
+        _distortion(celestial, header, size, text, where)
         return
-    words.lines.append(f"  {place:<9} {_position(celestial, ra[0], dec[0])}")
+    text.lines.append(f"  {place:<9} {_position(celestial, ra[0], dec[0])}")
     try:
         xi, eta = tangent_plane(ra[1:], dec[1:], (float(ra[0]), float(dec[0])))
     except InputError:
-        words.doubt("warning", where, "one pixel is as large as the sky")
+        text.add_finding("warning", where, "one pixel is as large as the sky")
         return
     slope = np.array([[xi[0] - xi[1], xi[2] - xi[3]], [eta[0] - eta[1], eta[2] - eta[3]]])
     across, up = np.hypot(*slope)
     angle = np.degrees(np.arctan2(slope[0, 1], slope[1, 1]))
     mirrored = np.linalg.det(slope) > 0
-    words.lines += [
+    text.lines += [
         f"  pixel     {across:.8g} x {up:.8g} arcsec, +y at position angle {angle:.4g} deg, "
         f"{'a mirror image of the sky' if mirrored else 'parity as on the sky'}"
     ]
     if size is not None:
-        words.lines.append(f"  field     {_field(celestial, size)}")
+        text.lines.append(f"  field     {_field(celestial, size)}")
     if not key:  # astropy.wcs applies them to each of several systems
-        words.lines += list(_tables(wcs))
-    _distortion(celestial, header, size, words, where)
+        text.lines += list(_tables(wcs))
+    _distortion(celestial, header, size, text, where)
 
 
 def _world(wcs: WCS, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -137,7 +139,7 @@ def _tables(wcs: WCS) -> Iterator[str]:
 
 
 def _distortion(
-    wcs: WCS, header: fits.Header, size: tuple[int, int] | None, words: Words, where: str
+    wcs: WCS, header: fits.Header, size: tuple[int, int] | None, text: HeaderText, where: str
 ) -> None:
     """Lines on the distortion in pixels, and on its closure."""
     if size is None:
@@ -147,15 +149,15 @@ def _distortion(
     if wcs.has_distortion:
         moved = np.hypot(*(wcs.pix2foc(pixels, 1) - pixels).T).max()
         tables = ", tables included" if any(_tables(wcs)) else ""
-        words.lines.append(f"  moves     pixels by up to {moved:.4g} px{tables}")
+        text.lines.append(f"  moves     pixels by up to {moved:.4g} px{tables}")
     lon, lat = _world(wcs, pixels)
-    if (plain := _withoutpv_keywords(header, wcs)) is not None:
+    if (plain := _without_pv_terms(header, wcs)) is not None:
         flat = plain.wcs_world2pix(np.column_stack([lon, lat]), 1)
         moved = np.nanmax(np.hypot(*(flat - pixels).T), initial=0.0)
-        words.lines.append(f"  moves     pixels by up to {moved:.4g} px, by the PV terms")
+        text.lines.append(f"  moves     pixels by up to {moved:.4g} px, by the PV terms")
     seen = np.isfinite(lon) & np.isfinite(lat)
     if not seen.all():
-        words.doubt("note", where, f"{(~seen).mean():.0%} of the image is beyond the sky")
+        text.add_finding("note", where, f"{(~seen).mean():.0%} of the image is beyond the sky")
     if not seen.any():
         return
     world = np.column_stack([lon, lat] if wcs.wcs.lng == 0 else [lat, lon])[seen]
@@ -164,21 +166,21 @@ def _distortion(
             warnings.simplefilter("ignore")
             back = wcs.all_world2pix(world, 1, tolerance=1e-6, maxiter=50)
     except NoConvergence:
-        words.doubt(
+        text.add_finding(
             "warning", where, "astropy.wcs does not find all pixels back from the sky: it iterates "
             "on the distortion, which does not converge",
         )  # fmt: skip
         return
     except Exception as error:  # as above: astropy.wcs's finding
-        words.doubt("warning", where, f"astropy.wcs has no way back: {first_line(error)}")
+        text.add_finding("warning", where, f"astropy.wcs has no way back: {first_line(error)}")
         return
     off = float(np.hypot(*(back - pixels[seen]).T).max())
-    words.lines.append(f"  to sky and back  {off:.2g} px at most, by astropy.wcs")
+    text.lines.append(f"  to sky and back  {off:.2g} px at most, by astropy.wcs")
     if not off <= _BACK:
-        words.doubt("warning", where, f"pixels come back from the sky up to {off:.3g} px off")
+        text.add_finding("warning", where, f"pixels come back from the sky up to {off:.3g} px off")
 
 
-def _withoutpv_keywords(header: fits.Header, wcs: WCS) -> WCS | None:
+def _without_pv_terms(header: fits.Header, wcs: WCS) -> WCS | None:
     """System without TPV's distortion; None where it is of another kind."""
     types = [str(header.get(f"CTYPE{k}", "")) for k in (1, 2)]
     scamp = all(t.endswith("-TAN") for t in types) and len(pv_keywords(header, "")) > _PV_OF_TAN

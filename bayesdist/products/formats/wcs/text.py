@@ -18,7 +18,7 @@ from bayesdist.products.formats.common.document import finding_lines
 from bayesdist.products.formats.sip.lint import lint_sip
 from bayesdist.products.formats.sip.read import image_size, parsed
 from bayesdist.products.formats.sip.text import coefficient_lines, sip_lines
-from bayesdist.products.formats.wcs.sky import Words, first_line, pv_keywords, sky_words
+from bayesdist.products.formats.wcs.sky import HeaderText, add_sky_lines, first_line, pv_keywords
 
 __all__ = ["describe_wcs"]
 
@@ -69,63 +69,63 @@ def _label(hdu: Hdu) -> str:
 
 def _hdu_lines(file: Content, hdu: Hdu, name: str, others: Sequence[Hdu] = ()) -> list[str]:
     """Lines of one HDU."""
-    header, words, terms = hdu.header, Words(), list[str]()
+    header, text, terms = hdu.header, HeaderText(), list[str]()
     size = image_size(header)
     if "A_ORDER" in header:
         sip = parsed(header, name)
-        words.lines += sip_lines(sip, name)
+        text.lines += sip_lines(sip, name)
         terms = coefficient_lines(sip)
-        words.findings += lint_sip(sip)
+        text.findings += lint_sip(sip)
     else:
         extent = "unknown" if size is None else f"{size[0]} x {size[1]} px"
-        words.lines.append(f"{name}: WCS, image size {extent}")
+        text.lines.append(f"{name}: WCS, image size {extent}")
     if others:
-        words.lines.append(f"  same in   {', '.join(_label(other) for other in others)}")
+        text.lines.append(f"  same in   {', '.join(_label(other) for other in others)}")
     if hdu.state == "none":
-        words.lines.append("  data      none: a header alone")
+        text.lines.append("  data      none: a header alone")
     elif hdu.state == "cut":
-        words.doubt("error", "data", "the file ends before its data do: it is truncated")
-    systems = _systems(file, hdu, words)
+        text.add_finding("error", "data", "the file ends before its data do: it is truncated")
+    systems = _systems(file, hdu, text)
     for wcs in systems:
         key = wcs.wcs.alt.strip()
         if len(systems) > 1 or key or wcs.wcs.name:
             title = f"WCS {key}" if key else "primary WCS"
-            words.lines.append(f"  {title}{f', {wcs.wcs.name!r}' if wcs.wcs.name else ''}")
-        words.lines += _axes(wcs, header, key, above="A_ORDER" in header and not key)
+            text.lines.append(f"  {title}{f', {wcs.wcs.name!r}' if wcs.wcs.name else ''}")
+        text.lines += _axes(wcs, header, key, above="A_ORDER" in header and not key)
         if wcs.has_celestial:
-            sky_words(wcs, header, size, words)
-    return [*words.lines, *terms, "", *finding_lines(words.findings)]
+            add_sky_lines(wcs, header, size, text)
+    return [*text.lines, *terms, "", *finding_lines(text.findings)]
 
 
 # -- the systems ----------------------------------------------------------------------------------
 
 
-def _systems(file: Content, hdu: Hdu, words: Words) -> list[WCS]:
+def _systems(file: Content, hdu: Hdu, text: HeaderText) -> list[WCS]:
     """Systems of a header that astropy.wcs can make."""
     out = []
     header = hdu.header
     primary = any(k.startswith(("CTYPE", "CRVAL")) and k[-1].isdigit() for k in header)
     table = "TABLE" in str(header.get("XTENSION", "")) and not header.get("ZIMAGE", False)
     if table or not (primary or "A_ORDER" in header or any(k[:5] == "CTYPE" for k in header)):
-        words.doubt("note", "columns", "a WCS of the columns of a table is not looked at")
+        text.add_finding("note", "columns", "a WCS of the columns of a table is not looked at")
         return []
     keys = {k[-1] for k in header if k.startswith(("CTYPE", "CRVAL")) and k[-1].isalpha()}
     for key in [*([" "] if primary or not keys else []), *sorted(keys)]:
         with _quiet_log():
-            wcs = _system(file, header, key, words)
+            wcs = _system(file, header, key, text)
         if wcs is not None:
             out.append(wcs)
     return out
 
 
-def _system(file: Content, header: fits.Header, key: str, words: Words) -> WCS | None:
+def _system(file: Content, header: fits.Header, key: str, text: HeaderText) -> WCS | None:
     where = f"WCS {key}".strip()
     stated = [k for k in _TABLES if k in header]
     fobj = file.opened
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         if stated and fobj is None:
-            words.doubt(
+            text.add_finding(
                 "warning", ", ".join(stated),
                 "the tables are extensions of the image, which are not here: positions are without "
                 "them",
@@ -137,17 +137,17 @@ def _system(file: Content, header: fits.Header, key: str, words: Words) -> WCS |
             wcs = WCS(header, fobj, key=key)
             wcs.wcs.set()
         except Exception as error:  # any of them is astropy.wcs's finding on this header
-            words.doubt("error", where, f"astropy.wcs cannot read it: {first_line(error)}")
+            text.add_finding("error", where, f"astropy.wcs cannot read it: {first_line(error)}")
             return None
     old = []
-    for message in dict.fromkeys(str(w.message) for w in caught if _tells(w)):
+    for message in dict.fromkeys(str(w.message) for w in caught if _is_on_positions(w)):
         if "is deprecated" in message:
             old.append(message.partition("=")[0].strip())
             continue
         level = "warning" if message.startswith("Removed redundant") else "note"
-        words.doubt(level, where, f"astropy.wcs: {' '.join(message.split())}")
+        text.add_finding(level, where, f"astropy.wcs: {' '.join(message.split())}")
     if old:
-        words.doubt("note", ", ".join(old), "a deprecated form, which astropy.wcs still reads")
+        text.add_finding("note", ", ".join(old), "a deprecated form, which astropy.wcs still reads")
     wcs.pixel_shape = None  # the size is that of `image_size`, also where NAXIS says none
     return wcs
 
@@ -163,7 +163,7 @@ def _quiet_log() -> Iterator[None]:
         log.setLevel(before)
 
 
-def _tells(warning: warnings.WarningMessage) -> bool:
+def _is_on_positions(warning: warnings.WarningMessage) -> bool:
     """True for a warning on positions: those on dates and on the lint of units are left out."""
     message = str(warning.message)
     return issubclass(warning.category, FITSFixedWarning) and not message.startswith(

@@ -20,7 +20,7 @@ from bayesdist.report.fields import Grid, scalar_map
 from bayesdist.report.panels import ChipPanels
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.run.residuals import residual_panels
-from bayesdist.report.style import OUTLINE, PALETTE, WIDTH, figure_style, new_figure, nice_below
+from bayesdist.report.style import OUTLINE, PALETTE, WIDTH, new_figure, nice_below
 from bayesdist.report.texttable import TextTable, listing
 
 if TYPE_CHECKING:
@@ -96,30 +96,29 @@ def table_residuals(r: ReportInput) -> Plot:
     every = np.concatenate([c.without for c in chips])
     reach = _REACH * 1.4826 * float(np.median(np.abs(every)))
     scale = display_scale("pix", reach)
-    with figure_style():
-        fig = new_figure(WIDTH, 2.35 * len(chips) + 0.35)
-        grid = fig.subplots(len(chips), 3, squeeze=False)
-        for axes, chip in zip(grid, chips, strict=True):
-            assert chip.with_tables is not None
-            name = chip.chip.name or f"chip {chip.chip.number}"
-            parts = ((chip.without, "without tables", WITHOUT), (chip.with_tables, "with", WITH))
-            for ax, (residual, what, color) in zip(axes, parts, strict=False):
-                _cloud(ax, residual * scale.factor, reach * scale.factor, color)
-                ax.set_title(f"{name}, {what}")
-                ax.set_xlabel(f"residual in x [{scale.unit}]")
-            axes[0].set_ylabel(f"residual in y [{scale.unit}]")
-            axes[1].tick_params(labelleft=False)
-            edges = np.linspace(-reach, reach, 91) * scale.factor
-            for residual, what, color in parts:
-                for k, style in enumerate(("-", ":")):
-                    counts, _ = np.histogram(residual[:, k] * scale.factor, edges)
-                    label = f"{'xy'[k]}, {what.split()[0]}"
-                    axes[2].stairs(counts, edges, color=color, ls=style, lw=1.0, label=label)
-            axes[2].set_xlim(edges[0], edges[-1])
-            axes[2].set_title(f"{name}, histograms")
-            axes[2].set_xlabel(f"residual [{scale.unit}]")
-            axes[2].set_ylabel("stars drawn per bin")
-        grid[0, 2].legend(loc="upper left", fontsize=6.5, handlelength=1.5, borderaxespad=0.2)
+    fig = new_figure(WIDTH, 2.35 * len(chips) + 0.35)
+    grid = fig.subplots(len(chips), 3, squeeze=False)
+    for axes, chip in zip(grid, chips, strict=True):
+        assert chip.with_tables is not None
+        name = chip.chip.name or f"chip {chip.chip.number}"
+        parts = ((chip.without, "without tables", WITHOUT), (chip.with_tables, "with", WITH))
+        for ax, (residual, what, color) in zip(axes, parts, strict=False):
+            _cloud(ax, residual * scale.factor, reach * scale.factor, color)
+            ax.set_title(f"{name}, {what}")
+            ax.set_xlabel(f"residual in x [{scale.unit}]")
+        axes[0].set_ylabel(f"residual in y [{scale.unit}]")
+        axes[1].tick_params(labelleft=False)
+        edges = np.linspace(-reach, reach, 91) * scale.factor
+        for residual, what, color in parts:
+            for k, style in enumerate(("-", ":")):
+                counts, _ = np.histogram(residual[:, k] * scale.factor, edges)
+                label = f"{'xy'[k]}, {what.split()[0]}"
+                axes[2].stairs(counts, edges, color=color, ls=style, lw=1.0, label=label)
+        axes[2].set_xlim(edges[0], edges[-1])
+        axes[2].set_title(f"{name}, histograms")
+        axes[2].set_xlabel(f"residual [{scale.unit}]")
+        axes[2].set_ylabel("stars drawn per bin")
+    grid[0, 2].legend(loc="upper left", fontsize=6.5, handlelength=1.5, borderaxespad=0.2)
     t = found.section("tables")
     drawn = sum(len(c.without) for c in chips)
     text = (

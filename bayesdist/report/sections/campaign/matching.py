@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.ticker import ScalarFormatter
+from numpy.typing import NDArray
 
 from bayesdist.numbers import count, number, percent, size_of
 from bayesdist.report.contents import REPORT
@@ -19,7 +20,7 @@ from bayesdist.report.style import (
     PALETTE,
     SEQUENTIAL,
     WIDTH,
-    figure_style,
+    guide_lines,
     new_figure,
 )
 from bayesdist.report.texttable import TextTable, listing
@@ -73,37 +74,34 @@ def catalogue_errors(r: ReportInput) -> Plot:
     c = campaign_of(r)
     catalog, centroids, found = c.catalog, c.centroids, c.section("matching")
     assert catalog is not None
-    with figure_style():
-        fig = new_figure(WIDTH, 3.3)
-        left, right = fig.subplots(1, 2)
-        if catalog.sigma is not None:
-            left.plot(
-                catalog.mag, catalog.sigma, ".", ms=1.2, color=_DOT, label="catalogue, quoted"
-            )
-        if centroids is not None:
-            points = np.hypot(centroids.scatter_u, centroids.scatter_v)
-            line = np.hypot(centroids.sigma_u, centroids.sigma_v)
-            left.plot(
-                centroids.mag,
-                points,
-                "o",
-                ms=2.8,
-                color=PALETTE["blue"],
-                label="residuals, scatter",
-            )
-            left.plot(centroids.mag, line, color=INK, label="one detection, fitted")
-        left.set_ylabel(rf"error of the position, $\sigma_{{uv}}$ [{catalog.unit}]")
-        left.set_title("Positions")
-        if catalog.sigma_motion is not None:
-            _motions(right, catalog)
-        else:
-            right.remove()
-        for ax in fig.axes:
-            ax.set_yscale("log")
-            ax.set_xlabel("instrumental magnitude")
-            ax.grid(True, which="major", lw=0.4, color=GUIDE, zorder=0)
-            legend = ax.legend(loc="upper center", markerscale=2.2, handlelength=1.6)
-            legend.set_zorder(6)
+    fig = new_figure(WIDTH, 3.3)
+    left, right = fig.subplots(1, 2)
+    if catalog.sigma is not None:
+        left.plot(catalog.mag, catalog.sigma, ".", ms=1.2, color=_DOT, label="catalogue, quoted")
+    if centroids is not None:
+        points = np.hypot(centroids.scatter_u, centroids.scatter_v)
+        line = np.hypot(centroids.sigma_u, centroids.sigma_v)
+        left.plot(
+            centroids.mag,
+            points,
+            "o",
+            ms=2.8,
+            color=PALETTE["blue"],
+            label="residuals, scatter",
+        )
+        left.plot(centroids.mag, line, color=INK, label="one detection, fitted")
+    left.set_ylabel(rf"error of the position, $\sigma_{{uv}}$ [{catalog.unit}]")
+    left.set_title("Positions")
+    if catalog.sigma_motion is not None:
+        _motions(right, catalog)
+    else:
+        right.remove()
+    for ax in fig.axes:
+        ax.set_yscale("log")
+        ax.set_xlabel("instrumental magnitude")
+        ax.grid(True, which="major", lw=0.4, color=GUIDE, zorder=0)
+        legend = ax.legend(loc="upper center", markerscale=2.2, handlelength=1.6)
+        legend.set_zorder(6)
     n = int(found["n_catalog"])
     text = "Left: errors of the positions, both axes together."
     if catalog.sigma is not None:
@@ -161,24 +159,23 @@ def fit_quality(r: ReportInput) -> Plot:
     assert d is not None
     faintest, brightest = np.quantile(d.mag, (0.9995, 0.001))
     low, high = np.quantile(d.q[d.q > 0], (0.0005, 0.9995))
-    with figure_style():
-        fig = new_figure(WIDTH, 3.5)
-        ax = fig.subplots()
-        for rows, color, label in ((~d.kept, "#C3CCD5", "left out"), (d.kept, "#2B6CA3", "kept")):
-            ax.plot(d.mag[rows], d.q[rows], ".", ms=1.4, color=color, label=label)
-        for edge in d.mag_cuts:
-            ax.axvline(edge, color=_LEFT_OUT, lw=0.9, ls="--")
-        if d.q_max is not None:
-            ax.axhline(d.q_max, color=_LEFT_OUT, lw=0.9, ls="--", label="cuts")
-        elif d.mag_cuts:
-            ax.plot([], [], color=_LEFT_OUT, lw=0.9, ls="--", label="cuts")
-        ax.set_yscale("log")
-        ax.set_xlim(brightest - 0.4, faintest + 0.4)
-        ax.set_ylim(low / 1.5, high * 3)  # room for the legend
-        ax.set_xlabel("instrumental magnitude")
-        ax.set_ylabel("quality of the fit q")
-        legend = ax.legend(loc="upper center", ncols=3, markerscale=4)
-        legend.set_zorder(6)
+    fig = new_figure(WIDTH, 3.5)
+    ax = fig.subplots()
+    for rows, color, label in ((~d.kept, "#C3CCD5", "left out"), (d.kept, "#2B6CA3", "kept")):
+        ax.plot(d.mag[rows], d.q[rows], ".", ms=1.4, color=color, label=label)
+    for edge in d.mag_cuts:
+        ax.axvline(edge, color=_LEFT_OUT, lw=0.9, ls="--")
+    if d.q_max is not None:
+        ax.axhline(d.q_max, color=_LEFT_OUT, lw=0.9, ls="--", label="cuts")
+    elif d.mag_cuts:
+        ax.plot([], [], color=_LEFT_OUT, lw=0.9, ls="--", label="cuts")
+    ax.set_yscale("log")
+    ax.set_xlim(brightest - 0.4, faintest + 0.4)
+    ax.set_ylim(low / 1.5, high * 3)  # room for the legend
+    ax.set_xlabel("instrumental magnitude")
+    ax.set_ylabel("quality of the fit q")
+    legend = ax.legend(loc="upper center", ncols=3, markerscale=4)
+    legend.set_zorder(6)
     text = (
         "Detections of all exposures; those between the cuts are kept,"
         f" {count(d.n_kept)} of {count(d.n_total)} ({percent(d.n_kept / d.n_total)})."
@@ -210,19 +207,17 @@ def matching(r: ReportInput) -> Plot:
         ("false pairs [10⁻⁶]", 1e6 * np.asarray(c.matching["false_share"], float), "vermilion"),
         ("pairs", np.asarray(c.matching["matched"], float), "green"),
     )
-    with figure_style():
-        fig = new_figure(WIDTH, 4.2)
-        axes = fig.subplots(len(rows), 1, sharex=True)
-        for ax, (label, values, color) in zip(axes, rows, strict=True):
-            ax.plot(epoch, values, "o", ms=3.2, mec="none", color=PALETTE[color])
-            ax.set_ylabel(label)
-            ax.margins(y=0.15)
-            ax.grid(True, lw=0.4, color=GUIDE)
-            ax.set_axisbelow(True)
-        axes[1].set_ylim(bottom=-0.05 * max(axes[1].get_ylim()[1], 1.0))
-        axes[2].set_ylim(bottom=0)
-        axes[2].set_xlabel("epoch [yr]")
-        fig.align_ylabels(axes)
+    fig = new_figure(WIDTH, 4.2)
+    axes = fig.subplots(len(rows), 1, sharex=True)
+    for ax, (label, values, color) in zip(axes, rows, strict=True):
+        ax.plot(epoch, values, "o", ms=3.2, mec="none", color=PALETTE[color])
+        ax.set_ylabel(label)
+        ax.margins(y=0.15)
+        guide_lines(ax)
+    axes[1].set_ylim(bottom=-0.05 * max(axes[1].get_ylim()[1], 1.0))
+    axes[2].set_ylim(bottom=0)
+    axes[2].set_xlabel("epoch [yr]")
+    fig.align_ylabels(axes)
     m = c.section("matching")
     completeness = m["completeness"]
     return Plot(
@@ -244,31 +239,30 @@ def footprints(r: ReportInput) -> Plot:
     c = campaign_of(r)
     field = c.footprints
     assert field is not None
-    with figure_style():
-        fig = new_figure(0.85 * WIDTH, 0.78 * WIDTH, layout="compressed")
-        ax = fig.subplots()
-        ax.plot(field.u, field.v, ".", ms=1.3, color="#9AA7B4", mec="none", zorder=1)
-        # so many outlines hide each other: three of them are drawn boldly
-        dates = np.unique(field.epoch)
-        strong = np.isin(field.epoch, dates[[0, len(dates) // 2, -1]])
-        for some, style in (
-            (~strong, {"lw": 0.4, "alpha": 0.35, "zorder": 2}),
-            (strong, {"lw": 1.6, "alpha": 1.0, "zorder": 3}),
-        ):
-            rows = np.flatnonzero(some)
-            shown = [field.outlines[k] for k in rows]
-            lines = LineCollection(shown, array=field.epoch[rows], cmap=SEQUENTIAL, **style)
-            lines.set_clim(dates[0], dates[-1])
-            ax.add_collection(lines)
-        ax.set_aspect("equal")
-        ax.autoscale_view()
-        ax.set_xlabel(f"u [{field.unit}]")
-        ax.set_ylabel(f"v [{field.unit}]")
-        bar = fig.colorbar(lines, ax=ax, fraction=0.045, pad=0.02, label="epoch [yr]")
-        bar.ax.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
-        ax.tick_params(colors=INK)
+    fig = new_figure(0.85 * WIDTH, 0.78 * WIDTH, layout="compressed")
+    ax = fig.subplots()
+    ax.plot(field.u, field.v, ".", ms=1.3, color="#9AA7B4", mec="none", zorder=1)
+    # so many outlines hide each other: three of them are drawn boldly
+    dates = np.unique(field.epoch)
+    strong = np.isin(field.epoch, dates[[0, len(dates) // 2, -1]])
+    for some, style in (
+        (~strong, {"lw": 0.4, "alpha": 0.35, "zorder": 2}),
+        (strong, {"lw": 1.6, "alpha": 1.0, "zorder": 3}),
+    ):
+        rows = np.flatnonzero(some)
+        shown = [field.outlines[k] for k in rows]
+        lines = LineCollection(shown, array=field.epoch[rows], cmap=SEQUENTIAL, **style)
+        lines.set_clim(dates[0], dates[-1])
+        ax.add_collection(lines)
+    ax.set_aspect("equal")
+    ax.autoscale_view()
+    ax.set_xlabel(f"u [{field.unit}]")
+    ax.set_ylabel(f"v [{field.unit}]")
+    bar = fig.colorbar(lines, ax=ax, fraction=0.045, pad=0.02, label="epoch [yr]")
+    bar.ax.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
+    ax.tick_params(colors=INK)
     n = len(field.outlines) // len(c.chips)
-    rolls = np.ma.filled(np.ma.asarray(c.matching["pa_v3"], float), np.nan)
+    rolls: NDArray[np.float64] = np.ma.filled(np.ma.asarray(c.matching["pa_v3"], float), np.nan)
     text = (
         f"Outlines of the chips of {count(n)} exposures over the catalogue, coloured by date; the"
         " first, the middle and the last one are drawn strong."

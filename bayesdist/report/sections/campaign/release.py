@@ -11,7 +11,7 @@ from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, campaign_of
 from bayesdist.report.panels import Panels
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import WIDTH, figure_style, new_figure, nice_below
+from bayesdist.report.style import WIDTH, new_figure, nice_below
 from bayesdist.report.texttable import TextTable
 
 __all__ = [
@@ -122,13 +122,12 @@ def _panels(t: OverlapTest) -> Panels:
     size = np.ptp(t.new.position, axis=0)
     middle, half = np.array(t.corner) + size / 2, 0.56 * size
     aspect = float(np.clip(size[1] / size[0], 0.5, 1.6))
-    with figure_style():
-        figure = new_figure(WIDTH, 0.5 * WIDTH * aspect + 0.9, layout="compressed")
-        axes = figure.subplots(1, 2, sharex=True, sharey=True)
-        for ax in axes:
-            ax.set_aspect("equal")
-            ax.set_xlim(middle[0] - half[0], middle[0] + half[0])
-            ax.set_ylim(middle[1] - half[1], middle[1] + half[1])
-            ax.set_xlabel(r"$\xi$ [pix]")
-        axes[0].set_ylabel(r"$\eta$ [pix]")
+    figure = new_figure(WIDTH, 0.5 * WIDTH * aspect + 0.9, layout="compressed")
+    axes = figure.subplots(1, 2, sharex=True, sharey=True)
+    for ax in axes:
+        ax.set_aspect("equal")
+        ax.set_xlim(middle[0] - half[0], middle[0] + half[0])
+        ax.set_ylim(middle[1] - half[1], middle[1] + half[1])
+        ax.set_xlabel(r"$\xi$ [pix]")
+    axes[0].set_ylabel(r"$\eta$ [pix]")
     return Panels(figure, [[ax] for ax in axes], ("", ""))

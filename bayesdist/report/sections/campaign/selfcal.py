@@ -12,7 +12,7 @@ from bayesdist.numbers import MISSING, count, display_scale, number, percent, wi
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, SelfcalResults
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import CYCLE, INK, PALE, WIDTH, figure_style, new_figure
+from bayesdist.report.style import CYCLE, INK, PALE, WIDTH, new_figure
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing
 
 if TYPE_CHECKING:
@@ -144,22 +144,21 @@ def selfcal(r: ReportInput) -> Plot:
     found = r.selfcal
     assert found is not None
     stars = found.stars[:: max(1, -(-len(found.stars) // MAX_STARS_DRAWN))]
-    with figure_style():
-        fig = new_figure(WIDTH, 0.5 * WIDTH)
-        field, errors = fig.subplots(1, 2)
-        field.plot(stars["u"], stars["v"], ".", ms=1.5, color=PALE, mec="none", zorder=1)
-        strong = (0.4, 0.5) if len(found.outlines) > 30 else (0.9, 0.9)
-        field.add_collection(
-            LineCollection(found.outlines, colors=CYCLE[0], linewidths=strong[0], alpha=strong[1])
-        )
-        field.set_aspect("equal")
-        field.autoscale_view()
-        field.set_xlabel(f"u [{r.unit}]")
-        field.set_ylabel(f"v [{r.unit}]")
-        field.set_title(f"{count(len(found.matching))} exposures")
-        _errors(errors, stars, r.unit)
-        for ax in (field, errors):
-            ax.tick_params(colors=INK)
+    fig = new_figure(WIDTH, 0.5 * WIDTH)
+    field, errors = fig.subplots(1, 2)
+    field.plot(stars["u"], stars["v"], ".", ms=1.5, color=PALE, mec="none", zorder=1)
+    strong = (0.4, 0.5) if len(found.outlines) > 30 else (0.9, 0.9)
+    field.add_collection(
+        LineCollection(found.outlines, colors=CYCLE[0], linewidths=strong[0], alpha=strong[1])
+    )
+    field.set_aspect("equal")
+    field.autoscale_view()
+    field.set_xlabel(f"u [{r.unit}]")
+    field.set_ylabel(f"v [{r.unit}]")
+    field.set_title(f"{count(len(found.matching))} exposures")
+    _errors(errors, stars, r.unit)
+    for ax in (field, errors):
+        ax.tick_params(colors=INK)
     s = found.summary["stars"]
     size = with_mas(s["radius_median"], s["unit"], r.scale_mas)
     return Plot(

@@ -22,7 +22,7 @@ from bayesdist.report.sections.campaign.terms import (
     name_of_term,
     terms_of,
 )
-from bayesdist.report.style import CYCLE, GUIDE, INK, WIDTH, figure_style, new_figure
+from bayesdist.report.style import CYCLE, INK, WIDTH, guide_lines, legend_above, new_figure
 
 if TYPE_CHECKING:
     from bayesdist.report.campaign import LinearSeries
@@ -61,16 +61,14 @@ def series(r: ReportInput, which: tuple[str, int]) -> Plot:
     courses = [course_of(series, found.get("lines", []), label) for label in labels]
     first = which == next(iter(_figures(r).values()))
     with_roll = bool(np.isfinite(series.pa_v3).any())
-    beside = 2 if with_roll else 1
+    columns = 2 if with_roll else 1
     ratios = ((2.0, 1.0) if with_roll else (2.0,)) * len(courses)
-    with figure_style():
-        fig = new_figure(WIDTH, 5.7)
-        grid = fig.subplots(3, beside * len(courses), squeeze=False, width_ratios=ratios)
-        for k, course in enumerate(courses):
-            panels = grid[:, beside * k : beside * (k + 1)]
-            _draw_course(panels, series, course, unit)
-        handles, labels = grid[1, 0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper left", ncols=len(labels), handlelength=1.6)
+    fig = new_figure(WIDTH, 5.7)
+    grid = fig.subplots(3, columns * len(courses), squeeze=False, width_ratios=ratios)
+    for k, course in enumerate(courses):
+        panels = grid[:, columns * k : columns * (k + 1)]
+        _draw_course(panels, series, course, unit)
+    legend_above(fig, grid[1, 0], handlelength=1.6)
     length_unit = unit if courses[0].is_constant else ""
 
     def size(value: float | None) -> str:
@@ -147,8 +145,7 @@ def _draw_course(panels: Any, series: LinearSeries, course: TermCourse, unit: st
             row[1].set_ylim(row[0].get_ylim())
             row[1].tick_params(labelleft=False)
         for ax in row:
-            ax.grid(True, lw=0.4, color=GUIDE)
-            ax.set_axisbelow(True)
+            guide_lines(ax)
     _share_limits(panels[0], panels[1])
     _draw_lines(panels[1][0], series, course, ref, factor)
     for ax in panels[2]:

@@ -25,7 +25,6 @@ from bayesdist.report.style import (
     OUTLINE,
     PALETTE,
     WIDTH,
-    figure_style,
     new_figure,
 )
 from bayesdist.report.texttable import TextTable
@@ -47,7 +46,13 @@ _KIND_COLORS = {
 }
 # one above the other, as both axes are often equal
 _AXIS_MARKERS = {"u": ("o", -0.15), "v": ("s", 0.15)}
-_MARKER_STYLE = {"ms": 5.5, "color": PALETTE["yellow"], "mec": INK, "mew": 0.7, "zorder": 4}
+_MARKER_STYLE: dict[str, Any] = {
+    "ms": 5.5,
+    "color": PALETTE["yellow"],
+    "mec": INK,
+    "mew": 0.7,
+    "zorder": 4,
+}
 
 
 def is_total(row: Mapping[str, str | float]) -> bool:
@@ -121,25 +126,24 @@ def budget_terms(r: ReportInput) -> Plot:
         parts |= {n: b.rows() for n, b in zip(r.mosaic.names, budget.chips, strict=True)}
     largest = max(float(row["radial"]) for part in parts.values() for row in part)
     scale = display_scale(budget.unit, largest)
-    with figure_style():
-        fig = new_figure(WIDTH, (1.1 if len(parts) == 1 else 1.3) + 0.34 * len(rows))
-        axes = fig.subplots(1, len(parts), sharey=True, squeeze=False)[0]
-        for ax, (name, part) in zip(axes, parts.items(), strict=True):
-            _bars(ax, part, scale.factor)
-            # a number beyond its bar takes more of a narrow panel
-            room = 1.12 if len(parts) == 1 else 1.12 + 0.12 * len(parts)
-            ax.set_xlim(0, largest * scale.factor * room or 1.0)
-            over = "the detector" if len(parts) == 1 else name
-            ax.set_xlabel(f"rms over {over} [{scale.unit}]")
-        axes[0].set_yticks(np.arange(len(rows)), [fill(str(row["name"]), 26) for row in rows])
-        axes[0].invert_yaxis()
-        present = {row["kind"] for row in rows if not is_total(row)}
-        kinds = [k for k in _KIND_COLORS if k in present]
-        handles = [Patch(color=_KIND_COLORS[k], label=f"{k}, radial") for k in kinds]
-        handles.append(Patch(color=INK, label="total, radial"))
-        for key, (marker, _) in _AXIS_MARKERS.items():
-            handles += axes[0].plot([], [], marker, label=f"{key} alone", **_MARKER_STYLE)
-        fig.legend(handles=handles, loc="outside upper left", ncols=len(handles))
+    fig = new_figure(WIDTH, (1.1 if len(parts) == 1 else 1.3) + 0.34 * len(rows))
+    axes = fig.subplots(1, len(parts), sharey=True, squeeze=False)[0]
+    for ax, (name, part) in zip(axes, parts.items(), strict=True):
+        _bars(ax, part, scale.factor)
+        # a number beyond its bar takes more of a narrow panel
+        room = 1.12 if len(parts) == 1 else 1.12 + 0.12 * len(parts)
+        ax.set_xlim(0, largest * scale.factor * room or 1.0)
+        over = "the detector" if len(parts) == 1 else name
+        ax.set_xlabel(f"rms over {over} [{scale.unit}]")
+    axes[0].set_yticks(np.arange(len(rows)), [fill(str(row["name"]), 26) for row in rows])
+    axes[0].invert_yaxis()
+    present = {row["kind"] for row in rows if not is_total(row)}
+    kinds = [k for k in _KIND_COLORS if k in present]
+    handles = [Patch(color=_KIND_COLORS[k], label=f"{k}, radial") for k in kinds]
+    handles.append(Patch(color=INK, label="total, radial"))
+    for key, (marker, _) in _AXIS_MARKERS.items():
+        handles += axes[0].plot([], [], marker, label=f"{key} alone", **_MARKER_STYLE)
+    fig.legend(handles=handles, loc="outside upper left", ncols=len(handles))
     *terms, total = (row for row in rows if row["kind"] != PRODUCT)
     top = max(terms, key=lambda row: row["radial"])
     return Plot(
@@ -189,8 +193,7 @@ def budget_dominating(r: ReportInput) -> Plot:
         Patch(color=c, label=f"{_shortened(budget.names[k])} ({100 * share[k]:.0f} %)")
         for c, k in zip(colors, present, strict=True)
     ]
-    with figure_style():
-        panels.figure.legend(handles=handles, loc="outside upper left", ncols=2)
+    panels.figure.legend(handles=handles, loc="outside upper left", ncols=2)
     top = int(share.argmax())
     return Plot(
         panels.figure,
@@ -201,5 +204,5 @@ def budget_dominating(r: ReportInput) -> Plot:
     )
 
 
-def _shortened(name: str, width: int = 40) -> str:
-    return name if len(name) <= width else name[: width - 1] + "…"
+def _shortened(name: str) -> str:
+    return name if len(name) <= 40 else name[:39] + "…"

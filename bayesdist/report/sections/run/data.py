@@ -13,7 +13,7 @@ from bayesdist.numbers import MISSING, count, display_scale, number
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import INK, PALETTE, SEQUENTIAL, WIDTH, figure_style, new_figure
+from bayesdist.report.style import INK, PALETTE, SEQUENTIAL, WIDTH, new_figure
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing, short_paths
 
 if TYPE_CHECKING:
@@ -35,8 +35,8 @@ def data_tables(r: ReportInput) -> tuple[TextTable, ...]:
     pairs = {
         "Sources": ", ".join(short_paths(m.sources)),
         "Rows read": count(m.n_rows),
-        words.all_things.capitalize(): count(r.stars.n_total),
-        f"Used by the {words.chooser}": count(fit.n_used),
+        words.all_rows.capitalize(): count(r.stars.n_total),
+        f"Used by the {words.rejection}": count(fit.n_used),
         "Unit of u, v": m.unit,
         "Exposures": count(np.count_nonzero(r.exposures.n)),
         "Filters": ", ".join(f for f in m.filter_names if f) or MISSING,
@@ -45,22 +45,22 @@ def data_tables(r: ReportInput) -> tuple[TextTable, ...]:
         pairs[f"Epochs [yr]{partial}"] = f"{np.min(m.epoch):.2f} to {np.max(m.epoch):.2f}"
     if m.mag is not None and np.isfinite(m.mag).any():
         pairs[f"Magnitudes{partial}"] = f"{np.nanmin(m.mag):.2f} to {np.nanmax(m.mag):.2f}"
-    pairs[f"Errors of the {words.things}"] = (
+    pairs[f"Errors of the {words.rows}"] = (
         "by magnitude, see below"
         if r.magnitude_errors is not None
         else str(r.setting("data", "sigma", "as given"))
     )
     reasons = [(f"{k} (reading)", count(v)) for k, v in m.rejected.items()]
-    reasons += [(f"{k} ({words.chooser})", count(v)) for k, v in fit.rejected.items()]
+    reasons += [(f"{k} ({words.rejection})", count(v)) for k, v in fit.rejected.items()]
     rejected = TextTable(
         "Rows left out, by reason",
         ("Reason", "Rows"),
         tuple(reasons) or (("none", "0"),),
-        note=f"The posterior uses all {words.all_things}: the mixture takes the place of rejection."
+        note=f"The posterior uses all {words.all_rows}: the mixture takes the place of rejection."
         if r.posterior is not None
         else "",
     )
-    note = f"Figures and tables of single {words.things} show {r.sample}." if partial else ""
+    note = f"Figures and tables of single {words.rows} show {r.sample}." if partial else ""
     out = [listing("Input", pairs, note), rejected]
     if r.magnitude_errors is not None:
         out.append(_magnitude_table(r))
@@ -81,7 +81,7 @@ def _magnitude_table(r: ReportInput) -> TextTable:
         "Errors by magnitude, estimated from the residuals",
         (
             "Magnitude",
-            r.words.things.capitalize(),
+            r.words.rows.capitalize(),
             f"σ u [{scale.unit}]",
             f"σ v [{scale.unit}]",
         ),
@@ -109,7 +109,7 @@ def _exposure_table(r: ReportInput) -> TextTable:
         "Exposures",
         (
             "Exposure",
-            r.words.things.capitalize(),
+            r.words.rows.capitalize(),
             "Used",
             f"rms u [{scale.unit}]",
             f"rms v [{scale.unit}]",
@@ -125,11 +125,11 @@ def _exposure_table(r: ReportInput) -> TextTable:
 def residuals_by_magnitude(r: ReportInput) -> Plot:
     """Density of the residuals against magnitude, with the errors assigned to each magnitude."""
     words, known = r.words, _magnitudes(r)
-    text = f"Residuals grow towards faint stars; colour counts {words.things}."
+    text = f"Residuals grow towards faint stars; colour counts {words.rows}."
     if r.magnitude_errors is not None:
+        more = ", or somewhat more, because the stars were fitted to them" if words.leverage else ""
         text += " The lines are ±1 σ as assigned to each magnitude: about two thirds of the"
-        text += f" {words.things} lie between them"
-        text += ", or somewhat more, because the stars were fitted to them." if words.taken else "."
+        text += f" {words.rows} lie between them{more}."
     if r.sample:
         text += f" Drawn from {r.sample}."
     assert r.stars.table.mag is not None
@@ -139,7 +139,7 @@ def residuals_by_magnitude(r: ReportInput) -> Plot:
             r.stars.residual[known],
             unit=r.unit,
             errors=r.magnitude_errors,
-            shown=f"sampled {words.things}" if r.stars.partial else words.things,
+            shown=f"sampled {words.rows}" if r.stars.partial else words.rows,
         ),
         "Residuals against magnitude",
         text,
@@ -161,36 +161,33 @@ def _density(
     scale = display_scale(unit, reach)
     low, high = np.quantile(mag, [0.002, 0.998])  # a few very bright stars must not fill the plot
     pad = 0.02 * max(high - low, 0.1)
-    with figure_style():
-        fig = new_figure(WIDTH, 3.2)
-        axes = fig.subplots(1, 2, sharey=True)
-        for ax, axis, values in zip(axes, "uv", residual.T, strict=True):
-            inside = (np.abs(values) <= reach) & (
-                np.abs(2 * mag - low - high) <= high - low + 2 * pad
-            )
-            hexagons = ax.hexbin(
-                mag[inside],
-                values[inside] * scale.factor,
-                gridsize=(45, 30),
-                extent=(low - pad, high + pad, -reach * scale.factor, reach * scale.factor),
-                mincnt=1,
-                norm=LogNorm(vmin=1),
-                cmap=SEQUENTIAL,
-                linewidths=0.1,
-            )
-            if errors is not None:
-                grid = np.linspace(low - pad, high + pad, 200)
-                sigma = np.asarray(errors.at(grid)["uv".index(axis)]) * scale.factor
-                for edge in (-sigma, sigma):
-                    ax.plot(grid, edge, color="white", lw=2.6)
-                    ax.plot(grid, edge, color=PALETTE["vermilion"], lw=1.3)
-            ax.axhline(0.0, color=INK, lw=0.5)
-            ax.set_xlim(low - pad, high + pad)
-            ax.set_ylim(-reach * scale.factor, reach * scale.factor)
-            ax.set_title(f"{axis}: {int((~inside).sum())} of {values.size} {shown} lie outside")
-            ax.set_xlabel("magnitude [mag]")
-        axes[0].set_ylabel(f"residual [{scale.unit}]")
-        fig.colorbar(hexagons, ax=axes, label=f"{shown} per hexagon", fraction=0.04, pad=0.01)
+    fig = new_figure(WIDTH, 3.2)
+    axes = fig.subplots(1, 2, sharey=True)
+    for ax, axis, values in zip(axes, "uv", residual.T, strict=True):
+        inside = (np.abs(values) <= reach) & (np.abs(2 * mag - low - high) <= high - low + 2 * pad)
+        hexagons = ax.hexbin(
+            mag[inside],
+            values[inside] * scale.factor,
+            gridsize=(45, 30),
+            extent=(low - pad, high + pad, -reach * scale.factor, reach * scale.factor),
+            mincnt=1,
+            norm=LogNorm(vmin=1),
+            cmap=SEQUENTIAL,
+            linewidths=0.1,
+        )
+        if errors is not None:
+            grid = np.linspace(low - pad, high + pad, 200)
+            sigma = np.asarray(errors.at(grid)["uv".index(axis)]) * scale.factor
+            for edge in (-sigma, sigma):
+                ax.plot(grid, edge, color="white", lw=2.6)
+                ax.plot(grid, edge, color=PALETTE["vermilion"], lw=1.3)
+        ax.axhline(0.0, color=INK, lw=0.5)
+        ax.set_xlim(low - pad, high + pad)
+        ax.set_ylim(-reach * scale.factor, reach * scale.factor)
+        ax.set_title(f"{axis}: {int((~inside).sum())} of {values.size} {shown} lie outside")
+        ax.set_xlabel("magnitude [mag]")
+    axes[0].set_ylabel(f"residual [{scale.unit}]")
+    fig.colorbar(hexagons, ax=axes, label=f"{shown} per hexagon", fraction=0.04, pad=0.01)
     return fig
 
 

@@ -35,7 +35,7 @@ def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
         f" {number(fit.chi2 / fit.dof if fit.dof > 0 else None)}",
         "rms of u": with_mas(fit.rms_u, r.unit, mas),
         "rms of v": with_mas(fit.rms_v, r.unit, mas),
-        f"{words.things} used, left out".capitalize(): f"{count(fit.n_used)}, "
+        f"{words.rows} used, left out".capitalize(): f"{count(fit.n_used)}, "
         f"{count(fit.n_rejected)}",
         "Condition of the scaled normal matrix": number(fit.condition, 2),
     }
@@ -49,12 +49,12 @@ def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
                 s = residual_statistics(values * scale.factor)
                 rows.append((f"{chip}{axis}", *(rounded(s[k], s["sigma"] / 10) for k in names)))
     if r.held:
-        pairs["Parameters"] += f", {count(len(r.held))} of them held by {words.holder}"
+        pairs["Parameters"] += f", {count(len(r.held))} of them held by {words.constraint}"
     return (
         listing(words.fit.capitalize(), pairs),
         *((_skew_table(r),) if r.setting("fit", "skew", False) else ()),
         TextTable(
-            f"Residuals of the {words.things} used [{scale.unit}]",
+            f"Residuals of the {words.rows} used [{scale.unit}]",
             ("Chip, axis" if r.several else "Axis", *heads),
             tuple(rows),
             note=_residual_note(r),
@@ -64,7 +64,7 @@ def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
 
 def _residual_note(r: ReportInput) -> str:
     notes = [f"From {r.sample}."] if r.sample else []
-    if r.words.taken:
+    if r.words.leverage:
         notes.append(
             "The stars were fitted to these detections, so that residuals are smaller than errors."
         )

@@ -17,7 +17,7 @@ from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.panels import chip_axes
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import CYCLE, INK, WIDTH, figure_style, new_figure
+from bayesdist.report.style import CYCLE, INK, WIDTH, new_figure
 from bayesdist.report.texttable import TextTable
 
 if TYPE_CHECKING:
@@ -106,23 +106,22 @@ def holdout(r: ReportInput) -> Plot:
     aspect = max(ny / nx for nx, ny in mosaic.sizes)
     panel = min(0.75 * WIDTH / columns, 4.4)
     height = 1.9 + rows * (panel * aspect + 0.7)
-    with figure_style():
-        fig = new_figure(WIDTH, height)
-        parts = fig.subfigures(2, 1, height_ratios=[1.9, height - 1.9], squeeze=False)
-        top, bottom = parts[:, 0]
-        for k, ax in enumerate(top.subplots(1, 3, sharey=True)):
-            _histogram(ax, found, k)
-        grid = bottom.subplots(rows, columns, squeeze=False)
-        panels = [grid[place] for place in mosaic.places]
-        limit = _limit(found)
-        norm = TwoSlopeNorm(1.0, 1.0 / limit, limit)
-        for k, (size, name) in enumerate(zip(mosaic.sizes, mosaic.names, strict=True)):
-            drawn = _regions(panels[k], found, k, size, norm)
-            panels[k].set_title(name or "Regions")
-        for ax in grid.ravel():
-            ax.set_visible(ax in panels)
-        bar = bottom.colorbar(drawn, ax=panels, shrink=0.9, aspect=25)
-        bar.set_label("residuals / predicted [no unit]")
+    fig = new_figure(WIDTH, height)
+    parts = fig.subfigures(2, 1, height_ratios=[1.9, height - 1.9], squeeze=False)
+    top, bottom = parts[:, 0]
+    for k, ax in enumerate(top.subplots(1, 3, sharey=True)):
+        _histogram(ax, found, k)
+    grid = bottom.subplots(rows, columns, squeeze=False)
+    panels = [grid[place] for place in mosaic.places]
+    limit = _limit(found)
+    norm = TwoSlopeNorm(1.0, 1.0 / limit, limit)
+    for k, (size, name) in enumerate(zip(mosaic.sizes, mosaic.names, strict=True)):
+        drawn = _regions(panels[k], found, k, size, norm)
+        panels[k].set_title(name or "Regions")
+    for ax in grid.ravel():
+        ax.set_visible(ax in panels)
+    bar = bottom.colorbar(drawn, ax=panels, shrink=0.9, aspect=25)
+    bar.set_label("residuals / predicted [no unit]")
     n_tests = len(found.tests)
     whole = f", {len(found.exposures)} whole exposures among them" if found.exposures else ""
     return Plot(

@@ -131,8 +131,7 @@ def _longest(r: ReportInput, which: str) -> tuple[VectorMap, str]:
     """Vectors of the chip where the longest one is, and its position in words."""
     worst = max(r.chips, key=lambda c: getattr(c, which).length_max)
     vectors: VectorMap = getattr(worst, which)
-    x, y = vectors.position_of_max
-    return vectors, f"pixel ({x:.0f}, {y:.0f}){r.on_chip(worst.chip)}"
+    return vectors, f"pixel {r.position(vectors.position_of_max, worst.chip.number)}"
 
 
 def _suppressed(r: ReportInput) -> str:

@@ -20,7 +20,6 @@ from bayesdist.report.style import (
     LEVEL_COLORS,
     PALETTE,
     WIDTH,
-    figure_style,
     new_figure,
 )
 from bayesdist.report.texttable import TextTable
@@ -52,7 +51,7 @@ def margin_table(r: ReportInput) -> TextTable:
         spread = (m.interval[1] - m.interval[0]) / 4
         cells = (
             rounded(m.value, spread),
-            interval(*m.interval, spread),
+            interval(m.interval[0], m.interval[1], spread),
             f"{rounded(m.margin, spread)} ({percent(m.percent / 100, 2)})",
             f"{number(m.probability_met)} ± {number(m.mc_error, 2)}",
         )
@@ -113,44 +112,41 @@ def rests_on_table(r: ReportInput) -> TextTable | None:
 def margins(r: ReportInput) -> Plot:
     """Each requirement's statistic in units of its own limit: its draws and their central 95 %."""
     margins = r.margins
-    with figure_style():
-        fig = new_figure(WIDTH, 0.9 + 0.62 * len(margins))
-        ax = fig.subplots()
-        ends = []
-        for k, m in enumerate(margins):
-            limit = m.requirement.limit
-            values = m.draws / limit
-            color = LEVEL_COLORS[VERDICT_LEVELS[m.verdict]]
-            _ridge(ax, k, values, color)
-            low, high = (end / limit for end in m.interval)
-            ends += [low, high, *np.quantile(values, _SHOWN)]
-            ax.plot([low, high], [k, k], color=color, lw=2.5, solid_capstyle="butt", zorder=3)
-            ax.plot(
-                m.value / limit, k, _MARKERS[m.verdict], ms=8, color=color, mec="white", zorder=4
-            )
-            ax.annotate(
-                _statement(m),
-                (1.02, k),
-                xycoords=ax.get_yaxis_transform(),
-                va="center",
-                fontsize=7.5,
-                annotation_clip=False,
-            )
-        ax.axvline(1.0, color=INK, lw=1.2, zorder=2)
-        low, high = min([*ends, 1.0]), max([*ends, 1.0])
-        if low > 0 and high / low > 10:
-            ax.set_xscale("log")
-            ax.set_xlim(low / 1.4, high * 1.4)
-            ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-            ax.xaxis.set_minor_locator(NullLocator())
-        else:
-            ax.set_xlim(0, high * 1.08)
-        ax.set_ylim(len(margins) - 0.5, -0.75)
-        ax.set_yticks(range(len(margins)), [_label(m) for m in margins])
-        ax.set_xlabel("statistic / limit [no unit]; the limit is the line at 1")
-        ax.spines[["top", "right"]].set_visible(False)
-        ax.tick_params(axis="y", length=0)
+    fig = new_figure(WIDTH, 0.9 + 0.62 * len(margins))
+    ax = fig.subplots()
+    ends = []
+    for k, m in enumerate(margins):
+        limit = m.requirement.limit
+        values = m.draws / limit
+        color = LEVEL_COLORS[VERDICT_LEVELS[m.verdict]]
+        _ridge(ax, k, values, color)
+        low, high = (end / limit for end in m.interval)
+        ends += [low, high, *np.quantile(values, _SHOWN)]
+        ax.plot([low, high], [k, k], color=color, lw=2.5, solid_capstyle="butt", zorder=3)
+        ax.plot(m.value / limit, k, _MARKERS[m.verdict], ms=8, color=color, mec="white", zorder=4)
+        ax.annotate(
+            _statement(m),
+            (1.02, k),
+            xycoords=ax.get_yaxis_transform(),
+            va="center",
+            fontsize=7.5,
+            annotation_clip=False,
+        )
+    ax.axvline(1.0, color=INK, lw=1.2, zorder=2)
+    low, high = min([*ends, 1.0]), max([*ends, 1.0])
+    if low > 0 and high / low > 10:
+        ax.set_xscale("log")
+        ax.set_xlim(low / 1.4, high * 1.4)
+        ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+        ax.xaxis.set_minor_locator(NullLocator())
+    else:
+        ax.set_xlim(0, high * 1.08)
+    ax.set_ylim(len(margins) - 0.5, -0.75)
+    ax.set_yticks(range(len(margins)), [_label(m) for m in margins])
+    ax.set_xlabel("statistic / limit [no unit]; the limit is the line at 1")
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.tick_params(axis="y", length=0)
     met = sum(m.verdict == "met" for m in margins)
     return Plot(
         fig,
@@ -190,38 +186,37 @@ def _statement(m: Margin) -> str:
 def horizon(r: ReportInput) -> Plot:
     """Probability of meeting each requirement against time, and when it becomes too low."""
     horizons = r.horizons
-    with figure_style():
-        fig = new_figure(WIDTH, 0.7 + 1.5 * len(horizons))
-        panels = fig.subplots(len(horizons), 1, sharex=True, squeeze=False)[:, 0]
-        for ax, one in zip(panels, horizons, strict=True):
-            asked = one.requirement.probability
-            ax.fill_between(one.epoch, one.low, one.high, color=CYCLE[0], alpha=0.25, lw=0)
-            ax.plot(one.epoch, one.probability, color=CYCLE[0])
-            ax.axhline(asked, color=INK, lw=0.8, ls="--")
-            ax.annotate(
-                f"asked: {asked:g}",
-                (1.0, asked),
-                xycoords=ax.get_yaxis_transform(),
-                xytext=(3, 0),
-                textcoords="offset points",
-                va="center",
-                fontsize=7.5,
+    fig = new_figure(WIDTH, 0.7 + 1.5 * len(horizons))
+    panels = fig.subplots(len(horizons), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, one in zip(panels, horizons, strict=True):
+        asked = one.requirement.probability
+        ax.fill_between(one.epoch, one.low, one.high, color=CYCLE[0], alpha=0.25, lw=0)
+        ax.plot(one.epoch, one.probability, color=CYCLE[0])
+        ax.axhline(asked, color=INK, lw=0.8, ls="--")
+        ax.annotate(
+            f"asked: {asked:g}",
+            (1.0, asked),
+            xycoords=ax.get_yaxis_transform(),
+            xytext=(3, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=7.5,
+        )
+        if one.date is not None:
+            early, late = one.interval
+            ax.axvspan(
+                one.epoch[0] if early is None else early,
+                one.epoch[-1] if late is None else late,
+                color=PALETTE["vermilion"],
+                alpha=0.2,
+                lw=0,
             )
-            if one.date is not None:
-                early, late = one.interval
-                ax.axvspan(
-                    one.epoch[0] if early is None else early,
-                    one.epoch[-1] if late is None else late,
-                    color=PALETTE["vermilion"],
-                    alpha=0.2,
-                    lw=0,
-                )
-                ax.axvline(one.date, color=PALETTE["vermilion"])
-            ax.set_ylim(-0.03, 1.03)
-            ax.set_xlim(one.epoch[0], one.epoch[-1])
-            ax.set_ylabel("P(met)")
-            ax.set_title(one.sentence)
-        panels[-1].set_xlabel("Epoch (yr)")
+            ax.axvline(one.date, color=PALETTE["vermilion"])
+        ax.set_ylim(-0.03, 1.03)
+        ax.set_xlim(one.epoch[0], one.epoch[-1])
+        ax.set_ylabel("P(met)")
+        ax.set_title(one.sentence)
+    panels[-1].set_xlabel("Epoch (yr)")
     return Plot(
         fig,
         "How long the requirements are met",

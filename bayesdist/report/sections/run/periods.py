@@ -72,7 +72,6 @@ def _periods(found: TimeVariation, r: ReportInput) -> TextTable:
         z = np.abs(comparison.coefficients(name, against).z)
         start, stop = found.spans[name]
         n = comparison.counts[comparison.names.index(name)]
-        x, y = change.at
         rows.append(
             (
                 name if against is None else f"{name} against {against}",
@@ -80,7 +79,7 @@ def _periods(found: TimeVariation, r: ReportInput) -> TextTable:
                 count(n) if against is None else MISSING,
                 with_mas(change.largest, r.unit, mas),
                 with_mas(change.sigma, r.unit, mas, 2),
-                f"({x:.0f}, {y:.0f}){_chip(found, change.chip)}",
+                r.position(change.at, change.chip),
                 with_mas(change.noise_95, r.unit, mas),
                 probability(change.p_value),
                 probability(change.p_field),
@@ -108,11 +107,6 @@ def _periods(found: TimeVariation, r: ReportInput) -> TextTable:
         " p of the largest refers to; p of the field is that of all coefficients together."
         f" By chance {number(chance, 2)} coefficients of a row lie beyond {_CLEAR:g} σ.",
     )
-
-
-def _chip(found: TimeVariation, chip: int) -> str:
-    chips = found.comparison.model.chips
-    return "" if len(chips) == 1 else next(f" of {c.name}" for c in chips if c.number == chip)
 
 
 def _coefficients(found: TimeVariation) -> TextTable:
@@ -206,7 +200,6 @@ def period_differences(r: ReportInput) -> Plot:
     ]
     vector_map(panels, chips, titles, magnification=M, key=nice_below(largest / 1.5), unit=unit)
     change, mas = found.ends, r.scale_mas
-    x, y = change.at
     size = with_mas(change.largest, r.unit, mas)
     return Plot(
         panels.figure,
@@ -214,7 +207,7 @@ def period_differences(r: ReportInput) -> Plot:
         f"Positions by the model of {found.last} minus those by the model of {found.first}. Dark"
         " vectors differ from zero beyond 2 σ at their place (both axes taken together); neighbours"
         f" share their coefficients and are dark together. The largest is {size} at pixel"
-        f" ({x:.0f}, {y:.0f}){_chip(found, change.chip)}; noise alone makes up to"
+        f" {r.position(change.at, change.chip)}; noise alone makes up to"
         f" {with_mas(change.noise_95, r.unit, mas)} in 95 of 100 cases"
         f" ({probability(change.p_value)}).",
         f"Map of difference vectors between two periods; the largest is {size}.",

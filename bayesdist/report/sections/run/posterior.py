@@ -26,7 +26,7 @@ from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.corners import Column, corner_figure
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import CYCLE, HYPER_LABELS, INK, WIDTH, figure_style, new_figure
+from bayesdist.report.style import CYCLE, HYPER_LABELS, INK, WIDTH, legend_above, new_figure
 from bayesdist.report.texttable import TextTable
 
 if TYPE_CHECKING:
@@ -58,9 +58,9 @@ def outlier_table(r: ReportInput) -> TextTable:
     post, words = r.posterior, r.words
     assert post is not None
     named = {
-        "f": (f"Fraction of {words.false}, f", ""),
+        "f": (f"Fraction of {words.false_rows}, f", ""),
         "j": ("Jitter, j: error beyond the quoted one", r.unit),
-        "s_out": (f"Scale of the {words.false}, s_out", r.unit),
+        "s_out": (f"Scale of the {words.false_rows}, s_out", r.unit),
     }
     rows = []
     for key, (name, unit) in named.items():
@@ -73,20 +73,14 @@ def outlier_table(r: ReportInput) -> TextTable:
         sd = float(v.std())
         cells = (rounded(v.mean(), sd), number(sd, 2), interval(low, high, sd))
         rows.append((name, *(r.marked(c) for c in cells), scale.unit))
-    things, missing = words.things, (MISSING, MISSING)
-    flagged = r.marked(count(post.n_flagged))
-    rows.append(
-        (f"{things.capitalize()} flagged (probability above 0.5)", flagged, *missing, things)
-    )
-    expected = r.marked(number(post.n_false, 4))
-    rows.append(
+    for name, number_of in (
+        (f"{words.rows.capitalize()} flagged (probability above 0.5)", count(post.n_flagged)),
         (
-            f"{words.false.capitalize()} expected (sum of the probabilities)",
-            expected,
-            *missing,
-            things,
-        )
-    )
+            f"{words.false_rows.capitalize()} expected (sum of the probabilities)",
+            number(post.n_false, 4),
+        ),
+    ):
+        rows.append((name, r.marked(number_of), MISSING, MISSING, words.rows))
     mixture, grouped = post.mixture, r.added_errors
     note = f"Outlier component: {mixture.model}"
     if mixture.match_radius is not None:
@@ -156,7 +150,7 @@ def outliers_corner(r: ReportInput) -> Plot:
             columns.append(Column(HYPER_LABELS[key], "%" if fraction else unit, values))
     text = "Joint posterior of the mixture's parameters; dashed lines hold 68 %."
     if r.posterior is not None and "f" in r.posterior.hyper:
-        text += f" The fraction of {r.words.false} is {percent(r.sampled_mean('f'))}."
+        text += f" The fraction of {r.words.false_rows} is {percent(r.sampled_mean('f'))}."
     return Plot(
         corner_figure(columns),
         "Outlier fraction, jitter and outlier scale",
@@ -237,21 +231,19 @@ def traces(r: ReportInput) -> Plot:
             fraction = key == "f"
             values = np.asarray(posterior.hyper[key], float) * (100.0 if fraction else 1.0)
             rows.append((HYPER_LABELS[key], "%" if fraction else posterior.model.unit, values))
-    with figure_style():
-        fig = new_figure(WIDTH, 1.0 * len(rows) + 0.7)
-        axes = fig.subplots(
-            len(rows), 2, sharey="row", sharex="col", width_ratios=(4, 1), squeeze=False
-        )
-        for (trace, density), (label, unit, values) in zip(axes, rows, strict=True):
-            scale = display_scale(unit, values)
-            _trace_row(trace, density, _by_walker(values * scale.factor, posterior))
-            trace.set_ylabel(f"{label}\n[{scale.unit or 'no unit'}]", fontsize=7.5)
-            trace.yaxis.set_major_locator(MaxNLocator(4))
-        axes[-1, 0].set_xlabel("step after warm-up [count]")
-        axes[-1, 1].set_xlabel("density [relative]")
-        fig.align_ylabels(axes[:, 0])
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper left", ncols=len(labels))
+    fig = new_figure(WIDTH, 1.0 * len(rows) + 0.7)
+    axes = fig.subplots(
+        len(rows), 2, sharey="row", sharex="col", width_ratios=(4, 1), squeeze=False
+    )
+    for (trace, density), (label, unit, values) in zip(axes, rows, strict=True):
+        scale = display_scale(unit, values)
+        _trace_row(trace, density, _by_walker(values * scale.factor, posterior))
+        trace.set_ylabel(f"{label}\n[{scale.unit or 'no unit'}]", fontsize=7.5)
+        trace.yaxis.set_major_locator(MaxNLocator(4))
+    axes[-1, 0].set_xlabel("step after warm-up [count]")
+    axes[-1, 1].set_xlabel("density [relative]")
+    fig.align_ylabels(axes[:, 0])
+    legend_above(fig, axes[0, 0])
     return Plot(
         fig,
         "Chains",

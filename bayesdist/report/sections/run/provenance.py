@@ -10,8 +10,7 @@ import numpy as np
 from bayesdist.numbers import MISSING, count, number, percent
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
-from bayesdist.report.sections.checks import check_cells
-from bayesdist.report.texttable import Level, TextTable, listing, short_paths
+from bayesdist.report.texttable import Level, TextTable, check_cells, listing, short_paths
 
 __all__ = [
     "config_table",

@@ -25,7 +25,7 @@ from bayesdist.report.context import ReportInput
 from bayesdist.report.mosaic import Mosaic
 from bayesdist.report.panels import ChipPanels, Panels
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure, nice_below
+from bayesdist.report.style import PALETTE, WIDTH, legend_above, new_figure, nice_below
 
 if TYPE_CHECKING:
     from bayesdist.assess import BinnedResiduals
@@ -117,16 +117,16 @@ def residual_histogram(r: ReportInput) -> Plot:
     if r.posterior is None:
         text = (
             "The line is what the quoted errors alone predict;"
-            f" {words.things} above it in the wings are outliers."
+            f" {words.rows} above it in the wings are outliers."
         )
     else:
         text = (
-            f"The line is the fitted mixture summed over the {words.things}' own errors"
-            f"{words.taken}, not a fit to the bars: it should follow them in the core (top) and in"
-            " the wings (bottom, logarithmic)."
+            f"The line is the fitted mixture summed over the {words.rows}' own errors"
+            f"{words.leverage}, not a fit to the bars: it should follow them in the core (top)"
+            " and in the wings (bottom, logarithmic)."
         )
         if r.posterior.mixture.model != "none":
-            text += f" The dashed part is {words.false}."
+            text += f" The dashed part is {words.false_rows}."
     if r.sample:
         text += f" Drawn from {r.sample}."
     return Plot(
@@ -135,7 +135,7 @@ def residual_histogram(r: ReportInput) -> Plot:
             _mixture_curves(r),
             unit=r.unit,
             sampled=r.stars.partial,
-            things=words.things,
+            rows=words.rows,
         ),
         "Residual histograms",
         text,
@@ -149,33 +149,31 @@ def _histograms(
     *,
     unit: str,
     sampled: bool,
-    things: str,
+    rows: str,
 ) -> Figure:
     """Figure with two rows of panels: the core, and everything."""
     width = max(float(np.sqrt(np.median(c.sigma**2 + c.jitter**2))) for c in curves)
     widest = max(float(np.sqrt(np.max(c.sigma**2 + c.jitter**2))) for c in curves)
     core = min(6.0 * width, 4.0 * widest)
     tail = max(float(np.abs(residual).max()), 1.2 * core) * 1.02
-    everything = "whole sample" if sampled else f"all {things}"
-    with figure_style():
-        fig = new_figure(WIDTH, 4.9)
-        axes = fig.subplots(2, 2, sharey="row")
-        for column, (axis, curve) in enumerate(zip("uv", curves, strict=True)):
-            for row, (reach, bins) in enumerate(((core, 81), (tail, 121))):
-                ax = axes[row, column]
-                scale = display_scale(unit, reach)
-                _histogram(ax, residual[:, column], curve, reach, bins, scale.factor, things)
-                ax.set_xlabel(f"residual in {axis} [{scale.unit}]")
-            axes[0, column].set_title(f"{axis}: core")
-            axes[1, column].set_title(f"{axis}: {everything}, logarithmic")
-            axes[1, column].set_yscale("log")
-        # curves fall far below one star: the axis is not for them
-        most = [np.histogram(r, np.linspace(-tail, tail, 122))[0].max() for r in residual.T]
-        axes[1, 0].set_ylim(0.5, 2.0 * max(*most, 1))
-        for ax in axes[:, 0]:
-            ax.set_ylabel(f"{things} of the sample per bin" if sampled else f"{things} per bin")
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper left", ncols=len(labels))
+    everything = "whole sample" if sampled else f"all {rows}"
+    fig = new_figure(WIDTH, 4.9)
+    axes = fig.subplots(2, 2, sharey="row")
+    for column, (axis, curve) in enumerate(zip("uv", curves, strict=True)):
+        for row, (reach, bins) in enumerate(((core, 81), (tail, 121))):
+            ax = axes[row, column]
+            scale = display_scale(unit, reach)
+            _histogram(ax, residual[:, column], curve, reach, bins, scale.factor, rows)
+            ax.set_xlabel(f"residual in {axis} [{scale.unit}]")
+        axes[0, column].set_title(f"{axis}: core")
+        axes[1, column].set_title(f"{axis}: {everything}, logarithmic")
+        axes[1, column].set_yscale("log")
+    # curves fall far below one star: the axis is not for them
+    most = [np.histogram(r, np.linspace(-tail, tail, 122))[0].max() for r in residual.T]
+    axes[1, 0].set_ylim(0.5, 2.0 * max(*most, 1))
+    for ax in axes[:, 0]:
+        ax.set_ylabel(f"{rows} of the sample per bin" if sampled else f"{rows} per bin")
+    legend_above(fig, axes[0, 0])
     return fig
 
 
@@ -186,13 +184,13 @@ def _histogram(
     reach: float,
     bins: int,
     factor: float,
-    things: str,
+    rows: str,
 ) -> None:
     edges = np.linspace(-reach, reach, bins + 1)
     counts, _ = np.histogram(values, edges)
     good, outlying = curve.expected(edges)
     middle = (edges[1:] + edges[:-1]) / 2 * factor
-    ax.stairs(counts, edges * factor, fill=True, color="#C5CED8", label=things, zorder=1)
+    ax.stairs(counts, edges * factor, fill=True, color="#C5CED8", label=rows, zorder=1)
     ax.plot(middle, good + outlying, color=PALETTE["blue"], label="expected", zorder=3)
     if curve.outliers != "none":
         ax.plot(
@@ -228,7 +226,7 @@ def residual_vectors(r: ReportInput) -> Plot:
             cannot = "neither tables nor polynomial follow"
             if significant < chance / 2:
                 which += " They are fewer than by chance, as the tables follow these very stars."
-    if r.words.taken:
+    if r.words.leverage:
         which = (
             " Stars were fitted to these very detections, so that fewer may do so than by chance:"
             " the status has the test that allows for it."

@@ -10,9 +10,8 @@ from bayesdist.checks import Check
 from bayesdist.numbers import number, rounded, with_mas
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
-from bayesdist.report.sections.checks import check_cells
 from bayesdist.report.sections.run.margins import VERDICT_LEVELS
-from bayesdist.report.texttable import TextTable
+from bayesdist.report.texttable import TextTable, check_cells
 
 __all__ = [
     "Verdict",
@@ -137,12 +136,11 @@ def _accuracy_sentence(r: ReportInput) -> str:
     worst = max(r.chips, key=lambda c: c.best_map.radius_max)
     best = worst.best_map
     median = float(np.median(np.concatenate([c.best_map.radius.ravel() for c in r.chips])))
-    x, y = best.position_of_max
     text = (
         f"The {whose} uncertainty of the distortion (radial, 1 σ) is"
         f" {with_mas(median, r.unit, r.scale_mas)} at the median"
         f" place and at most {with_mas(best.radius_max, r.unit, r.scale_mas)},"
-        f" at pixel ({x:.0f}, {y:.0f}){r.on_chip(worst.chip)}"
+        f" at pixel {r.position(best.position_of_max, worst.chip.number)}"
         f"{_with_shift(r)}"
     )
     if r.budget is None:
