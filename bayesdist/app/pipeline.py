@@ -21,15 +21,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from bayesdist.app.assessment.diagnosing import diagnose_run as diagnose
+from bayesdist.app.assessment.error_terms import errors_of_run as error_model
+from bayesdist.app.assessment.judging import evaluate_run
 from bayesdist.app.config import Config
-from bayesdist.app.diagnosing import diagnose_run as diagnose
-from bayesdist.app.error_terms import errors_of_run as error_model
-from bayesdist.app.judging import evaluate_run
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
-from bayesdist.app.made_files import ProductInput, product_input
+from bayesdist.app.products.made_files import ProductInput, product_input
 from bayesdist.app.stages.export import export_files
 from bayesdist.app.stages.report import run_report as report
 from bayesdist.assess.error_model import ErrorModel, solution_with_errors

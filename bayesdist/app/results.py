@@ -9,21 +9,21 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.assessment import evaluation_settings
-from bayesdist.app.checks import run_checks
+from bayesdist.app.assessment.checks import run_checks
+from bayesdist.app.assessment.diagnosing import diagnose_fit_of_run, diagnose_run
+from bayesdist.app.assessment.error_terms import errors_of_run
+from bayesdist.app.assessment.settings import evaluation_settings
 from bayesdist.app.config import Config
-from bayesdist.app.diagnosing import diagnose_fit_of_run, diagnose_run
-from bayesdist.app.diagnostics_files import load_diagnostics
-from bayesdist.app.error_terms import errors_of_run
-from bayesdist.app.evaluation_files import load_evaluation
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.kind import Kind, kind_of
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
-from bayesdist.app.made_files import ProductInput, product_input
-from bayesdist.app.match_sources import RunInput, input_of_run
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.matches.sources import RunInput, input_of_run
+from bayesdist.app.products.made_files import ProductInput, product_input
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.diagnostics_files import load_diagnostics
+from bayesdist.app.tables.evaluation_files import load_evaluation
 from bayesdist.assess.error_model import ErrorModel, solution_with_errors
 from bayesdist.assess.evaluation import Evaluation, EvaluationSettings
 from bayesdist.checks import Check, in_order

@@ -9,17 +9,17 @@ from pathlib import Path
 
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.kind import kind_of
-from bayesdist.app.made_from import NEEDS
-from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results, open_results
-from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import log_file
 from bayesdist.app.stages.assess import run_assess
 from bayesdist.app.stages.export import run_export
 from bayesdist.app.stages.fit import run_fit
 from bayesdist.app.stages.match import run_match
+from bayesdist.app.stages.rehearsal import rehearse
 from bayesdist.app.stages.report import run_report
 from bayesdist.app.stages.sample import run_sample
+from bayesdist.app.store.made_from import NEEDS
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.errors import InputError, NotConvergedError
 from bayesdist.infer.checks import convergence_check
 

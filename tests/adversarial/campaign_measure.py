@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.app.assessment import assessment_rng
+from bayesdist.app.assessment.settings import assessment_rng
 from bayesdist.app.campaign.interpolation import INTERPOLATION as BETWEEN
 from bayesdist.app.config import load_config
 from bayesdist.app.results import Results
-from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.stages.assess import run_diagnose, run_evaluate
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import LocalErrors
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.evaluation import budget_over

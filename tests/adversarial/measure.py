@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.assessment import assessment_rng
+from bayesdist.app.assessment.judging import margins_of
+from bayesdist.app.assessment.settings import assessment_rng
 from bayesdist.app.config import load_config
-from bayesdist.app.judging import margins_of
 from bayesdist.app.results import Results
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.evaluation import budget_over
 from bayesdist.assess.requirements.verdict import clopper_pearson

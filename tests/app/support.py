@@ -18,10 +18,10 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.cli import main
-from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results, results_of
 from bayesdist.app.run import run_stage
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.stages.rehearsal import rehearse
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import Truth, simulate_matches

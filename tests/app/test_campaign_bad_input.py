@@ -13,7 +13,7 @@ from astropy.time import Time
 from bayesdist.app.campaign.soundness import frames_not_set, shear_warnings
 from bayesdist.app.results import results_of
 from bayesdist.app.run import STAGES
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches
 from bayesdist.data.tables.files import read_table
 from bayesdist.errors import DegenerateError

@@ -16,8 +16,8 @@ from bayesdist.app.campaign.matching import match_lists
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.results import open_results, results_of
-from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.stages.assess import run_diagnose
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import read_matches
 from bayesdist.data.tables.files import read_table
 from bayesdist.infer import load_fit

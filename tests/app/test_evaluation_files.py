@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.app.diagnostics_files import load_diagnostics
-from bayesdist.app.evaluation_files import load_evaluation
-from bayesdist.app.judging import evaluate_run
+from bayesdist.app.assessment.judging import evaluate_run
 from bayesdist.app.results import open_results
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.diagnostics_files import load_diagnostics
+from bayesdist.app.tables.evaluation_files import load_evaluation
 from bayesdist.errors import InputError
 
 from .support import summary_of

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from bayesdist.app.config import KINDS, load_config
-from bayesdist.app.made_from import LATER, LIMITS, changes, is_adjustable, settings_of
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.made_from import LATER, LIMITS, changes, is_adjustable, settings_of
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer import load_posterior
 from tests.app.support import cli, good, refused, snapshot, summary_of, toml
 

@@ -7,7 +7,7 @@ import numpy as np
 from bayesdist.app.config import load_config
 from bayesdist.app.pipeline import diagnose, error_model, evaluate, export, fit, match, sample
 from bayesdist.app.results import open_results
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
 
 from .support import snapshot, summary_of
 

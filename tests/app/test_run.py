@@ -24,9 +24,9 @@ from astropy.wcs import WCS, FITSFixedWarning
 import bayesdist
 from bayesdist.app.config import load_config, parse_config
 from bayesdist.app.run import STAGES
-from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import progress_bar
 from bayesdist.app.stages.report import title_of
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.summary import Summary, schema_text
 from bayesdist.assess.terms.correlated import STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.data import read_matches

@@ -17,9 +17,9 @@ from bayesdist.app.campaign.matched import CampaignMatched, campaign_matches
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.results import Results, open_results
-from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.stages.fit import run_fit
 from bayesdist.app.stages.match import run_match
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit
 from bayesdist.infer.nodes import Matern, NodeGrid, TableFit

@@ -11,10 +11,10 @@ from scipy.interpolate import RegularGridInterpolator
 
 from bayesdist.app.config import load_config
 from bayesdist.app.results import Results, results_of
-from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.stages.assess import run_diagnose
 from bayesdist.app.stages.fit import run_fit
 from bayesdist.app.stages.sample import run_sample
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.simulate import simulate_matches
 

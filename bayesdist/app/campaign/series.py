@@ -11,8 +11,8 @@ from astropy.table import Table
 from bayesdist.app.campaign.reference import free_rates
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fitted import Fitted, required
-from bayesdist.app.output import write_table
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.output import write_table
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.series import Series, SeriesPosterior, TrendModel, describe, fit_series
 

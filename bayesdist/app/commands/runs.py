@@ -37,7 +37,7 @@ def init(
     force: bool,
 ) -> None:
     """A commented configuration for matched stars."""
-    from bayesdist.app.init import init as write_configuration
+    from bayesdist.app.commands.on_files.init import init as write_configuration
 
     n = write_configuration(config, matches, columns=columns, size=size, force=force)
     click.echo(f"{config}: for {n} matches; read it, then 'bayesdist check' it")
@@ -47,7 +47,7 @@ def init(
 @click.argument("config", metavar="CONFIG.toml")
 def check(config: str) -> None:
     """Units, rank, null space and cost; samples nothing."""
-    from bayesdist.app.check import check as checked
+    from bayesdist.app.commands.on_runs.check import check as checked
 
     click.echo(checked(config))
 
@@ -75,8 +75,8 @@ def run(
     if resume and force:
         raise click.UsageError("--resume and --force exclude each other.")
     from bayesdist.app.run import run as whole_job
-    from bayesdist.app.rundir import RunDirectory
-    from bayesdist.app.summary_text import results_text
+    from bayesdist.app.store.rundir import RunDirectory
+    from bayesdist.app.tables.margins import results_text
 
     path = whole_job(
         config, output, resume=resume, force=force, strict=strict, seed=seed, command=line

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import logging
 
+from bayesdist.app.assessment.diagnosing import diagnose_run
+from bayesdist.app.assessment.holdout import holdout_summary, holdout_table
+from bayesdist.app.assessment.judging import evaluate_run
+from bayesdist.app.assessment.periods import periods_summary, periods_table
+from bayesdist.app.assessment.settings import idle_dates
 from bayesdist.app.campaign.lines import line_sections
 from bayesdist.app.campaign.series import write_series_tables
-from bayesdist.app.dates import idle_dates
-from bayesdist.app.diagnosing import diagnose_run
-from bayesdist.app.diagnostics_files import save_diagnostics
-from bayesdist.app.evaluation_files import save_evaluation
-from bayesdist.app.holdout import holdout_summary, holdout_table
-from bayesdist.app.judging import evaluate_run
-from bayesdist.app.output import write_table
-from bayesdist.app.periods import periods_summary, periods_table
 from bayesdist.app.results import Results
 from bayesdist.app.selfcal.stars import write_stars
+from bayesdist.app.tables.diagnostics_files import save_diagnostics
+from bayesdist.app.tables.evaluation_files import save_evaluation
+from bayesdist.app.tables.output import write_table
 from bayesdist.checks import warnings_of
 
 __all__ = ["run_assess", "run_diagnose", "run_evaluate"]

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from bayesdist.app.assessment.error_terms import published_tables
 from bayesdist.app.campaign.release import write_files
 from bayesdist.app.config import Config
-from bayesdist.app.error_terms import published_tables
 from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.app.made_files import ProductInput, made_files
+from bayesdist.app.products.made_files import ProductInput, made_files
+from bayesdist.app.products.sky_closure import sky_closure
 from bayesdist.app.results import Results
-from bayesdist.app.sky_closure import sky_closure
 from bayesdist.assess.budget.budget import with_product
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.diagnose.residuals.sample import StarSample

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 
-from bayesdist.app.added_errors import grouping_sentence
-from bayesdist.app.checks import frames_doubt
+from bayesdist.app.assessment.checks import frames_doubt
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.summary import fit_sections, log_fit
-from bayesdist.app.rehearsal import rehearse_solution
+from bayesdist.app.matches.added_errors import grouping_sentence
 from bayesdist.app.results import Results
+from bayesdist.app.stages.rehearsal import rehearse_solution
 from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
 from bayesdist.diagnose.residuals.majority import majority_sentence
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 
-from bayesdist.app.checks import in_circle
+from bayesdist.app.assessment.checks import in_circle
 from bayesdist.app.kinds.summary import sample_sections
 from bayesdist.app.results import Results
 from bayesdist.app.screen import progress_bar
-from bayesdist.app.star_files import FOLDER, write_star_files
+from bayesdist.app.tables.star_files import FOLDER, write_star_files
 from bayesdist.infer import Posterior, save_posterior
 
 __all__ = ["run_sample", "save_sampled"]

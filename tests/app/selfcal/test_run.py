@@ -15,11 +15,11 @@ from bayesdist.app.config import load_config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.results import results_of
 from bayesdist.app.run import STAGES
-from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.selfcal.fit import fit_selfcal
 from bayesdist.app.selfcal.given import read_given
 from bayesdist.app.selfcal.matching import match_dithers
 from bayesdist.app.store import as_json
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer import load_fit, load_posterior
 from bayesdist.infer.selfcal import gauge_free
 from tests.app.selfcal.support import affine_left

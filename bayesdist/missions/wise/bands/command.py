@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 
-from bayesdist.app.folder import atomic_directory, versions
 from bayesdist.app.screen import table_text
 from bayesdist.app.store import write_json
+from bayesdist.app.tables.output import atomic_directory, versions
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bands.context import BandsInput
 from bayesdist.missions.wise.bands.findings import overview_table

@@ -10,10 +10,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from bayesdist.app.config import Data
-from bayesdist.app.matches import is_large
-from bayesdist.app.named_files import named_files
-from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.star_files import PAIRS, part_files
+from bayesdist.app.matches.reading import is_large
+from bayesdist.app.store.named_files import named_files
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.star_files import PAIRS, part_files
 from bayesdist.data import Matches, open_matches, write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder

@@ -1,0 +1,376 @@
+"""A run directory: one folder that holds everything about one calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypeVar
+
+from bayesdist.app.config import (
+    Config,
+    config_of_record,
+    load_config,
+)
+from bayesdist.app.store import SCHEMA, Made, Record, RunStore, as_json
+from bayesdist.app.store.made_from import STAGES, changes, made_from_of, with_seed
+from bayesdist.app.store.named_files import files_of_products, named_files
+from bayesdist.app.store.refusals import (
+    refuse_another_solution,
+    refuse_edited,
+    refuse_foreign_files,
+    refuse_inside_input,
+    refuse_other_inputs,
+)
+from bayesdist.app.summary import head_of
+from bayesdist.app.tables.output import versions
+from bayesdist.app.tables.star_files import PAIRS, part_files
+from bayesdist.assess import Requirement
+from bayesdist.data import input_files
+from bayesdist.errors import ConfigError, InputError
+from bayesdist.files import atomic_path, made_folder, remove_leftovers, sha256_of
+
+__all__ = ["RunDirectory"]
+
+T = TypeVar("T")
+
+
+class RunDirectory:
+    """Files and state of a run.
+
+    Parameters
+    ----------
+    path : path
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.store = RunStore(self.path, STAGES, head_of)
+        self._planned: tuple[dict[str, Any], str] | None = None
+        self._adopted: tuple[Config, str, dict[str, str]] | None = None
+
+    def __truediv__(self, name: str) -> Path:
+        return self.path / name
+
+    # -- beginning --------------------------------------------------------------------------------
+
+    @classmethod
+    def plan(
+        cls,
+        path: str | Path,
+        config: Config,
+        text: str,
+        base: Path,
+        *,
+        resume: bool = False,
+        force: bool = False,
+        seed: int | None = None,
+        command: str = "",
+    ) -> RunDirectory:
+        """A run that may be resumed in a folder, or may begin there; nothing is written yet.
+
+        Parameters
+        ----------
+        path : path
+        config : Config
+        text : str
+            The configuration as written by the user.
+        base : Path
+            Folder that relative inputs are relative to.
+        resume, force : bool
+            Resume the run that is there, or replace it.
+        seed : int, optional
+            In place of the configured one.
+        command : str
+            For the record.
+
+        Raises
+        ------
+        InputError
+            When the folder holds another run or foreign files, or a resumed run was made from other
+            inputs or settings.
+        """
+        run = cls(path)
+        if run.path.exists() and not run.path.is_dir():
+            raise InputError("is a file, not a folder", where=str(path), do="choose another folder")
+        refuse_inside_input(run.path, config, base)
+        inputs = _hashes(config, base)
+        if run.is_initialized and not force:
+            if not resume:
+                raise InputError(
+                    "the folder holds another run",
+                    where=str(path),
+                    do="go on with it by --resume, replace it by --force, or choose another folder",
+                )
+            refuse_another_solution(run.path, run.config, run.record, config, base, inputs, seed)
+            run._adopted = config, text, inputs
+            return run
+        if run.is_initialized:
+            run.store.record  # noqa: B018 - refuse to replace what nobody can tell from other files
+        else:
+            refuse_foreign_files(run.path, text)
+        facts = {
+            "config": with_seed(config, seed).model_dump(),
+            "base": str(base.resolve()),
+            "inputs": inputs,
+            "seed": config.sampler.seed if seed is None else seed,
+            "versions": versions(),
+            "command": command,
+            "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        }
+        run._planned = as_json(facts), text
+        return run
+
+    @property
+    def is_initialized(self) -> bool:
+        """Boolean: the folder holds a run."""
+        return (self / "run.json").exists()
+
+    @property
+    def is_planned(self) -> bool:
+        """Boolean: nothing of this run has been written yet."""
+        return self._planned is not None
+
+    def locked(self) -> AbstractContextManager[None]:
+        """Keep other processes from working on this run; its folder is made.
+
+        Raises
+        ------
+        InputError
+            When another process is at work on it, or the folder cannot be made.
+        """
+        made_folder(self.path)
+        return self.store.locked()
+
+    def begin(self) -> None:
+        """Write down what is about to be done.
+
+        Another run that stands there is removed; a resumed one takes over the settings that may
+        change.
+
+        Raises
+        ------
+        InputError
+            When the folder cannot be made or written.
+        """
+        if self._planned is None:
+            self._adopt()
+            return
+        facts, text = self._planned
+        made_folder(self.path)
+        if self.is_initialized:
+            self.clear()
+        remove_leftovers(self.path)
+        self._write_text(text)
+        Record(facts).write(self / "run.json")
+        self._planned = None
+
+    def _adopt(self) -> None:
+        """Take over what a resumed run was given in another way, and put summary.json right."""
+        remove_leftovers(self.path)
+        if self._adopted is not None:
+            config, text, inputs = self._adopted
+            record, known = self.store.record, self.config
+            changed = {key for key, *_ in changes(known, with_seed(config, known.sampler.seed))}
+            if changed or inputs != record.facts["inputs"]:
+                config = with_seed(config, known.sampler.seed)
+                record.facts |= {"config": as_json(config.model_dump()), "inputs": inputs}
+                if any(key.startswith("requirement") for key in changed):
+                    record.facts.pop("requirements", None)
+                self._write_text(text)
+                record.write(self / "run.json")
+            self._adopted = None
+        self.store.restore_summary()
+
+    def _write_text(self, text: str) -> None:
+        """Write config.toml as the user wrote it."""
+        with atomic_path(self / "config.toml") as temporary:
+            temporary.write_text(text, encoding="utf-8", newline="")
+
+    @classmethod
+    def open(cls, path: str | Path) -> RunDirectory:
+        """A run that exists, or a folder with a config.toml that becomes one.
+
+        Raises
+        ------
+        InputError
+        """
+        run = cls(path)
+        if run.is_initialized:
+            refuse_edited(run.path, run.config)
+            now = _hashes(run.config, Path(run.record["base"]))
+            refuse_other_inputs(run.record["inputs"], now)
+            return run
+        if (run / "config.toml").exists():
+            config, text = load_config(run / "config.toml")
+            return cls.plan(path, config, text, run.path)
+        raise run.not_a_run_error()
+
+    def not_a_run_error(self) -> InputError:
+        """The error for a place that holds no run; a demo has its run in a folder of its own."""
+        within = self / "run"
+        cause = "is no run: it has neither run.json nor config.toml"
+        if not self.path.exists():
+            cause = "there is no such folder"
+        elif not self.path.is_dir():
+            cause = "is a file, not the folder of a run"
+        return InputError(
+            cause,
+            where=str(self.path),
+            do=f"give {within}, which is one"
+            if (within / "run.json").exists()
+            else "make one with 'bayesdist run CONFIG.toml -o RUN'",
+        )
+
+    # -- record -----------------------------------------------------------------------------------
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Content of run.json, or of what it will be."""
+        if self._planned is not None:
+            return {"schema": SCHEMA, **self._planned[0], "stages": {}}
+        return self.store.record.as_dict()
+
+    def note(self, **facts: Any) -> None:
+        """Add facts to run.json."""
+        record = self.store.record
+        record.facts |= as_json(facts)
+        record.write(self / "run.json")
+
+    @property
+    def config(self) -> Config:
+        """The resolved configuration."""
+        try:
+            return config_of_record(self.record["config"], str(self / "run.json"))
+        except ConfigError as error:  # made by a version that allowed other settings
+            raise InputError(
+                error.cause, where=error.where, do="start again with --force"
+            ) from error
+
+    # -- stages -----------------------------------------------------------------------------------
+
+    def make(self, stage: str, function: Callable[[], T], *, force: bool = False) -> Made[T]:
+        """The artefact of a stage: made where it or what it was made from is not as it was.
+
+        Parameters
+        ----------
+        stage : str
+        function : callable
+            Writes its files into the folder and its sections by `summarise`.
+        force : bool
+            Make it also where it stands.
+        """
+        made_from = self._made_from(stage)
+        if made_from is None:
+            raise InputError(
+                f"'{stage}' needs stages that have not been run",
+                where=str(self.path),
+                do="run them first",
+            )
+        return self.store.stage(stage, function, *made_from, force=force)
+
+    def done(self, stage: str) -> bool:
+        """Boolean: a stage has ended, and what it was made from is as it was."""
+        return self._planned is None and stage in self._standing()
+
+    def _standing(self, before: str = "") -> dict[str, Made[object]]:
+        """Stages that stand, of all or of those before one, in order."""
+        config, facts = self.config, self.store.record.facts
+        found: dict[str, Made[object]] = {}
+        for name in STAGES:
+            if name == before:
+                break
+            made_from = made_from_of(name, found, config, facts)
+            made = None if made_from is None else self.store.standing(name, *made_from)
+            if made is not None:
+                found[name] = made
+        return found
+
+    def _made_from(
+        self, stage: str, requirements: Sequence[Requirement] | None = None
+    ) -> tuple[object, ...] | None:
+        """What a stage is made from now; None where a stage is missing that it needs."""
+        facts = self.store.record.facts
+        if requirements is not None:
+            facts = facts | {"requirements": [as_json(vars(one)) for one in requirements]}
+        return made_from_of(stage, self._standing(stage), self.config, facts)
+
+    def require(self, stage: str, needs: Sequence[str], *, thorough: bool = False) -> None:
+        """Refuse a stage, or another command, whose predecessors do not stand.
+
+        Parameters
+        ----------
+        stage : str
+            In words.
+        needs : sequence of str
+        thorough : bool
+            Look at the content of their files, not just at their sizes.
+
+        Raises
+        ------
+        InputError
+        """
+        for earlier in needs:
+            do = f"run 'bayesdist stage {earlier} {self.path}'"
+            known = None if self._planned is not None else self.store.record.artefacts.get(earlier)
+            if known is None:
+                raise InputError(
+                    f"'{stage}' needs stage '{earlier}', which has not been run",
+                    where=str(self.path),
+                    do=f"{do} first",
+                )
+            harmed = self.store.harmed(earlier, thorough=thorough)
+            if harmed:
+                raise InputError(
+                    f"is not as stage '{earlier}' wrote it",
+                    where=str(self / harmed),
+                    do=f"{do} again",
+                )
+            if not self.done(earlier):
+                raise InputError(
+                    f"'{stage}' needs stage '{earlier}', which was made from something else",
+                    where=str(self.path),
+                    do=f"{do} again",
+                )
+
+    @contextmanager
+    def judged_by(self, requirements: Sequence[Requirement]) -> Iterator[None]:
+        """Write margins by other requirements: the assessment is by these from now on.
+
+        Until other ones are given, or the configuration's own are changed.
+        """
+        made_from = self._made_from("assess", requirements) if self.done("assess") else None
+        blocks = [as_json(vars(one)) for one in requirements]
+        own = [as_json(vars(one)) for one in self.config.requirements()]
+        with self.store.amended("assess", *(made_from or ())) as facts:
+            yield
+            facts.pop("requirements", None)
+            if blocks != own:
+                facts["requirements"] = blocks
+
+    # -- summary ----------------------------------------------------------------------------------
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Sections of summary.json so far."""
+        return {} if self._planned is not None else self.store.summary
+
+    def summarise(self, **sections: Any) -> None:
+        """Replace sections of summary.json, for the stage that is being made."""
+        self.store.summarise(**sections)
+
+    # -- the end ----------------------------------------------------------------------------------
+
+    def clear(self) -> None:
+        """Remove what a run wrote, and nothing else."""
+        pairs = part_files(self / PAIRS)
+        others = [path.relative_to(self.path).as_posix() for path in pairs]
+        # the last one may be of a command that came before the assessment
+        self.store.clear("config.toml", "bayesdist.log", *others, "catalogue_errors.h5")
+
+
+def _hashes(config: Config, base: Path) -> dict[str, str]:
+    """SHA-256 of every file that the configuration names, by its absolute path."""
+    named, others = named_files(config, base.resolve()), files_of_products(config, base.resolve())
+    return {str(f): sha256_of(f) for f in [*input_files(named), *others]}
