@@ -33,7 +33,17 @@ from bayesdist.infer import LinearFit, Posterior, load_posterior
 __all__ = ["Results", "open_results", "results_of"]
 
 # each rests on those before it
-ARTEFACTS = ("inputs", "matched", "fitted", "data", "posterior", "stored", "evaluation")
+ARTEFACTS = (
+    "inputs",
+    "matched",
+    "fitted",
+    "data",
+    "posterior",
+    "stored",
+    "evaluation",
+    "products",
+    "figures",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +162,12 @@ class Results:
     def evaluation(self) -> Evaluation:
         """Maps, budget, margins and validity periods, as the assessment has found them."""
         return self.made.get("evaluation") or load_evaluation(self.run, self.fit, self.posterior)
+
+    @property
+    def stored_evaluation(self) -> Evaluation | None:
+        """The evaluation, if there is one of this posterior."""
+        there = "evaluation" in self.made or self.run.done("evaluate")
+        return self.evaluation if there else None
 
     # -- what follows from them -------------------------------------------------------------------
 

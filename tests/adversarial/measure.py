@@ -34,7 +34,7 @@ from .truth import KINDS, Truth
 from .written import toml_text
 
 GRID, DRAWS = (17, 17), 2000
-STAGES = ("fit", "sample", "assess")
+STAGES = ("fit", "sample", "diagnose", "evaluate")
 JUDGED = 3  # exposures for which requirements are judged, at most
 # name, statistic, limit in units of what the actual error has
 ASKED = (("below p95", "p95", 0.9), ("above p95", "p95", 1.6), ("below max", "max", 0.9))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.app.assessment.judging import evaluate_run
+from bayesdist.app.pipeline import evaluate
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.diagnostics_files import load_diagnostics
@@ -25,12 +25,11 @@ def results(finished):
 
 def test_what_is_read_is_what_would_be_made_again(results):
     kept = load_evaluation(results.run, results.fit, results.posterior)
-    made = evaluate_run(
+    made = evaluate(
         results.errors,
         results.posterior,
         results.diagnostics,
         results.data,
-        results.product,
         results.config,
         results.base,
     )

@@ -60,7 +60,8 @@ def test_what_comes_after_sampling_is_made_anew(finished, run, tmp_path):
     for words in (
         "fit: done before",
         "sample: done before",
-        "assess: begins again, as assess.grid [9, 7] is now [5, 4]",
+        "diagnose: done before",
+        "evaluate: begins again, as assess.grid [9, 7] is now [5, 4]",
         "export: begins again",
     ):
         assert words in said
@@ -72,7 +73,7 @@ def test_what_comes_after_sampling_is_made_anew(finished, run, tmp_path):
     assert rows(run) == rows(fresh)
     assert (run / "sip.hdr").read_bytes() == (fresh / "sip.hdr").read_bytes()
     before = (run / "run.json").read_bytes()
-    assert good("run", config, "-o", run, "--resume").err.count("done before") == 5
+    assert good("run", config, "-o", run, "--resume").err.count("done before") == 6
     assert (run / "run.json").read_bytes() == before
 
 
@@ -100,7 +101,7 @@ def test_the_solution_is_what_a_run_is(finished, run, tmp_path, old, new, words)
 
 def test_where_the_work_is_done_is_in_no_key(finished, run):
     config = edited(finished, more="[compute]\nmemory_mb = 500\n")
-    assert good("run", config, "-o", run, "--resume").err.count("done before") == 5
+    assert good("run", config, "-o", run, "--resume").err.count("done before") == 6
     assert RunDirectory(run).config.compute.memory_mb == 500
 
 
@@ -132,7 +133,7 @@ def test_a_file_that_is_not_as_it_was_written_is_written_again(finished, run, na
 def test_a_run_that_was_moved_is_the_same(finished, run, tmp_path):
     run.rename(tmp_path / "moved")
     said = good("run", finished.config, "-o", tmp_path / "moved", "--resume").err
-    assert said.count("done before") == 5
+    assert said.count("done before") == 6
 
 
 def test_two_processes_do_not_work_on_one_run(finished, run, tmp_path):

@@ -45,7 +45,7 @@ def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> No
     except DegenerateError as error:
         if free_rates(config):
             raise
-        log.info("assess: no drift from these exposures alone: %s", error.cause)
+        log.info("diagnose: no drift from these exposures alone: %s", error.cause)
         return
     write_table(_exposures(series, posterior), run / "series.ecsv")
     write_table(_predictions(posterior), run / "drift.ecsv")
@@ -71,7 +71,7 @@ def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> No
         }
     )
     for row in verdicts:
-        log.info("assess: %s: %s", row["term"], row["claim"])
+        log.info("diagnose: %s: %s", row["term"], row["claim"])
 
 
 def _doubts(known: Sequence[str], outlying: Sequence[str]) -> Iterator[str]:

@@ -8,7 +8,7 @@ import click
 
 from bayesdist.app.commands.options import column_names, command, force
 
-STAGES = ("match", "fit", "sample", "assess", "export", "report")
+STAGES = ("match", "fit", "sample", "diagnose", "evaluate", "assess", "export", "report")
 
 
 @command()
@@ -71,7 +71,7 @@ def run(
     strict: bool,
     seed: int | None,
 ) -> None:
-    """The whole job: fit, sample, assess, export, report."""
+    """The whole job: match, fit, sample, diagnose, evaluate, export, report."""
     if resume and force:
         raise click.UsageError("--resume and --force exclude each other.")
     from bayesdist.app.run import run as whole_job
@@ -92,8 +92,8 @@ def stage(name: str, run: str, strict: bool) -> None:
     """One stage of a run.
 
     match: star lists to matches, of a campaign or a self-calibration; fit: the linear fit; sample:
-    the posterior, from its checkpoints on; assess: maps, budget, margins; export: files for
-    pipelines; report: figures and report.html.
+    the posterior, from its checkpoints on; diagnose: what residuals say; evaluate: maps, budget,
+    margins; assess: these two; export: files for pipelines; report: figures and report.html.
     """
     if strict and name != "sample":
         raise click.UsageError("--strict is an option of the stage 'sample'.")

@@ -8,6 +8,7 @@ inverse is compared with the forward terms of its own file, between which a user
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,6 +24,7 @@ from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import MEASURED, PRODUCT, Known, Row
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC
+from bayesdist.errors import BayesdistError
 from bayesdist.model import corrected
 from bayesdist.model.grid import grid_pixels, mesh
 from bayesdist.products import SipHeader, read_d2im, read_lookup_file
@@ -32,7 +34,9 @@ from bayesdist.products.formats.sip.read import sip_of
 from bayesdist.products.formats.wise.meta import bands_of
 from bayesdist.products.registry import read_calibration, recognized
 
-__all__ = ["product_terms"]
+__all__ = ["file_errors", "product_terms"]
+
+log = logging.getLogger("bayesdist")
 
 Float = NDArray[np.float64]
 Positions = Callable[[Float, Float, int, float | None], Float]
@@ -73,6 +77,15 @@ def product_terms(product: ProductInput, config: Config, base: Path) -> tuple[Kn
             sets = _released(product, config, base, Path(folder))
             out += _idctab_terms(product, release.name, sets)
     return tuple(out)
+
+
+def file_errors(product: ProductInput, config: Config, base: Path) -> tuple[Known, ...]:
+    """As `product_terms`; none where the files cannot be made, of which the export complains."""
+    try:
+        return product_terms(product, config, base)
+    except BayesdistError as error:
+        log.warning("evaluate: WARNING: the files were not compared with the solution: %s", error)
+        return ()
 
 
 def _content(built: Built) -> Content:

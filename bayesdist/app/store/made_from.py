@@ -28,7 +28,8 @@ STAGES = {
     "match": Stage(),
     "fit": Stage(),
     "sample": Stage(checkpoints=("chain-*.h5",)),
-    "assess": Stage(),
+    "diagnose": Stage(),
+    "evaluate": Stage(),
     "export": Stage(),
     "report": Stage(),
 }
@@ -38,9 +39,10 @@ NEEDS = {
     "match": (),
     "fit": (),
     "sample": ("fit",),
-    "assess": ("fit", "sample"),
+    "diagnose": ("fit", "sample"),
+    "evaluate": ("fit", "sample", "diagnose"),
     "export": ("fit", "sample"),
-    "report": ("fit", "sample", "assess"),
+    "report": ("fit", "sample", "diagnose", "evaluate"),
 }
 
 # when to stop: the sampler goes on from its chains where these are others
@@ -105,10 +107,22 @@ def made_from_of(
         return solution, {"inputs": inputs}, *before.values()
     if stage == "sample":
         return solution, *before.values(), Adjustable(limits)
-    if stage == "assess":
-        return before["fit"], before["sample"], Adjustable(later)
+    if stage == "diagnose":
+        return before["fit"], before["sample"], Adjustable(_of_diagnoses(later, own, config))
+    if stage == "evaluate":
+        return before["fit"], before["sample"], before["diagnose"], Adjustable(later)
     later["files"] = {k: v for k, v in facts["inputs"].items() if k in of_products}
     return *before.values(), Adjustable(later), {"bayesdist": __version__}
+
+
+def _of_diagnoses(later: Mapping[str, Any], own: list[Any], config: Config) -> dict[str, Any]:
+    """Settings that decide what residuals say."""
+    found = {key: later[key] for key in ("discrepancy", "periods") if key in later}
+    if later.get("periods"):
+        found["requirement"] = own  # the tightest limit is the tolerance of periods
+    if config.holdout is not None:  # what is held out is predicted with all errors of a position
+        found |= {key: later[key] for key in ("assess", "budget")}
+    return found
 
 
 def _is_on_the_grid(config: Config) -> bool:

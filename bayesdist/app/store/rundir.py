@@ -336,14 +336,14 @@ class RunDirectory:
 
     @contextmanager
     def judged_by(self, requirements: Sequence[Requirement]) -> Iterator[None]:
-        """Write margins by other requirements: the assessment is by these from now on.
+        """Write margins by other requirements: the evaluation is by these from now on.
 
         Until other ones are given, or the configuration's own are changed.
         """
-        made_from = self._made_from("assess", requirements) if self.done("assess") else None
+        made_from = self._made_from("evaluate", requirements) if self.done("evaluate") else None
         blocks = [as_json(vars(one)) for one in requirements]
         own = [as_json(vars(one)) for one in self.config.requirements()]
-        with self.store.amended("assess", *(made_from or ())) as facts:
+        with self.store.amended("evaluate", *(made_from or ())) as facts:
             yield
             facts.pop("requirements", None)
             if blocks != own:

@@ -1,4 +1,4 @@
-"""Diagnostics of a run in its folder: written by `assess`, read by whatever follows."""
+"""Diagnostics of a run in its folder: written by `diagnose`, read by whatever follows."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bayesdist.infer.catalogue.star_errors import StarCovariance
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.records import record_from_arrays, record_to_arrays
 
-__all__ = ["load_diagnostics", "save_diagnostics"]
+__all__ = ["load_diagnostics", "write_diagnostics"]
 
 CORRELATED = "discrepancy.h5"
 CATALOGUE = "catalogue_errors.h5"
@@ -29,7 +29,7 @@ OTHERS = "diagnostics.h5"
 log = logging.getLogger("bayesdist")
 
 
-def save_diagnostics(
+def write_diagnostics(
     run: RunDirectory, fit: LinearFit, posterior: Posterior, found: Diagnostics
 ) -> None:
     """Write diagnostics, and their sections of summary.json.
@@ -55,13 +55,13 @@ def save_diagnostics(
     )
     for row in facts.get("structure", []):
         log.info(
-            "assess: structure beyond the model on chip %s, %s: %.2g %s rms, at most %.2g with "
+            "diagnose: structure beyond the model on chip %s, %s: %.2g %s rms, at most %.2g with "
             "95 %% probability",
             *(row["chip"], row["axis"], row["median"], facts["unit"], row["most"]),
         )
     for test in found.score_tests:
         if test.significant:
-            log.info("assess: %s: %s", test.finding, test.remedy)
+            log.info("diagnose: %s: %s", test.finding, test.remedy)
 
 
 def load_diagnostics(run: RunDirectory, fit: LinearFit, posterior: Posterior) -> Diagnostics | None:
@@ -103,7 +103,7 @@ def _load_catalogue(run: RunDirectory, fingerprint: str) -> StarCovariance | Non
     if not (run / CATALOGUE).exists():
         return None
     names = ("total", "counted", "motions")
-    arrays = read_arrays(run / CATALOGUE, fingerprint, names, do="run the stage 'assess' again")
+    arrays = read_arrays(run / CATALOGUE, fingerprint, names, do="run the stage 'diagnose' again")
     if not arrays["motions"].size:
         del arrays["motions"]
     return StarCovariance(**arrays)

@@ -26,13 +26,13 @@ from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.products.maps_file import write_maps
 from bayesdist.records import record_from_arrays, record_to_arrays
 
-__all__ = ["load_evaluation", "save_evaluation", "save_margins", "validity_rows"]
+__all__ = ["load_evaluation", "save_margins", "validity_rows", "write_evaluation"]
 
 FILE = "evaluation.h5"
 COLUMNS = ("epoch", "probability", "low", "high", "value")
 
 
-def save_evaluation(
+def write_evaluation(
     run: RunDirectory,
     fit: LinearFit,
     posterior: Posterior,
@@ -88,7 +88,7 @@ def save_margins(
     Parameters
     ----------
     run, fit, posterior, gauge
-        As of `save_evaluation`.
+        As of `write_evaluation`.
     margins : sequence of Margin
     validity : sequence of Horizon
     """
@@ -100,14 +100,14 @@ def save_margins(
 
 
 def load_evaluation(run: RunDirectory, fit: LinearFit, posterior: Posterior) -> Evaluation:
-    """The evaluation of a fit and a posterior, as `assess` wrote it.
+    """The evaluation of a fit and a posterior, as the stage 'evaluate' wrote it.
 
     Raises
     ------
     InputError
         Where there is none of just these.
     """
-    again = f"run 'bayesdist stage assess {run.path}' again"
+    again = f"run 'bayesdist stage evaluate {run.path}' again"
     found = record_from_arrays(read_arrays(run / FILE, fingerprint_of(fit, posterior), do=again))
     assert isinstance(found, Evaluation)
     return found

@@ -46,7 +46,7 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
         For a run without requirements or without that one.
     """
     with open_results(RunDirectory.open(run)) as results:
-        results.run.require("plan", ("fit", "sample", "assess"))
+        results.run.require("plan", ("fit", "sample", "diagnose", "evaluate"))
         if results.config.selfcal is not None:
             raise InputError(
                 "is a run of a self-calibration, where an exposure is worth what it overlaps",

@@ -1,4 +1,4 @@
-"""Stage 'report': figures and report.html."""
+"""The report of a run: figures and report.html."""
 
 from __future__ import annotations
 
@@ -22,15 +22,20 @@ from bayesdist.infer import Posterior
 from bayesdist.model import Chip
 from bayesdist.report.context import ChipResults, Product, ReportInput
 
-__all__ = ["run_report", "title_of"]
+__all__ = ["report", "title_of"]
 
 log = logging.getLogger("bayesdist")
 
 VECTOR_GRID = 17  # vectors along the longer side of a diagram: more would hide each other
 
 
-def run_report(results: Results) -> Results:
-    """Draw and write the report."""
+def report(results: Results) -> list[str]:
+    """Names of the figures of a report, which is written into the folder of the run.
+
+    Parameters
+    ----------
+    results : Results
+    """
     # figures take seconds to import
     from bayesdist.report.drawing import save_drawings
     from bayesdist.report.run_report import draw_report, write_report
@@ -39,12 +44,9 @@ def run_report(results: Results) -> Results:
     drawings = draw_report(inputs, processes=2 if _is_command_line() else 1)
     names = [f"{name}.{kind}" for name in drawings for kind in ("png", "pdf")]
     save_drawings(drawings, run / "figures")
-    for stale in set(run.summary.get("figures", [])) - set(names):
-        (run / "figures" / stale).unlink(missing_ok=True)
-    run.summarise(figures=names)  # what is there, should the disk be full
     write_report(run / "report.html", inputs, drawings)
     log.info("report: %s", run / "report.html")
-    return results
+    return names
 
 
 def _is_command_line() -> bool:

@@ -1,4 +1,4 @@
-"""Stage 'export': files for pipelines."""
+"""Files for pipelines, written and compared with the solution."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from bayesdist.app.config import Config
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.products.made_files import ProductInput, made_files
 from bayesdist.app.products.sky_closure import sky_closure
-from bayesdist.app.results import Results
 from bayesdist.assess.budget.budget import with_product
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.diagnose.residuals.sample import StarSample
@@ -21,27 +20,9 @@ from bayesdist.files import atomic_path
 from bayesdist.limits import FILE_ERROR
 from bayesdist.products.registry import lint
 
-__all__ = ["export_files", "run_export"]
+__all__ = ["export_files"]
 
 log = logging.getLogger("bayesdist")
-
-
-def run_export(results: Results) -> Results:
-    """Write what the configuration asks for into the run's folder."""
-    run, config, product = results.run, results.config, results.product
-    on_sky = product.tangent_point is not None and config.products.asked()
-    products = export_files(
-        product,
-        results.fitted,
-        config,
-        results.base,
-        run.path,
-        stars=results.diagnostics.sample if on_sky else None,
-        budget=run.summary.get("budget", []),
-    )
-    run.summarise(products=products)
-    log.info("export: %s", ", ".join(p["path"] for p in products) or "no products asked for")
-    return results
 
 
 def export_files(
@@ -51,8 +32,8 @@ def export_files(
     base: Path,
     folder: Path,
     *,
-    stars: StarSample | None = None,
-    budget: Sequence[dict[str, Any]] = (),
+    stars: StarSample | None,
+    budget: Sequence[dict[str, Any]],
 ) -> list[dict[str, Any]]:
     """Write the files that a configuration asks for.
 
@@ -66,7 +47,7 @@ def export_files(
         Folder that its files are relative to.
     folder : Path
         Where they are written.
-    stars : StarSample, optional
+    stars : StarSample or None
         Stars with which headers are compared on the sky.
     budget : sequence of dict
         Rows of the error budget, with which the errors of files are compared.
