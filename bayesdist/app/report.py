@@ -60,7 +60,7 @@ def report_input(results: Results) -> ReportInput:
     """All that the report shows."""
     run, config, fitted = results.run, results.config, results.fitted
     fit, posterior = results.fit, results.posterior
-    record, folder = run.record, run.path.resolve().name
+    facts, folder = run.facts, run.path.resolve().name
     products = tuple(
         Product(
             path=p["path"],
@@ -94,7 +94,8 @@ def report_input(results: Results) -> ReportInput:
         campaign=None if fitted.scatter is None else campaign_results(results),
         selfcal=None if fitted.solved is None else selfcal_results(results),
         provenance={"folder": folder}
-        | {k: record[k] for k in ("command", "created", "seed", "inputs", "versions", "stages")},
+        | {k: facts[k] for k in ("command", "created", "seed", "inputs", "versions")}
+        | {"stages": run.record.stages},
     )
 
 

@@ -97,7 +97,7 @@ class Results:
     @cached_property
     def base(self) -> Path:
         """Folder that the configuration's files are relative to."""
-        return Path(self.run.record["base"])
+        return Path(self.run.facts["base"])
 
     @cached_property
     def kind(self) -> Kind:

@@ -93,8 +93,8 @@ def _log_matches(data: FitData, config: Config) -> None:
 def save_sampled(results: Results) -> None:
     """Write the posterior, and what it says of each star."""
     run, data, posterior = results.run, results.data, results.posterior
-    record, gauge = run.record, results.gauge_words
-    provenance = {k: record[k] for k in ("inputs", "seed", "versions", "created")}
+    facts, gauge = run.facts, results.gauge_words
+    provenance = {k: facts[k] for k in ("inputs", "seed", "versions", "created")}
     provenance |= {"gauge": gauge} if gauge else {}
     table = data.stars if data.stars.in_memory else None
     save_posterior(posterior, table, run / "posterior.nc", provenance=provenance)

@@ -456,7 +456,7 @@ def test_the_seed_of_the_command_line_is_recorded(finished, tmp_path):
     """... and rules: --seed 1 in place of a configured 2 gives what seed 1 gives."""
     config, text = load_config(finished.config)
     run = RunDirectory.plan(tmp_path / "r", config, text, finished.config.parent, seed=77)
-    assert run.record["seed"] == 77 and run.config.sampler.seed == 77
+    assert run.facts["seed"] == 77 and run.config.sampler.seed == 77
     assert not (tmp_path / "r").exists()
 
 

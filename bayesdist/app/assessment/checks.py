@@ -31,14 +31,7 @@ def run_checks(
 ) -> tuple[Check, ...]:
     """Checks of a run that has been sampled, or of a fit alone, beside those of its diagnostics.
 
-    Parameters
-    ----------
-    data : FitData
-    posterior : Posterior or None
-    found : Diagnostics
-    config : Config
-    series : mapping, optional
-        Section 'time_dependence' of summary.json, of runs that have one.
+    `series` is the section 'time_dependence' of summary.json, of runs that have one.
     """
     kind, circle = kind_of(config), in_circle(data, config)
     has, words = data.matched.has_catalogue, CATALOGUE_WORDS

@@ -20,20 +20,7 @@ __all__ = ["diagnose_fit_of_run", "diagnose_run"]
 
 
 def diagnose_run(posterior: Posterior, data: FitData, config: Config, base: Path) -> Diagnostics:
-    """What residuals say of a posterior, and what stars say that were held out.
-
-    Parameters
-    ----------
-    posterior : Posterior
-    data : FitData
-    config : Config
-    base : Path
-        Folder that its files are relative to.
-
-    Returns
-    -------
-    Diagnostics
-    """
+    """Diagnostics of a posterior, and of the stars that were held out."""
     scatter, tables = data.fitted.scatter, data.fitted.tables.tables
     found = diagnose(
         data.fit,
@@ -66,13 +53,7 @@ def diagnose_run(posterior: Posterior, data: FitData, config: Config, base: Path
 
 
 def diagnose_fit_of_run(data: FitData, config: Config) -> Diagnostics:
-    """What residuals say of a fit alone.
-
-    Parameters
-    ----------
-    data : FitData
-    config : Config
-    """
+    """Diagnostics of a fit alone."""
     options = _of_kind(data, config)
     return diagnose_fit(data.fit, None, data.stars, data.shards, data.sample, **options)
 

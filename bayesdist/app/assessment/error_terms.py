@@ -33,13 +33,7 @@ def errors_of_run(
 ) -> ErrorModel:
     """The error model of a posterior with what residuals say, or of a solution alone.
 
-    Parameters
-    ----------
-    solution : Posterior or LinearFit
-    found : Diagnostics or None
-        Of the posterior; without them there are no terms that rest on residuals.
-    data : FitData
-    config : Config
+    Without diagnostics there are no terms that rest on residuals.
     """
     fitted = data.fitted
     terms: list[ErrorTerm] = []
@@ -105,13 +99,8 @@ def published_tables(stored: StoredLookupTables, *, held: bool) -> tuple[LookupT
     """The tables with the errors that a user meets: of the nodes, and of what lies between.
 
     What is between the nodes of a pattern is at the nodes too: the value of a table there is
-    that of the area around.  It counts in the tables that were fitted in this run.
-
-    Parameters
-    ----------
-    stored : StoredLookupTables
-    held : bool
-        The detector's tables are those of another run.
+    that of the area around.  It counts in the tables that were fitted in this run: `held` are the
+    detector's tables of another run.
     """
     out = []
     for table in stored.tables:

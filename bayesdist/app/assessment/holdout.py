@@ -33,20 +33,11 @@ def predictive_of_run(
     data: FitData,
     settings: EvaluationSettings,
 ) -> Predictive:
-    """The solution as it is assessed, as it predicts.
+    """The solution as it is assessed, as it predicts stars that are held out of `found`.
 
     Quoted errors and jitter hold what the model leaves out at a position, as each star errs by it;
     neighbours err by it together.  Exposures that were fitted jointly scatter, and have errors of
     the catalogue and of tables.
-
-    Parameters
-    ----------
-    posterior : Posterior
-    found : Diagnostics
-        Of it, without what is held out.
-    errors : ErrorModel
-    data : FitData
-    settings : EvaluationSettings
     """
     scatter = data.fitted.scatter
     if scatter is not None:

@@ -23,22 +23,9 @@ __all__ = ["check_pairs", "period_settings", "periods_summary", "periods_table"]
 
 
 def check_pairs(raw: Matches, config: Config) -> dict[str, int]:
-    """About how many pairs each period has, from the epochs of some of the pairs.
+    """About how many pairs each period has, from the epochs of some; empty without periods.
 
-    Parameters
-    ----------
-    raw : Matches
-    config : Config
-
-    Returns
-    -------
-    dict of str to int
-        Empty where no periods are asked for.
-
-    Raises
-    ------
-    InputError
-        Without epochs, and for a period without pairs: before anything is sampled.
+    Pairs without epochs and a period without pairs are refused, before anything is sampled.
     """
     spans = config.spans()
     if not spans:
@@ -69,22 +56,7 @@ def check_pairs(raw: Matches, config: Config) -> dict[str, int]:
 
 
 def period_settings(data: FitData, config: Config) -> PeriodSettings | None:
-    """Which periods are compared, and how; None where none are asked for.
-
-    Parameters
-    ----------
-    data : FitData
-    config : Config
-
-    Returns
-    -------
-    PeriodSettings or None
-
-    Raises
-    ------
-    InputError
-        As `check_pairs`.
-    """
+    """Settings of a comparison of periods; None where none are asked for."""
     if config.periods is None:
         return None
     fit = data.fit

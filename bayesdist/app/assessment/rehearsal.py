@@ -27,14 +27,6 @@ def rehearse(results: Results) -> Results:
     """Results with what a run begins with and, of matched stars, their fit; nothing is written.
 
     What is wrong with the data or the configuration shows here, before hours of sampling.
-
-    Parameters
-    ----------
-    results : Results
-
-    Raises
-    ------
-    BayesdistError
     """
     kind, config, base = results.kind, results.config, results.base
     kind.refuse(results.inputs, config, base)
@@ -50,24 +42,14 @@ def rehearse(results: Results) -> Results:
 
 
 def rehearse_solution(results: Results) -> None:
-    """Budget, margins and files of a fit, with few draws; nothing is written.
-
-    Raises
-    ------
-    BayesdistError
-    """
+    """Refuse terms, requirements and files that could not be made of a fit; nothing is written."""
     data, config = results.data, results.config
     _rehearse_evaluation(data, config, REHEARSAL_DRAWS)
     made_files(product_input(data.fit, data, config, str(results.run.path)), config)
 
 
 def _check_residuals(data: FitData, config: Config) -> None:
-    """Refuse a budget with errors that are said to be in the residuals and are larger than these.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a budget with errors that are included in the residuals and larger than these."""
     fit = data.fit
     held = config.held_in_residuals(fit.model.unit)
     if held:

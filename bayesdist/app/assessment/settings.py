@@ -57,21 +57,10 @@ def rehearsal_settings(data: FitData, config: Config) -> EvaluationSettings:
 
 
 def idle_dates(config: Config, requirements: Sequence[Requirement], where: str = "") -> str:
-    """A sentence on dates that have no effect, as nothing in the model depends on time.
+    """Sentence on dates that have no effect, as nothing in the model depends on time; '' for none.
 
-    They may well document when the data are from, so that they are no error.
-
-    Parameters
-    ----------
-    config : Config
-    requirements : sequence of Requirement
-    where : str
-        File of the requirements, where it is not the configuration.
-
-    Returns
-    -------
-    str
-        Empty where the model depends on time, or nothing names a date.
+    They may well document when the data are from, so that they are no error.  `where` is the file
+    of the requirements, if it is not the configuration.
     """
     if config.campaign is not None or config.time() is not None:
         return ""

@@ -30,22 +30,10 @@ MOST_LISTED = 4  # groups that are listed one by one
 def compared_errors(
     config: Config, fit: LinearFit, sample: Matches, priors: GaussianPriors
 ) -> GroupedErrors | None:
-    """Jitters of groups of stars, or the one that will do, from the residuals of a fit.
+    """Jitters of groups of stars, or the one that will do, from a fit with the quoted errors.
 
-    Parameters
-    ----------
-    config : Config
-    fit : LinearFit
-        With the quoted errors.
-    sample : Matches
-        Some of its stars.
-    priors : GaussianPriors
-
-    Returns
-    -------
-    GroupedErrors or None
-        None where that is not asked: where errors come from the residuals themselves, where the
-        jitter is given or is to be one, and where the match circle has cut the residuals.
+    None where that is not asked: where errors come from the residuals themselves, where the jitter
+    is given or is to be one, and where the match circle has cut the residuals.
     """
     if not config.compares_jitters or (knows_circle(config) and sample.has_nominal):
         return None
@@ -116,14 +104,7 @@ def grouped_errors_of(part: Mapping[str, Any] | None) -> GroupedErrors | None:
 
 
 def grouping_sentence(found: GroupedErrors, unit: str) -> str:
-    """Which errors go beyond the quoted ones, as a clause.
-
-    Parameters
-    ----------
-    found : GroupedErrors
-    unit : str
-        Of u and v.
-    """
+    """Clause on errors beyond the quoted ones; `unit` is of u and v."""
     evidence = ", ".join(f"{name} {gain:.3g}" for name, gain in found.evidence.items())
     head = f"ln evidence gained by groups: {evidence}"
     if found.grouping == ONE:

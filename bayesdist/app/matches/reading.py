@@ -22,22 +22,7 @@ PathLike = str | os.PathLike[str]
 def load_matches(
     path: PathLike | Sequence[PathLike], *, format: str = "auto", **options: Any
 ) -> Matches:
-    """Matches of any known kind; large tables in Parquet stay on disk.
-
-    Parameters
-    ----------
-    path, format, **options
-        As `read_matches`.
-
-    Returns
-    -------
-    Matches
-
-    Raises
-    ------
-    InputError
-        As `read_matches`.
-    """
+    """Matches of any known kind, as of `read_matches`; large tables in Parquet stay on disk."""
     if format in ("auto", "table") and is_large(path):
         if options.pop("not_finite", "refuse") == "reject":
             raise InputError(
@@ -50,15 +35,7 @@ def load_matches(
 
 
 def reading_options(data: Data, chips: Sequence[ChipBlock]) -> dict[str, Any]:
-    """Options of `load_matches` that a configuration gives.
-
-    Parameters
-    ----------
-    data : Data
-        Section [data].
-    chips : sequence of ChipBlock
-        Their names stand for their numbers in tables that have names.
-    """
+    """Options of `load_matches` that a section [data] gives; chips may be named in tables."""
     names = (
         *("format", "columns", "unit", "sigma", "pixel_origin", "tangent_point"),
         *("epoch", "catalogue_epoch", "not_finite"),
@@ -76,19 +53,10 @@ def is_large(path: PathLike | Sequence[PathLike]) -> bool:
 
 
 def check_chips(chips: Sequence[Chip], numbers: Sequence[int]) -> None:
-    """Refuse chips that only one side knows.
+    """Refuse a ``[[chip]]`` block without stars, and stars without a block.
 
-    Parameters
-    ----------
-    chips : sequence of Chip
-        Of the ``[[chip]]`` blocks; nothing is checked where there is none.
-    numbers : sequence of int
-        Chip numbers of the matches; (1,) also where they name no chip.
-
-    Raises
-    ------
-    InputError
-        For a chip of the data that has no block, or a block whose chip has no star.
+    `numbers` are the chips of the matches, (1,) also where they name none; nothing is checked where
+    there is no block.
     """
     if not chips:
         return

@@ -83,22 +83,7 @@ def read_configured(
     size: tuple[float, float] | None,
     chips: Sequence[ChipBlock],
 ) -> Matches:
-    """Matches as a section [data] reads them.
-
-    Parameters
-    ----------
-    path : path or sequence of path
-    data : Data
-    size : tuple of float, optional
-        Columns and rows of the detector.
-    chips : sequence of ChipBlock
-        In place of it.
-
-    Raises
-    ------
-    InputError
-        For files that cannot be read.
-    """
+    """Matches as a section [data] reads them; `size` is columns and rows of a single chip."""
     source = _source(data.format)
     if source is not None and size is not None:
         return source.read(path, data, size)

@@ -35,27 +35,10 @@ def export_files(
     stars: StarSample | None,
     budget: Sequence[dict[str, Any]],
 ) -> list[dict[str, Any]]:
-    """Write the files that a configuration asks for.
+    """Write the files that a configuration asks for, and list what is known of each.
 
-    Parameters
-    ----------
-    product : ProductInput
-        What they are made from.
-    fitted : Fitted
-    config : Config
-    base : Path
-        Folder that its files are relative to.
-    folder : Path
-        Where they are written.
-    stars : StarSample or None
-        Stars with which headers are compared on the sky.
-    budget : sequence of dict
-        Rows of the error budget, with which the errors of files are compared.
-
-    Returns
-    -------
-    list of dict
-        One entry for each file: path, kind, findings, and what else is known of it.
+    Headers are compared on the sky with `stars`, the errors of files with rows of the error
+    `budget`.  Each entry has path, kind, findings, and what else is known of the file.
     """
     products: list[dict[str, Any]] = []
     if config.products.release is not None:

@@ -28,21 +28,11 @@ def sip_positions(
     like: SipHeader | None = None,
     tangent_point: tuple[float, float] | None = None,
 ) -> Float:
-    """(u, v) of pixels (N,) by the forward terms of a header, shape (N, 2).
+    """(u, v) of FITS 1-based pixels (N,) by the forward terms of a header, shape (N, 2).
 
-    Parameters
-    ----------
-    sip : SipHeader
-    x, y : ndarray, shape (N,)
-        FITS 1-based pixels.
-    unit : str
-        Of u and v.
-    scale_arcsec : float or None
-        Arcseconds in a pixel, as the header was made with, for u and v in pixels.
-    like : SipHeader, optional
-        Whose CD and zero point hold, for a file that states neither.
-    tangent_point : tuple of float, optional
-        Sky position of u, v = 0: the way is then over the sky, as astropy.wcs has it.
+    `scale_arcsec` is that of a pixel as the header was made with, for u and v in pixels; CD and
+    zero point of `like` hold for a file that states neither; with a `tangent_point` (sky position
+    of u, v = 0) the way is over the sky, as astropy.wcs has it.
     """
     if tangent_point is not None:
         plane = tangent_plane(*sky_of_header(sip_header(sip), x, y), tangent_point)

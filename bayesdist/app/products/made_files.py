@@ -58,16 +58,7 @@ class ProductInput:
 
 
 def product_input(solution: Solution, data: FitData, config: Config, source: str) -> ProductInput:
-    """What the files of a solution are made from.
-
-    Parameters
-    ----------
-    solution : Solution
-    data : FitData
-    config : Config
-    source : str
-        Where the solution is from, for the files to say.
-    """
+    """Ingredients of the files of a solution; they say that it is from `source`."""
     mas, fitted, model = config.detector.scale_mas, data.fitted, data.model
     several = model.frames != "none" and len(model.exposures) > 1
     return ProductInput(

@@ -52,13 +52,6 @@ def product_terms(product: ProductInput, config: Config, base: Path) -> tuple[Kn
 
     They are read back from their bytes, so that digits and orders are those of the files; nothing
     of the run is touched.
-
-    Parameters
-    ----------
-    product : ProductInput
-    config : Config
-    base : Path
-        Folder that its files are relative to.
     """
     release, made = config.products.release, made_files(product, config)
     out: list[Known] = []

@@ -98,15 +98,7 @@ def sky_closure(
 ) -> SkyClosure | None:
     """Closure of a header as written; None where the stars are not on the sky, or none is left.
 
-    Parameters
-    ----------
-    product : ProductInput
-    stars : StarSample
-        Some of those that were fitted.
-    path : pathlib.Path
-        Of the header.
-    chip : int
-        Its chip.  Of several exposures with frames only the first one counts, whose it is.
+    Of several exposures with frames only the first one counts, whose header it is.
     """
     point, solution = product.tangent_point, product.solution
     if point is None:

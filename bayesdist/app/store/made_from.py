@@ -56,21 +56,7 @@ NOWHERE = ("compute",)
 
 
 def settings_of(config: Config) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-    """Settings of a run by what they decide.
-
-    Parameters
-    ----------
-    config : Config
-
-    Returns
-    -------
-    solution : dict
-        What the run is: its matches, its fit and its chains.
-    limits : dict
-        How far the chains go.
-    later : dict
-        What is done with the posterior.
-    """
+    """Settings of a run by what they decide: the solution, the length of chains, and all later."""
     whole = as_json(config.model_dump())
     later = {key: whole.pop(key) for key in LATER if key in whole}
     limits = {"sampler": {key: whole["sampler"].pop(key) for key in LIMITS}}
@@ -84,16 +70,10 @@ def settings_of(config: Config) -> tuple[dict[str, Any], dict[str, Any], dict[st
 def made_from_of(
     stage: str, before: Mapping[str, Made[object]], config: Config, facts: Mapping[str, Any]
 ) -> tuple[object, ...] | None:
-    """What a stage is made from; None where a stage is missing that it needs.
+    """Ingredients of a stage; None where a stage is missing that it needs.
 
-    Parameters
-    ----------
-    stage : str
-    before : mapping of str to Made
-        Stages before it that stand.
-    config : Config
-    facts : mapping
-        Of the record: inputs with their hashes, and requirements in place of the configured ones.
+    `before` are the stages before it that stand; `facts` of the record have the inputs with their
+    hashes, and requirements in place of the configured ones.
     """
     begins_with = () if config.data is not None or stage == "match" else ("match",)
     if not before.keys() >= {*begins_with, *NEEDS[stage]}:

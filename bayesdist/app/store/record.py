@@ -119,13 +119,7 @@ class Record:
 
     @classmethod
     def read(cls, path: Path) -> Record:
-        """Read run.json.
-
-        Raises
-        ------
-        InputError
-            For a file that cannot be read, and for a run of another version of the package.
-        """
+        """Content of a run.json; InputError where it cannot be read or has another schema."""
         try:
             facts = json.loads(path.read_text(encoding="utf-8"))
             schema = facts.pop("schema")

@@ -23,12 +23,7 @@ __all__ = [
 
 
 def refuse_inside_input(folder: Path, config: Config, base: Path) -> None:
-    """Refuse a run whose own Parquet files would become part of its input.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a run whose own Parquet files would become part of its input."""
     named = named_files(config, base)
     for path in named if isinstance(named, list) else [named]:
         if path.is_dir() and folder.resolve().is_relative_to(path.resolve()):
@@ -43,10 +38,6 @@ def refuse_foreign_files(folder: Path, text: str) -> None:
     """Refuse to begin in a folder that holds other files.
 
     A config.toml with the text of the configuration is no obstacle: a stage may be run on it.
-
-    Raises
-    ------
-    InputError
     """
     if not folder.is_dir():
         return
@@ -72,27 +63,8 @@ def refuse_another_solution(
 ) -> None:
     """Refuse to resume with inputs or settings that the solution was not made from.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the run.
-    known : Config
-        That it began with.
-    record : mapping
-        Content of its run.json.
-    config : Config
-        That it is to be resumed with.
-    base : Path
-        Folder that relative names are relative to.
-    inputs : mapping of str to str
-        SHA-256 of the inputs now.
-    seed : int, optional
-        Of the command line.
-
-    Raises
-    ------
-    InputError
-        With key and value.
+    `known` is the configuration that the run began with, `facts` are those of its record, `inputs`
+    the SHA-256 of the inputs now, `seed` that of the command line.
     """
     path = folder / "config.toml"
     if seed is not None and seed != known.sampler.seed:
@@ -116,12 +88,7 @@ def refuse_another_solution(
 
 
 def refuse_edited(folder: Path, known: Config) -> None:
-    """Refuse a config.toml that was edited in place: the run goes by what it was given.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a config.toml that was edited in place: the run goes by what it was given."""
     path = folder / "config.toml"
     if not path.exists():
         return
@@ -141,12 +108,7 @@ def refuse_edited(folder: Path, known: Config) -> None:
 def refuse_other_inputs(
     known: Mapping[str, str], now: Mapping[str, str], but: Collection[str] = ()
 ) -> None:
-    """Refuse inputs that are not those of the record, but for some.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse inputs that are not those of the record, but for some."""
     for name in sorted((known.keys() | now.keys()) - set(but)):
         if known.get(name) != now.get(name):
             raise InputError(

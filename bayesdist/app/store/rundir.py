@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,7 +13,7 @@ from bayesdist.app.config import (
     config_of_record,
     load_config,
 )
-from bayesdist.app.store import SCHEMA, Made, Record, RunStore, as_json
+from bayesdist.app.store import Made, Record, RunStore, as_json
 from bayesdist.app.store.made_from import STAGES, changes, made_from_of, with_seed
 from bayesdist.app.store.named_files import files_of_products, named_files
 from bayesdist.app.store.refusals import (
@@ -36,8 +36,8 @@ __all__ = ["RunDirectory"]
 T = TypeVar("T")
 
 
-class RunDirectory:
-    """Files and state of a run.
+class RunDirectory(RunStore):
+    """The folder of a run: its configuration and inputs, and the artefacts of its stages.
 
     Parameters
     ----------
@@ -45,9 +45,8 @@ class RunDirectory:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
-        self.store = RunStore(self.path, STAGES, head_of)
-        self._planned: tuple[dict[str, Any], str] | None = None
+        super().__init__(Path(path), STAGES, head_of)
+        self._text = ""  # of a planned run's configuration
         self._adopted: tuple[Config, str, dict[str, str]] | None = None
 
     def __truediv__(self, name: str) -> Path:
@@ -103,11 +102,11 @@ class RunDirectory:
                     where=str(path),
                     do="go on with it by --resume, replace it by --force, or choose another folder",
                 )
-            refuse_another_solution(run.path, run.config, run.record, config, base, inputs, seed)
+            refuse_another_solution(run.path, run.config, run.facts, config, base, inputs, seed)
             run._adopted = config, text, inputs
             return run
         if run.is_initialized:
-            run.store.record  # noqa: B018 - refuse to replace what nobody can tell from other files
+            run.record  # noqa: B018 - refuse to replace what nobody can tell from other files
         else:
             refuse_foreign_files(run.path, text)
         facts = {
@@ -119,7 +118,7 @@ class RunDirectory:
             "command": command,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
         }
-        run._planned = as_json(facts), text
+        run._planned, run._text = Record(as_json(facts)), text
         return run
 
     @property
@@ -132,46 +131,29 @@ class RunDirectory:
         """Boolean: nothing of this run has been written yet."""
         return self._planned is not None
 
-    def locked(self) -> AbstractContextManager[None]:
-        """Keep other processes from working on this run; its folder is made.
-
-        Raises
-        ------
-        InputError
-            When another process is at work on it, or the folder cannot be made.
-        """
-        made_folder(self.path)
-        return self.store.locked()
-
     def begin(self) -> None:
         """Write down what is about to be done.
 
         Another run that stands there is removed; a resumed one takes over the settings that may
         change.
-
-        Raises
-        ------
-        InputError
-            When the folder cannot be made or written.
         """
         if self._planned is None:
             self._adopt()
             return
-        facts, text = self._planned
+        planned, self._planned = self._planned, None
         made_folder(self.path)
         if self.is_initialized:
             self.clear()
         remove_leftovers(self.path)
-        self._write_text(text)
-        Record(facts).write(self / "run.json")
-        self._planned = None
+        self._write_text(self._text)
+        planned.write(self / "run.json")
 
     def _adopt(self) -> None:
         """Take over what a resumed run was given in another way, and put summary.json right."""
         remove_leftovers(self.path)
         if self._adopted is not None:
             config, text, inputs = self._adopted
-            record, known = self.store.record, self.config
+            record, known = self.record, self.config
             changed = {key for key, *_ in changes(known, with_seed(config, known.sampler.seed))}
             if changed or inputs != record.facts["inputs"]:
                 config = with_seed(config, known.sampler.seed)
@@ -181,7 +163,7 @@ class RunDirectory:
                 self._write_text(text)
                 record.write(self / "run.json")
             self._adopted = None
-        self.store.restore_summary()
+        self.restore_summary()
 
     def _write_text(self, text: str) -> None:
         """Write config.toml as the user wrote it."""
@@ -199,8 +181,8 @@ class RunDirectory:
         run = cls(path)
         if run.is_initialized:
             refuse_edited(run.path, run.config)
-            now = _hashes(run.config, Path(run.record["base"]))
-            refuse_other_inputs(run.record["inputs"], now)
+            now = _hashes(run.config, Path(run.facts["base"]))
+            refuse_other_inputs(run.facts["inputs"], now)
             return run
         if (run / "config.toml").exists():
             config, text = load_config(run / "config.toml")
@@ -226,15 +208,13 @@ class RunDirectory:
     # -- record -----------------------------------------------------------------------------------
 
     @property
-    def record(self) -> dict[str, Any]:
-        """Content of run.json, or of what it will be."""
-        if self._planned is not None:
-            return {"schema": SCHEMA, **self._planned[0], "stages": {}}
-        return self.store.record.as_dict()
+    def facts(self) -> dict[str, Any]:
+        """What the run is made from: configuration, inputs, seed, versions."""
+        return self.record.facts
 
     def note(self, **facts: Any) -> None:
         """Add facts to run.json."""
-        record = self.store.record
+        record = self.record
         record.facts |= as_json(facts)
         record.write(self / "run.json")
 
@@ -242,7 +222,7 @@ class RunDirectory:
     def config(self) -> Config:
         """The resolved configuration."""
         try:
-            return config_of_record(self.record["config"], str(self / "run.json"))
+            return config_of_record(self.facts["config"], str(self / "run.json"))
         except ConfigError as error:  # made by a version that allowed other settings
             raise InputError(
                 error.cause, where=error.where, do="start again with --force"
@@ -251,15 +231,10 @@ class RunDirectory:
     # -- stages -----------------------------------------------------------------------------------
 
     def make(self, stage: str, function: Callable[[], T], *, force: bool = False) -> Made[T]:
-        """The artefact of a stage: made where it or what it was made from is not as it was.
+        """The artefact of a stage: made where it, or what it was made from, is not as it was.
 
-        Parameters
-        ----------
-        stage : str
-        function : callable
-            Writes its files into the folder and its sections by `summarise`.
-        force : bool
-            Make it also where it stands.
+        `function` writes files into the folder and sections by `summarise`; with `force` it is
+        called also where the artefact stands.
         """
         made_from = self._made_from(stage)
         if made_from is None:
@@ -268,21 +243,21 @@ class RunDirectory:
                 where=str(self.path),
                 do="run them first",
             )
-        return self.store.stage(stage, function, *made_from, force=force)
+        return self.stage(stage, function, *made_from, force=force)
 
     def done(self, stage: str) -> bool:
         """Boolean: a stage has ended, and what it was made from is as it was."""
-        return self._planned is None and stage in self._standing()
+        return stage in self._standing()
 
     def _standing(self, before: str = "") -> dict[str, Made[object]]:
         """Stages that stand, of all or of those before one, in order."""
-        config, facts = self.config, self.store.record.facts
+        config, facts = self.config, self.facts
         found: dict[str, Made[object]] = {}
         for name in STAGES:
             if name == before:
                 break
             made_from = made_from_of(name, found, config, facts)
-            made = None if made_from is None else self.store.standing(name, *made_from)
+            made = None if made_from is None else self.standing(name, *made_from)
             if made is not None:
                 found[name] = made
         return found
@@ -291,7 +266,7 @@ class RunDirectory:
         self, stage: str, requirements: Sequence[Requirement] | None = None
     ) -> tuple[object, ...] | None:
         """What a stage is made from now; None where a stage is missing that it needs."""
-        facts = self.store.record.facts
+        facts = self.facts
         if requirements is not None:
             facts = facts | {"requirements": [as_json(vars(one)) for one in requirements]}
         return made_from_of(stage, self._standing(stage), self.config, facts)
@@ -299,28 +274,17 @@ class RunDirectory:
     def require(self, stage: str, needs: Sequence[str], *, thorough: bool = False) -> None:
         """Refuse a stage, or another command, whose predecessors do not stand.
 
-        Parameters
-        ----------
-        stage : str
-            In words.
-        needs : sequence of str
-        thorough : bool
-            Look at the content of their files, not just at their sizes.
-
-        Raises
-        ------
-        InputError
+        A `thorough` check looks at the content of their files, not just at their sizes.
         """
         for earlier in needs:
             do = f"run 'bayesdist stage {earlier} {self.path}'"
-            known = None if self._planned is not None else self.store.record.artefacts.get(earlier)
-            if known is None:
+            if earlier not in self.record.artefacts:
                 raise InputError(
                     f"'{stage}' needs stage '{earlier}', which has not been run",
                     where=str(self.path),
                     do=f"{do} first",
                 )
-            harmed = self.store.harmed(earlier, thorough=thorough)
+            harmed = self.harmed(earlier, thorough=thorough)
             if harmed:
                 raise InputError(
                     f"is not as stage '{earlier}' wrote it",
@@ -343,31 +307,20 @@ class RunDirectory:
         made_from = self._made_from("evaluate", requirements) if self.done("evaluate") else None
         blocks = [as_json(vars(one)) for one in requirements]
         own = [as_json(vars(one)) for one in self.config.requirements()]
-        with self.store.amended("evaluate", *(made_from or ())) as facts:
+        with self.amended("evaluate", *(made_from or ())) as facts:
             yield
             facts.pop("requirements", None)
             if blocks != own:
                 facts["requirements"] = blocks
 
-    # -- summary ----------------------------------------------------------------------------------
-
-    @property
-    def summary(self) -> dict[str, Any]:
-        """Sections of summary.json so far."""
-        return {} if self._planned is not None else self.store.summary
-
-    def summarise(self, **sections: Any) -> None:
-        """Replace sections of summary.json, for the stage that is being made."""
-        self.store.summarise(**sections)
-
     # -- the end ----------------------------------------------------------------------------------
 
-    def clear(self) -> None:
+    def clear(self, *others: str) -> None:
         """Remove what a run wrote, and nothing else."""
         pairs = part_files(self / PAIRS)
-        others = [path.relative_to(self.path).as_posix() for path in pairs]
+        names = [path.relative_to(self.path).as_posix() for path in pairs]
         # the last one may be of a command that came before the assessment
-        self.store.clear("config.toml", "bayesdist.log", *others, "catalogue_errors.h5")
+        super().clear(*others, "config.toml", "bayesdist.log", *names, "catalogue_errors.h5")
 
 
 def _hashes(config: Config, base: Path) -> dict[str, str]:

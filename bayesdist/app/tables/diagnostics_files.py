@@ -32,15 +32,7 @@ log = logging.getLogger("bayesdist")
 def write_diagnostics(
     run: RunDirectory, fit: LinearFit, posterior: Posterior, found: Diagnostics
 ) -> None:
-    """Write diagnostics, and their sections of summary.json.
-
-    Parameters
-    ----------
-    run : RunDirectory
-    fit, posterior
-        That they are of.
-    found : Diagnostics
-    """
+    """Write diagnostics of a fit and a posterior, and their sections of summary.json."""
     fingerprint = fingerprint_of(fit, posterior)
     assert found.correlated is not None
     arrays, facts = discrepancy_to_arrays(found.correlated)
@@ -65,14 +57,7 @@ def write_diagnostics(
 
 
 def load_diagnostics(run: RunDirectory, fit: LinearFit, posterior: Posterior) -> Diagnostics | None:
-    """Diagnostics of a fit and a posterior; None where there are none of just these.
-
-    Parameters
-    ----------
-    run : RunDirectory
-    fit : LinearFit
-    posterior : Posterior
-    """
+    """Diagnostics of a fit and a posterior; None where there are none of just these."""
     facts = run.summary.get("discrepancy")
     fingerprint = fingerprint_of(fit, posterior)
     if not facts or not (run / OTHERS).exists():

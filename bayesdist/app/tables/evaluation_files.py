@@ -42,16 +42,8 @@ def write_evaluation(
 ) -> None:
     """Write an evaluation: maps.fits, tables, sections of summary.json, and evaluation.h5.
 
-    Parameters
-    ----------
-    run : RunDirectory
-    fit, posterior
-        What was evaluated.
-    solution : Posterior
-        With all errors of the parameters.
-    gauge : str
-        In which gauge it stands, as a sentence; empty where that is no question.
-    found : Evaluation
+    `solution` is the posterior with all errors of the parameters, `gauge` that in which it stands,
+    as a sentence; empty where that is no question.
     """
     head = provenance_notes(posterior, gauge)
     maps = [*found.formal, *found.maps, *found.relative]
@@ -83,15 +75,7 @@ def save_margins(
     margins: Sequence[Margin],
     validity: Sequence[Horizon],
 ) -> None:
-    """Replace the margins and validity periods of a run by others.
-
-    Parameters
-    ----------
-    run, fit, posterior, gauge
-        As of `write_evaluation`.
-    margins : sequence of Margin
-    validity : sequence of Horizon
-    """
+    """Replace the margins and validity periods of a run by others."""
     _write_margins(run, posterior, provenance_notes(posterior, gauge), margins, validity)
     if (run / FILE).exists():
         found = load_evaluation(run, fit, posterior)
@@ -100,13 +84,7 @@ def save_margins(
 
 
 def load_evaluation(run: RunDirectory, fit: LinearFit, posterior: Posterior) -> Evaluation:
-    """The evaluation of a fit and a posterior, as the stage 'evaluate' wrote it.
-
-    Raises
-    ------
-    InputError
-        Where there is none of just these.
-    """
+    """The evaluation of a fit and a posterior; InputError where there is none of just these."""
     again = f"run 'bayesdist stage evaluate {run.path}' again"
     found = record_from_arrays(read_arrays(run / FILE, fingerprint_of(fit, posterior), do=again))
     assert isinstance(found, Evaluation)

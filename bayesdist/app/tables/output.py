@@ -55,28 +55,9 @@ def versions() -> dict[str, str]:
 
 @contextmanager
 def record_folder(path: Path, name: str, command: str) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """A folder of tables and figures with a record that scripts read.
+    """A new folder, and a record to be filled, which is written when the block succeeds.
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        New, or empty.
-    name : str
-        File of the record.
-    command : str
-        By which the folder is made.
-
-    Yields
-    ------
-    folder : pathlib.Path
-        Where to write.
-    record : dict
-        To be filled: it is written when the block succeeds.
-
-    Raises
-    ------
-    InputError
-        As `atomic_directory`.
+    `name` is the file of the record, `command` that by which the folder is made.
     """
     with atomic_directory(path) as folder:
         record: dict[str, Any] = {"schema": SCHEMA, "command": command, "versions": versions()}

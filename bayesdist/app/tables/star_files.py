@@ -23,22 +23,7 @@ def part_files(folder: Path) -> list[Path]:
 
 
 def write_star_files(matches: Matches, fit: LinearFit, posterior: Posterior, folder: Path) -> None:
-    """Write what fit and posterior say of each star, piece by piece.
-
-    Parameters
-    ----------
-    matches : Matches
-        With errors.
-    fit : LinearFit
-    posterior : Posterior
-    folder : Path
-        Parts that are there already are replaced or removed.
-
-    Raises
-    ------
-    InputError
-        When the folder or a file cannot be written, or the data have become unreadable.
-    """
+    """Write residuals and memberships of each star by batches, in place of parts that are there."""
     made_folder(folder)
     remove_leftovers(folder)
     for path in part_files(folder):

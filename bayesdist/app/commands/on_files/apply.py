@@ -57,48 +57,14 @@ def apply_to_table(
     corner: tuple[float, float] | None = None,
     force: bool = False,
 ) -> str:
-    """Take the positions of a table to the output frame, or back to pixels.
+    """Take the positions of a table to the output frame, or `inverse` back to pixels, into a file.
 
-    Parameters
-    ----------
-    path : path
-        As of `calibration_at`.
-    table : path
-        Positions in columns x, y (back: x_out, y_out), and the chip's number in chip.
-    output : path
-        .ecsv, .csv or .fits: the table, and what is added to it.
-    inverse : bool
-        Back to pixels.
-    method : str
-        One of METHODS: Newton's method on the forward polynomials, a polynomial fitted here, or the
-        INVERSE rows of an IDCTAB.
-    order : int, optional
-        Of the polynomial fitted.
-    columns : sequence of str, optional
-        Names of the two columns of positions.
-    chip : int, optional
-        In place of a column; back it is found where it is not given.
-    filter, scale
-        As of `calibration_at`.
-    epoch : float, optional
-        Decimal years, for what depends on time.
-    origin : sequence of float, optional
-        Output pixel of the zero point; (0, 0) by default.
-    vafactor : float
-    image, ltv, corner
-        As of `images_of`.
-    force : bool
-        Replace a file that is there.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For what cannot be read, applied or written.
+    Positions are in `columns`, by default x, y (back: x_out, y_out), and the chip's number in a
+    column chip unless `chip` gives it.  `method` is one of METHODS: Newton's method on the forward
+    polynomials, a polynomial fitted here, of an `order`, or the INVERSE rows of an IDCTAB; `epoch`
+    is in decimal years; `origin` is the output pixel of the zero point, (0, 0) by default.  Filter
+    and scale are as of `calibration_at`; image, ltv and corner as of `images_of`.  What is to be
+    printed is returned.
     """
     output = Path(output)
     check_output(output, force)
@@ -188,7 +154,7 @@ def _gathered(parts: dict[int, tuple[NDArray[np.bool_], Positions]], n: int) -> 
         at[0, mine], at[1, mine], number[mine] = part.x, part.y, part.chip
         if cov is not None:
             cov[mine] = part.cov
-    return Positions(*at, cov, number)
+    return Positions(at[0], at[1], cov, number)
 
 
 def _head(output: Path, at: Positions, found: Calibration, epoch: float | None) -> str:

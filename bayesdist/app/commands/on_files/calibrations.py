@@ -69,16 +69,8 @@ def calibration_at(
 def solution_at(path: Path) -> Solution | None:
     """The fit or posterior at a place; None where it is no such file.
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        A run directory, or posterior.nc in it, stands for the posterior with the errors that the
-        run was assessed with, or for the fit where there is no posterior yet.
-
-    Raises
-    ------
-    InputError
-        As `load_posterior` and `load_fit`.
+    A run directory, or posterior.nc in it, stands for the posterior with the errors that the run
+    was assessed with, or for the fit where there is no posterior yet.
     """
     if path.is_dir():
         if (path / "posterior.nc").exists() or not (path / "fit.nc").exists():

@@ -121,29 +121,10 @@ def init(
     size: tuple[int, int] | None = None,
     force: bool = False,
 ) -> int:
-    """Write a commented configuration for a file of matches.
+    """Number of matches that a new configuration reads, which is written with comments.
 
-    Parameters
-    ----------
-    path : path
-        TOML file to write.
-    matches : path
-        Input, as in ``data.matches``.
-    columns : mapping of str to str, optional
-        As ``data.columns``.
-    size : tuple of int, optional
-        Columns and rows of each chip; by default as large as the positions ask for.
-    force : bool
-        Replace a file that is there.
-
-    Returns
-    -------
-    int
-        Matches that the configuration reads.
-
-    Raises
-    ------
-    InputError
+    `path` is the TOML file, `matches` its ``data.matches``, `columns` its ``data.columns``; `size`
+    are columns and rows of each chip, by default as large as the positions ask for.
     """
     path = Path(path)
     refuse_existing(path, force)

@@ -87,14 +87,7 @@ EACH = 4  # stars for each coefficient, at least
 def guessed_sigma(table: Matches) -> float | None:
     """Robust scatter along an axis about polynomials on each chip of each exposure, two digits.
 
-    Parameters
-    ----------
-    table : Matches
-
-    Returns
-    -------
-    float or None
-        In the unit of u, v; None of too few stars, or without scatter.
+    It is in the unit of u, v; None of too few stars, or without scatter.
     """
     i, j = np.array(polynomial_terms(ORDER)).T
     groups = table.exposure * len(table.chip_numbers) + table.chip

@@ -14,22 +14,7 @@ __all__ = ["inspect"]
 
 
 def inspect(path: str | Path) -> str:
-    """Describe an IDCTAB, a D2IMFILE or NPOLFILE, the WCS of a FITS file or header, or a posterior.
-
-    Parameters
-    ----------
-    path : path
-        A run directory stands for its posterior.nc.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    BayesdistError
-        For a file that is none of these.
-    """
+    """Text on an IDCTAB, a D2IMFILE or NPOLFILE, a WCS in FITS, a posterior, or that of a run."""
     path = Path(path)
     if path.is_dir() or path.suffix == ".nc":
         from bayesdist.infer.files import load_posterior

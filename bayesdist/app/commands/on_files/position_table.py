@@ -41,13 +41,7 @@ def check_output(output: Path, force: bool) -> None:
 
 
 def position_column(table: Table, name: str, where: str) -> Float:
-    """Numbers (N,) of a column; NaN for missing ones.
-
-    Raises
-    ------
-    InputError
-        Where there is no such column, or no numbers in it.
-    """
+    """Numbers (N,) of a column; NaN for missing ones."""
     if name not in table.colnames:
         raise InputError(
             f"there is no column {name!r}",
@@ -63,24 +57,9 @@ def position_column(table: Table, name: str, where: str) -> Float:
 def chip_numbers(
     table: Table, chip: int | None, known: Sequence[int], name: str, where: str, *, needed: bool
 ) -> NDArray[np.int64] | None:
-    """Chip of each row, by an option or a column; None where it is to be found.
+    """Chip (N,) of each row, by an option or a column; None where it is not `needed` and not given.
 
-    Parameters
-    ----------
-    table : astropy.table.Table
-    chip : int, optional
-        For all rows.
-    known : sequence of int
-        Chips of the calibration.
-    name, where : str
-        What to call calibration and table.
-    needed : bool
-        Whether it must be told.
-
-    Raises
-    ------
-    InputError
-        For a chip that the calibration has not, or that is needed and not told.
+    `known` are the chips of the calibration; `name` and `where` are what to call it and the table.
     """
     listed = ", ".join(map(str, known))
     if chip is not None:
@@ -110,13 +89,7 @@ def chip_numbers(
 
 
 def add_positions(table: Table, at: Positions, names: tuple[str, str], where: str) -> None:
-    """Add positions and their errors, and back on the detector the chip, as columns.
-
-    Raises
-    ------
-    InputError
-        For a column that is there already.
-    """
+    """Add positions and their errors, and back on the detector the chip, as columns."""
     x, y = names
     new: dict[str, NDArray] = {x: at.x, y: at.y}
     if at.cov is not None:

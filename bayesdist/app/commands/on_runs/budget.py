@@ -27,33 +27,11 @@ def budget_at(
     epoch: float | None = None,
     magnitude: float | None = None,
 ) -> str:
-    """The error budget of a position.
+    """The error budget of a pixel `at` (FITS 1-based) of a run that has been sampled, as text.
 
-    Parameters
-    ----------
-    run : path
-        A run that has been sampled.
-    at : tuple of float
-        FITS 1-based pixel.
-    to : sequence of tuple of float
-        Other pixels of the same image: the errors are then those of their differences to `at`.
-    chip : int, optional
-        Chip number; needed where there are several.
-    epoch : float, optional
-        Decimal years; that of the assessment by default.
-    magnitude : float, optional
-        Of the stars: the errors of their centroids are a term then.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For a run that has not been sampled, a chip that is not named or not there, and what
-        `place_budget` refuses.
+    With other pixels `to` of the same image it is that of their differences to it.  `chip` is
+    needed where there are several; `epoch` (decimal years) is by default that of the assessment;
+    with a `magnitude` of the stars the errors of their centroids are a term.
     """
     with open_results(RunDirectory.open(run)) as results:
         results.run.require("budget", ("fit", "sample"))

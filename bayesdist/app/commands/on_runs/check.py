@@ -32,22 +32,9 @@ FIXED_S = 1.0  # diagnostics and files
 
 
 def check(path: str | Path) -> str:
-    """Units, rank, null space and expected cost of a configuration.
+    """Units, rank, null space and expected cost of a configuration, as text.
 
-    Parameters
-    ----------
-    path : path
-        Configuration file.
-
-    Returns
-    -------
-    str
-        A readable text.
-
-    Raises
-    ------
-    BayesdistError
-        For whatever would stop the run: bad input, or parameters that the data do not determine.
+    Whatever would stop the run is refused: bad input, or parameters that the data do not determine.
     """
     config, text = load_config(path)
     with TemporaryDirectory() as nowhere:

@@ -39,36 +39,13 @@ def compare_files(
     grid: Sequence[int] = DEFAULT_GRID,
     command: str = "",
 ) -> str:
-    """Compare two calibrations.
+    """Verdicts on two calibrations, as text; tables, summary and figure in a new folder `output`.
 
-    Parameters
-    ----------
-    a, b : path
-        Each a run directory, posterior.nc, fit.nc, IDCTAB, SIP header or WISE meta-data file.
-    output : path, optional
-        New or empty folder for tables, summary and figure.
-    chip : int, optional
-        All chips that both have by default, each by itself.
-    filter : str, optional
-        Of IDCTABs, or the band of WISE meta-data; two, joined by a colon, for A and B.
-    epoch : float, optional
-        Decimal years, for what depends on time.
-    keep : bool
-        Leave shift, rotation and scale in the difference.
-    grid : sequence of int
-        Points on x and y.
-    command : str
-        For the record.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        As `calibration_at` and `compare`; for files without a common chip.
+    `a` and `b` are each a run directory, posterior.nc, fit.nc, IDCTAB, SIP header or WISE meta-data
+    file.  All chips that both have are compared by default, each by itself.  `filter` is of
+    IDCTABs, or the band of WISE meta-data; two, joined by a colon, are for A and B.  `epoch` is in
+    decimal years; `keep` leaves shift, rotation and scale in the difference; `grid` are points on
+    x and y.
     """
     first, _, second = (filter or "").partition(":")
     both = _read((Path(a), Path(b)), (first or None, second or first or None))

@@ -22,23 +22,7 @@ __all__ = ["comparison_summary", "joined", "write_comparison"]
 def write_comparison(
     output: Path, found: Sequence[Comparison], gaps: Sequence[GapDifference], command: str
 ) -> None:
-    """Write tables, summary and figure of a comparison into a new folder.
-
-    Parameters
-    ----------
-    output : pathlib.Path
-    found : sequence of Comparison
-        One for each chip.
-    gaps : sequence of GapDifference
-        Between them, where there are several in one system.
-    command : str
-        For the record.
-
-    Raises
-    ------
-    InputError
-        For a folder that holds something, or cannot be made.
-    """
+    """Write tables, summary and figure of chips and the gaps between them into a new folder."""
     with record_folder(output, "comparison.json", command) as (folder, record):
         write_table(joined(found, comparison_table), folder / "comparison.ecsv")
         write_table(joined(found, difference_table), folder / "difference.ecsv")
@@ -50,16 +34,7 @@ def write_comparison(
 
 
 def comparison_summary(found: Comparison) -> dict[str, Any]:
-    """What scripts read of a comparison.
-
-    Parameters
-    ----------
-    found : Comparison
-
-    Returns
-    -------
-    dict
-    """
+    """Content of comparison.json for one chip."""
     s, field = found.similarity, found.field
     sides = {}
     for letter, c in (("a", found.a), ("b", found.b)):
@@ -128,15 +103,7 @@ def _gap_summary(gap: GapDifference) -> dict[str, Any]:
 def joined(found: Sequence[Comparison], table_of: Any) -> Table:
     """The tables of all chips as one, with the chip in front where there are several.
 
-    Parameters
-    ----------
-    found : sequence of Comparison
-    table_of : callable
-        The table of one of them.
-
-    Returns
-    -------
-    astropy.table.Table
+    `table_of` makes that of one comparison.
     """
     tables = []
     for one in found:

@@ -41,30 +41,11 @@ CHANGE_MAPS = 1  # of the random streams that follow from the one seed
 def monitor(
     run: str | Path, new: str | Path, output: str | Path | None = None, *, command: str = ""
 ) -> str:
-    """Confront the posterior of a run with new matches.
+    """Verdict of new matches on the posterior of a run, as text; files in a new folder `output`.
 
-    Parameters
-    ----------
-    run : path
-        A run with a posterior.  The matches that it was made from are not needed any more.
-    new : path
-        New matches, which are read as the run's were, or a configuration whose [data] says how.
-        Of a campaign: another run of which stage 'match' is done, or pairs as a run keeps them.
-    output : path, optional
-        New or empty folder for tables, summary and figures.
-    command : str
-        For the record.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For a run that is none, or has no posterior; for matches that this was made from; as
-        `read_matches`, `read_new_exposures` and `fit_new`.
+    The matches that the run was made from are not needed any more.  `new` are matches, which are
+    read as the run's were, or a configuration whose [data] says how; of a campaign another run of
+    which stage 'match' is done, or pairs as a run keeps them.
     """
     directory = RunDirectory(run)
     if not (directory / "run.json").exists():
@@ -168,7 +149,7 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
 
 def _refuse_the_same(run: RunDirectory, path: Any) -> None:
     """Refuse matches that the release was made from, under whatever name: they cannot test it."""
-    seen = set(run.record["inputs"].values())
+    seen = set(run.facts["inputs"].values())
     for file in input_files(path):
         if sha256_of(file) in seen:
             raise InputError(

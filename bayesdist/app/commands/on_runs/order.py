@@ -35,31 +35,11 @@ def order(
     figure: str | Path | None = None,
     force: bool = False,
 ) -> str:
-    """Compare orders on the data that a run of a configuration would use.
+    """Orders from the lowest to the highest compared on the data of a configuration, as text.
 
-    Parameters
-    ----------
-    path : path
-        Configuration file; its own order, priors and extra weights do not matter.
-    orders : sequence of int
-        The lowest and the highest.
-    output : path, optional
-        ECSV file for the table.
-    figure : path, optional
-        PNG file.
-    force : bool
-        Replace files that are there.
-
-    Returns
-    -------
-    str
-        A readable table and the verdict.
-
-    Raises
-    ------
-    BayesdistError
-        For whatever would stop the run, and as `select_order`.  Orders that the data do not
-        determine are rows that say so, as long as two lower ones can be compared.
+    Its own order, priors and extra weights do not matter.  `output` is an ECSV file for the table,
+    `figure` a PNG file.  Orders that the data do not determine are rows that say so, as long as two
+    lower ones can be compared.
     """
     targets = [Path(name) for name in (output, figure) if name is not None]
     for target in targets:

@@ -24,26 +24,9 @@ LATER = 4  # dates that stand for exposures spread evenly
 
 
 def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = ()) -> str:
-    """What more exposures like those at hand would do for a run's requirements.
+    """Exposures like those at hand that a run's requirements would take, as text.
 
-    Parameters
-    ----------
-    run : path
-        A run that has been assessed.
-    name : str, optional
-        Of one requirement; all by default.
-    epochs : sequence of float
-        Dates at which exposures could be taken, decimal years.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For a run without requirements or without that one.
+    Of all requirements, or of one `name`; exposures could be taken at `epochs`, decimal years.
     """
     with open_results(RunDirectory.open(run)) as results:
         results.run.require("plan", ("fit", "sample", "diagnose", "evaluate"))
@@ -97,8 +80,10 @@ def _lines(
     if time is None:
         schedules.append(Schedule("at any date", exposure_information(solution, content, None)))
     else:
-        wanted = requirement.epoch or (requirement.epochs or [results.epoch])[-1]
-        last = float(np.max(results.diagnostics.sample.table.epoch))
+        epoch, seen = results.epoch, results.diagnostics.sample.table.epoch
+        assert epoch is not None and seen is not None  # as the model drifts
+        wanted = requirement.epoch or (requirement.epochs or [epoch])[-1]
+        last = float(np.max(seen))
         for date in dict.fromkeys([*epochs, wanted]):
             schedules.append(
                 Schedule(f"at {date:.2f}", exposure_information(solution, content, date))
@@ -107,7 +92,9 @@ def _lines(
             dates = np.linspace(last, wanted, LATER + 1)[1:]
             spread = [exposure_information(solution, content, float(d)) for d in dates]
             schedules.append(
-                Schedule(f"evenly from {last:.2f} to {wanted:.2f}", sum(spread) / len(spread))
+                Schedule(
+                    f"evenly from {last:.2f} to {wanted:.2f}", np.sum(spread, axis=0) / len(spread)
+                )
             )
 
     def met(candidate: Solution) -> float:

@@ -35,31 +35,12 @@ def release_runs(
     allow_unconverged: bool = False,
     command: str = "",
 ) -> str:
-    """Write IDCTABs, D2IMFILE and NPOLFILEs of several filters into a new folder.
+    """Write IDCTABs, D2IMFILE and NPOLFILEs of several filters into a new folder; what to print.
 
-    Parameters
-    ----------
-    runs : sequence of path
-        Finished runs of campaigns, one for each filter.  The first is that of the reference filter:
-        its [products.release] says what is written, its drift is stored, and its tables are the
-        detector's.
-    output : path
-        New or empty folder.  It appears with all files in it, or not at all.
-    allow_unconverged : bool
-        Also runs that have not converged; the files then say so.
-    command : str
-        For the record.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For runs that are not finished or do not go together, for one that has not converged unless
-        allowed, and a folder that is in use.
+    The runs are finished ones of campaigns, one for each filter.  The first is that of the
+    reference filter: its [products.release] says what is written, its drift is stored, and its
+    tables are the detector's.  Runs that have not converged are refused unless allowed; the files
+    then say so.
     """
     with ExitStack() as stack:
         by_filter: dict[str, Results] = {}

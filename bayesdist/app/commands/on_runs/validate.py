@@ -20,27 +20,10 @@ __all__ = ["validate"]
 
 
 def validate(run: str | Path, requirements: str | Path) -> tuple[str, bool]:
-    """Judge a run by requirements, and replace its margins and horizons by theirs.
+    """Judge a run that has been sampled, and replace its margins and validity periods.
 
-    Parameters
-    ----------
-    run : path
-        A run that has been sampled.
-    requirements : path
-        TOML file of ``[[requirement]]`` blocks.
-
-    Returns
-    -------
-    text : str
-        What to print.
-    met : bool
-        Whether all are met.
-
-    Raises
-    ------
-    InputError
-        For a run that has not been sampled, and for a file that cannot be read or asks for what the
-        run cannot be judged by; its name is in the message.
+    `requirements` is a TOML file of ``[[requirement]]`` blocks.  Text to print, and truth of all
+    being met.
     """
     asked = load_requirements(requirements)
     directory = RunDirectory.open(run)
