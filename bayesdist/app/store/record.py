@@ -142,10 +142,6 @@ class Record:
 
     def write(self, path: Path) -> None:
         """Replace run.json."""
-        write_json(path, self.as_dict())
-
-    def as_dict(self) -> dict[str, Any]:
-        """Content of run.json as plain values."""
         found = {name: asdict(one) for name, one in self.artefacts.items()}
         whole = {"schema": SCHEMA, **self.facts, "stages": self.stages, "artefacts": found}
-        return as_json(whole | {"under_way": self.under_way, "checkpoints": self.checkpoints})
+        write_json(path, whole | {"under_way": self.under_way, "checkpoints": self.checkpoints})

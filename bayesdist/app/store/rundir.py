@@ -278,13 +278,14 @@ class RunDirectory(RunStore):
         """
         for earlier in needs:
             do = f"run 'bayesdist stage {earlier} {self.path}'"
-            if earlier not in self.record.artefacts:
+            artefact = self.record.artefacts.get(earlier)
+            if artefact is None:
                 raise InputError(
                     f"'{stage}' needs stage '{earlier}', which has not been run",
                     where=str(self.path),
                     do=f"{do} first",
                 )
-            harmed = self.harmed(earlier, thorough=thorough)
+            harmed = self.harmed(artefact, thorough=thorough)
             if harmed:
                 raise InputError(
                     f"is not as stage '{earlier}' wrote it",

@@ -136,7 +136,7 @@ class RunStore:
         artefact = self.record.artefacts.get(name)
         if artefact is None or artefact.key != digest_of(self._parts(name, made_from)):
             return None
-        if self._harmed(artefact, thorough=False):
+        if self.harmed(artefact, thorough=False):
             return None
         return Made(name, artefact.digest)
 
@@ -149,8 +149,8 @@ class RunStore:
                 parts |= canonical(one)
         return parts
 
-    def _harmed(self, artefact: Artefact, *, thorough: bool) -> str:
-        """The first file that is not as the stage left it, '' where all are."""
+    def harmed(self, artefact: Artefact, *, thorough: bool) -> str:
+        """The first file of an artefact that is not as its stage left it, '' where all are."""
         for name, mark in artefact.files.items():
             path = self.path / name
             if not path.is_file() or path.stat().st_size != mark.size:
@@ -158,11 +158,6 @@ class RunStore:
             if thorough and FileMark.of(path) != mark:
                 return name
         return ""
-
-    def harmed(self, name: str, *, thorough: bool = True) -> str:
-        """The first file of a stage that has changed since it was written, '' for none."""
-        artefact = self.record.artefacts.get(name)
-        return "" if artefact is None else self._harmed(artefact, thorough=thorough)
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -199,7 +194,7 @@ class RunStore:
         """
         parts, record = self._parts(name, made_from), self.record
         key, known = digest_of(parts), record.artefacts.get(name)
-        harmed = "" if known is None else self._harmed(known, thorough=True)
+        harmed = "" if known is None else self.harmed(known, thorough=True)
         if known is not None and known.key == key and not harmed and not force:
             log.info("%s: done before", name)
             return Made(name, known.digest)
