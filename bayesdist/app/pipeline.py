@@ -1,39 +1,43 @@
-"""From stars to files in Python: the functions that the stages of a run call, without a folder.
+"""From stars to files in Python: the functions that `bayesdist run` calls, without a folder.
 
 A configuration says what is asked for, and paths in it are relative to `base`::
 
     config, _ = load_config("job/config.toml")
     base = Path("job")
-    data = fit(match(config, base), config, base)
+    data = fit(match(read(config, base), config, base), config, base)
     posterior = sample(data, config)
     found = diagnose(posterior, data, config, base)
     errors = error_model(posterior, found, data, config)
     evaluation = evaluate(errors, posterior, found, data, config, base)
     export(evaluation, posterior, found, data, config, base, Path("products"))
 
-What `bayesdist run` makes of the same configuration is the same to the last bit.  A report shows
-the `Results` of a run's folder (`bayesdist.app.results`).
+What `bayesdist run` makes of the same configuration is the same to the last bit: it makes these
+calls in `bayesdist.app.run.make_stages`, and writes what they give.  A `report` shows the
+`Results` of a run's folder (`bayesdist.app.results`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from bayesdist.app.assessment.checks import run_checks
+from bayesdist.app.assessment.diagnosing import diagnose_run as diagnose
+from bayesdist.app.assessment.error_terms import errors_of_run as error_model
+from bayesdist.app.assessment.settings import assessment_rng, evaluation_settings
 from bayesdist.app.config import Config
-from bayesdist.app.diagnosing import diagnose_run as diagnose
-from bayesdist.app.error_terms import errors_of_run as error_model
-from bayesdist.app.judging import evaluate_run
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
-from bayesdist.app.made_files import ProductInput, product_input
-from bayesdist.app.stages.export import export_files
-from bayesdist.app.stages.report import run_report as report
+from bayesdist.app.products.export import export_files
+from bayesdist.app.products.made_files import ProductInput, product_input
+from bayesdist.app.products.product_terms import file_errors
+from bayesdist.app.report import report
+from bayesdist.assess import evaluation as assessed
+from bayesdist.assess import star_sample
 from bayesdist.assess.error_model import ErrorModel, solution_with_errors
-from bayesdist.assess.evaluation import Evaluation
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
 
@@ -44,13 +48,14 @@ __all__ = [
     "export",
     "fit",
     "match",
+    "read",
     "report",
     "sample",
 ]
 
 
-def match(config: Config, base: Path) -> Matched:
-    """Stars that are fitted and stars that are held out, read or matched.
+def read(config: Config, base: Path) -> Any:
+    """All that a run begins with: matched stars, or star lists with what goes with them.
 
     Parameters
     ----------
@@ -66,26 +71,32 @@ def match(config: Config, base: Path) -> Matched:
     kind = kind_of(config)
     inputs = kind.read(config, base)
     kind.refuse(inputs, config, base)
-    return kind.match(inputs, config, base)
+    return inputs
 
 
-def fit(matched: Matched, config: Config, base: Path) -> FitData:
+def match(inputs: Any, config: Config, base: Path) -> Matched:
+    """Stars that are fitted and stars that are held out; `inputs` are from `read`."""
+    return kind_of(config).match(inputs, config, base)
+
+
+def fit(matched: Matched, config: Config, base: Path, reader: StarReader | None = None) -> FitData:
     """The least-squares solution with its stars.
 
     Parameters
     ----------
     matched : Matched
     config, base
-        As of `match`.
+        As of `read`.
+    reader : StarReader, optional
+        That has read the stars before.
 
     Raises
     ------
     BayesdistError
         For parameters that the stars do not determine.
     """
-    reader = StarReader(config.resources())
-    fitted = kind_of(config).fit(matched, config, base, reader)
-    return FitData(matched, fitted, reader)
+    reader = reader or StarReader(config.resources())
+    return FitData(matched, kind_of(config).fit(matched, config, base, reader), reader)
 
 
 def sample(
@@ -116,7 +127,10 @@ def evaluate(
     data: FitData,
     config: Config,
     base: Path,
-) -> Evaluation:
+    *,
+    source: str = "",
+    series: Mapping[str, Any] | None = None,
+) -> assessed.Evaluation:
     """Maps, budget, margins and validity periods.
 
     Parameters
@@ -126,50 +140,78 @@ def evaluate(
     found : Diagnostics
     data : FitData
     config, base
-        As of `match`.
+        As of `read`.
+    source : str
+        Where the solution is from, by default the detector.
+    series : mapping, optional
+        How linear terms went with time, as summary.json has it.
     """
-    product = _product(posterior, found, data, config)
-    return evaluate_run(errors, posterior, found, data, product, config, base)
+    product = _product(posterior, found, data, config, source)
+    assert isinstance(product.solution, Posterior)
+    return assessed.evaluate(
+        errors,
+        found,
+        config.requirements(),
+        evaluation_settings(data, config),
+        assessment_rng(config),
+        fit=data.fit,
+        solution=product.solution,
+        checks=run_checks(data, posterior, found, config, series),
+        files=file_errors(product, config, base),
+        null=None if data.fitted.solved is None else data.fitted.solved.gauge.null,
+    )
 
 
 def export(
-    evaluation: Evaluation,
+    evaluation: assessed.Evaluation | None,
     posterior: Posterior,
-    found: Diagnostics,
+    found: Diagnostics | None,
     data: FitData,
     config: Config,
     base: Path,
     folder: Path,
+    *,
+    source: str = "",
 ) -> list[dict[str, Any]]:
     """Write the files that a configuration asks for, and list what is known of each.
 
     Parameters
     ----------
-    evaluation : Evaluation
+    evaluation : Evaluation or None
         With whose budget the errors of the files are compared.
     posterior : Posterior
-    found : Diagnostics
+    found : Diagnostics or None
+        Whose errors of the parameters the files have, too.
     data : FitData
     config, base
-        As of `match`.
+        As of `read`.
     folder : Path
         Where the files are written.
+    source : str
+        As of `evaluate`.
     """
+    product = _product(posterior, found, data, config, source)
+    stars = None
+    if product.tangent_point is not None and config.products.asked():
+        if found is not None:
+            stars = found.sample
+        else:
+            stars = star_sample(data.sample, len(data.stars), data.fit, posterior)
     return export_files(
-        _product(posterior, found, data, config),
+        product,
         data.fitted,
         config,
         base,
         folder,
-        stars=found.sample,
-        budget=evaluation.budget.rows(),
+        stars=stars,
+        budget=() if evaluation is None else evaluation.budget.rows(),
     )
 
 
 def _product(
-    posterior: Posterior, found: Diagnostics, data: FitData, config: Config
+    posterior: Posterior, found: Diagnostics | None, data: FitData, config: Config, source: str
 ) -> ProductInput:
     """What files are made from: the solution with all errors of the parameters."""
     hierarchy = None if data.fitted.scatter is None else data.fit
     solution = solution_with_errors(posterior, found, hierarchy)
-    return product_input(solution, data, config, config.detector.name or "solution")
+    return product_input(solution, data, config, source or config.detector.name or "solution")

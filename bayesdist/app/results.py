@@ -9,21 +9,21 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.assessment import evaluation_settings
-from bayesdist.app.checks import run_checks
+from bayesdist.app.assessment.checks import run_checks
+from bayesdist.app.assessment.diagnosing import diagnose_fit_of_run, diagnose_run
+from bayesdist.app.assessment.error_terms import errors_of_run
+from bayesdist.app.assessment.settings import evaluation_settings
 from bayesdist.app.config import Config
-from bayesdist.app.diagnosing import diagnose_fit_of_run, diagnose_run
-from bayesdist.app.diagnostics_files import load_diagnostics
-from bayesdist.app.error_terms import errors_of_run
-from bayesdist.app.evaluation_files import load_evaluation
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.kind import Kind, kind_of
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
-from bayesdist.app.made_files import ProductInput, product_input
-from bayesdist.app.match_sources import RunInput, input_of_run
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.matches.sources import RunInput, input_of_run
+from bayesdist.app.products.made_files import ProductInput, product_input
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.diagnostics_files import load_diagnostics
+from bayesdist.app.tables.evaluation_files import load_evaluation
 from bayesdist.assess.error_model import ErrorModel, solution_with_errors
 from bayesdist.assess.evaluation import Evaluation, EvaluationSettings
 from bayesdist.checks import Check, in_order
@@ -33,7 +33,17 @@ from bayesdist.infer import LinearFit, Posterior, load_posterior
 __all__ = ["Results", "open_results", "results_of"]
 
 # each rests on those before it
-ARTEFACTS = ("inputs", "matched", "fitted", "data", "posterior", "stored", "evaluation")
+ARTEFACTS = (
+    "inputs",
+    "matched",
+    "fitted",
+    "data",
+    "posterior",
+    "stored",
+    "evaluation",
+    "products",
+    "figures",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +97,7 @@ class Results:
     @cached_property
     def base(self) -> Path:
         """Folder that the configuration's files are relative to."""
-        return Path(self.run.record["base"])
+        return Path(self.run.facts["base"])
 
     @cached_property
     def kind(self) -> Kind:
@@ -152,6 +162,12 @@ class Results:
     def evaluation(self) -> Evaluation:
         """Maps, budget, margins and validity periods, as the assessment has found them."""
         return self.made.get("evaluation") or load_evaluation(self.run, self.fit, self.posterior)
+
+    @property
+    def stored_evaluation(self) -> Evaluation | None:
+        """The evaluation, if there is one of this posterior."""
+        there = "evaluation" in self.made or self.run.done("evaluate")
+        return self.evaluation if there else None
 
     # -- what follows from them -------------------------------------------------------------------
 

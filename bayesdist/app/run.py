@@ -2,39 +2,46 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+from bayesdist.app.assessment.rehearsal import rehearse
 from bayesdist.app.config import load_config
+from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.kind import kind_of
-from bayesdist.app.made_from import NEEDS
-from bayesdist.app.rehearsal import rehearse
+from bayesdist.app.pipeline import (
+    diagnose,
+    error_model,
+    evaluate,
+    export,
+    fit,
+    match,
+    report,
+    sample,
+)
 from bayesdist.app.results import Results, open_results
-from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.screen import log_file
-from bayesdist.app.stages.assess import run_assess
-from bayesdist.app.stages.export import run_export
-from bayesdist.app.stages.fit import run_fit
-from bayesdist.app.stages.match import run_match
-from bayesdist.app.stages.report import run_report
-from bayesdist.app.stages.sample import run_sample
+from bayesdist.app.saving import (
+    save_diagnosed,
+    save_evaluation,
+    save_figures,
+    save_fit,
+    save_matches,
+    save_products,
+    save_sampled,
+)
+from bayesdist.app.screen import log_file, progress_bar
+from bayesdist.app.store.made_from import NEEDS, STAGES
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.assess.evaluation import Evaluation
 from bayesdist.errors import InputError, NotConvergedError
+from bayesdist.infer import Posterior
 from bayesdist.infer.checks import convergence_check
 
-__all__ = ["continue_stage", "initialized", "run", "run_stage"]
+__all__ = ["continue_stage", "initialized", "make_stages", "run"]
 
-log = logging.getLogger("bayesdist")
-
-STAGES: dict[str, Callable[[Results], Results]] = {
-    "match": run_match,
-    "fit": run_fit,
-    "sample": run_sample,
-    "assess": run_assess,
-    "export": run_export,
-    "report": run_report,
-}
+ASSESS = ("diagnose", "evaluate")
 
 
 def run(
@@ -47,7 +54,7 @@ def run(
     seed: int | None = None,
     command: str = "",
 ) -> Path:
-    """Fit, sample, assess, export and report, as a configuration says.
+    """Match, fit, sample, diagnose, evaluate, export and report, as a configuration says.
 
     Parameters
     ----------
@@ -88,14 +95,72 @@ def run(
     )
     with initialized(directory) as results:
         names = list(STAGES)
-        for stage in names[names.index(results.kind.begins_with) :]:
-            results = run_stage(results, stage, force=False)
-        _judge(results, strict)
+        results = make_stages(results, names[names.index(results.kind.begins_with) :])
+        _require_converged(results, strict)
     return directory.path
 
 
+def make_stages(results: Results, stages: Collection[str], *, force: bool = False) -> Results:
+    """Results with the artefacts of some stages: each that does not stand is made and saved.
+
+    What the other stages made is loaded where it is needed.
+
+    Parameters
+    ----------
+    results : Results
+    stages : collection of str
+    force : bool
+        Make them also where they stand.
+    """
+    r, run, config, base = results, results.run, results.config, results.base
+    source = str(run.path)
+
+    def stage(
+        name: str, artefact: str, make: Callable[[], Any], save: Callable[[Results], None]
+    ) -> None:
+        """Make and save an artefact, where its stage is among them."""
+        nonlocal r
+
+        def made() -> Results:
+            found = r.having(**{artefact: make()})
+            save(found)
+            # matches are read back: their rows may name the files that they lie in from now on
+            return found if name != "match" else r.having(inputs=r.inputs)
+
+        if name in stages:
+            r = run.make(name, made, force=force).value or r
+
+    def evaluated() -> Evaluation:
+        known = r.posterior, r.diagnostics, r.data, config
+        return evaluate(error_model(*known), *known, base, source=source, series=r.series)
+
+    def exported() -> list[dict[str, Any]]:
+        known = r.stored_evaluation, r.posterior, r.stored, r.data, config, base
+        return export(*known, run.path, source=source)
+
+    stage("match", "matched", lambda: match(r.inputs, config, base), save_matches)
+    stage("fit", "fitted", lambda: _fitted(r), save_fit)
+    stage("sample", "posterior", lambda: _sampled(r), save_sampled)
+    stage("diagnose", "stored", lambda: diagnose(r.posterior, r.data, config, base), save_diagnosed)
+    stage("evaluate", "evaluation", evaluated, save_evaluation)
+    stage("export", "products", exported, save_products)
+    stage("report", "figures", lambda: report(r), save_figures)
+    return r
+
+
+def _fitted(r: Results) -> Fitted:
+    """The fit, unless the rehearsal has made it."""
+    return r.made.get("fitted") or fit(r.matched, r.config, r.base, r.reader).fitted
+
+
+def _sampled(r: Results) -> Posterior:
+    """The posterior, with a progress bar."""
+    with progress_bar("sample") as progress:
+        return sample(r.data, r.config, folder=r.run.path, progress=progress)
+
+
 def continue_stage(path: str | Path, stage: str, *, strict: bool = False) -> RunDirectory:
-    """One stage of a run.
+    """One stage of a run; 'assess' stands for 'diagnose' and 'evaluate'.
 
     Raises
     ------
@@ -107,27 +172,14 @@ def continue_stage(path: str | Path, stage: str, *, strict: bool = False) -> Run
         raise InputError(
             "has no star lists to match", where=str(path), do="begin with the stage 'fit'"
         )
-    needs = (begins_with,) if stage == "fit" != begins_with else NEEDS[stage]
+    stages = ASSESS if stage == "assess" else (stage,)
+    needs = (begins_with,) if stage == "fit" != begins_with else NEEDS[stages[0]]
     directory.require(stage, needs, thorough=True)
     with initialized(directory) as results:
-        results = run_stage(results, stage)
+        results = make_stages(results, stages, force=True)
         if stage == "sample":
-            _judge(results, strict)
+            _require_converged(results, strict)
     return directory
-
-
-def run_stage(results: Results, stage: str, *, force: bool = True) -> Results:
-    """Results with the artefact of a stage: loaded where it stands, and else made.
-
-    Parameters
-    ----------
-    results : Results
-    stage : str
-    force : bool
-        Make it also where it stands.
-    """
-    made = results.run.make(stage, lambda: STAGES[stage](results), force=force)
-    return made.value or results
 
 
 @contextmanager
@@ -154,7 +206,7 @@ def initialized(directory: RunDirectory) -> Iterator[Results]:
                 yield results
 
 
-def _judge(results: Results, strict: bool) -> None:
+def _require_converged(results: Results, strict: bool) -> None:
     """Raise where a sampler has not converged, if that is asked for."""
     posterior = results.posterior
     if strict and convergence_check(posterior.convergence).level == "fail":

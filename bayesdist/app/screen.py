@@ -33,13 +33,7 @@ def start_logging(verbosity: int = 0) -> None:
 
 @contextmanager
 def log_file(path: Path) -> Iterator[None]:
-    """Send the log to a file as well.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be written.
-    """
+    """Send the log to a file as well."""
     try:
         handler = logging.FileHandler(path, encoding="utf-8")
     except OSError as error:

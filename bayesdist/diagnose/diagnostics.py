@@ -377,7 +377,7 @@ def catalogue_covariance(
     """
     if errors is None or stars is None or stars.star is None:
         return None
-    log.info("assess: errors of the catalogue, one for each star in all of its exposures")
+    log.info("diagnose: errors of the catalogue, one for each star in all of its exposures")
     return star_covariance(fit, stars, errors, frames=False)
 
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
-from bayesdist.app.assessment import assessment_rng
+from bayesdist.app.assessment.settings import assessment_rng
 from bayesdist.app.campaign.interpolation import INTERPOLATION as BETWEEN
 from bayesdist.app.config import load_config
 from bayesdist.app.results import Results
-from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.stages.assess import run_diagnose, run_evaluate
+from bayesdist.app.run import make_stages
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import LocalErrors
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.evaluation import budget_over
@@ -60,9 +61,8 @@ def assessed(truth: CampaignTruth, folder: Path, seed: int) -> Results:
     directory = RunDirectory.plan(folder / "run", settings, text, folder)
     results = after_stages(directory, *STAGES)
     # how the linear terms went with time takes longer than all the rest, and no error has it
-    made = directory.make("assess", lambda: run_evaluate(run_diagnose(results)))
-    assert made.value is not None
-    return made.value
+    with patch("bayesdist.app.saving.write_series_tables"):
+        return make_stages(results, ("diagnose", "evaluate"))
 
 
 def actual_error(results: Results, truth: CampaignTruth) -> np.ndarray:

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.assessment import assessment_rng
+from bayesdist.app.assessment.judging import margins_of
+from bayesdist.app.assessment.settings import assessment_rng
 from bayesdist.app.config import load_config
-from bayesdist.app.judging import margins_of
 from bayesdist.app.results import Results
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.evaluation import budget_over
 from bayesdist.assess.statistics import field_statistic
@@ -34,7 +34,7 @@ from .truth import KINDS, Truth
 from .written import toml_text
 
 GRID, DRAWS = (17, 17), 2000
-STAGES = ("fit", "sample", "assess")
+STAGES = ("fit", "sample", "diagnose", "evaluate")
 JUDGED = 3  # exposures for which requirements are judged, at most
 # name, statistic, limit in units of what the actual error has
 ASKED = (("below p95", "p95", 0.9), ("above p95", "p95", 1.6), ("below max", "max", 0.9))

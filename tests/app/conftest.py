@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bayesdist.app.run import STAGES
 from bayesdist.simulate import Truth
 from tests.app.support import Result, as_table, cli, simulated, write_job
 
@@ -84,4 +83,4 @@ def finished(sketched, tmp_path_factory) -> Finished:
 @pytest.fixture
 def no_report(monkeypatch):
     """Runs without the figures, which take seconds and are not the subject here."""
-    monkeypatch.setitem(STAGES, "report", lambda results: results)
+    monkeypatch.setattr("bayesdist.app.run.report", lambda results: [])

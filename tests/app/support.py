@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.assessment.rehearsal import rehearse
 from bayesdist.app.cli import main
-from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results, results_of
-from bayesdist.app.run import run_stage
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.run import make_stages
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import Truth, simulate_matches
@@ -226,6 +226,4 @@ def after_stages(directory: RunDirectory, *stages: str, rehearsed: bool = True) 
         results = rehearse(results)
     directory.begin()
     results = results.adopting_inputs()
-    for stage in stages:
-        results = run_stage(results, stage)
-    return results
+    return make_stages(results, stages, force=True)

@@ -6,12 +6,12 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from bayesdist.app import matches as app_matches
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.stars import fit_stars
-from bayesdist.app.matches import load_matches
+from bayesdist.app.matches import reading as app_matches
+from bayesdist.app.matches.reading import load_matches
 from bayesdist.app.results import open_results
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, read_matches, write_partitioned
 from bayesdist.data.storage.on_disk import StoredRows
 from bayesdist.infer import load_fit, load_posterior

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bayesdist.app import matches as app_matches
+from bayesdist.app.matches import reading as app_matches
 from tests.app.support import (
     begin_stagewise,
     model_of,
@@ -210,7 +210,7 @@ def test_a_part_that_is_damaged_while_it_is_read(job, tmp_path, monkeypatch):
 
 def test_a_part_that_vanishes_before_it_is_written_about(job, tmp_path, monkeypatch):
     """When what is said of each star is written: the draws stay, and the stage can be repeated."""
-    from bayesdist.app import star_files
+    from bayesdist.app.tables import star_files
     from tests.app.support import cli, good
 
     run = begin_stagewise_here(job, tmp_path)

@@ -12,8 +12,7 @@ from astropy.time import Time
 
 from bayesdist.app.campaign.soundness import frames_not_set, shear_warnings
 from bayesdist.app.results import results_of
-from bayesdist.app.run import STAGES
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches
 from bayesdist.data.tables.files import read_table
 from bayesdist.errors import DegenerateError
@@ -565,7 +564,7 @@ def test_resuming_after_a_list_was_removed(campaign):
 
 @pytest.mark.slow
 def test_a_damaged_campaign_is_calibrated_and_says_so(campaign, monkeypatch):
-    monkeypatch.setitem(STAGES, "report", lambda results: results)
+    monkeypatch.setattr("bayesdist.app.run.report", lambda results: [])
     campaign.lists(scattered, ONE).lists(lambda t: t[t["chip"] == 1], "f606w-006")
     # a few steps: what is said does not rest on the draws
     campaign.replaced("target_ess = 100", "max_steps = 20")

@@ -15,9 +15,10 @@ from bayesdist.app.campaign.inputs import read_campaign
 from bayesdist.app.campaign.matching import match_lists
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.pipeline import diagnose
 from bayesdist.app.results import open_results, results_of
-from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.stages.assess import run_diagnose
+from bayesdist.app.run import make_stages
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import read_matches
 from bayesdist.data.tables.files import read_table
 from bayesdist.infer import load_fit
@@ -77,7 +78,7 @@ def run(folder):
         good("stage", stage, run, "-q")
     directory = RunDirectory.open(run)
     with open_results(directory) as results:
-        directory.make("assess", lambda: run_diagnose(results))
+        make_stages(results, ("diagnose",))
     return run
 
 
@@ -153,9 +154,8 @@ def test_an_exposure_that_went_wrong_is_named(run, folder, tmp_path) -> None:
         if one.is_file():
             shutil.copy(one, tmp_path / "other" / one.name)
     results = results_of(RunDirectory.open(tmp_path / "other"))
-    run_diagnose(results)
-    found = results.run.summary["holdout"]
-    assert found["level"] == "fail" and f"exposure {name}, held out whole" in found["verdict"]
+    found = diagnose(results.posterior, results.data, results.config, results.base).holdout
+    assert found.level == "fail" and f"exposure {name}, held out whole" in found.verdict
 
 
 def test_later_exposures_confirm_the_release(run, later, tmp_path) -> None:

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.app.diagnostics_files import load_diagnostics
-from bayesdist.app.evaluation_files import load_evaluation
-from bayesdist.app.judging import evaluate_run
+from bayesdist.app.pipeline import evaluate
 from bayesdist.app.results import open_results
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.diagnostics_files import load_diagnostics
+from bayesdist.app.tables.evaluation_files import load_evaluation
 from bayesdist.errors import InputError
 
 from .support import summary_of
@@ -25,12 +25,11 @@ def results(finished):
 
 def test_what_is_read_is_what_would_be_made_again(results):
     kept = load_evaluation(results.run, results.fit, results.posterior)
-    made = evaluate_run(
+    made = evaluate(
         results.errors,
         results.posterior,
         results.diagnostics,
         results.data,
-        results.product,
         results.config,
         results.base,
     )

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-import bayesdist.app.release
+import bayesdist.app.commands.on_runs.release
 import bayesdist.app.results
 import bayesdist.products.release
 from bayesdist.app.campaign.filters import compare_filters
 from bayesdist.app.campaign.reference import held_tables
+from bayesdist.app.commands.on_runs.release import _require_alike
 from bayesdist.app.kinds.table_file import StoredLookupTables, read_tables, write_tables
-from bayesdist.app.release import _require_alike
 from bayesdist.app.results import results_of
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import LocalErrors
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.data import read_exposures
@@ -407,7 +407,8 @@ def test_nothing_is_left_of_a_release_that_fails_late(runs, tmp_path, monkeypatc
     def has_none(*args, **options):
         raise InputError("not of interest here")
 
-    monkeypatch.setattr(bayesdist.app.release, "compare_filters", has_none)  # it takes a while
+    # it takes a while
+    monkeypatch.setattr(bayesdist.app.commands.on_runs.release, "compare_filters", has_none)
     monkeypatch.setattr(bayesdist.products.release, "write_npol", fails)
     refused(tmp_path, *runs.values(), words=["the disk is full"])
 

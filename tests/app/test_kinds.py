@@ -20,8 +20,8 @@ from bayesdist.app.kinds.stars import (
 )
 from bayesdist.app.kinds.summary import fit_sections
 from bayesdist.app.results import open_results
-from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.store import as_json
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import MagnitudeErrors
 from bayesdist.infer import load_fit, load_posterior
 from tests.app.support import as_table, simulated, snapshot, summary_of, write_job

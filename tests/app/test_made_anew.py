@@ -11,8 +11,17 @@ from pathlib import Path
 import pytest
 
 from bayesdist.app.config import KINDS, load_config
-from bayesdist.app.made_from import LATER, LIMITS, changes, is_adjustable, settings_of
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store import Made
+from bayesdist.app.store.keys import digest_of
+from bayesdist.app.store.made_from import (
+    LATER,
+    LIMITS,
+    changes,
+    is_adjustable,
+    made_from_of,
+    settings_of,
+)
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer import load_posterior
 from tests.app.support import cli, good, refused, snapshot, summary_of, toml
 
@@ -60,7 +69,8 @@ def test_what_comes_after_sampling_is_made_anew(finished, run, tmp_path):
     for words in (
         "fit: done before",
         "sample: done before",
-        "assess: begins again, as assess.grid [9, 7] is now [5, 4]",
+        "diagnose: done before",
+        "evaluate: begins again, as assess.grid [9, 7] is now [5, 4]",
         "export: begins again",
     ):
         assert words in said
@@ -72,7 +82,7 @@ def test_what_comes_after_sampling_is_made_anew(finished, run, tmp_path):
     assert rows(run) == rows(fresh)
     assert (run / "sip.hdr").read_bytes() == (fresh / "sip.hdr").read_bytes()
     before = (run / "run.json").read_bytes()
-    assert good("run", config, "-o", run, "--resume").err.count("done before") == 5
+    assert good("run", config, "-o", run, "--resume").err.count("done before") == 6
     assert (run / "run.json").read_bytes() == before
 
 
@@ -100,7 +110,7 @@ def test_the_solution_is_what_a_run_is(finished, run, tmp_path, old, new, words)
 
 def test_where_the_work_is_done_is_in_no_key(finished, run):
     config = edited(finished, more="[compute]\nmemory_mb = 500\n")
-    assert good("run", config, "-o", run, "--resume").err.count("done before") == 5
+    assert good("run", config, "-o", run, "--resume").err.count("done before") == 6
     assert RunDirectory(run).config.compute.memory_mb == 500
 
 
@@ -132,7 +142,7 @@ def test_a_file_that_is_not_as_it_was_written_is_written_again(finished, run, na
 def test_a_run_that_was_moved_is_the_same(finished, run, tmp_path):
     run.rename(tmp_path / "moved")
     said = good("run", finished.config, "-o", tmp_path / "moved", "--resume").err
-    assert said.count("done before") == 5
+    assert said.count("done before") == 6
 
 
 def test_two_processes_do_not_work_on_one_run(finished, run, tmp_path):
@@ -174,6 +184,33 @@ def test_each_key_is_of_the_solution_or_of_what_comes_later(tmp_path, kind):
             name = f"{section}.{key}".strip(".")
             fixed = key in solution.get(section, {}) if key else section in solution
             assert fixed != is_adjustable(name, config), name
+
+
+DIAGNOSED = "[data]\nmatches = 'a'\n[model]\norder = 2\n[detector]\nsize = [9, 9]\n"
+REQUIREMENT = "[[requirement]]\nname = 'r'\nstatistic = 'rms'\nlimit = 0.1\n"
+TERM = "[[budget]]\nname = 'c'\nkind = 'random'\nsigma_u = 0.1\nsigma_v = 0.1\n"
+
+
+@pytest.mark.parametrize(
+    ("begun", "more", "anew"),
+    [
+        ("", REQUIREMENT + TERM + "[assess]\ndraws = 500\n", False),
+        ("", "[discrepancy]\nstructure = 5.0\n", True),
+        ("[periods]\ncentres = [55212.5, 55262.5]\ndays = 5.0\n", REQUIREMENT, True),
+        ("[holdout]\nfraction = 0.1\n", TERM, True),
+    ],
+)
+def test_diagnostics_are_made_anew_by_what_they_rest_on(tmp_path, begun, more, anew):
+    """The limit of a requirement is a tolerance of periods, and stars held out meet all errors."""
+    before = {name: Made(name, name) for name in ("fit", "sample")}
+    keys = []
+    for text in (DIAGNOSED + begun, DIAGNOSED + begun + more):
+        path = tmp_path / "c.toml"
+        path.write_text(text, encoding="utf-8")
+        facts = {"inputs": {}, "base": str(tmp_path)}
+        found = made_from_of("diagnose", before, load_config(path)[0], facts)
+        keys.append(digest_of([one for one in found if not isinstance(one, Made)]))
+    assert (keys[0] != keys[1]) == anew
 
 
 def test_changes_are_named_by_their_keys(finished):

@@ -5,9 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from bayesdist.app.config import load_config
-from bayesdist.app.pipeline import diagnose, error_model, evaluate, export, fit, match, sample
+from bayesdist.app.pipeline import (
+    diagnose,
+    error_model,
+    evaluate,
+    export,
+    fit,
+    match,
+    read,
+    sample,
+)
 from bayesdist.app.results import open_results
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
 
 from .support import snapshot, summary_of
 
@@ -16,7 +25,7 @@ def test_a_script_finds_what_a_run_finds(finished, tmp_path):
     before = snapshot(finished.path.parent)
     config, _ = load_config(finished.config)
     base = finished.config.parent
-    data = fit(match(config, base), config, base)
+    data = fit(match(read(config, base), config, base), config, base)
     posterior = sample(data, config)
     found = diagnose(posterior, data, config, base)
     errors = error_model(posterior, found, data, config)
@@ -29,11 +38,11 @@ def test_a_script_finds_what_a_run_finds(finished, tmp_path):
         known = results.evaluation
     assert evaluation.budget.rows() == known.budget.rows()
     assert evaluation.checks == known.checks
-    for made, read in zip(evaluation.margins, known.margins, strict=True):
-        assert made.verdict == read.verdict and made.rests_on == read.rests_on
-        np.testing.assert_array_equal(made.draws, read.draws)
-    for made, read in zip(evaluation.maps, known.maps, strict=True):
-        np.testing.assert_array_equal(made.radius, read.radius)
+    for made, stored in zip(evaluation.margins, known.margins, strict=True):
+        assert made.verdict == stored.verdict and made.rests_on == stored.rests_on
+        np.testing.assert_array_equal(made.draws, stored.draws)
+    for made, stored in zip(evaluation.maps, known.maps, strict=True):
+        np.testing.assert_array_equal(made.radius, stored.radius)
     written = summary_of(finished.path)["products"]
     assert [one["path"] for one in products] == [one["path"] for one in written] != []
     for one, other in zip(products, written, strict=True):

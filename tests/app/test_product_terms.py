@@ -10,11 +10,11 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
 
-from bayesdist.app.file_positions import sip_positions
-from bayesdist.app.made_files import ProductInput
-from bayesdist.app.product_terms import _Laid, product_terms
+from bayesdist.app.products.file_positions import sip_positions
+from bayesdist.app.products.made_files import ProductInput
+from bayesdist.app.products.product_terms import _Laid, product_terms
 from bayesdist.app.results import open_results
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.calibration.calibration import GaussianSolution
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import read_wise_meta, sip_from_solution, write_wise_meta

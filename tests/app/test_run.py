@@ -23,10 +23,9 @@ from astropy.wcs import WCS, FITSFixedWarning
 
 import bayesdist
 from bayesdist.app.config import load_config, parse_config
-from bayesdist.app.run import STAGES
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.report import title_of
 from bayesdist.app.screen import progress_bar
-from bayesdist.app.stages.report import title_of
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.summary import Summary, schema_text
 from bayesdist.assess.terms.correlated import STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.data import read_matches
@@ -89,7 +88,7 @@ def test_the_record(finished):
     assert record["seed"] == 1
     for package in ("python", "numpy", "scipy", "astropy", "emcee", "numba", "arviz", "bayesdist"):
         assert re.match(r"\d+\.\d+", record["versions"][package]), package
-    assert list(record["stages"]) == ["fit", "sample", "assess", "export", "report"]
+    assert list(record["stages"]) == ["fit", "sample", "diagnose", "evaluate", "export", "report"]
     assert all(s["wall_s"] > 0 for s in record["stages"].values())
     assert record["command"].startswith("bayesdist run")
     # resolved: what the file leaves out stands here with its default
@@ -99,7 +98,7 @@ def test_the_record(finished):
 
 def test_the_log(finished):
     log = (finished.path / "bayesdist.log").read_text()
-    for stage in ("fit", "sample", "assess", "export", "report"):
+    for stage in ("fit", "sample", "diagnose", "evaluate", "export", "report"):
         assert f"{stage}: begins" in log
     # the screen says the same, and draws no bar where it is no terminal
     assert "fit: begins" in finished.result.err
@@ -457,7 +456,7 @@ def test_the_seed_of_the_command_line_is_recorded(finished, tmp_path):
     """... and rules: --seed 1 in place of a configured 2 gives what seed 1 gives."""
     config, text = load_config(finished.config)
     run = RunDirectory.plan(tmp_path / "r", config, text, finished.config.parent, seed=77)
-    assert run.record["seed"] == 77 and run.config.sampler.seed == 77
+    assert run.facts["seed"] == 77 and run.config.sampler.seed == 77
     assert not (tmp_path / "r").exists()
 
 
@@ -468,16 +467,16 @@ def test_resuming_a_finished_run_changes_nothing(copy, finished):
 
 
 def test_an_interrupted_run_goes_on(finished, posterior, tmp_path, monkeypatch):
-    def interrupt(results):
+    def interrupt(*_):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setitem(STAGES, "assess", interrupt)
+        patch.setattr("bayesdist.app.run.diagnose", interrupt)
         result = cli("run", finished.config, "-o", tmp_path / "run")
     assert result.code == 130 and "--resume" in result.err and "Traceback" not in result.err
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert list(record["stages"]) == ["fit", "sample"]
-    monkeypatch.setitem(STAGES, "report", lambda results: results)
+    monkeypatch.setattr("bayesdist.app.run.report", lambda results: [])
     result = good("run", finished.config, "-o", tmp_path / "run", "--resume")
     assert "sample: done before" in result.err
     np.testing.assert_array_equal(load_posterior(tmp_path / "run").theta, posterior.theta)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from astropy.table import Table, vstack
 
-from bayesdist.app import matches
+from bayesdist.app.matches import reading
 from bayesdist.data import open_matches
 from bayesdist.infer import load_fit
 from bayesdist.missions.wise.pairs.read import read_rvb
@@ -26,7 +26,7 @@ STAGES = ("fit", "sample", "assess", "export")
 @pytest.fixture
 def on_disk(monkeypatch):
     """Parquet of more than 100 rows is left on disk."""
-    monkeypatch.setattr(matches, "IN_MEMORY", 100)
+    monkeypatch.setattr(reading, "IN_MEMORY", 100)
 
 
 def counted(table: Table) -> dict[str, int]:

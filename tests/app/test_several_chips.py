@@ -13,7 +13,7 @@ from astropy.table import Table
 from astropy.wcs import WCS
 
 from bayesdist.app.results import results_of
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import area_map, binned_residuals, misfit_of, uncertainty_map
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.infer import load_fit, load_posterior, residuals

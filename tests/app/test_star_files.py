@@ -11,8 +11,8 @@ import xarray as xr
 from scipy.special import logsumexp
 from scipy.stats import norm
 
-from bayesdist.app import star_files
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables import star_files
 from bayesdist.data import batches, read_matches
 from bayesdist.data.tables.files import parquet_units
 from bayesdist.infer import load_fit, load_posterior

@@ -17,9 +17,8 @@ from bayesdist.app.campaign.matched import CampaignMatched, campaign_matches
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.results import Results, open_results
-from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.stages.fit import run_fit
-from bayesdist.app.stages.match import run_match
+from bayesdist.app.run import make_stages
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit
 from bayesdist.infer.nodes import Matern, NodeGrid, TableFit
@@ -139,9 +138,9 @@ def calibrated(setting: Setting, seed: int) -> Iterator[Calibrated]:
         run = RunDirectory.plan(Path(folder) / "run", settings, text, base)
         run.begin()
         with open_results(run) as results:
-            results = run_match(results)
+            results = make_stages(results, ("match",))
             with _results_of("fit_tables", "fit_hierarchical") as made:
-                results = run_fit(results)
+                results = make_stages(results, ("fit",))
             bare = made["fit_hierarchical"]
             yield Calibrated(
                 campaign=read_acs(base),

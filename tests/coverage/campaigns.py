@@ -11,10 +11,8 @@ from scipy.interpolate import RegularGridInterpolator
 
 from bayesdist.app.config import load_config
 from bayesdist.app.results import Results, results_of
-from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.stages.assess import run_diagnose
-from bayesdist.app.stages.fit import run_fit
-from bayesdist.app.stages.sample import run_sample
+from bayesdist.app.run import make_stages
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.simulate import simulate_matches
 
@@ -184,4 +182,4 @@ def assessed(kind: Kind, seed: int, stars: Table, folder: Path) -> Results:
     directory = RunDirectory.plan(folder / "run", config, text, folder)
     results = results_of(directory)
     directory.begin()
-    return run_diagnose(run_sample(run_fit(results)))
+    return make_stages(results, ("fit", "sample", "diagnose"))

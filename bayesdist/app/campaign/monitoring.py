@@ -13,8 +13,8 @@ from bayesdist.app.config import Config
 from bayesdist.app.kinds.errors import read_magnitude_errors
 from bayesdist.app.kinds.fitted import Fitted, required
 from bayesdist.app.results import Results
-from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.star_files import PAIRS, part_files
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.star_files import PAIRS, part_files
 from bayesdist.data import MagnitudeErrors, Matches, read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
@@ -191,7 +191,7 @@ def _catalogue_errors(pairs: Matches) -> StarErrors | None:
 
 def _catalogue_of(run: RunDirectory) -> str | None:
     """Hash of a run's catalogue."""
-    block, base = run.config.campaign, Path(run.record["base"])
+    block, base = run.config.campaign, Path(run.facts["base"])
     assert block is not None
-    found: str | None = run.record["inputs"].get(str(base / block.catalog))
+    found: str | None = run.facts["inputs"].get(str(base / block.catalog))
     return found

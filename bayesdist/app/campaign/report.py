@@ -19,8 +19,8 @@ from bayesdist.app.config import Config
 from bayesdist.app.config.campaign import CampaignBlock
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.results import Results
-from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.store import as_json
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches
 from bayesdist.data.motions import motion_error_line
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals

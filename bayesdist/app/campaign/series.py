@@ -11,8 +11,8 @@ from astropy.table import Table
 from bayesdist.app.campaign.reference import free_rates
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fitted import Fitted, required
-from bayesdist.app.output import write_table
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.output import write_table
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.series import Series, SeriesPosterior, TrendModel, describe, fit_series
 
@@ -45,7 +45,7 @@ def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> No
     except DegenerateError as error:
         if free_rates(config):
             raise
-        log.info("assess: no drift from these exposures alone: %s", error.cause)
+        log.info("diagnose: no drift from these exposures alone: %s", error.cause)
         return
     write_table(_exposures(series, posterior), run / "series.ecsv")
     write_table(_predictions(posterior), run / "drift.ecsv")
@@ -71,7 +71,7 @@ def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> No
         }
     )
     for row in verdicts:
-        log.info("assess: %s: %s", row["term"], row["claim"])
+        log.info("diagnose: %s: %s", row["term"], row["claim"])
 
 
 def _doubts(known: Sequence[str], outlying: Sequence[str]) -> Iterator[str]:

@@ -20,7 +20,7 @@ from bayesdist.app.commands.options import (
 @click.argument("file", metavar="FILE")
 def inspect(file: str) -> None:
     """What a product or a posterior holds, and its faults."""
-    from bayesdist.app.inspect import inspect as described
+    from bayesdist.app.commands.on_files.inspect import inspect as described
 
     click.echo(described(file))
 
@@ -61,7 +61,7 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
     FILE is an IDCTAB, a run, or whatever 'compare' takes; TABLE has the columns x, y, chip, or
     x_out, y_out on the way back.
     """
-    from bayesdist.app.apply import apply_to_table
+    from bayesdist.app.commands.on_files.apply import apply_to_table
 
     click.echo(apply_to_table(file, table, output, **options))
 
@@ -83,7 +83,7 @@ def compare(
 
     A and B are each a run, a posterior, a fit, an IDCTAB, a SIP header or WISE meta-data.
     """
-    from bayesdist.app.compare import compare_files
+    from bayesdist.app.commands.on_runs.compare import compare_files
 
     click.echo(compare_files(a, b, output, keep=keep_linear, command=line, **options))
 
@@ -98,7 +98,7 @@ def monitor(line: str, run: str, new: str, output: str | None) -> None:
 
     NEW is a table of matches, or a CONFIG.toml that names them.
     """
-    from bayesdist.app.monitor import monitor as watched
+    from bayesdist.app.commands.on_runs.monitor import monitor as watched
 
     click.echo(watched(run, new, output, command=line))
 
@@ -113,6 +113,6 @@ def release(line: str, runs: tuple[str, ...], output: str, allow_unconverged: bo
 
     The first run is that of the reference filter.
     """
-    from bayesdist.app.release import release_runs
+    from bayesdist.app.commands.on_runs.release import release_runs
 
     click.echo(release_runs(runs, output, allow_unconverged=allow_unconverged, command=line))

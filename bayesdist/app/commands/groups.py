@@ -34,13 +34,7 @@ class LazyGroup(click.Group):
 
     @staticmethod
     def load(target: str) -> click.Command:
-        """Command that "module:object" names.
-
-        Raises
-        ------
-        InputError
-            When that is no command.
-        """
+        """Command that "module:object" names."""
         command = load_object(target)
         if not isinstance(command, click.Command):
             raise InputError("is no command", where=target, do="mend the package that names it")

@@ -20,7 +20,7 @@ from bayesdist.errors import InputError
 )
 def plan(run: str, requirement: str | None, epochs: tuple[float, ...]) -> None:
     """How many more exposures would meet the requirements."""
-    from bayesdist.app.plan import plan as exposures_planned
+    from bayesdist.app.commands.on_runs.plan import plan as exposures_planned
 
     if run.endswith(".toml"):
         raise InputError(
@@ -52,6 +52,6 @@ def select_order(
     config: str, orders: tuple[int, int], output: str | None, figure: str | None, force: bool
 ) -> None:
     """The polynomial order, selected by the data."""
-    from bayesdist.app.order import order
+    from bayesdist.app.commands.on_runs.order import order
 
     click.echo(order(config, orders, output=output, figure=figure, force=force))

@@ -16,7 +16,7 @@ MISSED = 4  # exit code
 )
 def requirements(run: str, requirements: str) -> int:
     """Margins of a run; exit 4 unless all are met."""
-    from bayesdist.app.validate import validate
+    from bayesdist.app.commands.on_runs.validate import validate
 
     text, met = validate(run, requirements)
     click.echo(text)
@@ -46,6 +46,6 @@ def budget(
     magnitude: float | None,
 ) -> None:
     """What the error of a position, or of a distance, is made of."""
-    from bayesdist.app.budget import budget_at
+    from bayesdist.app.commands.on_runs.budget import budget_at
 
     click.echo(budget_at(run, at, to=list(to), chip=chip, epoch=epoch, magnitude=magnitude))

@@ -8,7 +8,7 @@ import click
 
 from bayesdist.app.commands.options import column_names, command, force
 
-STAGES = ("match", "fit", "sample", "assess", "export", "report")
+STAGES = ("match", "fit", "sample", "diagnose", "evaluate", "assess", "export", "report")
 
 
 @command()
@@ -37,7 +37,7 @@ def init(
     force: bool,
 ) -> None:
     """A commented configuration for matched stars."""
-    from bayesdist.app.init import init as write_configuration
+    from bayesdist.app.commands.on_files.init import init as write_configuration
 
     n = write_configuration(config, matches, columns=columns, size=size, force=force)
     click.echo(f"{config}: for {n} matches; read it, then 'bayesdist check' it")
@@ -47,7 +47,7 @@ def init(
 @click.argument("config", metavar="CONFIG.toml")
 def check(config: str) -> None:
     """Units, rank, null space and cost; samples nothing."""
-    from bayesdist.app.check import check as checked
+    from bayesdist.app.commands.on_runs.check import check as checked
 
     click.echo(checked(config))
 
@@ -71,12 +71,12 @@ def run(
     strict: bool,
     seed: int | None,
 ) -> None:
-    """The whole job: fit, sample, assess, export, report."""
+    """The whole job: match, fit, sample, diagnose, evaluate, export, report."""
     if resume and force:
         raise click.UsageError("--resume and --force exclude each other.")
     from bayesdist.app.run import run as whole_job
-    from bayesdist.app.rundir import RunDirectory
-    from bayesdist.app.summary_text import results_text
+    from bayesdist.app.store.rundir import RunDirectory
+    from bayesdist.app.tables.margins import results_text
 
     path = whole_job(
         config, output, resume=resume, force=force, strict=strict, seed=seed, command=line
@@ -92,8 +92,8 @@ def stage(name: str, run: str, strict: bool) -> None:
     """One stage of a run.
 
     match: star lists to matches, of a campaign or a self-calibration; fit: the linear fit; sample:
-    the posterior, from its checkpoints on; assess: maps, budget, margins; export: files for
-    pipelines; report: figures and report.html.
+    the posterior, from its checkpoints on; diagnose: what residuals say; evaluate: maps, budget,
+    margins; assess: these two; export: files for pipelines; report: figures and report.html.
     """
     if strict and name != "sample":
         raise click.UsageError("--strict is an option of the stage 'sample'.")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.output import write_table
+from bayesdist.app.tables.output import write_table
 from bayesdist.data.added_errors import AddedErrors
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import Matches

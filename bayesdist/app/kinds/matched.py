@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from astropy.table import Table
 
 from bayesdist.app.config import Config
-from bayesdist.app.output import write_table
+from bayesdist.app.tables.output import write_table
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.infer import Posterior

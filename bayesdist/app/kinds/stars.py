@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.app.added_errors import compared_errors, grouped_errors_of, knows_circle
-from bayesdist.app.chips import check_chips
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw, read_magnitude_errors
 from bayesdist.app.kinds.fit_data import FitData
@@ -18,7 +16,9 @@ from bayesdist.app.kinds.fitted import FIT, Fitted
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.kinds.split import set_aside
-from bayesdist.app.match_sources import read_configured
+from bayesdist.app.matches.added_errors import compared_errors, grouped_errors_of, knows_circle
+from bayesdist.app.matches.reading import check_chips
+from bayesdist.app.matches.sources import read_configured
 from bayesdist.assess import SAMPLE
 from bayesdist.data import Matches
 from bayesdist.diagnose.residuals.quoted import error_scale

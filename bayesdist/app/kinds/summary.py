@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from bayesdist.app.added_errors import added_errors_rows
 from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.matches.added_errors import added_errors_rows
 from bayesdist.data import Matches
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.skew import Skew, skew_of

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.inputs import cuts_of, lists_of
-from bayesdist.app.chips import check_chips
 from bayesdist.app.config import Config
 from bayesdist.app.config.selfcal import SelfcalBlock
+from bayesdist.app.matches.reading import check_chips
 from bayesdist.data import ReferenceCatalog, StarList, read_catalog, read_exposures
 from bayesdist.data.detections import Detections, detections_of
 from bayesdist.data.matching.frames import refuse_duplicates

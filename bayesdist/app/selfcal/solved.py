@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.output import write_table
 from bayesdist.app.selfcal.gauge import gauge_table, gauge_words
+from bayesdist.app.tables.output import write_table
 from bayesdist.data.matches import Matches
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal import Gauge, SelfCalibrationMode

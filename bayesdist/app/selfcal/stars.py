@@ -10,11 +10,11 @@ from astropy.table import Table
 from astropy.units import Unit
 from numpy.typing import NDArray
 
-from bayesdist.app.checks import provenance_notes
+from bayesdist.app.assessment.checks import provenance_notes
 from bayesdist.app.kinds.fitted import required
-from bayesdist.app.output import write_table
 from bayesdist.app.results import Results
 from bayesdist.app.selfcal.matched import selfcal_matches
+from bayesdist.app.tables.output import write_table
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.storage.write import write_columns
 from bayesdist.infer.selfcal import SelfCalibrationMode, StarCatalogue, star_catalogue

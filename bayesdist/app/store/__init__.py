@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from bayesdist.app.store.keys import Adjustable, differences
-from bayesdist.app.store.record import SCHEMA, Artefact, Record, as_json, write_json
+from bayesdist.app.store.record import Artefact, Record, as_json, write_json
 from bayesdist.app.store.store import Made, RunStore, Stage
 
 __all__ = [
-    "SCHEMA",
     "Adjustable",
     "Artefact",
     "Made",

@@ -23,22 +23,10 @@ class Adjustable:
 
 
 def canonical(value: Any) -> Any:
-    """A value as JSON, the same for values that are equal.
+    """A value as JSON, the same for values that are equal; TypeError for unknown content.
 
-    Parameters
-    ----------
-    value : object
-        Settings, a dataclass, arrays, paths, and mappings and sequences of these.
-
-    Returns
-    -------
-    object
-        Of mappings, lists, text, numbers and None.
-
-    Raises
-    ------
-    TypeError
-        For a value whose content is not known: it must not be in a key.
+    Settings, dataclasses, arrays, paths, and mappings and sequences of these become mappings,
+    lists, text, numbers and None.
     """
     if isinstance(value, Adjustable):
         return canonical(value.value)

@@ -119,13 +119,7 @@ class Record:
 
     @classmethod
     def read(cls, path: Path) -> Record:
-        """Read run.json.
-
-        Raises
-        ------
-        InputError
-            For a file that cannot be read, and for a run of another version of the package.
-        """
+        """Content of a run.json; InputError where it cannot be read or has another schema."""
         try:
             facts = json.loads(path.read_text(encoding="utf-8"))
             schema = facts.pop("schema")
@@ -148,10 +142,6 @@ class Record:
 
     def write(self, path: Path) -> None:
         """Replace run.json."""
-        write_json(path, self.as_dict())
-
-    def as_dict(self) -> dict[str, Any]:
-        """Content of run.json as plain values."""
         found = {name: asdict(one) for name, one in self.artefacts.items()}
         whole = {"schema": SCHEMA, **self.facts, "stages": self.stages, "artefacts": found}
-        return as_json(whole | {"under_way": self.under_way, "checkpoints": self.checkpoints})
+        write_json(path, whole | {"under_way": self.under_way, "checkpoints": self.checkpoints})

@@ -24,7 +24,7 @@ from bayesdist.app.store.record import (
     write_json,
 )
 from bayesdist.errors import InputError
-from bayesdist.files import is_leftover, remove_leftovers, watched_writes
+from bayesdist.files import is_leftover, made_folder, remove_leftovers, watched_writes
 
 __all__ = ["Made", "RunStore", "Stage"]
 
@@ -84,8 +84,8 @@ class RunStore:
 
     Parameters
     ----------
-    folder : Path
-        With a run.json.
+    path : Path
+        A folder with a run.json, or one that will have it.
     stages : mapping of str to Stage
         By name, in order.
     head : callable, optional
@@ -94,11 +94,12 @@ class RunStore:
 
     def __init__(
         self,
-        folder: Path,
+        path: Path,
         stages: Mapping[str, Stage],
         head: Callable[[Mapping[str, Any]], Mapping[str, Any]] = lambda facts: {},
     ) -> None:
-        self.folder, self.stages, self.head = folder, stages, head
+        self.path, self.stages, self.head = path, stages, head
+        self._planned: Record | None = None
         # of the stage that is being made here
         self._making = ""
         self._sections: dict[str, Any] = {}
@@ -108,8 +109,8 @@ class RunStore:
 
     @property
     def record(self) -> Record:
-        """Content of run.json."""
-        return Record.read(self.folder / RECORD)
+        """Content of run.json, or of what it will be."""
+        return self._planned or Record.read(self.path / RECORD)
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -135,7 +136,7 @@ class RunStore:
         artefact = self.record.artefacts.get(name)
         if artefact is None or artefact.key != digest_of(self._parts(name, made_from)):
             return None
-        if self._harmed(artefact, thorough=False):
+        if self.harmed(artefact, thorough=False):
             return None
         return Made(name, artefact.digest)
 
@@ -148,45 +149,35 @@ class RunStore:
                 parts |= canonical(one)
         return parts
 
-    def _harmed(self, artefact: Artefact, *, thorough: bool) -> str:
-        """The first file that is not as the stage left it, '' where all are."""
+    def harmed(self, artefact: Artefact, *, thorough: bool) -> str:
+        """The first file of an artefact that is not as its stage left it, '' where all are."""
         for name, mark in artefact.files.items():
-            path = self.folder / name
+            path = self.path / name
             if not path.is_file() or path.stat().st_size != mark.size:
                 return name
             if thorough and FileMark.of(path) != mark:
                 return name
         return ""
 
-    def harmed(self, name: str, *, thorough: bool = True) -> str:
-        """The first file of a stage that has changed since it was written, '' for none."""
-        artefact = self.record.artefacts.get(name)
-        return "" if artefact is None else self._harmed(artefact, thorough=thorough)
-
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes from writing into the folder; the lock dies with the process.
-
-        Raises
-        ------
-        InputError
-            Where another one has it.
-        """
+        """Keep other processes from writing into the folder; the lock dies with the process."""
+        made_folder(self.path)
         if fcntl is None:
             yield
             return
-        held = os.open(self.folder, os.O_RDONLY)
+        held = os.open(self.path, os.O_RDONLY)
         try:
             try:
                 fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 raise InputError(
                     "another process is at work on this run",
-                    where=str(self.folder),
+                    where=str(self.path),
                     do="wait until it has ended, or choose another folder",
                 ) from error
             except OSError as error:  # file systems that know no locks
-                log.debug("%s cannot be locked: %s", self.folder, error)
+                log.debug("%s cannot be locked: %s", self.path, error)
             yield
         finally:
             os.close(held)
@@ -196,25 +187,14 @@ class RunStore:
     def stage(
         self, name: str, function: Callable[[], T], *made_from: object, force: bool = False
     ) -> Made[T]:
-        """The artefact of a stage, which is made unless it stands.
+        """The artefact of a stage, which is made unless it stands; with `force` also where it does.
 
-        Parameters
-        ----------
-        name : str
-        function : callable
-            Writes files into the folder, and sections by `summarise`.
-        *made_from : object
-            `Made`, and mappings whose values have a canonical form.
-        force : bool
-            Make it also where it stands.
-
-        Returns
-        -------
-        Made
+        `function` writes files into the folder, and sections by `summarise`; `made_from` are
+        `Made`, and mappings whose values have a canonical form.
         """
         parts, record = self._parts(name, made_from), self.record
         key, known = digest_of(parts), record.artefacts.get(name)
-        harmed = "" if known is None else self._harmed(known, thorough=True)
+        harmed = "" if known is None else self.harmed(known, thorough=True)
         if known is not None and known.key == key and not harmed and not force:
             log.info("%s: done before", name)
             return Made(name, known.digest)
@@ -233,18 +213,9 @@ class RunStore:
 
     @contextmanager
     def amended(self, name: str, *made_from: object) -> Iterator[dict[str, Any]]:
-        """Note what a command writes as part of a stage.
+        """Note what a command writes as part of a stage; yields facts of the record, to be changed.
 
-        Parameters
-        ----------
-        name : str
-        *made_from : object
-            What the artefact is made from afterwards; nothing where it does not stand.
-
-        Yields
-        ------
-        dict
-            Facts of the record, which may be changed.
+        `made_from` is what the artefact is made from afterwards; nothing where it does not stand.
         """
         record, self._sections = self.record, {}
         known = record.artefacts.get(name)
@@ -259,7 +230,7 @@ class RunStore:
             yield record.facts
         parts = self._parts(name, made_from) if known and made_from else {}
         known = known or Artefact("", {})
-        files = {one: FileMark.of(self.folder / one) for one in written if self._is_there(one)}
+        files = {one: FileMark.of(self.path / one) for one in written if self._is_there(one)}
         files = {one: mark for one, mark in known.files.items() if self._is_there(one)} | files
         sections = {**known.sections, **self._sections}
         key = digest_of(parts) if parts else ""
@@ -272,7 +243,7 @@ class RunStore:
         before = record.under_way or {"stage": name, "files": []}
         known = record.artefacts.pop(name, None)
         record.stages.pop(name, None)
-        remove_leftovers(self.folder)
+        remove_leftovers(self.path)
         files = set(known.files) if known else set()
         if before["stage"] == name:
             files |= set(before["files"])
@@ -294,7 +265,7 @@ class RunStore:
         record = self.record
         written = {one for one in self._written if self._is_there(one)}
         written |= set(self._checkpoints(name))
-        marks = {one: FileMark.of(self.folder / one) for one in sorted(written)}
+        marks = {one: FileMark.of(self.path / one) for one in sorted(written)}
         artefact = Artefact(key, parts, marks, self._sections)
         self._drop_sections(record, name, artefact)
         record.artefacts[name], record.under_way, self._sections = artefact, None, {}
@@ -324,7 +295,7 @@ class RunStore:
 
     def _is_there(self, name: str) -> bool:
         """Boolean: a file of the folder exists."""
-        return (self.folder / name).is_file()
+        return (self.path / name).is_file()
 
     @contextmanager
     def _noted(self, stage: str) -> Iterator[None]:
@@ -339,7 +310,7 @@ class RunStore:
             assert record.under_way is not None
             if name not in record.under_way["files"]:
                 record.under_way["files"] = sorted([*record.under_way["files"], name])
-                record.write(self.folder / RECORD)
+                record.write(self.path / RECORD)
 
         self._making = stage
         try:
@@ -350,7 +321,7 @@ class RunStore:
 
     def _own(self, path: Path) -> str | None:
         """Name of a file in the folder, None for one elsewhere and for the record itself."""
-        path, folder = path.absolute(), self.folder.absolute()
+        path, folder = path.absolute(), self.path.absolute()
         if not path.is_relative_to(folder):
             return None
         name = path.relative_to(folder).as_posix()
@@ -359,18 +330,18 @@ class RunStore:
 
     def _checkpoints(self, name: str) -> list[str]:
         """Files by which a stage goes on, as they are there."""
-        found = (path for one in self.stages[name].checkpoints for path in self.folder.glob(one))
+        found = (path for one in self.stages[name].checkpoints for path in self.path.glob(one))
         return sorted(path.name for path in found)
 
     def _write(self, record: Record) -> None:
         """Write run.json, and summary.json where it is another."""
         self.restore_summary(record)
-        record.write(self.folder / RECORD)
+        record.write(self.path / RECORD)
 
     def restore_summary(self, record: Record | None = None) -> None:
         """Write summary.json as the stages that have ended have it, where it is not so."""
         record = record or self.record
-        path, sections = self.folder / SUMMARY, self._merged(record)
+        path, sections = self.path / SUMMARY, self._merged(record)
         if not sections:
             path.unlink(missing_ok=True)
             return
@@ -396,10 +367,10 @@ class RunStore:
         others = {one for artefact in record.artefacts.values() for one in artefact.files}
         folders = set()
         for name in set(names) - others:
-            path = self.folder / name
+            path = self.path / name
             path.unlink(missing_ok=True)
             folders.add(path.parent)
-        for folder in folders - {self.folder}:
+        for folder in folders - {self.path}:
             if folder.is_dir():
                 remove_leftovers(folder)
                 if not any(not is_leftover(one.name) for one in folder.iterdir()):

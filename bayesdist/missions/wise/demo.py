@@ -9,9 +9,9 @@ from astropy.table import QTable
 
 from bayesdist.app.results import results_of
 from bayesdist.app.run import run
-from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number, table_text
-from bayesdist.app.summary_text import results_text
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.margins import results_text
 from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path, made_folder

@@ -10,7 +10,7 @@ from astropy.table import Table
 
 from bayesdist.app.config import load_config
 from bayesdist.app.results import Results
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.simulate.dithers import DitheredField
 from tests.app.support import after_stages, write_config
 from tests.infer.selfcal.fields import SIZE, field

@@ -7,8 +7,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.app.results import results_of
-from bayesdist.app.run import STAGES
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import read_hst1pass
 from bayesdist.infer.selfcal import gauge_free
 from tests.app.support import good, summary_of, write_config
@@ -36,7 +35,7 @@ def run(data_dir, tmp_path_factory):
         sampler={"seed": 1},
     )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(STAGES, "report", lambda results: results)
+        patch.setattr("bayesdist.app.run.report", lambda results: [])
         good("run", config, "-o", folder / "run")
     return folder / "run"
 

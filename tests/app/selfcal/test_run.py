@@ -14,12 +14,11 @@ from scipy import stats
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.results import results_of
-from bayesdist.app.run import STAGES
-from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.selfcal.fit import fit_selfcal
 from bayesdist.app.selfcal.given import read_given
 from bayesdist.app.selfcal.matching import match_dithers
 from bayesdist.app.store import as_json
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer import load_fit, load_posterior
 from bayesdist.infer.selfcal import gauge_free
 from tests.app.selfcal.support import affine_left
@@ -206,12 +205,12 @@ def test_a_run_that_was_killed_goes_on(three_rolls, tmp_path, monkeypatch, no_re
     shutil.copytree(three_rolls.config.parent, tmp_path / "input")
     config, run = tmp_path / "input" / "config.toml", tmp_path / "run"
 
-    def killed(results):
+    def killed(*_, **options):
         raise Killed
 
-    for stage, flag in (("fit", ()), ("sample", ("--resume",)), ("assess", ("--resume",))):
+    for stage, flag in (("fit", ()), ("sample", ("--resume",)), ("diagnose", ("--resume",))):
         with monkeypatch.context() as patch:
-            patch.setitem(STAGES, stage, killed)
+            patch.setattr(f"bayesdist.app.run.{stage}", killed)
             with pytest.raises(Killed):
                 cli("run", config, "-o", run, *flag)
     good("run", config, "-o", run, "--resume")

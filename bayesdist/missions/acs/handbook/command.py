@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING
 
 from astropy.table import Table
 
-from bayesdist.app.calibrations import calibration_at
-from bayesdist.app.folder import atomic_directory
-from bayesdist.app.output import write_table
+from bayesdist.app.commands.on_files.calibrations import calibration_at
 from bayesdist.app.results import open_results
-from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import table_text
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.output import atomic_directory, write_table
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
 from bayesdist.missions.acs.handbook.numbers import detector_numbers

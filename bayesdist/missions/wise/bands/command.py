@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 
-from bayesdist.app.folder import atomic_directory, versions
 from bayesdist.app.screen import table_text
-from bayesdist.app.store import write_json
+from bayesdist.app.tables.output import record_folder
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bands.context import BandsInput
 from bayesdist.missions.wise.bands.findings import overview_table
@@ -57,7 +56,8 @@ def bands_of_runs(
         bands = open_bands(runs)
         for band in bands.values():
             stack.enter_context(closing(band.results))
-        folder = stack.enter_context(atomic_directory(Path(output)))
+        made = record_folder(Path(output), "bands.json", command)
+        folder, record = stack.enter_context(made)
         order = {str(band.results.run.path): name for name, band in bands.items()}
         named = [order[str(Path(path))] for path in runs]
         inputs = measure_bands(
@@ -65,10 +65,10 @@ def bands_of_runs(
             bins=bins,
             optical=optical_models(optical, rotation, named),
             published=published,
-            provenance={"command": command, **versions()},
+            provenance={"command": command, **record["versions"]},
         )
         files = [*write_tables(inputs, folder), *_meta(bands, folder), *write_bands(folder, inputs)]
-        write_json(folder / "bands.json", record_of(inputs) | {"files": files})
+        record |= record_of(inputs) | {"files": files}
     return _text(Path(output), inputs)
 
 

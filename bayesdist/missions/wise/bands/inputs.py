@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bayesdist.app.results import Results, results_of
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import pixel_scale_of
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.published import WISE_BANDS

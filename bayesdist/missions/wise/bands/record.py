@@ -8,21 +8,18 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.output import write_table
+from bayesdist.app.tables.output import write_table
 from bayesdist.missions.wise.assess.account import RowAccount
 from bayesdist.missions.wise.assess.histograms import ResidualHistogram
 from bayesdist.missions.wise.assess.published import HEADS
 from bayesdist.missions.wise.bands.context import BandResult, BandsInput
 
-__all__ = ["SCHEMA", "record_of", "write_tables"]
-
-SCHEMA = 1
+__all__ = ["record_of", "write_tables"]
 
 
 def record_of(inputs: BandsInput) -> dict[str, Any]:
-    """Content of bands.json."""
+    """Content of bands.json beside command and versions."""
     return {
-        "schema": SCHEMA,
         "converged": not inputs.provisional,
         "n_bins": inputs.n_bins,
         "optical": inputs.optical or None,
@@ -41,7 +38,6 @@ def record_of(inputs: BandsInput) -> dict[str, Any]:
             name: {"unit": inputs.tables[name].unit, "rows": [_row(one) for one in several]}
             for name, several in inputs.accounts.items()
         },
-        "provenance": inputs.provenance,
     }
 
 

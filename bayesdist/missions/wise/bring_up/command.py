@@ -9,9 +9,8 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.app.folder import atomic_directory
-from bayesdist.app.output import write_table
 from bayesdist.app.screen import table_text
+from bayesdist.app.tables.output import atomic_directory, write_table
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import find_columns

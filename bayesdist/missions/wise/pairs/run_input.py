@@ -10,10 +10,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from bayesdist.app.config import Data
-from bayesdist.app.matches import is_large
-from bayesdist.app.named_files import named_files
-from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.star_files import PAIRS, part_files
+from bayesdist.app.matches.reading import is_large
+from bayesdist.app.store.named_files import named_files
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.star_files import PAIRS, part_files
 from bayesdist.data import Matches, open_matches, write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
@@ -47,14 +47,14 @@ class RvbInput:
         band's.
         """
         data, size = self._settings
-        path = named_files(self.run.config, Path(self.run.record["base"]))
+        path = named_files(self.run.config, Path(self.run.facts["base"]))
         options = _options(data, size)
         if not is_large(path):
             return load_rvb(path, data, size)
         if data.band is not None:
             _require_array(data.band, size)
-        if "pairs" in self.run.record and part_files(self.run / PAIRS):
-            return self._opened(self.run / PAIRS, self.run.record["pairs"])
+        if "pairs" in self.run.facts and part_files(self.run / PAIRS):
+            return self._opened(self.run / PAIRS, self.run.facts["pairs"])
         selection = data.rvb.selection()
         if selection.takes_all:
             opened = open_rvb(path, **options)
@@ -99,7 +99,7 @@ class RvbInput:
         self._counts = {"n_rows": selected.n_rows, "rejected": selected.rejected}
         if not self.run.is_planned:
             self.move_into_run()
-            return self._opened(self.run / PAIRS, self.run.record["pairs"])
+            return self._opened(self.run / PAIRS, self.run.facts["pairs"])
         return self._opened(folder, self._counts)
 
     def _opened(self, folder: Path, counts: Mapping[str, Any]) -> Matches:

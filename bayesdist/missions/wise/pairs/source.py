@@ -1,6 +1,6 @@
 """The format "rvb" of a run."""
 
-from bayesdist.app.match_sources import MatchSource
+from bayesdist.app.matches.sources import MatchSource
 from bayesdist.missions.wise.pairs.run_input import RvbInput, load_rvb
 from bayesdist.missions.wise.pairs.template import rvb_template
 

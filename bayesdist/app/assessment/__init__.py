@@ -1,0 +1,1 @@
+"""A run diagnosed and evaluated: settings, error terms, checks."""

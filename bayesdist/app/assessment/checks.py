@@ -1,0 +1,112 @@
+"""Checks of a run beside what residuals say: of its kind, the sampling, the fit, the catalogue."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from bayesdist.app.campaign.checks import campaign_checks, campaign_remarks
+from bayesdist.app.config import CATALOGUE_WORDS, Config
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.kind import kind_of
+from bayesdist.app.matches.added_errors import knows_circle
+from bayesdist.assess.checks import catalogue_checks, matching_checks, time_checks
+from bayesdist.assess.units import pixel_doubt
+from bayesdist.checks import LARGER, Check
+from bayesdist.diagnose.checks import score_checks
+from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.infer import Posterior
+from bayesdist.infer.checks import fit_checks, sampling_checks
+from bayesdist.limits import CHI2_TOO_LARGE
+
+__all__ = ["frames_doubt", "in_circle", "provenance_notes", "run_checks"]
+
+
+def run_checks(
+    data: FitData,
+    posterior: Posterior | None,
+    found: Diagnostics,
+    config: Config,
+    series: Mapping[str, Any] | None = None,
+) -> tuple[Check, ...]:
+    """Checks of a run that has been sampled, or of a fit alone, beside those of its diagnostics.
+
+    `series` is the section 'time_dependence' of summary.json, of runs that have one.
+    """
+    kind, circle = kind_of(config), in_circle(data, config)
+    has, words = data.matched.has_catalogue, CATALOGUE_WORDS
+    errors = (data.matched.states_errors or config.states(*words)) if has else None
+    motions = (data.matched.states_motion_errors or config.states("motion")) if has else None
+    return (
+        *_kind_checks(data, found, series),
+        *sampling_checks(posterior),
+        *fit_checks(data.fit, in_circle=circle, things=kind.rows, chooser=kind.chooser),
+        *_remarks(data, found.majority, config),
+        *matching_checks(
+            config.outliers.match_radius, data.shards.survey.reference_sigma, in_circle=circle
+        ),
+        *catalogue_checks(errors),
+        *time_checks(data.model.time, data.dates, motions),
+    )
+
+
+def in_circle(data: FitData, config: Config) -> bool:
+    """Boolean: the likelihood is of stars that were matched in circles about nominal positions."""
+    return knows_circle(config) and data.matched.stars.has_nominal
+
+
+def _kind_checks(
+    data: FitData, found: Diagnostics, series: Mapping[str, Any] | None
+) -> tuple[Check, ...]:
+    """Checks of matching, tables and exposures, and of what fixes the gauge."""
+    matched, fitted = data.matched, data.fitted
+    if fitted.solved is not None:
+        solved = fitted.solved
+        texts = (*solved.gauge.sentences, *solved.contradictions, *matched.warnings)
+        return tuple(Check("Gauge", level="warn", sentence=text) for text in texts)
+    if fitted.scatter is None:
+        return ()
+    facts = {matched.section: matched.facts, **fitted.facts, "time_dependence": series or {}}
+    remarks = campaign_remarks(facts)
+    tests: Sequence[Check] = tuple(score_checks(found.score_tests, found.correlated))
+    return (*remarks, *campaign_checks(facts, (*remarks, *tests)))
+
+
+def _remarks(data: FitData, majority: str, config: Config) -> Iterator[Check]:
+    if doubt := pixel_doubt(data.fit):
+        yield Check("Fit", level="warn", sentence=doubt)
+    if text := frames_doubt(data, majority, config):
+        yield Check("Fit", level="warn", sentence=text)
+    if data.error_scale_sentence:
+        yield Check("Fit", sentence=data.error_scale_sentence, doubt=LARGER)
+    if config.data is None or in_circle(data, config) or not data.placed.has_nominal:
+        return
+    yield Check(
+        "Matching",
+        level="warn",
+        sentence="the matches have nominal positions, and outliers.match_radius is not given: the "
+        "likelihood does not know that they were selected",
+    )
+
+
+def frames_doubt(data: FitData, majority: str, config: Config) -> str:
+    """Frames of the exposures that would make residuals far smaller; empty where none would.
+
+    Asked where the residuals are larger than their errors, or most pairs are false.
+    """
+    fit = data.fit
+    too_large = fit.chi2 > CHI2_TOO_LARGE.value * fit.dof
+    large = majority or data.fitted.errors.factor != 1.0 or too_large
+    if not large or config.data is None or data.better_frames is None:
+        return ""
+    return f"the exposures lie differently: {data.better_frames.sentence}"
+
+
+def provenance_notes(posterior: Posterior, gauge: str) -> dict[str, bool | str]:
+    """What must be said of the draws, and of the gauge, in the head of a file."""
+    label = posterior.approximation
+    return {
+        "converged": posterior.convergence.converged,
+        **({"posterior": label} if label else {}),
+        **({"gauge": gauge} if gauge else {}),
+    }

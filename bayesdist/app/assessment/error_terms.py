@@ -1,0 +1,112 @@
+"""The error model of a run: its solution, what residuals say, and what it was given."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from bayesdist.app.assessment.settings import assessment_epoch
+from bayesdist.app.campaign.aberration import aberration_term
+from bayesdist.app.campaign.inputs import campaign_block
+from bayesdist.app.campaign.interpolation import interpolation_term
+from bayesdist.app.campaign.matched import campaign_matches
+from bayesdist.app.config import Config
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.fitted import required
+from bayesdist.app.kinds.table_file import StoredLookupTables
+from bayesdist.assess import pixel_scale_of
+from bayesdist.assess.error_model import ErrorModel, error_model
+from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorTerm
+from bayesdist.assess.terms.local import LocalErrors
+from bayesdist.assess.terms.parameters import ExposureVariation
+from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.infer import Posterior
+from bayesdist.infer.solution import Solution
+from bayesdist.model import LookupTable
+
+__all__ = ["errors_of_run", "published_tables"]
+
+
+def errors_of_run(
+    solution: Solution, found: Diagnostics | None, data: FitData, config: Config
+) -> ErrorModel:
+    """The error model of a posterior with what residuals say, or of a solution alone.
+
+    Without diagnostics there are no terms that rest on residuals.
+    """
+    fitted = data.fitted
+    terms: list[ErrorTerm] = []
+    if found is not None and fitted.scatter is not None:
+        assert isinstance(solution, Posterior)
+        terms.append(_variation(solution, data, config))
+    terms += config.linear_terms(solution)
+    if fitted.scatter is not None:
+        terms += _table_terms(solution, data, config)
+    terms += config.user_terms()
+    scale = pixel_scale_of(solution, scale_mas=config.detector.scale_mas)
+    if found is None:
+        return error_model(solution, None, terms, pixel_scale=scale)
+    joint = fitted.scatter is not None
+    return error_model(
+        solution,
+        found,
+        terms,
+        hierarchy=fitted.linear if joint else None,
+        catalogue=data.matched.catalogue_name,
+        aligned=joint,  # errors in a new exposure, whose shift and rotation its user fits
+        single=not joint and config.assess.exposure == "single",
+        frames=fitted.solved is not None,  # exposures overlap in part
+        structure_left=not fitted.tables.position_sigma,  # errors of tables stand for it
+        pixel_scale=scale,
+    )
+
+
+def _variation(solution: Posterior, data: FitData, config: Config) -> ExposureVariation:
+    """How a new exposure deviates: as those at hand scatter, velocity aberration among it."""
+    scatter = required(data.fitted.scatter, "joint fit of exposures")
+    return ExposureVariation(
+        solution.model,
+        np.asarray(solution.mean, float),
+        scatter.kinds,
+        scatter.tau,
+        aberration=aberration_term(
+            scatter,
+            campaign_matches(data.matched).inputs.log,
+            solution,
+            corrected=campaign_block(config).vafactor_source != "earth",
+        ),
+    )
+
+
+def _table_terms(solution: Solution, data: FitData, config: Config) -> tuple[LocalErrors, ...]:
+    """What the errors of the tables leave of the position, and what lies between their nodes."""
+    stored, block = data.fitted.tables, config.tables
+    epoch = assessment_epoch(data, config)
+    between = interpolation_term(stored.between, solution, grid=config.assess.grid, epoch=epoch)
+    if not stored.position_sigma:
+        return between
+    source = MEASURED
+    if block.detector is not None:
+        given = f"{GIVEN}: errors of the detector's tables in {block.detector}"
+        source = given if block.method == "none" else f"{MEASURED}, and {given}"
+    name = "look-up tables"
+    tables = LocalErrors.on_grid(name, stored.position_sigma, solution.model, source)
+    return (tables, *between)
+
+
+def published_tables(stored: StoredLookupTables, *, held: bool) -> tuple[LookupTable, ...]:
+    """The tables with the errors that a user meets: of the nodes, and of what lies between.
+
+    What is between the nodes of a pattern is at the nodes too: the value of a table there is
+    that of the area around.  It counts in the tables that were fitted in this run: `held` are the
+    detector's tables of another run.
+    """
+    out = []
+    for table in stored.tables:
+        between = stored.between.get(table.chip)
+        if table.sigma is not None and between is not None and bool(table.filter) == held:
+            whole = np.sqrt(table.sigma**2 + between.left.mean[:, None, None])
+            table = replace(table, sigma=whole)
+        out.append(table)
+    return tuple(out)

@@ -1,0 +1,147 @@
+"""Stars set aside before the fit: what they say afterwards, and what is written of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.assess.error_model import ErrorModel, solution_with_errors
+from bayesdist.assess.evaluation import EvaluationSettings
+from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
+from bayesdist.diagnose.holdout.validation import HoldoutValidation
+from bayesdist.infer import Posterior
+from bayesdist.infer.catalogue.star_influence import StarInfluence, star_influence
+
+__all__ = [
+    "holdout_summary",
+    "holdout_table",
+    "predictive_of_run",
+]
+
+TOGETHER = 1.5  # steps between nodes over which tables err as one: what their covariance comes to
+
+
+def predictive_of_run(
+    posterior: Posterior,
+    found: Diagnostics,
+    errors: ErrorModel,
+    data: FitData,
+    settings: EvaluationSettings,
+) -> Predictive:
+    """The solution as it is assessed, as it predicts stars that are held out of `found`.
+
+    Quoted errors and jitter hold what the model leaves out at a position, as each star errs by it;
+    neighbours err by it together.  Exposures that were fitted jointly scatter, and have errors of
+    the catalogue and of tables.
+    """
+    scatter = data.fitted.scatter
+    if scatter is not None:
+        return replace(
+            predictive_of(solution_with_errors(posterior, found, data.fit)),
+            deviations=ExposureDeviations(scatter.kinds, scatter.tau),
+            stars=_known_stars(data),
+            local=errors.local_tables(settings.grid, settings.epoch),
+            cell=_table_cell(data),
+        )
+    out = predictive_of(solution_with_errors(posterior, found))
+    rows = None if found.correlated is None else found.correlated.facts.get("structure")
+    if not rows:
+        return out
+    side = max(row["length_pix"] for row in rows)
+    local = errors.local_tables(settings.grid, settings.epoch)
+    return replace(out, local=local, cell=(side, side), local_in_noise=True)
+
+
+def _known_stars(data: FitData) -> StarInfluence | None:
+    """What errors of the catalogue did in the fit, of stars of exposures that are held out whole.
+
+    These stars were in the fit, in other exposures: that is no part of their residuals.
+    """
+    errors, held = data.matched.star_errors, data.matched.held
+    if errors is None or held is None or held.star is None:
+        return None
+    whole = np.isin(held.exposure_names, data.matched.whole)
+    codes = np.unique(held.star[whole[held.exposure]])
+    return star_influence(data.fit, data.stars, errors, codes)
+
+
+def _table_cell(data: FitData) -> tuple[float, float] | None:
+    """Pixels over which stars share the errors of the tables; None without tables."""
+    tables = data.fitted.tables.tables
+    if not tables:
+        return None
+    across, up = tables[0].step
+    return TOGETHER * across, TOGETHER * up
+
+
+def holdout_table(found: HoldoutValidation) -> Table:
+    """All tests, the most telling first."""
+    names = (
+        "name",
+        "part",
+        "is_omnibus",
+        "where",
+        "n",
+        "value",
+        "expected",
+        "p_value",
+        "p_corrected",
+        "limit",
+    )
+    table = Table({name: [getattr(t, name) for t in found.tests] for name in names})
+    table["lo95"], table["hi95"] = np.array([t.interval for t in found.tests]).T
+    table["limit"].description = "of tails, in sigma; scatter of deviations"
+    table["value"].description = (
+        f"offset: {found.unit}; spread: factor on the predicted errors; distribution: largest "
+        "difference of distribution functions; tails: fraction of stars; deviation: in its own unit"
+    )
+    table.meta = {
+        "verdict": found.verdict,
+        "n": found.n,
+        "n_excluded": found.n_left_out,
+        "exposures": list(found.exposures),
+        "p_corrected": "Holm 1979, over all tests of this table",
+    }
+    return table
+
+
+def holdout_summary(found: HoldoutValidation) -> dict[str, Any]:
+    """Section 'holdout' of summary.json."""
+    return {
+        "n": found.n,
+        "n_excluded": found.n_left_out,
+        "exposures": list(found.exposures),
+        "p_value": found.p_value,
+        "verdict": found.verdict,
+        "level": found.level,
+        "coverage": [
+            {
+                "axis": c.axis,
+                "sigma": c.level,
+                "n": c.n,
+                "value": c.value,
+                "expected": c.expected,
+                "interval": list(c.interval),
+            }
+            for c in found.coverage
+        ],
+        "tests": [
+            {
+                "name": t.name,
+                "part": t.part,
+                "is_omnibus": t.is_omnibus,
+                "where": t.where,
+                "n": t.n,
+                "value": t.value,
+                "expected": t.expected,
+                "p_value": t.p_value,
+                "p_corrected": t.p_corrected,
+            }
+            for t in found.tests
+        ],
+    }

@@ -1,0 +1,197 @@
+"""The periods of a configuration: what is compared, and what of it goes into the files of a run."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from astropy.table import Table, vstack
+from astropy.time import Time
+
+from bayesdist.app.config import Config
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.assess import SAMPLE, convert, pixel_scale_of
+from bayesdist.data import Matches
+from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, bins_for
+from bayesdist.errors import InputError
+
+if TYPE_CHECKING:
+    from bayesdist.diagnose.residuals import PatternChange, StatisticsTable
+    from bayesdist.infer.compare.positions import PositionChange
+
+__all__ = ["check_pairs", "period_settings", "periods_summary", "periods_table"]
+
+
+def check_pairs(raw: Matches, config: Config) -> dict[str, int]:
+    """About how many pairs each period has, from the epochs of some; empty without periods.
+
+    Pairs without epochs and a period without pairs are refused, before anything is sampled.
+    """
+    spans = config.spans()
+    if not spans:
+        return {}
+    where = ", ".join(raw.sources)
+    if not raw.has_epoch:
+        raise InputError(
+            "[periods] needs an epoch for every pair", where=where, do="map column 'epoch'"
+        )
+    some = raw if raw.in_memory else raw.sample(SAMPLE)
+    epoch = some.epoch
+    assert epoch is not None
+    share = len(raw) / len(some)
+    out = {}
+    for name, (start, stop) in spans.items():
+        n = int(((epoch >= start) & (epoch < stop)).sum())
+        if not n:
+            years = [epoch.min(), epoch.max(), start, stop]
+            first, last, begin, end = Time(years, format="decimalyear", scale="tt").mjd
+            raise InputError(
+                f"the period about MJD {name} has no pairs: they go from MJD {first:.3f} to "
+                f"{last:.3f}, and it from {begin:.3f} to {end:.3f}",
+                where=where,
+                do="correct periods.centres and periods.days, or leave the period out",
+            )
+        out[name] = round(n * share)
+    return out
+
+
+def period_settings(data: FitData, config: Config) -> PeriodSettings | None:
+    """Settings of a comparison of periods; None where none are asked for."""
+    if config.periods is None:
+        return None
+    fit = data.fit
+    least = min(check_pairs(data.placed, config).values())
+    scale = pixel_scale_of(fit, scale_mas=config.detector.scale_mas)
+    angle = fit.unit != "pix" or scale is not None
+    limits = [
+        convert(r.limit, r.unit, fit.unit, scale, where=f"requirement {r.name!r}")
+        for r in config.requirements()
+    ]
+    return PeriodSettings(
+        config.spans(),
+        bins=bins_for(least // len(fit.model.chips)),
+        radial_weight=config.fit.radial_weight,
+        tolerance=min(limits, default=None),
+        unit_arcsec=convert(1.0, fit.unit, "arcsec", scale) if angle else None,
+    )
+
+
+def periods_table(found: TimeVariation) -> Table:
+    """Differences of all coefficients: each period against the combined model, and the ends."""
+    comparison = found.comparison
+    parts = []
+    for name, against in (*((n, None) for n in comparison.names), (found.last, found.first)):
+        change, monomial = (
+            comparison.coefficients(name, against, monomial=m) for m in (False, True)
+        )
+        n = len(change.names)
+        parts.append(
+            Table(
+                {
+                    "period": [name] * n,
+                    "against": [against or "combined"] * n,
+                    "name": list(change.names),
+                    "difference": change.difference,
+                    "sigma": change.sigma,
+                    "z": change.z,
+                    "p_value": change.p_value,
+                    "monomial_difference": monomial.difference,
+                    "monomial_sigma": monomial.sigma,
+                }
+            )
+        )
+    out = vstack(parts)
+    chi2, dof, p = comparison.homogeneity
+    out.meta = {
+        "verdict": found.verdict,
+        "chi2": chi2,
+        "dof": dof,
+        "p_value": p,
+        "error_scale": comparison.error_scale,
+        "unit": comparison.model.unit,
+    }
+    return out
+
+
+def periods_summary(found: TimeVariation) -> dict[str, Any]:
+    """Section 'periods' of summary.json."""
+    comparison = found.comparison
+    chi2, dof, p = comparison.homogeneity
+    rows = []
+    for name, n in zip(comparison.names, comparison.counts, strict=True):
+        start, stop = found.spans[name]
+        change = comparison.coefficients(name)
+        rows.append(
+            {
+                "name": name,
+                "start": start,
+                "stop": stop,
+                "n_pairs": n,
+                **_position(found.changes[name]),
+                "z_max": float(np.abs(change.z).max()),
+            }
+        )
+    return {
+        "verdict": found.verdict,
+        "pattern": found.pattern_sentence,
+        "significant": found.significant,
+        "tolerance": found.tolerance,
+        "unit": comparison.model.unit,
+        "error_scale": comparison.error_scale,
+        "chi2": chi2,
+        "dof": dof,
+        "p_value": p,
+        "n_outside": found.n_outside,
+        "n_repeated": found.n_repeated,
+        "periods": rows,
+        "first_vs_last": {"period": found.last, "against": found.first, **_position(found.ends)},
+        "residuals": [
+            _statistics(table, chip.number)
+            for table, chip in zip(found.residuals, comparison.model.chips, strict=True)
+        ],
+        "patterns": [
+            _pattern(one) | {"chip": chip.number}
+            for several, chip in zip(found.patterns, comparison.model.chips, strict=True)
+            for one in several
+        ],
+    }
+
+
+def _position(change: PositionChange) -> dict[str, Any]:
+    return {
+        "largest": change.largest,
+        "sigma": change.sigma,
+        "at": list(change.at),
+        "chip": change.chip,
+        "noise_median": change.noise_median,
+        "noise_95": change.noise_95,
+        "p_value": change.p_value,
+        "chi2": change.chi2,
+        "dof": change.dof,
+        "p_field": change.p_field,
+    }
+
+
+def _statistics(table: StatisticsTable, chip: int) -> dict[str, Any]:
+    rows = [
+        {
+            "label": row.label,
+            **row.value,
+            "sigma_error": row.error["sigma"],
+            "sigma_noise_free": row.noise_free["sigma"],
+            "n_bins": row.n_bins,
+        }
+        for row in table.rows
+    ]
+    return {"chip": chip, "unit": table.unit, "rows": rows}
+
+
+def _pattern(one: PatternChange) -> dict[str, Any]:
+    return {
+        "period": one.period,
+        "axis": one.axis,
+        "p_value": one.p_value,
+        "rms": one.rms,
+        "correlation": one.correlation,
+        "n_bins": one.n_bins,
+    }

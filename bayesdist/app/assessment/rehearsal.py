@@ -1,0 +1,87 @@
+"""All that can be known to be wrong before anything is written."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from bayesdist.app.assessment.error_terms import errors_of_run
+from bayesdist.app.assessment.periods import check_pairs
+from bayesdist.app.assessment.settings import assessment_rng, rehearsal_settings
+from bayesdist.app.config import Config
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.products.made_files import made_files, product_input
+from bayesdist.app.results import Results
+from bayesdist.assess import Requirement, star_sample
+from bayesdist.assess.evaluation import budget_over
+from bayesdist.assess.requirements.margins import judge
+from bayesdist.assess.terms.centroid import centroid_errors
+from bayesdist.diagnose.residuals.centroid import centroid_scatter
+from bayesdist.errors import InputError
+
+__all__ = ["rehearse", "rehearse_solution"]
+
+REHEARSAL_DRAWS = 100
+
+
+def rehearse(results: Results) -> Results:
+    """Results with what a run begins with and, of matched stars, their fit; nothing is written.
+
+    What is wrong with the data or the configuration shows here, before hours of sampling.
+    """
+    kind, config, base = results.kind, results.config, results.base
+    kind.refuse(results.inputs, config, base)
+    if kind.begins_with == "match":  # which takes long
+        return results
+    matched = results.matched
+    check_pairs(matched.stars, config)
+    fitted = kind.fit(matched, config, base, results.reader)
+    results = results.having(fitted=fitted)
+    _check_residuals(results.data, config)
+    rehearse_solution(results)
+    return results
+
+
+def rehearse_solution(results: Results) -> None:
+    """Refuse terms, requirements and files that could not be made of a fit; nothing is written."""
+    data, config = results.data, results.config
+    _rehearse_evaluation(data, config, REHEARSAL_DRAWS)
+    made_files(product_input(data.fit, data, config, str(results.run.path)), config)
+
+
+def _check_residuals(data: FitData, config: Config) -> None:
+    """Refuse a budget with errors that are included in the residuals and larger than these."""
+    fit = data.fit
+    held = config.held_in_residuals(fit.model.unit)
+    if held:
+        stars = star_sample(data.sample, len(data.stars), fit)
+        scatter = centroid_scatter(stars, n_params=fit.model.n_params)
+        if scatter is not None:
+            centroid_errors(scatter, held)
+
+
+def _rehearse_evaluation(data: FitData, config: Config, n_draws: int) -> None:
+    """Refuse terms and requirements that the run could not be judged by."""
+    settings = replace(rehearsal_settings(data, config), draws=n_draws)
+    errors = errors_of_run(data.fit, None, data, config)
+    budget_over(errors, settings, assessment_rng(config))
+    # without a posterior centroids have no errors yet
+    has_mag = data.placed.has_mag
+    requirements = [_of_any_star(r, has_mag=has_mag) for r in config.requirements()]
+    judge(
+        errors.drawn(n_draws, assessment_rng(config)),
+        requirements,
+        grid=settings.grid,
+        epoch=settings.epoch,
+        pixel_scale=settings.pixel_scale(errors),
+    )
+
+
+def _of_any_star(requirement: Requirement, *, has_mag: bool) -> Requirement:
+    """A requirement without its magnitude, if the matches have such."""
+    if requirement.magnitude is not None and not has_mag:
+        raise InputError(
+            f"names magnitude {requirement.magnitude:g}, and the matches have no magnitudes",
+            where=requirement.where,
+            do="name their column in [data.columns], or leave magnitude out",
+        )
+    return replace(requirement, magnitude=None)

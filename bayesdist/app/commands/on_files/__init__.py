@@ -1,0 +1,1 @@
+"""Commands on files: positions, contents, a first configuration."""

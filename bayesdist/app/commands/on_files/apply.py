@@ -1,0 +1,197 @@
+"""`bayesdist apply`: positions on the detector to the undistorted frame, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.app.commands.on_files.calibrations import calibration_at, images_of, notes_of
+from bayesdist.app.commands.on_files.position_table import (
+    OUT,
+    add_positions,
+    check_output,
+    chip_numbers,
+    position_column,
+    write_positions,
+)
+from bayesdist.app.screen import number
+from bayesdist.calibration.apply import (
+    Application,
+    OutputFrame,
+    Positions,
+    frame_that_holds,
+    on_chip,
+)
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.inverse import fitted_inverse
+from bayesdist.data.tables.files import read_table
+from bayesdist.errors import InputError
+
+__all__ = ["METHODS", "apply_to_table"]
+
+Float = NDArray[np.float64]
+
+METHODS = ("newton", "polynomial", "table")
+
+
+def apply_to_table(
+    path: str | Path,
+    table: str | Path,
+    output: str | Path,
+    *,
+    inverse: bool = False,
+    method: str = "newton",
+    order: int | None = None,
+    columns: Sequence[str] | None = None,
+    chip: int | None = None,
+    filter: str | None = None,
+    epoch: float | None = None,
+    scale: float | None = None,
+    origin: Sequence[float] | None = None,
+    vafactor: float = 1.0,
+    image: str | Path | None = None,
+    ltv: tuple[float, float] | None = None,
+    corner: tuple[float, float] | None = None,
+    force: bool = False,
+) -> str:
+    """Take the positions of a table to the output frame, or `inverse` back to pixels, into a file.
+
+    Positions are in `columns`, by default x, y (back: x_out, y_out), and the chip's number in a
+    column chip unless `chip` gives it.  `method` is one of METHODS: Newton's method on the forward
+    polynomials, a polynomial fitted here, of an `order`, or the INVERSE rows of an IDCTAB; `epoch`
+    is in decimal years; `origin` is the output pixel of the zero point, (0, 0) by default.  Filter
+    and scale are as of `calibration_at`; image, ltv and corner as of `images_of`.  What is to be
+    printed is returned.
+    """
+    output = Path(output)
+    check_output(output, force)
+    found = calibration_at(path, filter=filter, scale=scale)
+    chips_of = found.in_frame(epoch)
+    pixel, source = found.pixel(epoch)
+    ox, oy = origin or (0.0, 0.0)
+    frame = OutputFrame(pixel, (ox, oy), vafactor)
+    images = images_of(found, image=image, ltv=ltv, corner=corner)
+    a = Application(chips_of, frame, images)
+    names = tuple(columns or (OUT if inverse else ("x", "y")))
+    rows = read_table(Path(table))
+    x, y = (position_column(rows, name, str(table)) for name in names)
+    chips = chip_numbers(rows, chip, list(chips_of), found.name, str(table), needed=not inverse)
+    if inverse:
+        at, lines = _back(a, found, x, y, chips, method, order, epoch)
+        added = ("x", "y")
+    else:
+        at, added = _forth(a, x, y, chips), OUT
+        lines = _frame_lines(a, source)
+    add_positions(rows, at, added, str(table))
+    rows.meta = {"calibration": found.name, "scale": pixel, "unit": found.unit}
+    rows.meta |= {"origin": [ox, oy], "vafactor": vafactor}
+    write_positions(rows, output)
+    return "\n".join([_head(output, at, found, epoch), *lines, *_losses(a, at, x, y, inverse)])
+
+
+def _forth(a: Application, x: Float, y: Float, chips: NDArray[np.int64] | None) -> Positions:
+    assert chips is not None
+    return _gathered(
+        {n: (chips == n, a.forward(x[chips == n], y[chips == n], chip=n)) for n in a.chips}, x.size
+    )
+
+
+def _back(
+    a: Application,
+    found: Calibration,
+    X: Float,
+    Y: Float,
+    chips: NDArray[np.int64] | None,
+    method: str,
+    order: int | None,
+    epoch: float | None,
+) -> tuple[Positions, list[str]]:
+    """Pixels, and what to say of their error."""
+    if chips is None:
+        at = a.locate(X, Y)
+    else:
+        parts = {n: (chips == n, a.inverse(X[chips == n], Y[chips == n], chip=n)) for n in a.chips}
+        at = _gathered(parts, X.size)
+    if method == "newton":
+        worst = max(a.closure(n) for n in a.chips)
+        return at, [f"  inverse by Newton's method: closes to {number(worst, 2)} pix"]
+    lines = []
+    about_zero = found.at(epoch, origin="chip")
+    x, y = at.x.copy(), at.y.copy()
+    for n in a.chips:
+        mine = at.chip == n
+        chip = about_zero[n]
+        if method == "polynomial":
+            back = fitted_inverse(chip, order)
+            what = f"polynomial of order {back.order}"
+        else:
+            if n not in found.inverses:
+                raise InputError(
+                    f"holds no INVERSE row of chip {n}",
+                    where=found.name,
+                    do="choose --method newton or polynomial",
+                )
+            back, what = found.inverses[n], "INVERSE row"
+        zero = a.chips[n].at(*(([v]) for v in chip.basis.reference_pixel))
+        pixels = back.pixels(*(a.plane(X[mine], Y[mine]) - zero))
+        x[mine], y[mine] = a.images[n].from_chip(*pixels) if n in a.images else pixels
+        worst, rms = back.misses(chip)
+        errors = f"{number(worst, 3)} pix at worst, {number(rms, 3)} rms"
+        lines.append(f"  chip {n}: {what}, closes to {errors}")
+    return Positions(x, y, at.cov, at.chip), lines
+
+
+def _gathered(parts: dict[int, tuple[NDArray[np.bool_], Positions]], n: int) -> Positions:
+    """Positions of several chips in the order of the rows."""
+    at = np.full((2, n), np.nan)
+    number = np.zeros(n, np.int64)
+    known = all(p.cov is not None for _, p in parts.values())
+    cov = np.full((n, 2, 2), np.nan) if known else None
+    for mine, part in parts.values():
+        at[0, mine], at[1, mine], number[mine] = part.x, part.y, part.chip
+        if cov is not None:
+            cov[mine] = part.cov
+    return Positions(at[0], at[1], cov, number)
+
+
+def _head(output: Path, at: Positions, found: Calibration, epoch: float | None) -> str:
+    notes = "".join(f"; {note}" for note in notes_of(found, epoch))
+    return f"{output}: {at.x.size} positions, by {found.name}{notes}"
+
+
+def _frame_lines(a: Application, source: str) -> list[str]:
+    frame, size = frame_that_holds(a.chips, a.frame.scale, a.frame.vafactor)
+    unit = next(iter(a.chips.values())).unit
+    unit = "pix of u, v" if unit == "pix" else unit
+    return [
+        f"  output pixels of {number(a.frame.scale, 6)} {unit} ({source})",
+        f"  an image of {size[0]} x {size[1]} pixels holds all chips, with --origin "
+        f"{frame.origin[0]:g} {frame.origin[1]:g}",
+    ]
+
+
+def _losses(a: Application, at: Positions, x: Float, y: Float, inverse: bool) -> list[str]:
+    """What happened to positions without a pixel, or beyond the detector."""
+    out = []
+    if inverse:
+        none = int((~np.isfinite(at.x)).sum())
+        if none:
+            out.append(f"  positions on no chip, whose x and y are NaN: {none}")
+        x, y = at.x, at.y
+    outside = 0
+    for n, c in a.chips.items():
+        mine = (at.chip == n) & np.isfinite(x) & np.isfinite(y)
+        image = a.images.get(n)
+        px, py = (x, y) if image is None else image.to_chip(x, y)
+        outside += int((mine & ~on_chip(c, px, py)).sum())
+    if outside:
+        out.append(
+            f"  positions outside of their chip, where polynomials are extrapolated: {outside}"
+        )
+    if at.cov is not None and np.isfinite(at.sigma_x).any():
+        largest = np.nanmax([at.sigma_x, at.sigma_y])
+        out.append(f"  largest standard deviation of a coordinate {number(float(largest), 3)} pix")
+    return out

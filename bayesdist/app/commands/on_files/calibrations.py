@@ -1,0 +1,153 @@
+"""The calibration that a file or a run holds, as commands take it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from bayesdist.app.results import open_results
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.calibration.plane import ARCSEC
+from bayesdist.calibration.subarray import Subarray, subarray_at_corner, subarrays_of_image
+from bayesdist.errors import InputError
+from bayesdist.infer import load_fit, load_posterior
+from bayesdist.infer.solution import Solution
+from bayesdist.products.formats.common.content import read_hdus
+from bayesdist.products.registry import read_calibration
+
+__all__ = ["calibration_at", "images_of", "notes_of", "solution_at"]
+
+
+def calibration_at(
+    path: str | Path,
+    *,
+    filter: str | None = None,
+    scale: float | None = None,
+    size: tuple[float, float] | None = None,
+) -> Calibration:
+    """The calibration of a file or a run.
+
+    Parameters
+    ----------
+    path : path
+        A file of any format, a run directory, posterior.nc or fit.nc.
+    filter : str, optional
+        Of an IDCTAB; names of both wheels may be joined by a comma.  The band of WISE meta-data.
+    scale : float, optional
+        Size of a corrected pixel, in the unit of the calibration.
+    size : tuple of float, optional
+        Columns and rows, for a SIP header that does not say.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    InputError
+        For a file that holds no calibration, a filter that is missing or not there, or a scale that
+        is not positive.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError("there is no such file", where=str(path), do="check the name")
+    solution = solution_at(path)
+    if solution is None:
+        found = read_calibration(path, filter=filter, size=size)
+    else:
+        found = calibration_of(solution, str(path), scale=_scale_of_run(path, solution))
+    if scale is None:
+        return found
+    if not (np.isfinite(scale) and scale > 0):
+        raise InputError(f"the scale is {scale}", where="--scale", do="give a positive number")
+    return replace(found, scale=float(scale), scale_from="--scale")
+
+
+def solution_at(path: Path) -> Solution | None:
+    """The fit or posterior at a place; None where it is no such file.
+
+    A run directory, or posterior.nc in it, stands for the posterior with the errors that the run
+    was assessed with, or for the fit where there is no posterior yet.
+    """
+    if path.is_dir():
+        if (path / "posterior.nc").exists() or not (path / "fit.nc").exists():
+            return _as_assessed(path)
+        return load_fit(path / "fit.nc")
+    if path.suffix != ".nc":
+        return None
+    if path.name == "fit.nc":
+        return load_fit(path)
+    return _as_assessed(path.parent) if path.name == "posterior.nc" else load_posterior(path)
+
+
+def _as_assessed(folder: Path) -> Solution:
+    """The posterior of a folder, with the errors as assessed where it is that of a run."""
+    if not (folder / "run.json").exists():
+        return load_posterior(folder)
+    with open_results(RunDirectory(folder)) as results:
+        return results.solution
+
+
+def _scale_of_run(path: Path, solution: Solution) -> tuple[float, str] | None:
+    """Size of a corrected pixel as a run was configured; None where nothing says it."""
+    unit = solution.model.unit
+    home = path if path.is_dir() else path.parent
+    if unit == "pix" or not (home / "run.json").exists():
+        return None
+    mas = RunDirectory(home).config.detector.scale_mas
+    return None if mas is None else (1e-3 * mas / ARCSEC[unit], "detector.scale_mas")
+
+
+def notes_of(found: Calibration, epoch: float | None) -> tuple[str, ...]:
+    """What a reader of results by a calibration has to know."""
+    first = found.chip(epoch=epoch)
+    errors = {
+        "none": ("it holds no errors",),
+        "sigma": ("its errors come without correlations",),
+        "covariance": (),
+    }
+    return (*first.notes, *errors[first.errors])
+
+
+def images_of(
+    found: Calibration,
+    *,
+    image: str | Path | None = None,
+    ltv: tuple[float, float] | None = None,
+    corner: tuple[float, float] | None = None,
+) -> dict[int, Subarray]:
+    """Where pixels lie on their chips, as one of three options says; empty for whole chips.
+
+    Parameters
+    ----------
+    found : Calibration
+    image : path, optional
+        A calibrated image.
+    ltv : tuple of float, optional
+        LTV1, LTV2.
+    corner : tuple of float, optional
+        The pixel of the chip that is the subarray's first.
+
+    Raises
+    ------
+    InputError
+        For more than one of them, or as `subarrays_of_image`.
+    """
+    given = [("--image", image), ("--ltv", ltv), ("--corner", corner)]
+    named = [name for name, value in given if value is not None]
+    if len(named) > 1:
+        raise InputError(
+            f"{' and '.join(named)} say the same", where="options", do="keep one of them"
+        )
+    if image is not None:
+        sizes = {chip.number: chip.size for chip in found.model.chips}
+        headers = (hdu.header for hdu in read_hdus(image))
+        return subarrays_of_image(headers, sizes, str(image))
+    if ltv is not None:
+        return dict.fromkeys(found.numbers, Subarray((ltv[0], ltv[1])))
+    if corner is not None:
+        return dict.fromkeys(found.numbers, subarray_at_corner(*corner))
+    return {}

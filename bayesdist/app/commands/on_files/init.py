@@ -1,0 +1,249 @@
+"""`bayesdist init`: a commented configuration for a file of matches."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayesdist.app.commands.on_files.init_columns import column_lines, guessed_sigma, quoted
+from bayesdist.app.config import parse_config
+from bayesdist.app.config.data import data_sections
+from bayesdist.app.matches.reading import load_matches
+from bayesdist.app.matches.sources import mission_template
+from bayesdist.app.tables.output import refuse_existing
+from bayesdist.data import FORMATS, Matches
+from bayesdist.data.reading.layout import TableLayout, table_layout
+from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
+
+__all__ = ["init"]
+
+SIGMA = 0.05  # for tables that say nothing about their errors
+SAMPLE = 20_000  # matches that are looked at
+# size of u, v beside x, y
+LIKE_PIXELS = (0.5, 2.0)
+DEGREES = 1e-3  # below it is the degree: pixels of more than 3.6 arcsec are rare
+MAS = 20.0
+
+_GUESSED_UNIT = "unit = {unit:22s}# GUESSED: the table does not say\n"
+
+_TEMPLATE = """\
+# A calibration of geometric distortion; see docs/configuration.md for every key.
+
+[data]
+matches = {matches}
+{format}{columns}{unit_line}sigma = {sigma}
+
+{detector}
+[model]
+order = {order}                       # 1 to 9
+{reference}# of each exposure: none | shift | shift_rotation | shift_rotation_scale | affine
+frames = "{frames}"
+# [model.tdd]                   # terms that drift with time: axis, power of x, power of y
+# epoch0 = 2004.5
+# terms = [["u", 1, 0], ["v", 1, 0]]
+
+[fit]
+clip_chi2 = 25.0                # second pass without pairs beyond this chi-square
+clip_abs = 2.0                  # ... or farther off than this, in pixels
+
+[outliers]
+model = "gaussian"              # gaussian | uniform (on the match circle) | none
+# match_radius = 2.0            # needed for uniform, in the unit of u, v
+
+[sampler]
+seed = 1
+target_ess = 400
+target_rhat = 1.01
+
+# [compute]
+# engine = "threads"            # threads | dask
+# memory_mb = 1000              # for the stars; those beyond it are kept in a scratch file
+
+[assess]
+grid = [33, {grid_y}]                 # points on x and y
+# epoch = 2006.5
+
+# Errors that the data cannot show: random | systematic.  No requirement is called met before one
+# of them is the reference catalogue's, of size 0 with its source where it has none.
+# [[budget]]
+# name = "reference catalogue"
+# kind = "systematic"
+# sigma_u = 0.02
+# sigma_v = 0.02
+# unit = "{unit}"
+
+# [[requirement]]
+# name = "field-wide"
+# statistic = "p95"             # max rms mean p50 p68 p90 p95 p99, or u_... v_... for one axis
+# limit = 0.1
+# unit = "{unit}"
+# probability = 0.95
+
+[products]
+sip = {{}}                        # inverse_order, linear = "cd" | "sip", crval
+# idctab = {{instrument = "ACS", detector = "WFC"}}
+"""
+
+_AUTO = """\
+# format = "auto"               # {formats}
+"""
+
+_CENTRE = """\
+# reference_pixel = [{cx}, {cy}]  # zero point of the polynomial; the centre by default
+"""
+
+_DETECTOR = """\
+[detector]
+name = "{name}"
+size = [{nx}, {ny}]             # columns, rows; {how}
+# scale_mas = 50.0              # size of a pixel, to state errors in mas beside pixels
+"""
+
+_CHIP = """\
+[[chip]]
+number = {number}
+name = {name}
+size = [{nx}, {ny}]             # columns, rows; {how}
+reference_pixel = [{cx}, {cy}]  # zero point of the polynomial
+"""
+
+
+def init(
+    path: str | Path,
+    matches: str | Path,
+    *,
+    columns: Mapping[str, str] | None = None,
+    size: tuple[int, int] | None = None,
+    force: bool = False,
+) -> int:
+    """Number of matches that a new configuration reads, which is written with comments.
+
+    `path` is the TOML file, `matches` its ``data.matches``, `columns` its ``data.columns``; `size`
+    are columns and rows of each chip, by default as large as the positions ask for.
+    """
+    path = Path(path)
+    refuse_existing(path, force)
+    relative = quoted(os.path.relpath(Path(matches), path.resolve().parent))
+    own = mission_template(matches) if columns is None else None
+    n, values = _of_matches(matches, columns, size) if own is None else own
+    order = 4 if n >= 300 else 3 if n >= 100 else 2
+    text = _TEMPLATE.format(matches=relative, order=order, **values)
+    parse_config(text, str(path))
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return n
+
+
+def _of_matches(
+    matches: str | Path, columns: Mapping[str, str] | None, size: tuple[int, int] | None
+) -> tuple[int, dict[str, object]]:
+    """How many there are, and what a table of matches puts into the template."""
+    table, unit_line, sigma, read_sigma = _read(matches, columns)
+    layout = table_layout(matches, columns, read_sigma=read_sigma)
+    chips = {n: _size(*reach, size) for n, reach in _reach(table).items()}
+    several = len(chips) > 1
+    first = next(iter(chips.values()))
+    name = Path(matches).stem.replace('"', "")
+    names = dict(zip(table.chip_numbers, _chip_names(table), strict=True))
+    blocks = [_CHIP.format(number=n, name=quoted(names[n]), **one) for n, one in chips.items()]
+    return len(table), {
+        "format": _AUTO.format(formats=" | ".join((*FORMATS, *data_sections()))),
+        "columns": column_lines(layout, columns),
+        "unit_line": unit_line,
+        "sigma": sigma,
+        "detector": "\n".join(blocks) if several else _DETECTOR.format(name=name, **first),
+        "reference": "" if several else _CENTRE.format(**first),
+        "frames": "shift_rotation_scale" if len(table.exposure_names) > 1 else "none",
+        "grid_y": max(3, round(32 * first["ny"] / first["nx"]) + 1),
+        "unit": table.unit,
+    }
+
+
+def _chip_names(matches: Matches) -> tuple[str, ...]:
+    """Names of the chips, in the order of their numbers."""
+    return matches.chip_names or tuple(f"chip {number}" for number in matches.chip_numbers)
+
+
+def _read(matches: str | Path, columns: Mapping[str, str] | None) -> tuple[Matches, str, str, bool]:
+    """Matches, the line about their unit, where errors come from, and whether columns are read."""
+    unit, line = None, ""
+    sigma: float | str = "columns"
+    while True:
+        try:
+            table = load_matches(matches, columns=columns, sigma=sigma, unit=unit)
+        except InputError as error:
+            if error.cause == "has no unit" and unit is None:
+                table = load_matches(matches, columns=columns, sigma=1.0, unit="pix")
+                unit = _guessed_unit(table, table_layout(matches, columns))
+                line = _GUESSED_UNIT.format(unit=quoted(unit))
+            elif error.cause == "holds no errors of the positions" and sigma == "columns":
+                sigma = SIGMA
+            else:
+                raise
+        else:
+            break
+    layout = table_layout(matches, columns)
+    taken = {} if layout is None else layout.taken
+    if sigma == "columns" and "sigma_ra" in taken and table.has_mag:
+        errors = f"{taken['sigma_ra']}, {taken['sigma_dec']}"
+        why = f"the errors of the table ({errors}) are the catalogue's alone"
+        return table, line, f'"by_magnitude"        # {why}', True
+    if sigma == "columns":
+        return table, line, '"columns"', True
+    if table.has_mag:
+        return table, line, '"by_magnitude"        # the table carries no errors', False
+    what = "GUESSED: the table carries neither errors nor magnitudes"
+    found = guessed_sigma(table.sample(SAMPLE))
+    if found is None:
+        return table, line, f"{SIGMA}                    # {what}", False
+    how = "the scatter about a polynomial"
+    return table, line, f"{found:<24g}# {what}; {how}", False
+
+
+def _guessed_unit(table: Matches, layout: TableLayout | None) -> str:
+    """Unit of u and v by their size beside pixels, and by their names."""
+    some = table.sample(SAMPLE)
+    ratio = float(np.ptp(some.u) / max(np.ptp(some.x), 1.0))
+    is_angle = layout is not None and layout.taken.get("u", "").lower() == "xi"
+    if LIKE_PIXELS[0] < ratio < LIKE_PIXELS[1]:
+        return "arcsec" if is_angle else "pix"
+    return "deg" if ratio < DEGREES else "mas" if ratio > MAS else "arcsec"
+
+
+def _reach(matches: Matches) -> dict[int, tuple[float, float]]:
+    """Largest x and y on each chip, by its number."""
+    out: dict[int, tuple[float, float]] = {}
+    for table in matches.batches():
+        for code, number in enumerate(table.chip_numbers):
+            rows = table.chip == code
+            if rows.any():
+                x, y = out.get(number, (0.0, 0.0))
+                out[number] = (
+                    max(x, float(table.x[rows].max())),
+                    max(y, float(table.y[rows].max())),
+                )
+    return dict(sorted(out.items()))
+
+
+def _size(x: float, y: float, given: tuple[int, int] | None) -> dict[str, Any]:
+    """What a chip's size is: as given, or as far as its stars say."""
+    if given is not None:
+        (nx, ny), how = given, "as given"
+    else:
+        nx, ny = _guess_size(x), _guess_size(y)
+        how = f"guessed from x up to {x:.1f}, y up to {y:.1f}"
+    return {"nx": nx, "ny": ny, "how": how, "cx": (nx + 1) / 2, "cy": (ny + 1) / 2}
+
+
+def _guess_size(largest: float) -> int:
+    """Detector size: the next multiple of 2 above the data, or a power of 2 that is near."""
+    largest -= 0.5
+    for power in (256, 512, 1024, 2048, 4096, 8192):
+        if 0.97 * power <= largest <= power:
+            return power
+    return int(np.ceil(largest / 2) * 2)

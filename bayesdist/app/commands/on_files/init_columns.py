@@ -1,0 +1,115 @@
+"""What `bayesdist init` finds in a table: its columns, and the scatter of its matches."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+
+from bayesdist.data import Matches
+from bayesdist.data.reading.layout import TableLayout
+from bayesdist.model.basis import polynomial_terms
+
+__all__ = ["column_lines", "guessed_sigma", "quoted"]
+
+# names under which SExtractor writes what the image's own WCS makes of the pixels
+_BY_THE_IMAGE = ("alpha_j2000", "alphawin_j2000", "alphapsf_j2000", "sky_centroid.ra")
+_TOLD = 3  # columns that may be chips
+
+_NONE = """\
+# columns = {x = "x", y = "y", u = "u", v = "v"}  # they are found by their names
+"""
+
+
+def quoted(text: str) -> str:
+    """Text as TOML has it."""
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def column_lines(layout: TableLayout | None, columns: Mapping[str, str] | None) -> str:
+    """Lines of [data] that name the columns taken, the pixel origin and the epochs.
+
+    Parameters
+    ----------
+    layout : TableLayout or None
+        None of a format that fixes its columns.
+    columns : mapping of str to str, or None
+        As the user names them; empty names stay.
+    """
+    if layout is None:
+        return _NONE + "# pixel_origin = 1              # of x, y: 1 as in FITS, or 0\n"
+    taken = layout.taken | {key: "" for key, name in (columns or {}).items() if not name}
+    pairs = ", ".join(f"{key} = {quoted(name)}" for key, name in taken.items())
+    out = [f"columns = {{{pairs}}}"]
+    out += [f"# {text}" for text in _remarks(layout)]
+    why = layout.why or "of x, y: 1 as in FITS, or 0"
+    out.append(f"pixel_origin = {layout.origin}                # {why}")
+    if "pm_ra" in taken and "epoch" not in taken and not layout.dated:
+        out.append(
+            "# epoch = 2012.5                # of the exposures: without it proper motions are not "
+            "used"
+        )
+    if "pm_ra" in taken and "catalogue_epoch" not in taken:
+        out.append(
+            "# catalogue_epoch = 2016.0      # of ra, dec (Gaia DR3: 2016.0, DR2: 2015.5): without "
+            "it proper motions are not used"
+        )
+    return "\n".join(out) + "\n"
+
+
+def _remarks(layout: TableLayout) -> list[str]:
+    """What a user has to look at."""
+    out = []
+    ra = layout.taken.get("ra", "")
+    if ra.lower() in _BY_THE_IMAGE:
+        out.append(
+            f"LOOK: {ra} is often made from the pixels by the image's own WCS: then it is no "
+            "reference"
+        )
+    if "chip" not in layout.taken:
+        for name, n in list(layout.like_chips.items())[:_TOLD]:
+            out.append(
+                f"LOOK: column {name} has {n} values; if these are chips, add chip = {quoted(name)}"
+                " (init --columns chip=NAME)"
+            )
+    return out
+
+
+ORDER = 4
+ROUNDS = 20
+NORMAL = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
+CLIP = 4.0  # robust standard deviations
+EACH = 4  # stars for each coefficient, at least
+
+
+def guessed_sigma(table: Matches) -> float | None:
+    """Robust scatter along an axis about polynomials on each chip of each exposure, two digits.
+
+    It is in the unit of u, v; None of too few stars, or without scatter.
+    """
+    i, j = np.array(polynomial_terms(ORDER)).T
+    groups = table.exposure * len(table.chip_numbers) + table.chip
+    residuals: list[NDArray[np.float64]] = []
+    for group in np.unique(groups):
+        rows = groups == group
+        if rows.sum() < EACH * len(i):
+            continue
+        X, Y = (2 * (z - z.min()) / max(np.ptp(z), 1.0) - 1 for z in (table.x[rows], table.y[rows]))
+        basis = legendre.legvander(X, ORDER)[:, i] * legendre.legvander(Y, ORDER)[:, j]
+        data = np.stack([table.u[rows], table.v[rows]], axis=-1)
+        used = np.ones(len(X), bool)
+        for _ in range(ROUNDS):
+            left = data - basis @ np.linalg.lstsq(basis[used], data[used])[0]
+            size = NORMAL * np.median(np.abs(left[used]))
+            now = (np.abs(left) <= CLIP * size).all(axis=1)
+            if (now == used).all() or now.sum() < 2 * len(i):
+                break
+            used = now
+        # what the fit has taken up is given back
+        residuals.append(left[used].ravel() * np.sqrt(used.sum() / (used.sum() - len(i))))
+    if not residuals:
+        return None
+    sigma = NORMAL * float(np.median(np.abs(np.concatenate(residuals))))
+    return float(f"{sigma:.2g}") if sigma > 0 else None

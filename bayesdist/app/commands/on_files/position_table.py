@@ -1,0 +1,119 @@
+"""Tables of positions that `bayesdist apply` reads, adds to and writes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from astropy.table import Table
+from numpy.typing import NDArray
+
+from bayesdist.app.tables.output import refuse_existing
+from bayesdist.calibration.apply import Positions
+from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
+
+__all__ = [
+    "OUT",
+    "add_positions",
+    "check_output",
+    "chip_numbers",
+    "position_column",
+    "write_positions",
+]
+
+Float = NDArray[np.float64]
+
+OUT = ("x_out", "y_out")
+_FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits"}
+
+
+def check_output(output: Path, force: bool) -> None:
+    """Refuse a file that cannot be written, or that is there already."""
+    if output.suffix.lower() not in _FORMATS:
+        raise InputError(
+            f"extension {output.suffix!r} is not one that can be written",
+            where=str(output),
+            do=f"choose one of {', '.join(_FORMATS)}",
+        )
+    refuse_existing(output, force)
+
+
+def position_column(table: Table, name: str, where: str) -> Float:
+    """Numbers (N,) of a column; NaN for missing ones."""
+    if name not in table.colnames:
+        raise InputError(
+            f"there is no column {name!r}",
+            where=where,
+            do=f"name those of the positions by --columns, of {', '.join(table.colnames[:8])}",
+        )
+    column = table[name]
+    if column.dtype.kind not in "iuf" or column.ndim != 1:
+        raise InputError("holds no numbers", where=f"{where}, column {name!r}", do="check it")
+    return np.ma.filled(np.ma.asarray(column).astype(float), np.nan)
+
+
+def chip_numbers(
+    table: Table, chip: int | None, known: Sequence[int], name: str, where: str, *, needed: bool
+) -> NDArray[np.int64] | None:
+    """Chip (N,) of each row, by an option or a column; None where it is not `needed` and not given.
+
+    `known` are the chips of the calibration; `name` and `where` are what to call it and the table.
+    """
+    listed = ", ".join(map(str, known))
+    if chip is not None:
+        if chip not in known:
+            raise InputError(f"there is no chip {chip}", where=name, do=f"choose one of {listed}")
+        return np.full(len(table), chip)
+    if len(known) == 1:
+        return np.full(len(table), known[0])
+    if "chip" not in table.colnames:
+        if not needed:
+            return None
+        raise InputError(
+            f"there is no column 'chip', and {name} has chips {listed}",
+            where=where,
+            do="add the column, or give --chip",
+        )
+    numbers = position_column(table, "chip", where)
+    strange = np.flatnonzero(~np.isin(numbers, known))
+    if strange.size:
+        k = int(strange[0])
+        raise InputError(
+            f"there is no chip {numbers[k]:g}",
+            where=f"{where}, row {k + 1}, column 'chip'",
+            do=f"{name} has {listed}",
+        )
+    return numbers.astype(np.int64)
+
+
+def add_positions(table: Table, at: Positions, names: tuple[str, str], where: str) -> None:
+    """Add positions and their errors, and back on the detector the chip, as columns."""
+    x, y = names
+    new: dict[str, NDArray] = {x: at.x, y: at.y}
+    if at.cov is not None:
+        new |= {f"sigma_{x}": at.sigma_x, f"sigma_{y}": at.sigma_y}
+        new[f"corr_{x}_{y}"] = at.correlation
+    if names != OUT and "chip" not in table.colnames:
+        new["chip"] = at.chip
+    taken = [name for name in new if name in table.colnames]
+    if taken:
+        raise InputError(
+            f"has a column {taken[0]!r} already, which would be overwritten",
+            where=where,
+            do="rename or drop it",
+        )
+    for name, values in new.items():
+        table[name] = values
+        if name.startswith(("sigma", *names)):
+            table[name].unit = "pix"
+
+
+def write_positions(table: Table, output: Path) -> None:
+    """Write a table in the format of its extension, whole or not at all."""
+    kind = _FORMATS[output.suffix.lower()]
+    if kind == "fits":  # whose header has short names and takes no lists
+        table.meta = {k.upper()[:8]: v for k, v in table.meta.items() if k != "origin"}
+    with atomic_path(output) as temporary:
+        table.write(temporary, format=kind)

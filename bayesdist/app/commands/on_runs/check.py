@@ -1,0 +1,105 @@
+"""`bayesdist check`: what a configuration would do, without sampling."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from bayesdist.app.assessment.checks import in_circle
+from bayesdist.app.assessment.rehearsal import rehearse
+from bayesdist.app.assessment.settings import idle_dates
+from bayesdist.app.config import Config, load_config
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.matches.added_errors import grouping_sentence
+from bayesdist.app.results import Results, open_results
+from bayesdist.app.screen import number
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.checks import warnings_of
+from bayesdist.infer import Limits
+from bayesdist.infer.sampler.certified import PILOTS, has_second_stage
+from bayesdist.infer.sampler.move_schedule import expected_passes
+
+__all__ = ["check"]
+
+# measured on two cores of a server at orders 4 and 5; other machines differ by factors
+STAR_S = 3e-9  # of the likelihood, for each star and pass
+EXPANSION_S = 1.5e-8  # of an expansion to second order, for each star
+IN_CIRCLE = 80.0  # times as much for a star that was matched in a circle about its nominal position
+EXPANSIONS = 40  # in the search for the proposal
+OVERHEAD_S = 6e-5  # of emcee and the proposal, for each walker and step
+FIXED_S = 1.0  # diagnostics and files
+
+
+def check(path: str | Path) -> str:
+    """Units, rank, null space and expected cost of a configuration, as text.
+
+    Whatever would stop the run is refused: bad input, or parameters that the data do not determine.
+    """
+    config, text = load_config(path)
+    with TemporaryDirectory() as nowhere:
+        run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
+    with open_results(run) as results:
+        rehearsed = rehearse(results)
+        lines = results.kind.lines(rehearsed.inputs, config) or _lines(rehearsed)
+        return "\n".join(lines)
+
+
+def _lines(results: Results) -> Iterator[str]:
+    """What the fit of matched stars says."""
+    data, config = results.data, results.config
+    matches, model, fit, fitted = data.placed, data.model, data.fit, data.fitted
+    sigma = data.shards.survey.reference_sigma
+    yield (
+        f"matches      {len(matches)} of {matches.n_rows} rows, "
+        f"{len(matches.exposure_names)} exposure(s), u and v in {matches.unit}"
+    )
+    for note in matches.notes:
+        yield f"read         {note}"
+    for reason, count in matches.rejected.items():
+        yield f"left out     {count} rows: {reason}"
+    yield (
+        f"errors       median {number(sigma)} {matches.unit}"
+        + (" (by magnitude)" if fitted.errors.by_magnitude is not None else "")
+    )
+    if fitted.grouped is not None:
+        yield f"jitter       {grouping_sentence(fitted.grouped, fit.unit)}"
+    yield f"model        order {model.order}, frames '{model.frames}', {model.n_params} parameters"
+    if len(model.chips) > 1:
+        found = zip(model.chips, data.shards.survey.chips, strict=True)
+        yield "chips        " + ", ".join(f"{c.name} {s.n} stars" for c, s in found)
+    yield f"rank         {model.n_params} of {model.n_params}, nothing is degenerate"
+    yield f"condition    {number(fit.condition)} (normal matrix, unit diagonal)"
+    yield (
+        f"linear fit   rms {number(fit.rms_u)}, {number(fit.rms_v)} {fit.unit}; "
+        f"chi2/dof {number(fit.chi2 / max(fit.dof, 1))}; {fit.n_rejected} rows rejected"
+    )
+    yield _cost(data, config)
+    idle = idle_dates(config, config.requirements())
+    scaled = data.error_scale_sentence
+    for text in (
+        *warnings_of(results.checks),
+        *([idle] if idle else []),
+        *([scaled] if scaled else []),
+    ):
+        yield f"WARNING      {text}"
+
+
+def _cost(data: FitData, config: Config) -> str:
+    """Expected passes and seconds, from the numbers of stars and parameters."""
+    sampler, n = config.sampler, len(data.shards)
+    limits = Limits(sampler.target_ess, sampler.target_rhat)
+    n_params = data.model.n_params + len(config.mixture().hyper)
+    passes, how = expected_passes(n_params, n, limits, sampler.ensembles), ""
+    if sampler.method == "certified":
+        exact = has_second_stage(sampler.second_stage, passes, n)
+        passes = PILOTS + (passes if exact else 0)
+        how = "certified, with an exact second stage; " if exact else "certified, approximate; "
+    dear = IN_CIRCLE if in_circle(data, config) else 1.0
+    per_pass = dear * STAR_S * n
+    total = dear * EXPANSIONS * EXPANSION_S * n + passes * (per_pass + OVERHEAD_S) + FIXED_S
+    return (
+        f"cost         {how}about {passes} passes over {n} stars, "
+        f"{number(1e3 * per_pass, 2)} ms each: "
+        f"{number(total, 2)} s to the posterior if it is well behaved"
+    )

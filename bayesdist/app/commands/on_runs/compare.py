@@ -1,0 +1,162 @@
+"""`bayesdist compare`: two calibrations, from whatever files, and how they differ."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from bayesdist.app.commands.on_files.calibrations import calibration_at
+from bayesdist.app.commands.on_runs.comparison_files import write_comparison
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.assess import DEFAULT_GRID
+from bayesdist.assess.comparison.compare import Comparison, compare
+from bayesdist.assess.comparison.gap import (
+    GapDifference,
+    gap_difference,
+    pair_of_chips,
+)
+from bayesdist.assess.comparison.sentences import comparison_lines, gap_lines, gap_verdict, verdict
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.errors import InputError
+from bayesdist.products.formats.sip.calibration import MissingSize
+
+__all__ = ["compare_files"]
+
+SEED = 20150206  # of the noise fields: the same comparison gives the same numbers
+
+
+def compare_files(
+    a: str | Path,
+    b: str | Path,
+    output: str | Path | None = None,
+    *,
+    chip: int | None = None,
+    filter: str | None = None,
+    epoch: float | None = None,
+    keep: bool = False,
+    grid: Sequence[int] = DEFAULT_GRID,
+    command: str = "",
+) -> str:
+    """Verdicts on two calibrations, as text; tables, summary and figure in a new folder `output`.
+
+    `a` and `b` are each a run directory, posterior.nc, fit.nc, IDCTAB, SIP header or WISE meta-data
+    file.  All chips that both have are compared by default, each by itself.  `filter` is of
+    IDCTABs, or the band of WISE meta-data; two, joined by a colon, are for A and B.  `epoch` is in
+    decimal years; `keep` leaves shift, rotation and scale in the difference; `grid` are points on
+    x and y.
+    """
+    first, _, second = (filter or "").partition(":")
+    both = _read((Path(a), Path(b)), (first or None, second or first or None))
+    maps = [one.by_chip(epoch) for one in both]
+    numbers = _common(both, chip)
+    rng = np.random.default_rng(SEED)
+    nx, ny = grid
+    found = [compare(maps[0][n], maps[1][m], rng=rng, grid=(nx, ny), keep=keep) for n, m in numbers]
+    gaps = _gaps(both, epoch, [n for n, m in numbers if n == m])
+    if output is not None:
+        write_comparison(Path(output), found, gaps, command)
+    scale = _scale_of(a) or _scale_of(b)
+    return _text(found, gaps, scale, related=_home(a) == _home(b))
+
+
+def _read(
+    paths: tuple[Path, Path], filters: tuple[str | None, str | None]
+) -> tuple[Calibration, Calibration]:
+    """Both calibrations; a SIP header that does not say its size has that of the other one."""
+    sizes: list[tuple[float, float] | None] = [None, None]
+    for k, other in ((0, 1), (1, 0)):
+        try:
+            calibration_at(paths[k], filter=filters[k])
+        except MissingSize:
+            sizes[k] = calibration_at(paths[other], filter=filters[other]).model.chips[0].size
+    a, b = (
+        calibration_at(path, filter=one, size=size)
+        for path, one, size in zip(paths, filters, sizes, strict=True)
+    )
+    return a, b
+
+
+def _home(path: str | Path) -> Path:
+    """The run that a file belongs to, or the file."""
+    path = Path(path).resolve()
+    return path.parent if (path.parent / "run.json").exists() else path
+
+
+def _scale_of(path: str | Path) -> float | None:
+    """Size of a pixel in mas, as a run was told it."""
+    home = _home(path)
+    if not (home / "run.json").exists():
+        return None
+    return RunDirectory(home).config.detector.scale_mas
+
+
+def _common(both: tuple[Calibration, Calibration], chip: int | None) -> list[tuple[int, int]]:
+    """What is compared with what: chips by their numbers, or the single ones of both."""
+    a, b = both
+    if chip is not None:
+        return [(_number(a, chip), _number(b, chip))]
+    if a.numbered == b.numbered:
+        common = sorted(set(a.numbers) & set(b.numbers))
+        if common:
+            return [(number, number) for number in common]
+    if len(a.numbers) == len(b.numbers) == 1:
+        return [(a.numbers[0], b.numbers[0])]
+    listed = " and ".join(
+        ", ".join(map(str, one.numbers)) if one.numbered else "none" for one in both
+    )
+    raise InputError(
+        f"their chips are {listed}",
+        where=f"{a.name}, {b.name}",
+        do="choose the chip by --chip, which a file without chip numbers takes for its own",
+    )
+
+
+def _number(one: Calibration, number: int) -> int:
+    if not one.numbered:
+        return one.numbers[0]
+    if number not in one.numbers:
+        raise InputError(
+            f"there is no chip {number}",
+            where=one.name,
+            do=f"choose one of {', '.join(map(str, one.numbers))}",
+        )
+    return number
+
+
+def _gaps(
+    both: tuple[Calibration, Calibration], epoch: float | None, numbers: list[int]
+) -> list[GapDifference]:
+    """How every further chip lies against the reference chip of A."""
+    if len(numbers) < 2:
+        return []
+    reference = next(n for n in both[0].numbers if n in numbers)
+    out = []
+    for number in numbers:
+        if number == reference:
+            continue
+        a, b = (pair_of_chips(one, reference, number, epoch=epoch) for one in both)
+        out.append(gap_difference(a, b))
+    return out
+
+
+def _text(
+    found: Sequence[Comparison],
+    gaps: Sequence[GapDifference],
+    scale: float | None,
+    *,
+    related: bool,
+) -> str:
+    lines = []
+    for one in found:
+        if len(found) > 1:
+            lines.append(f"chip {one.a.chip}, by itself:")
+        lines += [verdict(one, scale), *comparison_lines(one)]
+    for gap in gaps:
+        lines += [gap_verdict(gap), *gap_lines(gap)]
+    if related and any(one.errors_of == "both" for one in found):
+        lines.append("A and B come from one source: errors that they share make p too large here")
+    elif any(one.errors_of == "both" for one in found):
+        lines.append("the errors of A and B are taken as independent")
+    return "\n".join(lines)

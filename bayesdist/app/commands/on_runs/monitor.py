@@ -1,0 +1,280 @@
+"""`bayesdist monitor`: does the released solution of a run still describe new matches?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.campaign.monitoring import fit_exposures_of, read_new_exposures
+from bayesdist.app.commands.on_runs.comparison_files import joined
+from bayesdist.app.config import Config, load_config
+from bayesdist.app.kinds.errors import read_magnitude_errors
+from bayesdist.app.matches.sources import read_configured
+from bayesdist.app.results import results_of
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.output import record_folder, write_table
+from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_late
+from bayesdist.assess.comparison.tables import comparison_table, difference_table
+from bayesdist.assess.units import convert, pixel_scale_of
+from bayesdist.data import Matches, input_files
+from bayesdist.diagnose.diagnostics import misfits_of, residual_sums
+from bayesdist.diagnose.residuals.misfit import worst_misfit
+from bayesdist.errors import InputError
+from bayesdist.files import sha256_of
+from bayesdist.infer import Posterior
+from bayesdist.infer.compare.change_date import PeriodScore, period_scores, scan_dates
+from bayesdist.infer.compare.monitoring import NewFit, change_of, fit_new
+from bayesdist.infer.linear import Rejection
+from bayesdist.infer.posterior.memberships import count_outliers
+from bayesdist.report.comparison import change_over_time, difference_vectors
+from bayesdist.report.drawing import save_figures
+
+__all__ = ["monitor"]
+
+CHANGE_MAPS = 1  # of the random streams that follow from the one seed
+
+
+def monitor(
+    run: str | Path, new: str | Path, output: str | Path | None = None, *, command: str = ""
+) -> str:
+    """Verdict of new matches on the posterior of a run, as text; files in a new folder `output`.
+
+    The matches that the run was made from are not needed any more.  `new` are matches, which are
+    read as the run's were, or a configuration whose [data] says how; of a campaign another run of
+    which stage 'match' is done, or pairs as a run keeps them.
+    """
+    directory = RunDirectory(run)
+    if not (directory / "run.json").exists():
+        raise directory.not_a_run_error()
+    config = directory.config
+    posterior, matches, fitted, left_out = _fitted(directory, config, Path(new))
+    try:
+        shards = fitted.target.shards
+        change = change_of(fitted, draws=posterior.convergence.ess_bulk_min)
+        scores: tuple[PeriodScore, ...] = ()
+        if matches.has_epoch:
+            scores = period_scores(fitted, change, matches)
+        date = scan_dates(scores, change) if scores else None
+        late = date is not None and is_late(change, date)
+        nx, ny = config.assess.grid
+        found = Monitored(
+            change=change,
+            maps=change_maps(
+                date.change if late and date is not None else change,
+                rng=np.random.default_rng([config.sampler.seed, CHANGE_MAPS]),
+                names=(str(new), str(run)),
+                grid=(nx, ny),
+            ),
+            date=date,
+            misfit=worst_misfit(misfits_of(fitted.fit, *residual_sums(fitted.fit, shards))),
+            pixel_mas=pixel_scale_of(posterior, scale_mas=config.detector.scale_mas),
+        )
+        facts = _facts(fitted, posterior) | {"left_out": list(left_out)}
+    finally:
+        fitted.target.shards.close()
+    if output is not None:
+        _write(Path(output), found, scores, facts, command)
+    return "\n".join([found.verdict, *_lines(found, facts, scores)])
+
+
+def _fitted(
+    run: RunDirectory, config: Config, new: Path
+) -> tuple[Posterior, Matches, NewFit, tuple[str, ...]]:
+    """Release, new matches and their fit, and the exposures that the release has seen."""
+    if config.campaign is not None:
+        release = results_of(run)
+        exposures = read_new_exposures(release, new)
+        found = fit_exposures_of(release, exposures)
+        return exposures.released, exposures.matches, found, exposures.left_out
+    if config.selfcal is not None:
+        raise InputError(
+            "is a run of a self-calibration, whose sky no new matches are on",
+            where=str(run.path),
+            do="calibrate the new exposures by themselves, and use 'bayesdist compare'",
+        )
+    posterior = results_of(run).solution
+    matches = _new_matches(run, config, new)
+    found = fit_new(
+        posterior,
+        matches,
+        rejection=Rejection(config.fit.clip_chi2, config.fit.clip_abs),
+        compute=config.resources(),
+    )
+    return posterior, matches, found, ()
+
+
+def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
+    """New matches with errors, read as those of the run or as their own configuration says."""
+    if new.suffix == ".toml":
+        loaded, base = load_config(new)[0], new.parent
+        data, size = loaded.data, loaded.detector.size
+        if data is None:
+            raise InputError(
+                "names no table of matches", where=str(new), do="give one in data.matches"
+            )
+        names = data.matches
+        path: Any = base / names if isinstance(names, str) else [base / n for n in names]
+    else:
+        # the date of the run's exposures is not that of new ones
+        own = config.data
+        data = None if own is None else own.model_copy(update={"epoch": None})
+        path, size = new, config.detector.size
+        if not new.exists():
+            raise InputError("there is no such file", where=str(new), do="check the name")
+        if (new / "run.json").exists():
+            itself = new.resolve() == run.path.resolve()
+            raise InputError(
+                "is the released run itself" if itself else "is a run, and not matches",
+                where=str(new),
+                do="give a file of new matches, or a configuration whose [data] names it",
+            )
+    assert data is not None
+    _refuse_the_same(run, path)
+    matches = read_configured(path, data, size=size, chips=config.chip)
+    if data.sigma != "by_magnitude":
+        return matches
+    errors = read_magnitude_errors(run.path)
+    if errors is None:
+        raise InputError(
+            "errors by magnitude are asked for, and the run has measured none",
+            where=str(new),
+            do="give data.sigma another value",
+        )
+    return matches.with_errors(errors)
+
+
+def _refuse_the_same(run: RunDirectory, path: Any) -> None:
+    """Refuse matches that the release was made from, under whatever name: they cannot test it."""
+    seen = set(run.facts["inputs"].values())
+    for file in input_files(path):
+        if sha256_of(file) in seen:
+            raise InputError(
+                "these are matches that the release was made from, and say nothing new of it",
+                where=str(file),
+                do="give matches that were not in its fit",
+            )
+
+
+def _facts(new: NewFit, posterior: Posterior) -> dict[str, Any]:
+    """What is told of the new matches beside the change."""
+    n = new.target.n_theta
+    shards = new.target.shards
+    flagged, _ = count_outliers(shards, new.target.hyper, new.theta[None], new.psi[None, n:])
+    released = {k: (float(v.mean()), float(v.std(ddof=1))) for k, v in posterior.hyper.items()}
+    return {
+        "n_matches": len(shards),
+        "n_flagged": flagged,
+        "n_exposures": len(new.model.exposures),
+        "frames": new.open.frames,
+        "deviating": bool(new.scatter.any()),
+        "unit": new.model.unit,
+        "mixture": new.hyper,
+        "mixture_released": {k: {"mean": m, "sd": s} for k, (m, s) in released.items()},
+        "converged": bool(posterior.convergence.converged),
+    }
+
+
+def _lines(found: Monitored, facts: dict[str, Any], scores: Sequence[PeriodScore]) -> list[str]:
+    """What stands below the verdict."""
+    frames = "nothing" if facts["frames"] == "none" else facts["frames"].replace("_", ", ")
+    lines = [
+        f"new matches: {facts['n_matches']}, of which {facts['n_flagged']} are more likely false "
+        f"than not, in {facts['n_exposures']} exposure(s); fitted to each and taken out: {frames}"
+    ]
+    if facts["deviating"]:
+        lines.append("exposures deviate as those of the release scatter")
+    if facts["left_out"]:
+        lines.append(f"left out: {len(facts['left_out'])} exposure(s) that the release has seen")
+    for key, what in (("j", "error beyond the quoted ones"), ("f", "share of false matches")):
+        if key in facts["mixture"] and key in facts["mixture_released"]:
+            old = facts["mixture_released"][key]
+            unit = f" {facts['unit']}" if key == "j" else ""
+            lines.append(
+                f"{what}: {facts['mixture'][key]:.3g}{unit}; of the release {old['mean']:.3g} +- "
+                f"{old['sd']:.2g}"
+            )
+    if found.change.epoch is not None:
+        lines.append(
+            f"compared at {found.change.epoch:.3f}, the errors of the extrapolated drift included"
+        )
+    if found.date is not None and len(scores) > 1:
+        lines.append(
+            f"mean change p = {found.p_value:.2g}; a change at one of {len(scores)} dates "
+            f"p = {found.p_since:.2g}; scatter of the periods {found.date.scatter:.3g} of what "
+            f"errors make (p = {found.date.p_scatter:.2g})"
+        )
+    lines += [f"WARNING: {doubt}" for doubt in found.doubts]
+    if not facts["converged"]:
+        lines.append("WARNING: the released posterior has not converged")
+    return lines
+
+
+def _write(
+    output: Path,
+    found: Monitored,
+    scores: Sequence[PeriodScore],
+    facts: dict[str, Any],
+    command: str,
+) -> None:
+    date, maps = found.date, found.maps
+    with record_folder(output, "monitor.json", command) as (folder, record):
+        write_table(joined(maps, comparison_table), folder / "change.ecsv")
+        write_table(joined(maps, difference_table), folder / "difference.ecsv")
+        figures = {"change": difference_vectors(maps, names=("new", "release"))}
+        if date is not None:
+            table = Table(
+                {
+                    "first": [s.first for s in scores],
+                    "last": [s.last for s in scores],
+                    "n": [s.n for s in scores],
+                    "gain": date.gain,
+                }
+            )
+            write_table(table, folder / "dates.ecsv")
+            if len(scores) > 1:
+                figures["dates"] = change_over_time(
+                    table["first"], date.gain, date.dof, found.p_since
+                )
+        save_figures(figures, folder / "figures")
+        record |= _summary(found, facts)
+
+
+def _summary(found: Monitored, facts: dict[str, Any]) -> dict[str, Any]:
+    test, date, worst = found.change.test, found.date, found.worst
+    since = None
+    if date is not None:
+        since = {
+            "after": date.after,
+            "before": date.before,
+            "interval_95": list(date.interval),
+            "p_value": found.p_since,
+            "scatter": date.scatter,
+            "scatter_dof": date.scatter_dof,
+            "p_scatter": date.p_scatter,
+        }
+    scale = found.pixel_mas
+    return {
+        "verdict": found.verdict,
+        "changed": found.changed,
+        "p_value": found.p_either,
+        "mean_change": {"chi2": test.chi2, "dof": test.dof, "p_value": found.p_value},
+        "epoch": found.change.epoch,
+        "size": {
+            "unit": "pix",
+            "rms": worst.rms,
+            "noise_rms": worst.noise_rms,
+            "max": worst.largest,
+            "sigma_of_max": worst.sigma_of_largest,
+            "position_of_max": list(worst.position_of_largest),
+            "chip": worst.a.chip,
+            "of": "change from its date on" if found.since_a_date else "mean change",
+            "max_mas": None if scale is None else convert(worst.largest, "pix", "mas", scale),
+        },
+        "since": since,
+        "warnings": found.doubts,
+        "new": facts,
+    }

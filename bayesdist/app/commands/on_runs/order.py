@@ -1,0 +1,184 @@
+"""`bayesdist select-order`: which polynomial order do the data of a configuration ask for?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.config import Config, load_config
+from bayesdist.app.kinds.errors import QUOTED
+from bayesdist.app.kinds.stars import fit_stars, model_of, shards_of
+from bayesdist.app.results import Results, open_results
+from bayesdist.app.screen import table_text
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.output import refuse_existing, write_table
+from bayesdist.errors import DegenerateError, InputError
+from bayesdist.files import atomic_path
+from bayesdist.infer.compare.order import select_order
+from bayesdist.infer.compare.order_result import OrderSelection
+from bayesdist.infer.linear import Rejection
+from bayesdist.model.basis import MAX_ORDER
+
+__all__ = ["order"]
+
+
+def order(
+    path: str | Path,
+    orders: Sequence[int] = (3, 9),
+    *,
+    output: str | Path | None = None,
+    figure: str | Path | None = None,
+    force: bool = False,
+) -> str:
+    """Orders from the lowest to the highest compared on the data of a configuration, as text.
+
+    Its own order, priors and extra weights do not matter.  `output` is an ECSV file for the table,
+    `figure` a PNG file.  Orders that the data do not determine are rows that say so, as long as two
+    lower ones can be compared.
+    """
+    targets = [Path(name) for name in (output, figure) if name is not None]
+    for target in targets:
+        refuse_existing(target, force)
+    low, high = orders
+    if not 1 <= low < high <= MAX_ORDER:
+        raise InputError(
+            f"the orders go from {low} to {high}",
+            where="--orders",
+            do=f"give the lowest and the highest, between 1 and {MAX_ORDER}",
+        )
+    config, text = load_config(path)
+    if config.data is None:
+        kind = "campaign" if config.campaign is not None else "selfcal"
+        raise InputError(
+            f"orders are compared on matched stars, and this is a [{kind}]",
+            where=str(path),
+            do="give a configuration with [data]",
+        )
+    with TemporaryDirectory() as nowhere:
+        run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
+        with open_results(run) as results:
+            found, failed = _selected(results, range(low, high + 1))
+    if output is not None:
+        write_table(_table(found, failed), Path(output))
+    if figure is not None:
+        _draw(found, Path(figure))
+    return "\n\n".join([_text(found, failed), found.sentence])
+
+
+def _selected(results: Results, orders: Sequence[int]) -> tuple[OrderSelection, dict[int, str]]:
+    """The comparison, and why the orders above those compared cannot be fitted."""
+    config = results.config
+    # names of priors may be those of other orders
+    free = config.model_copy(
+        update={"prior": [], "fit": config.fit.model_copy(update={"radial_weight": 1.0})}
+    )
+    failed: dict[int, str] = {}
+    for top in sorted(orders, reverse=True):
+        highest = free.model.model_copy(update={"order": top})
+        wanted = free.model_copy(update={"model": highest})
+        try:
+            return _compared(results, wanted, range(min(orders), top + 1)), failed
+        except DegenerateError as error:
+            if top <= min(orders) + 1:
+                raise
+            failed[top] = error.sentence
+    raise AssertionError("the lowest two orders are compared or refused")
+
+
+def _compared(results: Results, config: Config, orders: Sequence[int]) -> OrderSelection:
+    """The comparison of orders, by a configuration of the highest.
+
+    Errors by magnitude are those of the highest order: its residuals hold the least misfit.
+    """
+    matched, reader, errors = results.matched, results.reader, QUOTED
+    if config.data is not None and config.data.sigma == "by_magnitude":
+        errors = fit_stars(matched, config, reader=reader).errors
+    model = model_of(matched.stars, config)
+    return select_order(
+        shards_of(matched.stars, model, config, errors, reader),
+        model,
+        orders=orders,
+        rejection=Rejection(config.fit.clip_chi2, config.fit.clip_abs),
+    )
+
+
+def _rows(found: OrderSelection, failed: dict[int, str]) -> list[dict[str, Any]]:
+    """A row for each order, rising; of those that cannot be fitted nothing but their terms."""
+    rows = found.rows()
+    empty = dict.fromkeys(rows[0])
+    more = [empty | {"order": n, "terms": (n + 1) * (n + 2) // 2} for n in sorted(failed)]
+    return rows + more
+
+
+def _table(found: OrderSelection, failed: dict[int, str]) -> Table:
+    rows = _rows(found, failed)
+    table = Table(
+        {key: [np.nan if row[key] is None else row[key] for row in rows] for key in rows[0]}
+    )
+    if failed:
+        table["not_fitted"] = [failed.get(row["order"], "") for row in rows]
+    for name in ("rms_u", "rms_v", "lost"):
+        table[name].unit = found.unit
+    noise = found.surfaces.noise
+    table.meta = {
+        "verdict": found.sentence,
+        "order": found.order,
+        "by_surfaces": found.by_surfaces,
+        "by_stars": found.by_stars,
+        "by_regions": found.by_regions,
+        "n_used": found.n_used,
+        "n_bins": found.surfaces.n_bins,
+        "noise_u": float(noise[0]),
+        "noise_v": float(noise[1]),
+        "pair_rms": found.pair_rms,
+        "error_scale": found.error_scale,
+        "unit": found.unit,
+    }
+    return table
+
+
+def _text(found: OrderSelection, failed: dict[int, str]) -> str:
+    """Surfaces on the left, what is held out on the right."""
+    noise, s = found.surfaces.noise, found.surfaces
+    rows = [
+        {
+            "order": f"{row['order']}{' *' if row['order'] == found.order else ''}",
+            "terms": row["terms"],
+            "rms u": row["rms_u"],
+            "rms v": row["rms_v"],
+            "chi2/dof u": row["chi2_u"],
+            "chi2/dof v": row["chi2_v"],
+            "F": row["F"],
+            "p": row["p_surface"],
+            "held-out stars": _with_error(row["stars"], row["stars_error"]),
+            "held-out regions": _with_error(row["regions"], row["regions_error"]),
+            "lost": row["lost"],
+        }
+        for row in _rows(found, failed)
+    ]
+    reasons = "".join(f"\norder {n} is not fitted: {failed[n]}" for n in sorted(failed))
+    return (
+        f"{found.n_used} pairs in {s.n_bins} bins; lengths in {found.unit}; noise of the bins "
+        f"{noise[0]:.3g} (u), {noise[1]:.3g} (v); errors are {found.error_scale:.3g} times those "
+        f"quoted\n\n{table_text(rows, 3)}\n\n"
+        "*  chosen: F, p and what is held out (log density) are against this order; lost: how far "
+        f"the model is from that of order {found.orders[-1]}{reasons}"
+    )
+
+
+def _with_error(value: float | None, error: float | None) -> str:
+    return "" if value is None or error is None else f"{value:.4g} +- {error:.2g}"
+
+
+def _draw(found: OrderSelection, path: Path) -> None:
+    from bayesdist.report.drawing import png_of  # figures take seconds to import
+    from bayesdist.report.order import order_comparison
+
+    png = png_of(order_comparison(found))
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(png)

@@ -1,0 +1,258 @@
+"""`bayesdist release`: one set of files from the finished runs of several filters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayesdist.app.assessment.error_terms import published_tables
+from bayesdist.app.campaign.filter_figures import draw_filters
+from bayesdist.app.campaign.filters import FilterComparison, compare_filters, comparison_table
+from bayesdist.app.campaign.release import write_files
+from bayesdist.app.kinds.fitted import Fitted, required
+from bayesdist.app.results import Results, results_of
+from bayesdist.app.screen import table_text
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.output import record_folder, write_table
+from bayesdist.errors import InputError
+from bayesdist.infer.exposures.shared_drift import with_drift_of
+from bayesdist.infer.solution import Solution
+from bayesdist.model import LookupTable
+
+__all__ = ["release_runs"]
+
+PRINTED = ("filter", "chip", "term", "at_edge", "sigma_at_edge")
+
+
+def release_runs(
+    runs: Sequence[str | Path],
+    output: str | Path,
+    *,
+    allow_unconverged: bool = False,
+    command: str = "",
+) -> str:
+    """Write IDCTABs, D2IMFILE and NPOLFILEs of several filters into a new folder; what to print.
+
+    The runs are finished ones of campaigns, one for each filter.  The first is that of the
+    reference filter: its [products.release] says what is written, its drift is stored, and its
+    tables are the detector's.  Runs that have not converged are refused unless allowed; the files
+    then say so.
+    """
+    with ExitStack() as stack:
+        by_filter: dict[str, Results] = {}
+        for path in runs:
+            results = stack.enter_context(closing(_opened(path)))
+            filter = results.inputs.filter
+            if filter in by_filter:
+                raise InputError(
+                    f"is of filter {filter}, as {by_filter[filter].run.path} is",
+                    where=str(path),
+                    do="give one run for each filter",
+                )
+            by_filter[filter] = results
+        _require_alike(by_filter)
+        doubts = _doubts(by_filter, allowed=allow_unconverged)
+        solutions = _solutions(by_filter)
+        comparison, why_not = _compared(by_filter)
+        notes = [*doubts, *_notes(by_filter, comparison)]
+        first = next(iter(by_filter.values()))
+        chip = first.config.chips()[0].number
+        table = comparison_table(solutions, comparison, chip=chip)
+        if comparison is None:
+            table.meta["drift"] = {"verdict": why_not}
+        with record_folder(Path(output), "release.json", command) as (folder, record):
+            tables = _tables(by_filter)
+            files = write_files(first.config, first.base, folder, solutions, tables, notes)
+            write_table(table, folder / "filters.ecsv")
+            figures = draw_filters(
+                folder, {k: one.fitted for k, one in by_filter.items()}, solutions
+            )
+            record |= {
+                "runs": {name: str(one.run.path) for name, one in by_filter.items()},
+                "converged": not doubts,
+                "drift": table.meta["drift"],
+                "products": files,
+                "figures": list(figures),
+            }
+    rows = [dict(zip(table.colnames, row, strict=True)) for row in table]
+    return _text(Path(output), files, rows, str(table["at_edge"].unit), why_not or None, comparison)
+
+
+def _opened(path: str | Path) -> Results:
+    """The results of a finished run of a campaign."""
+    run = RunDirectory.open(path)
+    if run.config.campaign is None:
+        raise InputError(
+            "is no run of a campaign", where=str(path), do="give runs that began with star lists"
+        )
+    run.require("release", ("match", "fit", "sample"))
+    return results_of(run)
+
+
+# -- whether the runs go together -----------------------------------------------------------------
+
+
+def _require_alike(by_filter: Mapping[str, Results]) -> None:
+    first, *others = by_filter.values()
+    if first.config.products.release is None:
+        raise InputError(
+            "has no [products.release], and the first run says what is released",
+            where=str(first.run.path),
+            do="put the run of the reference filter first",
+        )
+    mine = _structure(first)
+    for results in others:
+        for what, theirs in _structure(results).items():
+            if theirs != mine[what]:
+                raise InputError(
+                    f"the {what} are not those of {first.run.path}"
+                    + (f": {theirs} and {mine[what]}" if what != "chips" else ""),
+                    where=str(results.run.path),
+                    do="run both filters with one structure",
+                )
+        if not _same_detector(first.fitted, results.fitted):
+            raise InputError(
+                f"the detector's tables are not those of {first.run.path}",
+                where=str(results.run.path),
+                do="name that run in tables.detector and run this filter again",
+            )
+
+
+def _structure(results: Results) -> dict[str, Any]:
+    """What files of several filters must have in common, in words that take a plural."""
+    model, time = results.posterior.model, results.posterior.model.time
+    return {
+        "chips": model.chips,
+        "orders": model.order,
+        "units": model.unit,
+        "pixel scales": results.config.detector.scale_mas,
+        "drifting terms": None if time is None else time.terms,
+        "reference dates (RDATE)": None if time is None else time.epoch0,
+        "breaks": None if time is None else time.breaks,
+    }
+
+
+def _same_detector(a: Fitted, b: Fitted) -> bool:
+    """Whether two runs corrected the pixels alike, as far as a D2IMFILE holds it."""
+    mine, theirs = (
+        {
+            t.chip: (t.first, t.step, t.values.astype(np.float32))
+            for t in one.tables.tables
+            if not t.filter
+        }
+        for one in (a, b)
+    )
+    return mine.keys() == theirs.keys() and all(
+        mine[c][:2] == theirs[c][:2] and np.array_equal(mine[c][2], theirs[c][2]) for c in mine
+    )
+
+
+def _doubts(by_filter: Mapping[str, Results], *, allowed: bool) -> list[str]:
+    """What has not converged, as sentences."""
+    out = []
+    for name, results in by_filter.items():
+        convergence = results.posterior.convergence
+        if not convergence.converged:
+            why = "; ".join(convergence.reasons)
+            if not allowed:
+                raise InputError(
+                    f"the run of {name} has not converged ({why})",
+                    where=str(results.run.path),
+                    do="resume it with more steps, or release it with --allow-unconverged",
+                )
+            out.append(f"NOT CONVERGED: the run of {name} ({why}).")
+    return out
+
+
+# -- what is released -----------------------------------------------------------------------------
+
+
+def _solutions(by_filter: Mapping[str, Results]) -> dict[str, Solution]:
+    """The reference filter's solution, and the others with its drift."""
+    (first, reference), *others = by_filter.items()
+    out: dict[str, Solution] = {first: reference.solution}
+    for name, results in others:
+        solution: Solution = results.solution
+        if solution.model.time is not None:
+            solution = with_drift_of(
+                solution,
+                reference.solution,
+                chip=reference.config.chips()[0].number,
+                formal=results.fit,
+            )
+        out[name] = solution
+    return out
+
+
+def _tables(by_filter: Mapping[str, Results]) -> list[LookupTable]:
+    """The detector's tables, once, and those of the filters."""
+    published = [
+        published_tables(one.fitted.tables, held=one.config.tables.detector is not None)
+        for one in by_filter.values()
+    ]
+    out = [table for table in published[0] if not table.filter]
+    return out + [table for tables in published for table in tables if table.filter]
+
+
+def _compared(by_filter: Mapping[str, Results]) -> tuple[FilterComparison | None, str]:
+    """The comparison of the filters, or why there is none."""
+    if len(by_filter) < 2:
+        return None, "not compared: there is one filter"
+    first = next(iter(by_filter.values()))
+    try:
+        found = compare_filters(
+            {
+                name: required(one.fitted.alone, "fits of single exposures")
+                for name, one in by_filter.items()
+            },
+            first.posterior.model.time,
+            seed=first.config.sampler.seed,
+        )
+    except InputError as error:  # too few exposures, or nothing that drifts
+        return None, f"not compared: {error.cause}"
+    return found, ""
+
+
+def _notes(by_filter: Mapping[str, Results], comparison: FilterComparison | None) -> list[str]:
+    """Lines for HISTORY."""
+    if len(by_filter) < 2:
+        return []
+    first = next(iter(by_filter))
+    out = [f"Filters {', '.join(by_filter)}; the drift is that of {first}."]
+    if comparison is not None:
+        said = comparison.sentence
+        out.append(f"Tested on the exposures: {said}.")
+    return out
+
+
+# -- what is printed ------------------------------------------------------------------------------
+
+
+def _text(
+    output: Path,
+    files: Sequence[Mapping[str, Any]],
+    rows: Sequence[Mapping[str, Any]],
+    unit: str,
+    why_not: str | None,
+    comparison: FilterComparison | None,
+) -> str:
+    lines = [table_text([{"file": str(output / f["path"]), "kind": f["kind"]} for f in files])]
+    for file in files:
+        lines += [f"  {file['path']}: {text}" for text in file["findings"]]
+    different = [row for row in rows if row["filter"] != rows[0]["filter"]]
+    if different:
+        reference = rows[0]["filter"]
+        lines += ["", f"Against {reference}, at half the chip ({unit}), the drift taken out:"]
+        lines.append(table_text([{k: _plain(row[k]) for k in PRINTED} for row in different]))
+    lines += ["", f"Drift: {comparison.sentence if comparison else why_not}"]
+    if comparison is not None and not comparison.alike:
+        lines.append("WARNING: the files hold one drift for all filters")
+    return "\n".join(lines)
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value

@@ -1,0 +1,65 @@
+"""`bayesdist requirements`: the margins of a run against requirements of their own file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from bayesdist.app.assessment.judging import margins_of, validity_periods_of
+from bayesdist.app.assessment.settings import idle_dates
+from bayesdist.app.config import load_requirements
+from bayesdist.app.results import open_results
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.evaluation_files import save_margins
+from bayesdist.app.tables.margins import margin_rows, margins_text
+from bayesdist.assess import Margin, Requirement
+from bayesdist.errors import InputError
+
+__all__ = ["validate"]
+
+
+def validate(run: str | Path, requirements: str | Path) -> tuple[str, bool]:
+    """Judge a run that has been sampled, and replace its margins and validity periods.
+
+    `requirements` is a TOML file of ``[[requirement]]`` blocks.  Text to print, and truth of all
+    being met.
+    """
+    asked = load_requirements(requirements)
+    directory = RunDirectory.open(run)
+    with open_results(directory) as results:
+        directory.require("requirements", ("fit", "sample"))
+        with _named_after(requirements, asked):
+            margins = margins_of(results, asked)
+            horizons = validity_periods_of(results, asked)
+        fit, posterior, gauge = results.fit, results.posterior, results.gauge_words
+        with directory.locked(), directory.judged_by(asked):
+            save_margins(directory, fit, posterior, gauge, margins, horizons)
+        report = directory / "report.html"
+        outdated = report.exists() and not directory.done("report")
+    warnings = posterior.approximation, idle_dates(results.config, asked, str(requirements))
+    lines = [*_lines(margins), *(one.sentence for one in horizons)]
+    lines += [f"WARNING: {text}" for text in warnings if text]
+    if outdated:
+        lines.append(f"{report} shows earlier margins; renew it by 'bayesdist stage report {run}'")
+    return "\n".join(lines), all(m.verdict == "met" for m in margins)
+
+
+@contextmanager
+def _named_after(path: str | Path, asked: Sequence[Requirement]) -> Iterator[None]:
+    """Put the name of their file before errors of its requirements."""
+    try:
+        yield
+    except InputError as error:
+        if not error.where.startswith(tuple(r.where for r in asked)):
+            raise
+        raise type(error)(error.cause, where=f"{path}: {error.where}", do=error.do) from error
+
+
+def _lines(margins: Sequence[Margin]) -> Iterator[str]:
+    yield margins_text(margin_rows(margins))
+    for m in margins:
+        if m.verdict != "met":
+            yield f"{m.requirement.name}: {m.verdict}: {m.reason}"
+        if m.remedy is not None:
+            yield f"{m.requirement.name}: {m.remedy.sentence}"

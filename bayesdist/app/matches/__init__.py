@@ -1,0 +1,1 @@
+"""Stars that were matched before: reading, formats of missions, added errors."""

@@ -1,0 +1,1 @@
+"""Files for pipelines, and what they differ from the solution by."""

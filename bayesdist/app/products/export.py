@@ -1,0 +1,85 @@
+"""Files for pipelines, written and compared with the solution."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bayesdist.app.assessment.error_terms import published_tables
+from bayesdist.app.campaign.release import write_files
+from bayesdist.app.config import Config
+from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.products.made_files import ProductInput, made_files
+from bayesdist.app.products.sky_closure import sky_closure
+from bayesdist.assess.budget.budget import with_product
+from bayesdist.assess.terms.forms import PRODUCT
+from bayesdist.diagnose.residuals.sample import StarSample
+from bayesdist.files import atomic_path
+from bayesdist.limits import FILE_ERROR
+from bayesdist.products.registry import lint
+
+__all__ = ["export_files"]
+
+log = logging.getLogger("bayesdist")
+
+
+def export_files(
+    product: ProductInput,
+    fitted: Fitted,
+    config: Config,
+    base: Path,
+    folder: Path,
+    *,
+    stars: StarSample | None,
+    budget: Sequence[dict[str, Any]],
+) -> list[dict[str, Any]]:
+    """Write the files that a configuration asks for, and list what is known of each.
+
+    Headers are compared on the sky with `stars`, the errors of files with rows of the error
+    `budget`.  Each entry has path, kind, findings, and what else is known of the file.
+    """
+    products: list[dict[str, Any]] = []
+    if config.products.release is not None:
+        held = config.tables.detector is not None
+        tables = published_tables(fitted.tables, held=held)
+        products += write_files(config, base, folder, {product.filter: product.solution}, tables)
+    for files in made_files(product, config).values():
+        for built in files:
+            path = folder / built.file_name
+            with atomic_path(path) as temporary:
+                temporary.write_bytes(built.content)
+            entry: dict[str, Any] = {"path": built.file_name, "kind": built.kind}
+            findings = [f"{f.level}: {f.where}: {f.message}" for f in lint(path)]
+            if built.chip is not None:
+                entry["chip"] = built.chip
+                sky = None if stars is None else sky_closure(product, stars, path, built.chip)
+                if sky is not None:
+                    entry["sky"] = sky.summary
+                    log.log(sky.level, "export: %s: %s", path.name, sky.sentence)
+                    findings += sky.findings
+            products.append(entry | built.summary | {"findings": findings})
+    for one in products:
+        _compare(one, budget)
+    return products
+
+
+def _compare(product: dict[str, Any], budget: Sequence[dict[str, Any]]) -> None:
+    """Note what the budget says of a file, and what the total is for whoever uses it."""
+    for row in budget:
+        files, _, direction = row["name"].rpartition(", ")
+        path = product["path"]
+        if row["kind"] != PRODUCT or not (
+            path in files.split(", ") or path.startswith(f"{files}_")
+        ):
+            continue
+        product[f"{direction}_rms"] = row["radial"]
+        total = budget[-1]["radial"]
+        if direction == "forward":
+            product["total_rms"] = with_product(total, row["radial"])
+            if row["radial"] > FILE_ERROR.value * total:
+                product["findings"].append(
+                    f"warning: forward: differs from the solution by {row['radial']:.2g} rms over "
+                    f"the detector, whose total error is {total:.2g}"
+                )

@@ -1,0 +1,97 @@
+"""Calibration files of a solution as the configuration asks for them, not yet written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from bayesdist.app.assessment.settings import assessment_epoch
+from bayesdist.app.config import Config
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.calibration.plane import Plane
+from bayesdist.infer.solution import Solution
+from bayesdist.model import LookupTable
+from bayesdist.products.formats.common.document import BuildOptions, Built
+from bayesdist.products.registry import build
+
+__all__ = ["ProductInput", "made_files", "product_input"]
+
+
+@dataclass(frozen=True, eq=False)
+class ProductInput:
+    """What the files of a run are made from.
+
+    Parameters
+    ----------
+    solution : Solution
+    source : str
+        Where it is from: the folder of a run.
+    detector : str
+    epoch : float or None
+        Of the assessment, decimal years.
+    scale_arcsec : float or None
+        Size of a pixel, where the configuration gives it.
+    tangent_point : tuple of float or None
+        Sky position of (u, v) = (0, 0), degrees; None where u, v are not along the sky.
+    exposure : str
+        Of several with frames of their own the one for which a file is right on the sky.
+    gauge : str
+        In which gauge the solution stands, as a sentence; empty where that is no question.
+    tables : tuple of LookupTable
+        By which pixels are corrected before the polynomials, of the detector and of the filter.
+    filter : str
+    aligned : bool
+        The user of a file fits shift and rotation of an exposure.
+    """
+
+    solution: Solution
+    source: str
+    detector: str = ""
+    epoch: float | None = None
+    scale_arcsec: float | None = None
+    tangent_point: tuple[float, float] | None = None
+    exposure: str = ""
+    gauge: str = ""
+    tables: tuple[LookupTable, ...] = ()
+    filter: str = ""
+    aligned: bool = False
+
+
+def product_input(solution: Solution, data: FitData, config: Config, source: str) -> ProductInput:
+    """Ingredients of the files of a solution; they say that it is from `source`."""
+    mas, fitted, model = config.detector.scale_mas, data.fitted, data.model
+    several = model.frames != "none" and len(model.exposures) > 1
+    return ProductInput(
+        solution,
+        source,
+        config.detector.name,
+        assessment_epoch(data, config),
+        None if mas is None else mas / 1000,
+        data.matched.tangent_point,
+        model.exposures[0] if several else "",
+        "" if fitted.solved is None else fitted.solved.gauge_words,
+        fitted.tables.tables,
+        data.matched.filter,
+        fitted.scatter is not None,
+    )
+
+
+def made_files(product: ProductInput, config: Config) -> dict[str, tuple[Built, ...]]:
+    """Files by the key of their format."""
+    calibration = _calibration(product)
+    options = BuildOptions(product.epoch, product.scale_arcsec)
+    return {
+        key: build(key, calibration, settings, options)
+        for key, settings in config.products.asked().items()
+    }
+
+
+def _calibration(product: ProductInput) -> Calibration:
+    """The calibration that the files hold, with what they have to say of the run it is from."""
+    point, plane = product.tangent_point, Plane()
+    if point is not None:
+        # for which exposure a file is right on the sky, where they differ
+        note = f"On the sky it is exposure {product.exposure}: others have frames of their own."
+        plane = Plane("sky", point=point, note=note if product.exposure else "")
+    found = calibration_of(product.solution, product.source, plane=plane, detector=product.detector)
+    return replace(found, notes=(product.gauge,) if product.gauge else ())

@@ -1,0 +1,166 @@
+"""The report of a run: figures and report.html."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from bayesdist.app.campaign.report import campaign_results
+from bayesdist.app.config import Config
+from bayesdist.app.results import Results
+from bayesdist.app.selfcal.report import selfcal_results
+from bayesdist.app.store import as_json
+from bayesdist.assess import VectorMap, distortion_vectors
+from bayesdist.assess.coefficients import coefficient_table
+from bayesdist.assess.evaluation import Evaluation
+from bayesdist.assess.solution import chip_places
+from bayesdist.checks import Check
+from bayesdist.infer import Posterior
+from bayesdist.model import Chip
+from bayesdist.report.context import ChipResults, Product, ReportInput
+
+__all__ = ["report", "title_of"]
+
+log = logging.getLogger("bayesdist")
+
+VECTOR_GRID = 17  # vectors along the longer side of a diagram: more would hide each other
+
+
+def report(results: Results) -> list[str]:
+    """Names of the figures of a report, which is written into the folder of the run.
+
+    Parameters
+    ----------
+    results : Results
+    """
+    # figures take seconds to import
+    from bayesdist.report.drawing import save_drawings
+    from bayesdist.report.run_report import draw_report, write_report
+
+    run, inputs = results.run, report_input(results)
+    drawings = draw_report(inputs, processes=2 if _is_command_line() else 1)
+    names = [f"{name}.{kind}" for name in drawings for kind in ("png", "pdf")]
+    save_drawings(drawings, run / "figures")
+    write_report(run / "report.html", inputs, drawings)
+    log.info("report: %s", run / "report.html")
+    return names
+
+
+def _is_command_line() -> bool:
+    """Whether other processes may import the main module: a user's own may not be guarded."""
+    path = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
+    name = path.parent.stem if path.name == "__main__.py" else path.stem
+    return name == "bayesdist" and (os.cpu_count() or 1) > 1
+
+
+def report_input(results: Results) -> ReportInput:
+    """All that the report shows."""
+    run, config, fitted = results.run, results.config, results.fitted
+    fit, posterior = results.fit, results.posterior
+    facts, folder = run.facts, run.path.resolve().name
+    products = tuple(
+        Product(
+            path=p["path"],
+            what=p["kind"],
+            checks=_product_checks(p),
+        )
+        for p in run.summary.get("products", [])
+    )
+    found, evaluation = results.diagnostics, results.evaluation
+    return ReportInput(
+        name=title_of(config) or folder,
+        config=as_json(config.model_dump(exclude_none=True)),
+        stars=found.sample,
+        exposures=found.sums.exposures,
+        fit=fit,
+        posterior=posterior,
+        chips=_chip_results(results, evaluation),
+        coefficients=coefficient_table(fit, results.solution),
+        budget=evaluation.budget,
+        surface=evaluation.surface,
+        margins=evaluation.margins,
+        horizons=evaluation.validity,
+        products=products,
+        checks=evaluation.checks,
+        score_tests=found.score_tests,
+        periods=found.periods,
+        held_out=found.holdout,
+        magnitude_errors=fitted.errors.by_magnitude,
+        added_errors=fitted.grouped,
+        flagged=found.flagged,
+        campaign=None if fitted.scatter is None else campaign_results(results),
+        selfcal=None if fitted.solved is None else selfcal_results(results),
+        provenance={"folder": folder}
+        | {k: facts[k] for k in ("command", "created", "seed", "inputs", "versions")}
+        | {"stages": run.record.stages},
+    )
+
+
+def title_of(config: Config) -> str:
+    """What was calibrated: detector, or chips, and the filter of a campaign; may be empty."""
+    detector = config.detector.name or " and ".join(chip.name for chip in config.chip)
+    band = None if config.campaign is None else config.campaign.filter
+    return ", ".join(part for part in (detector, band) if part)
+
+
+def _chip_results(results: Results, evaluation: Evaluation) -> tuple[ChipResults, ...]:
+    posterior, epoch = results.solution, results.epoch
+    relative = evaluation.relative or (None,) * len(evaluation.maps)
+    return tuple(
+        ChipResults(
+            chip=chip,
+            formal_map=formal,
+            posterior_map=with_errors,
+            displacement=_vectors(posterior, "no_constant", chip, epoch),
+            non_linear=_vectors(posterior, "non_linear", chip, epoch),
+            area=area,
+            binned=sums.residuals(),
+            place=place,
+            relative_map=of_pairs,
+        )
+        for chip, place, sums, formal, with_errors, area, of_pairs in zip(
+            posterior.model.chips,
+            chip_places(posterior, epoch=epoch),
+            results.diagnostics.shown,
+            evaluation.formal,
+            evaluation.maps,
+            evaluation.areas,
+            relative,
+            strict=True,
+        )
+    )
+
+
+def _vectors(solution: Posterior, part: str, chip: Chip, epoch: float | None) -> VectorMap:
+    grid = _vector_grid(chip.size)
+    return distortion_vectors(solution, part=part, grid=grid, epoch=epoch, chip=chip.number)
+
+
+def _product_checks(product: dict[str, Any]) -> tuple[Check, ...]:
+    """What was verified on a file as written."""
+    out = []
+    if product.get("closure_pix") is not None:
+        out.append(Check("Products", "worst closure of the inverse (pix)", product["closure_pix"]))
+        out.append(Check("Products", "A_DMAX (pix)", product["a_dmax"]))
+        out.append(Check("Products", "B_DMAX (pix)", product["b_dmax"]))
+    if product.get("sky"):
+        sky = product["sky"]
+        name = f"rms distance from RA, Dec of {sky['n']} stars (arcsec)"
+        out.append(Check("Products", name, sky["rms_arcsec"]))
+        out.append(
+            Check("Products", "largest distance from the solution (arcsec)", sky["solution_arcsec"])
+        )
+    levels = {"error": "fail", "warning": "warn", "note": "note"}
+    for finding in product["findings"]:
+        level, _, text = finding.partition(": ")
+        out.append(Check("Products", text, level, "", levels.get(level, "note")))
+    return tuple(out)
+
+
+def _vector_grid(size: tuple[float, float]) -> tuple[int, int]:
+    longest = max(size)
+    nx, ny = (max(3, round(VECTOR_GRID * s / longest)) for s in size)
+    return nx, ny

@@ -1,0 +1,160 @@
+"""What stages write into the folder of a run: files, sections of summary.json, lines of the log."""
+
+from __future__ import annotations
+
+import logging
+
+from bayesdist.app.assessment.checks import frames_doubt, in_circle
+from bayesdist.app.assessment.holdout import holdout_summary, holdout_table
+from bayesdist.app.assessment.periods import periods_summary, periods_table
+from bayesdist.app.assessment.rehearsal import rehearse_solution
+from bayesdist.app.assessment.settings import idle_dates
+from bayesdist.app.campaign.lines import line_sections
+from bayesdist.app.campaign.series import write_series_tables
+from bayesdist.app.config import Config
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.summary import fit_sections, log_fit, sample_sections
+from bayesdist.app.matches.added_errors import grouping_sentence
+from bayesdist.app.results import Results
+from bayesdist.app.selfcal.stars import write_stars
+from bayesdist.app.tables.diagnostics_files import write_diagnostics
+from bayesdist.app.tables.evaluation_files import write_evaluation
+from bayesdist.app.tables.output import write_table
+from bayesdist.app.tables.star_files import FOLDER, write_star_files
+from bayesdist.checks import warnings_of
+from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
+from bayesdist.diagnose.residuals.majority import majority_sentence
+from bayesdist.infer import save_posterior
+
+__all__ = [
+    "save_diagnosed",
+    "save_evaluation",
+    "save_figures",
+    "save_fit",
+    "save_matches",
+    "save_products",
+    "save_sampled",
+]
+
+log = logging.getLogger("bayesdist")
+
+
+def save_matches(results: Results) -> None:
+    """Write the matches of star lists."""
+    matched = results.matched
+    matched.save(results.run.path)
+    results.run.summarise(**{matched.section: matched.facts})
+
+
+def save_fit(results: Results) -> None:
+    """Write the least-squares solution, and what is odd about it, before hours of sampling."""
+    config, data = results.config, results.data
+    fitted = data.fitted
+    fitted.save(results.run.path)
+    results.run.summarise(**fit_sections(fitted, data.placed, skew=config.fit.skew))
+    log_fit(data.fit, results.kind.rows)
+    if results.kind.begins_with == "fit":
+        _log_matches(data, config)
+        return
+    if fitted.solved is not None:
+        rehearse_solution(results)
+        warnings = fitted.solved.gauge.sentences
+    else:
+        warnings = fitted.facts["deviations"]["warnings"]
+    for text in warnings:
+        log.warning("fit: WARNING: %s", text)
+    if fitted.scatter is not None:
+        scatter = fitted.facts["scatter"]
+        sizes = ", ".join(f"{name} {found['value']:.2g}" for name, found in scatter.items())
+        log.info("fit: scatter of the exposures %s", sizes)
+
+
+def _log_matches(data: FitData, config: Config) -> None:
+    """Lines of the log on stars that were matched before."""
+    matches, fit = data.placed, data.fit
+    for note in matches.notes:
+        log.info("fit: %s", note)
+    for reason, count in matches.rejected.items():
+        log.info("fit: %d rows were left out in reading: %s", count, reason)
+    shift = epoch_shift(data.sample, fit)
+    if shift is not None and shift.significant:
+        log.warning("fit: WARNING: %s", shift.sentence)
+    majority = majority_sentence(fit)
+    if data.error_scale_sentence:
+        log.warning("fit: WARNING: %s", data.error_scale_sentence)
+    if text := frames_doubt(data, majority, config):
+        log.warning("fit: WARNING: %s", text)
+    if data.fitted.grouped is not None:
+        log.info("fit: %s", grouping_sentence(data.fitted.grouped, fit.unit))
+    if majority:
+        log.warning("fit: WARNING: %s", majority)
+
+
+def save_sampled(results: Results) -> None:
+    """Write the posterior, and what it says of each star."""
+    run, data, posterior = results.run, results.data, results.posterior
+    facts, gauge = run.facts, results.gauge_words
+    provenance = {k: facts[k] for k in ("inputs", "seed", "versions", "created")}
+    provenance |= {"gauge": gauge} if gauge else {}
+    table = data.stars if data.stars.in_memory else None
+    save_posterior(posterior, table, run / "posterior.nc", provenance=provenance)
+    write_star_files(data.stars, data.fit, posterior, run / FOLDER)
+    run.summarise(**sample_sections(posterior, in_circle=in_circle(data, results.config)))
+    c, n = posterior.convergence, posterior.sampler
+    if posterior.approximation:
+        log.warning("sample: %s", posterior.approximation)
+    elif c.converged:
+        log.info("sample: converged after %d steps, %d passes", n.steps, n.passes)
+    else:
+        log.warning("sample: NOT CONVERGED after %d steps: %s", n.steps, "; ".join(c.reasons))
+
+
+def save_diagnosed(results: Results) -> None:
+    """Write what residuals say, held-out stars, periods and exposures among them."""
+    run, found = results.run, results.diagnostics
+    if results.fitted.alone is not None:
+        write_series_tables(run, results.fitted, results.config)
+    write_diagnostics(run, results.fit, results.posterior, found)
+    if found.holdout is not None:
+        write_table(holdout_table(found.holdout), run / "holdout.ecsv")
+        run.summarise(holdout=holdout_summary(found.holdout))
+        log.info("diagnose: %s", found.holdout.verdict)
+        log.info("diagnose: %s", found.holdout.coverage_words)
+    periods = found.periods
+    if periods is not None:
+        write_table(periods_table(periods), run / "periods.ecsv")
+        run.summarise(periods=periods_summary(periods))
+        for text in (periods.verdict, periods.pattern_sentence, *periods.cautions):
+            log.info("diagnose: %s", text)
+    if results.fitted.solved is not None:
+        known = run.summary.get("selfcal", {})
+        run.summarise(selfcal=known | {"stars": write_stars(results)})
+
+
+def save_evaluation(results: Results) -> None:
+    """Write maps, budget, margins and validity periods."""
+    run, config, found = results.run, results.config, results.evaluation
+    for text in warnings_of(found.checks):
+        log.warning("evaluate: WARNING: %s", text)
+    if idle := idle_dates(config, config.requirements()):
+        log.warning("evaluate: WARNING: %s", idle)
+    gauge, solution = results.gauge_words, results.solution
+    write_evaluation(run, results.fit, results.posterior, solution, gauge, found)
+    if results.fitted.scatter is not None:
+        run.summarise(**line_sections(solution, config.chips()[0].number))
+    for one in found.validity:
+        log.info("evaluate: %s", one.sentence)
+    worst = max(found.maps, key=lambda m: m.radius_max)
+    log.info("evaluate: largest formal radius %.4g %s", worst.radius_max, worst.unit)
+
+
+def save_products(results: Results) -> None:
+    """List the files that were exported."""
+    products = results.made["products"]
+    results.run.summarise(products=products)
+    log.info("export: %s", ", ".join(p["path"] for p in products) or "no products asked for")
+
+
+def save_figures(results: Results) -> None:
+    """List the figures that were drawn."""
+    results.run.summarise(figures=results.made["figures"])

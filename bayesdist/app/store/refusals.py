@@ -1,0 +1,118 @@
+"""Folders, inputs and settings with which a run is refused, before anything is written."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+from bayesdist.app.config import Config, load_config, load_text, parse_config
+from bayesdist.app.store.keys import shown
+from bayesdist.app.store.made_from import changes, is_adjustable, with_seed
+from bayesdist.app.store.named_files import files_of_products, named_files
+from bayesdist.errors import InputError
+from bayesdist.files import is_leftover
+
+__all__ = [
+    "refuse_another_solution",
+    "refuse_edited",
+    "refuse_foreign_files",
+    "refuse_inside_input",
+    "refuse_other_inputs",
+]
+
+
+def refuse_inside_input(folder: Path, config: Config, base: Path) -> None:
+    """Refuse a run whose own Parquet files would become part of its input."""
+    named = named_files(config, base)
+    for path in named if isinstance(named, list) else [named]:
+        if path.is_dir() and folder.resolve().is_relative_to(path.resolve()):
+            raise InputError(
+                "the run would lie inside the folder of its input",
+                where=str(folder),
+                do="choose a folder outside of it",
+            )
+
+
+def refuse_foreign_files(folder: Path, text: str) -> None:
+    """Refuse to begin in a folder that holds other files.
+
+    A config.toml with the text of the configuration is no obstacle: a stage may be run on it.
+    """
+    if not folder.is_dir():
+        return
+    names = {path.name for path in folder.iterdir() if not is_leftover(path.name)}
+    if "config.toml" in names and load_text(folder / "config.toml") == text:
+        names.remove("config.toml")
+    if names:
+        raise InputError(
+            f"the folder holds other files ({min(names)})",
+            where=str(folder),
+            do="choose an empty folder",
+        )
+
+
+def refuse_another_solution(
+    folder: Path,
+    known: Config,
+    record: Mapping[str, Any],
+    config: Config,
+    base: Path,
+    inputs: Mapping[str, str],
+    seed: int | None,
+) -> None:
+    """Refuse to resume with inputs or settings that the solution was not made from.
+
+    `known` is the configuration that the run began with, `facts` are those of its record, `inputs`
+    the SHA-256 of the inputs now, `seed` that of the command line.
+    """
+    path = folder / "config.toml"
+    if seed is not None and seed != known.sampler.seed:
+        raise InputError(
+            f"the run began with seed {known.sampler.seed}",
+            where=str(folder),
+            do="leave --seed out, or start again with --force",
+        )
+    if path.exists():  # the command line may have given another seed than the file
+        known = with_seed(known, parse_config(load_text(path), str(path)).sampler.seed)
+    for key, old, new in changes(known, config):
+        if not is_adjustable(key, known):
+            raise InputError(
+                f"the configuration has {key} = {shown(new)}, and this run began with {shown(old)}",
+                where=str(path),
+                do="resume with the old value, or start again with --force",
+            )
+    of_products = {str(one) for one in files_of_products(config, base.resolve())}
+    of_products |= {str(one) for one in files_of_products(known, Path(record["base"]))}
+    refuse_other_inputs(record["inputs"], inputs, but=of_products)
+
+
+def refuse_edited(folder: Path, known: Config) -> None:
+    """Refuse a config.toml that was edited in place: the run goes by what it was given."""
+    path = folder / "config.toml"
+    if not path.exists():
+        return
+    # the command line may have given another seed
+    now = with_seed(load_config(path)[0], known.sampler.seed)
+    keys = [key for key, *_ in changes(known, now)]
+    if keys:
+        resumed = f"take it over by 'bayesdist run {path} -o {folder} --resume'"
+        adjustable = all(is_adjustable(key, known) for key in keys)
+        raise InputError(
+            f"was edited since the run began ({keys[0]}), which goes by the old one",
+            where=str(path),
+            do=f"restore it, or {resumed if adjustable else 'start again with --force'}",
+        )
+
+
+def refuse_other_inputs(
+    known: Mapping[str, str], now: Mapping[str, str], but: Collection[str] = ()
+) -> None:
+    """Refuse inputs that are not those of the record, but for some."""
+    for name in sorted((known.keys() | now.keys()) - set(but)):
+        if known.get(name) != now.get(name):
+            raise InputError(
+                "this input changed since the run began",
+                where=name,
+                do="restore it, or start again with --force",
+            )

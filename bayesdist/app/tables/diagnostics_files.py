@@ -1,0 +1,115 @@
+"""Diagnostics of a run in its folder: written by `diagnose`, read by whatever follows."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.fingerprint import fingerprint_of
+from bayesdist.diagnose.correlated.storage import discrepancy_from_arrays, discrepancy_to_arrays
+from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.diagnose.residuals.misfit import Misfit
+from bayesdist.diagnose.score.result import ScoreTest
+from bayesdist.errors import InputError
+from bayesdist.infer import LinearFit, Posterior
+from bayesdist.infer.catalogue.star_errors import StarCovariance
+from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
+from bayesdist.records import record_from_arrays, record_to_arrays
+
+__all__ = ["load_diagnostics", "write_diagnostics"]
+
+CORRELATED = "discrepancy.h5"
+CATALOGUE = "catalogue_errors.h5"
+OTHERS = "diagnostics.h5"
+
+log = logging.getLogger("bayesdist")
+
+
+def write_diagnostics(
+    run: RunDirectory, fit: LinearFit, posterior: Posterior, found: Diagnostics
+) -> None:
+    """Write diagnostics of a fit and a posterior, and their sections of summary.json."""
+    fingerprint = fingerprint_of(fit, posterior)
+    assert found.correlated is not None
+    arrays, facts = discrepancy_to_arrays(found.correlated)
+    write_arrays(run / CORRELATED, fingerprint, arrays)
+    _save_catalogue(run, fingerprint, found.catalogue)
+    others = replace(found, correlated=None, catalogue=None)
+    write_arrays(run / OTHERS, fingerprint, record_to_arrays(others))
+    run.summarise(
+        discrepancy=facts,
+        score_tests=[_row(test) for test in found.score_tests],
+        misfit=_misfit_summary(found),
+    )
+    for row in facts.get("structure", []):
+        log.info(
+            "diagnose: structure beyond the model on chip %s, %s: %.2g %s rms, at most %.2g with "
+            "95 %% probability",
+            *(row["chip"], row["axis"], row["median"], facts["unit"], row["most"]),
+        )
+    for test in found.score_tests:
+        if test.significant:
+            log.info("diagnose: %s: %s", test.finding, test.remedy)
+
+
+def load_diagnostics(run: RunDirectory, fit: LinearFit, posterior: Posterior) -> Diagnostics | None:
+    """Diagnostics of a fit and a posterior; None where there are none of just these."""
+    facts = run.summary.get("discrepancy")
+    fingerprint = fingerprint_of(fit, posterior)
+    if not facts or not (run / OTHERS).exists():
+        return None
+    try:
+        others = record_from_arrays(read_arrays(run / OTHERS, fingerprint, do=""))
+        arrays = read_arrays(run / CORRELATED, fingerprint, do="")
+    except InputError:
+        return None
+    correlated = discrepancy_from_arrays(posterior.model, arrays)
+    return replace(
+        others,
+        correlated=replace(correlated, facts=facts),
+        catalogue=_load_catalogue(run, fingerprint),
+    )
+
+
+def _save_catalogue(run: RunDirectory, fingerprint: str, stars: StarCovariance | None) -> None:
+    if stars is None:
+        (run / CATALOGUE).unlink(missing_ok=True)
+        return
+    motions = np.empty((0, 0)) if stars.motions is None else stars.motions
+    arrays = {"total": stars.total, "counted": stars.counted, "motions": motions}
+    write_arrays(run / CATALOGUE, fingerprint, arrays)
+
+
+def _load_catalogue(run: RunDirectory, fingerprint: str) -> StarCovariance | None:
+    if not (run / CATALOGUE).exists():
+        return None
+    names = ("total", "counted", "motions")
+    arrays = read_arrays(run / CATALOGUE, fingerprint, names, do="run the stage 'diagnose' again")
+    if not arrays["motions"].size:
+        del arrays["motions"]
+    return StarCovariance(**arrays)
+
+
+def _row(test: ScoreTest) -> dict[str, Any]:
+    """A test as a row of summary.json."""
+    row = asdict(test)
+    # JSON has no infinity: what no effect can show has no smallest size
+    return row | {"smallest": test.smallest if np.isfinite(test.smallest) else None}
+
+
+def _misfit_summary(found: Diagnostics) -> dict[str, Any]:
+    worst = found.misfit
+    out = _misfit_row(worst) | {"unit": worst.unit, "significant": worst.significant}
+    if len(found.misfits) > 1:
+        out["chips"] = [_misfit_row(m) for m in found.misfits]
+    return out
+
+
+def _misfit_row(m: Misfit) -> dict[str, Any]:
+    row = {"p_value": m.p_value, "partition": m.partition, "structure": m.structure}
+    row["power"] = m.power
+    return row if m.chip is None else row | {"chip": m.chip.number}

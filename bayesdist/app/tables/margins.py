@@ -1,0 +1,130 @@
+"""Margins of a run: rows of summary.json, margins.ecsv, and text for the screen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.screen import number, table_text
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.assess import Margin, Requirement
+
+__all__ = [
+    "judged_requirements",
+    "margin_rows",
+    "margin_table",
+    "margins_text",
+    "requirement_of",
+    "results_text",
+]
+
+# of what a requirement is, beside chip and epoch
+SCOPE = ("region", "epochs", "relative", "separation", "magnitude")
+
+
+def margin_rows(margins: Sequence[Margin]) -> list[dict[str, Any]]:
+    """Margins as plain rows, for files and for the screen."""
+    return [
+        {
+            "name": m.requirement.name,
+            "statistic": m.requirement.statistic,
+            "limit": m.requirement.limit,
+            "value": m.value,
+            "interval": list(m.interval),
+            "margin": m.margin,
+            "margin_percent": m.percent,
+            "unit": m.unit,
+            "epoch": m.epoch,
+            "chip": m.requirement.chip,
+            **{key: getattr(m.requirement, key) for key in SCOPE},
+            "probability": m.requirement.probability,
+            "probability_met": m.probability_met,
+            "mc_error": m.mc_error,
+            "verdict": m.verdict,
+            "reason": m.reason,
+            "rests_on": list(m.rests_on),
+            "worst": {"chip": m.worst.chip, "x": m.worst.x, "y": m.worst.y, "rms": m.worst.rms},
+            "remedy": None if m.remedy is None else m.remedy.sentence,
+        }
+        for m in margins
+    ]
+
+
+def margin_table(margins: Sequence[Margin], *, several: bool) -> Table:
+    """Margins as margins.ecsv has them; with chips where there are several."""
+    columns: dict[str, list[Any]] = {}
+    for m, row in zip(margins, margin_rows(margins), strict=True):
+        flat = {k: v for k, v in row.items() if k not in ("interval", "worst", "rests_on", *SCOPE)}
+        flat["epoch"] = np.nan if flat["epoch"] is None else flat["epoch"]
+        flat["chip"] = "all" if flat["chip"] is None else str(flat["chip"])
+        flat["remedy"] = flat["remedy"] or ""
+        flat["rests_on"] = "; ".join(row["rests_on"])
+        flat |= {"scope": m.requirement.scope, "lo95": m.interval[0], "hi95": m.interval[1]}
+        flat |= {f"worst_{key}": value for key, value in row["worst"].items()}
+        if not several:
+            del flat["chip"], flat["worst_chip"]
+        for name, value in flat.items():
+            columns.setdefault(name, []).append(value)
+    return Table(columns)
+
+
+def judged_requirements(run: RunDirectory) -> tuple[Requirement, ...]:
+    """The requirements behind the margins in summary.json."""
+    return tuple(requirement_of(row) for row in run.summary.get("margins", []))
+
+
+def requirement_of(row: Mapping[str, Any]) -> Requirement:
+    """The requirement behind one row of the margins in summary.json."""
+    keys = ("name", "statistic", "limit", "unit", "probability", "epoch", "chip", *SCOPE)
+    # runs of earlier versions had one chip and named none, and no part of it
+    known = {k: row[k] for k in keys if row.get(k) is not None}
+    if "epochs" in known:
+        del known["epoch"]  # the worst one of them
+    return Requirement(**known)
+
+
+def results_text(run: RunDirectory) -> str:
+    """Budget, margins, verdict of the sampler, and where the report is."""
+    summary = run.summary
+    c = summary["sampler"]
+    state = (
+        "converged"
+        if c["converged"]
+        else f"NOT CONVERGED: everything here is provisional ({'; '.join(c['reasons'])})"
+    )
+    parts = [
+        f"Error budget (rms over the detector, {summary['fit']['unit']})",
+        table_text([{k: v for k, v in r.items() if k != "source"} for r in summary["budget"]], 3),
+        "",
+        "Margins",
+        margins_text(summary["margins"]),
+        "",
+        f"Sampler: {state}; R-hat {number(c['rhat_max'], 5)}, ESS bulk {number(c['ess_bulk_min'])} "
+        f"and tail {number(c['ess_tail_min'])}, {c['passes']} passes, {number(c['wall_s'], 3)} s",
+        *(f"WARNING: {text}" for text in summary.get("warnings", [])),
+        f"Report:  {run / 'report.html'}",
+    ]
+    return "\n".join(parts)
+
+
+def margins_text(rows: list[dict]) -> str:
+    """Margins as a table for the screen; what the statistic is of, where that is said of one."""
+    scopes = [requirement_of(r).scope for r in rows]
+    shown = [
+        {
+            "requirement": r["name"],
+            "statistic": r["statistic"],
+            **({"scope": scope or "-"} if any(scopes) else {}),
+            "value": r["value"],
+            "limit": r["limit"],
+            "unit": r["unit"],
+            "P(met)": f"{r['probability_met']:.3f} +- {r['mc_error']:.3f}",
+            "asked": r["probability"],
+            "verdict": r["verdict"],
+        }
+        for r, scope in zip(rows, scopes, strict=True)
+    ]
+    return table_text(shown, 3)

@@ -1,0 +1,109 @@
+"""Files and folders that a command writes: whole or not at all, and never over others."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from astropy.table import Table
+
+from bayesdist.app.store import write_json
+from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
+from bayesdist.version import __version__
+
+__all__ = ["atomic_directory", "record_folder", "refuse_existing", "versions", "write_table"]
+
+
+def refuse_existing(path: Path, force: bool) -> None:
+    """Refuse a file that is there already, unless it may be replaced.
+
+    Raises
+    ------
+    InputError
+    """
+    if path.exists() and not force:
+        raise InputError("this file exists", where=str(path), do="replace it by --force")
+
+
+def write_table(table: Table, path: Path) -> None:
+    """Write a table as ECSV, whole or not at all."""
+    with atomic_path(path) as temporary:
+        table.write(temporary, format="ascii.ecsv")
+
+
+SCHEMA = 1  # of records of commands
+
+PACKAGES = ("arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, the platform, and the packages that matter."""
+    out = {"python": sys.version.split()[0], "platform": platform.platform()}
+    out["bayesdist"] = __version__  # also where it runs from a source tree
+    out |= {name: metadata.version(name) for name in PACKAGES}
+    return out
+
+
+@contextmanager
+def record_folder(path: Path, name: str, command: str) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """A new folder, and a record to be filled, which is written when the block succeeds.
+
+    `name` is the file of the record, `command` that by which the folder is made.
+    """
+    with atomic_directory(path) as folder:
+        record: dict[str, Any] = {"schema": SCHEMA, "command": command, "versions": versions()}
+        yield folder, record
+        write_json(folder / name, record)
+
+
+@contextmanager
+def atomic_directory(path: Path) -> Iterator[Path]:
+    """A folder that takes its name when the block succeeds, and else is removed.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        New, or empty.
+
+    Yields
+    ------
+    pathlib.Path
+        Where to write.
+
+    Raises
+    ------
+    InputError
+        For a folder that holds something, or that cannot be made.
+    """
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise InputError(
+            "the folder holds other files" if path.is_dir() else "is a file, not a folder",
+            where=str(path),
+            do="choose a new folder: what is there is never overwritten",
+        )
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
+    except OSError as error:
+        raise InputError(
+            f"the folder cannot be made ({error.strerror})",
+            where=str(path),
+            do="choose one that you may write to",
+        ) from error
+    try:
+        yield temporary
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o777 & ~mask)  # a temporary folder is its owner's alone
+        os.replace(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
