@@ -6,7 +6,7 @@ from pathlib import Path
 
 from bayesdist.app.campaign.gap import with_gap
 from bayesdist.app.config import Config
-from bayesdist.app.config.campaign import TablesBlock
+from bayesdist.app.config.model import TablesBlock
 from bayesdist.app.kinds.table_file import read_tables
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Posterior, load_posterior

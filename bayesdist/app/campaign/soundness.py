@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bayesdist.app.campaign.inputs import Inputs, campaign_block, cuts_of
 from bayesdist.app.campaign.reference import free_rates, rehearse_references
 from bayesdist.app.config import Config
-from bayesdist.app.config.campaign import ReleaseBlock
+from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.data import StarCuts, StarList
 from bayesdist.data.holdout import refuse_strangers
 from bayesdist.data.matching.reports import check_campaign
