@@ -9,16 +9,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bayesdist.app.campaign.inputs import (
-    Inputs,
-    campaign_block,
-    errors_by_star,
-    known_calibration,
-    unit_arcsec_of,
-)
+from bayesdist.app.campaign.inputs import Inputs, errors_by_star
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.split import set_aside
+from bayesdist.app.kinds.star_lists import known_calibration
 from bayesdist.app.star_files import PAIRS, part_files
 from bayesdist.data import read_matches, write_partitioned
 from bayesdist.data.matches import Matches
@@ -112,19 +107,17 @@ class CampaignMatched(Matched):
             columns[name] = by_code[table.star]
         return table.with_columns(**columns)
 
-    def overlap(
-        self, posterior: Posterior, tables: tuple[LookupTable, ...], config: Config, base: Path
-    ) -> OverlapTest | None:
+    def overlap(self, posterior: Posterior, tables: tuple[LookupTable, ...]) -> OverlapTest | None:
         """Two exposures far apart in time laid on each other; None where none are known so."""
-        block, mas = campaign_block(config), config.detector.scale_mas
+        inputs, block = self.inputs, self.inputs.config.campaign
         return overlap_test(
             self.stars,
             posterior,
-            known_calibration(base / block.initial_distortion, block.filter),
+            known_calibration(inputs.base / block.initial_distortion, block.filter),
             tables,
-            unit_arcsec=unit_arcsec_of(self.inputs.catalog.unit, config),
-            pixel=0.05 if mas is None else mas / 1000,
-            rolls={one.name: one.pa_v3 for one in self.inputs.log},
+            unit_arcsec=inputs.unit_arcsec,
+            pixel=inputs.pixel_arcsec,
+            rolls={one.name: one.pa_v3 for one in inputs.log},
         )
 
     def reopened(self, folder: Path, config: Config) -> CampaignMatched:

@@ -44,8 +44,10 @@ class RunConfig(Section):
         model: MatchedModel | CampaignModel | SelfcalModel
         outliers: Outliers | CampaignOutliers | SelfcalOutliers
         sampler: Sampler | SelfcalSampler
-        compute: ComputeBlock
         products: Products
+
+        @property
+        def compute(self) -> ComputeBlock: ...
 
     detector: Detector = Detector()
     chip: list[ChipBlock] = Field(default_factory=list)

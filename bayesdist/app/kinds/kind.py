@@ -8,28 +8,29 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from bayesdist.app.campaign.check import campaign_lines
-from bayesdist.app.campaign.fit import fit_campaign, load_fitted_campaign
+from bayesdist.app.campaign.fit import fit_campaign
 from bayesdist.app.campaign.inputs import read_campaign
 from bayesdist.app.campaign.matched import campaign_matches, load_matched_campaign
 from bayesdist.app.campaign.matching import match_lists
 from bayesdist.app.campaign.soundness import refuse_campaign
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.kinds.fitted import Fitted, load_fitted
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.kinds.stars import (
     fit_stars,
-    load_fitted_stars,
     match_stars,
+    priors_of,
     read_stars,
     sample_stars,
 )
 from bayesdist.app.selfcal.check import selfcal_lines
-from bayesdist.app.selfcal.fit import fit_selfcal, load_fitted_selfcal, sample_detections
-from bayesdist.app.selfcal.given import read_given, refuse_given
+from bayesdist.app.selfcal.fit import fit_selfcal, sample_detections
+from bayesdist.app.selfcal.inputs import read_selfcal, refuse_selfcal
 from bayesdist.app.selfcal.matched import load_matched_selfcal, selfcal_matches
 from bayesdist.app.selfcal.matching import match_dithers
+from bayesdist.app.selfcal.solved import read_solution, solved_of
 from bayesdist.infer import Posterior
 
 __all__ = ["Kind", "kind_of"]
@@ -50,7 +51,7 @@ class Sampler(Protocol):
 
 @dataclass(frozen=True)
 class Kind:
-    """Matched stars, a campaign, or a self-calibration.
+    """Matched stars, a campaign, or a self-calibration; each takes configurations of its own type.
 
     Parameters
     ----------
@@ -83,14 +84,14 @@ class Kind:
     rows: str
     chooser: str
     begins_with: str
-    read: Callable[[Config, Path], Any]
-    refuse: Callable[[Any, Config, Path], None]
-    match: Callable[[Any, Config, Path], Matched]
+    read: Callable[[Any, Path], Any]
+    refuse: Callable[[Any, Any, Path], None]
+    match: Callable[[Any, Any, Path], Matched]
     fit: Callable[[Matched, Config, Path, StarReader], Fitted]
     sample: Sampler
-    load_matched: Callable[[Path, Any, Config, Path, Mapping[str, Any]], Matched]
+    load_matched: Callable[[Path, Any, Any, Path, Mapping[str, Any]], Matched]
     load_fitted: Callable[[Path, Callable[[], Matched], Config, Mapping[str, Any]], Fitted]
-    lines: Callable[[Any, Config], Iterator[str] | None]
+    lines: Callable[[Any, Any], Iterator[str] | None]
 
 
 MATCHES = Kind(
@@ -103,7 +104,9 @@ MATCHES = Kind(
     lambda matched, config, base, reader: fit_stars(matched, config, reader=reader),
     sample_stars,
     lambda folder, inputs, config, base, summary: match_stars(inputs, config, base),
-    lambda folder, matched, config, summary: load_fitted_stars(folder, config, summary),
+    lambda folder, matched, config, summary: load_fitted(
+        folder, summary, priors=lambda model: priors_of(model, config)
+    ),
     lambda inputs, config: None,
 )
 
@@ -119,7 +122,7 @@ CAMPAIGN = Kind(
     lambda folder, inputs, config, base, summary: load_matched_campaign(
         folder, config, inputs, summary
     ),
-    lambda folder, matched, config, summary: load_fitted_campaign(folder, summary),
+    lambda folder, matched, config, summary: load_fitted(folder, summary, joint=True),
     campaign_lines,
 )
 
@@ -127,14 +130,16 @@ SELFCAL = Kind(
     "detections",
     "limits of residuals",
     "match",
-    read_given,
-    refuse_given,
-    match_dithers,
+    read_selfcal,
+    lambda inputs, config, base: refuse_selfcal(inputs),
+    lambda inputs, config, base: match_dithers(inputs),
     lambda matched, config, base, reader: fit_selfcal(selfcal_matches(matched)),
     sample_detections,
     lambda folder, inputs, config, base, summary: load_matched_selfcal(folder, inputs, summary),
-    lambda folder, matched, config, summary: load_fitted_selfcal(
-        folder, selfcal_matches(matched()), summary
+    lambda folder, matched, config, summary: load_fitted(
+        folder,
+        summary,
+        solved=lambda model: solved_of(selfcal_matches(matched()), model, read_solution(folder)),
     ),
     lambda inputs, config: selfcal_lines(inputs),
 )

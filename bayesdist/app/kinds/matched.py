@@ -95,9 +95,7 @@ class Matched:
         """Matches with what the catalogue states of the motions of their stars."""
         return table
 
-    def overlap(
-        self, posterior: Posterior, tables: tuple[LookupTable, ...], config: Config, base: Path
-    ) -> OverlapTest | None:
+    def overlap(self, posterior: Posterior, tables: tuple[LookupTable, ...]) -> OverlapTest | None:
         """Two exposures far apart in time laid on each other; None where none are known so."""
         return None
 

@@ -13,7 +13,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.kinds.matched import Matched
-from bayesdist.app.selfcal.given import Given
+from bayesdist.app.selfcal.inputs import Inputs
 from bayesdist.app.selfcal.matches import matches_of
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
@@ -38,7 +38,7 @@ class SelfcalMatched(Matched):
 
     Parameters
     ----------
-    given : Given
+    inputs : Inputs
     detections : Detections
         With their stars and errors, on one tangent plane.
     problem : Problem
@@ -57,7 +57,7 @@ class SelfcalMatched(Matched):
     has_catalogue: ClassVar[bool] = False
 
     stars: Matches
-    given: Given = field(kw_only=True)
+    inputs: Inputs = field(kw_only=True)
     detections: Detections = field(kw_only=True)
     problem: Problem = field(kw_only=True)
     theta: Float = field(kw_only=True)
@@ -90,12 +90,12 @@ class SelfcalMatched(Matched):
 
 
 def matched_of(
-    found: SelfCalibration, given: Given, facts: Mapping[str, Any], table: Table
+    found: SelfCalibration, inputs: Inputs, facts: Mapping[str, Any], table: Table
 ) -> SelfcalMatched:
     """What a self-calibration made of its detections, as later stages take it."""
     solution = found.mode
     return _matched(
-        given,
+        inputs,
         found.detections,
         solution.problem.model,
         (solution.theta, solution.stars, solution.mixture),
@@ -118,14 +118,16 @@ def selfcal_matches(matched: Matched) -> SelfcalMatched:
     return matched
 
 
-def load_matched_selfcal(folder: Path, given: Given, summary: Mapping[str, Any]) -> SelfcalMatched:
+def load_matched_selfcal(
+    folder: Path, inputs: Inputs, summary: Mapping[str, Any]
+) -> SelfcalMatched:
     """The detections of an earlier stage.
 
     Parameters
     ----------
     folder : Path
         Of the run.
-    given : Given
+    inputs : Inputs
     summary : mapping
         Content of summary.json.
 
@@ -137,7 +139,7 @@ def load_matched_selfcal(folder: Path, given: Given, summary: Mapping[str, Any])
     arrays = read_arrays(folder / DETECTIONS, "", ARRAYS, do="run the stage 'match' again")
     model = DistortionModel.from_dict(json.loads(arrays["model"].astype(np.uint8).tobytes()))
     detections = replace(
-        given.inputs.detections,
+        inputs.detections,
         x=arrays["x"],
         y=arrays["y"],
         star=arrays["star"].astype(np.int64),
@@ -145,11 +147,11 @@ def load_matched_selfcal(folder: Path, given: Given, summary: Mapping[str, Any])
     )
     mixture = Mixture(*(float(value) for value in arrays["mixture"]))
     first = arrays["theta"], arrays["stars"], mixture
-    return _matched(given, detections, model, first, facts=summary.get("selfcal", {}))
+    return _matched(inputs, detections, model, first, facts=summary.get("selfcal", {}))
 
 
 def _matched(
-    given: Given,
+    inputs: Inputs,
     detections: Detections,
     model: DistortionModel,
     first: tuple[Float, Float, Mixture],
@@ -159,13 +161,13 @@ def _matched(
     magnitudes: tuple[Float, Float] | None = None,
 ) -> SelfcalMatched:
     theta, places, mixture = first
-    problem = given.problem(model, detections, theta, theta)
+    problem = inputs.problem(model, detections, theta, theta)
     unused = facts.get("detections", {}).get("unused", {})
     return SelfcalMatched(
-        matches_of(problem, places, detections, given.inputs, unused),
+        matches_of(problem, places, detections, inputs, unused),
         facts=facts,
         table=table,
-        given=given,
+        inputs=inputs,
         detections=detections,
         problem=problem,
         theta=theta,

@@ -46,7 +46,7 @@ def write_stars(results: Results) -> dict[str, Any]:
         For summary.json.
     """
     solved = required(results.fitted.solved, "solution of detections")
-    solution, references = solved.solution, selfcal_matches(results.matched).given.catalog
+    solution, references = solved.solution, selfcal_matches(results.matched).inputs.catalog
     correlated = results.diagnostics.correlated
     cov = None if correlated is None else correlated.covariance
     found = star_catalogue(solution, cov)

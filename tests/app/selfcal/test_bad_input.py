@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from astropy.table import Table, vstack
 
-from bayesdist.app.selfcal.matching import Matching
+from bayesdist.app.selfcal.matching import refuse_unconnected
 from bayesdist.errors import InputError
 from bayesdist.simulate.dithers import simulate_dithers, smooth_distortion
 from tests.app.selfcal.support import list_table, small, write_selfcal
@@ -94,10 +94,10 @@ def test_an_exposure_that_shares_hardly_a_star(roll, words):
     rolls, shares = np.array([0.0, 0.1, roll, 0.0]), np.array([0.7, 0.8, 0.1, 0.75])
     table = Table({"exposure": list("abcd"), "share_common": shares, "rotation": rolls})
     with pytest.raises(InputError, match="exposure c ") as caught:
-        Matching(table, {}).refuse_strangers()
+        refuse_unconnected(table)
     for word in words:
         assert word in str(caught.value)
-    Matching(table[[0, 1, 3]], {}).refuse_strangers()
+    refuse_unconnected(table[[0, 1, 3]])
 
 
 def test_a_duplicated_exposure(truth, tmp_path):
