@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.campaign.monitoring import fit_exposures_of, read_new_exposures
 from bayesdist.app.comparison_files import joined
 from bayesdist.app.config import Config, load_config
+from bayesdist.app.exposures.monitoring import fit_exposures_of, read_new_exposures
 from bayesdist.app.folder import record_folder
 from bayesdist.app.kinds.errors import read_magnitude_errors
 from bayesdist.app.match_sources import read_configured

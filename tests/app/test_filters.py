@@ -13,8 +13,8 @@ from astropy.table import Table
 import bayesdist.app.release
 import bayesdist.app.results
 import bayesdist.products.release
-from bayesdist.app.campaign.filters import compare_filters
 from bayesdist.app.campaign.reference import held_tables
+from bayesdist.app.exposures.filters import compare_filters
 from bayesdist.app.kinds.table_file import StoredLookupTables, read_tables, write_tables
 from bayesdist.app.release import _require_alike
 from bayesdist.app.results import results_of

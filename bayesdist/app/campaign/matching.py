@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.campaign.input_validation import input_warnings, refuse_few, shear_warnings
 from bayesdist.app.campaign.inputs import Inputs, parities_of
 from bayesdist.app.campaign.matched import CampaignMatched, matched_campaign
 from bayesdist.app.campaign.reference import free_rates
-from bayesdist.app.campaign.soundness import input_warnings, refuse_few, shear_warnings
 from bayesdist.app.config import CampaignConfig
 from bayesdist.app.kinds.star_lists import StarLists, positions_by_chip, start_of
 from bayesdist.data import (

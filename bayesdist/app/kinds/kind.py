@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from bayesdist.app.campaign.check import campaign_lines
 from bayesdist.app.campaign.fit import fit_campaign
+from bayesdist.app.campaign.input_validation import refuse_campaign
 from bayesdist.app.campaign.inputs import read_campaign
 from bayesdist.app.campaign.matched import campaign_matches, load_matched_campaign
 from bayesdist.app.campaign.matching import match_lists
-from bayesdist.app.campaign.soundness import refuse_campaign
+from bayesdist.app.campaign.preview import campaign_lines
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted, load_fitted
@@ -25,11 +25,11 @@ from bayesdist.app.kinds.stars import (
     read_stars,
     sample_stars,
 )
-from bayesdist.app.selfcal.check import selfcal_lines
 from bayesdist.app.selfcal.fit import fit_selfcal, sample_detections
 from bayesdist.app.selfcal.inputs import read_selfcal, refuse_selfcal
 from bayesdist.app.selfcal.matched import load_matched_selfcal, selfcal_matches
 from bayesdist.app.selfcal.matching import match_dithers
+from bayesdist.app.selfcal.preview import selfcal_lines
 from bayesdist.app.selfcal.solved import read_solution, solved_of
 from bayesdist.infer import Posterior
 

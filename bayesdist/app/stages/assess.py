@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 
-from bayesdist.app.campaign.lines import line_sections
-from bayesdist.app.campaign.series import write_series_tables
 from bayesdist.app.dates import idle_dates
 from bayesdist.app.diagnosing import diagnose_run
 from bayesdist.app.diagnostics_files import save_diagnostics
 from bayesdist.app.evaluation_files import save_evaluation
+from bayesdist.app.exposures.linear_terms import line_sections
+from bayesdist.app.exposures.series import write_series_tables
 from bayesdist.app.holdout import holdout_summary, holdout_table
 from bayesdist.app.judging import evaluate_run
 from bayesdist.app.output import write_table

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.campaign.release import write_files
 from bayesdist.app.config import Config
 from bayesdist.app.error_terms import published_tables
+from bayesdist.app.exposures.release_files import write_files
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.made_files import ProductInput, made_files
 from bayesdist.app.results import Results

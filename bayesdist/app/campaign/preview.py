@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bayesdist.app.campaign.inputs import Inputs
-from bayesdist.app.campaign.soundness import (
+from bayesdist.app.campaign.input_validation import (
     input_warnings,
     segment_counts,
     shear_warnings,
 )
+from bayesdist.app.campaign.inputs import Inputs
 from bayesdist.app.config import CampaignConfig
 
 __all__ = ["campaign_lines"]
