@@ -39,18 +39,6 @@ SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
 def fit_campaign(matched: CampaignMatched, config: Config, base: Path) -> Fitted:
     """Tables, errors, all exposures jointly, and every one alone.
 
-    Parameters
-    ----------
-    matched : CampaignMatched
-    config : Config
-        With a section [campaign].
-    base : Path
-        Folder that its files are relative to.
-
-    Returns
-    -------
-    Fitted
-
     Raises
     ------
     BayesdistError

@@ -47,13 +47,6 @@ STILL = 1.0  # years over which stars may stand still
 def refuse_campaign(inputs: Inputs, config: CampaignConfig, base: Path) -> None:
     """Refuse inputs that do not go together, and files of others that cannot be used.
 
-    Parameters
-    ----------
-    inputs : Inputs
-    config : CampaignConfig
-    base : Path
-        Folder that its files are relative to.
-
     Raises
     ------
     BayesdistError

@@ -93,12 +93,6 @@ class Inputs:
 def read_campaign(config: CampaignConfig, base: Path) -> Inputs:
     """Read catalogue, exposures and star lists.
 
-    Parameters
-    ----------
-    config : CampaignConfig
-    base : Path
-        Folder that its files are relative to.
-
     Raises
     ------
     InputError

@@ -67,10 +67,6 @@ def measured_between(
         Of the pairs; by default that of their residuals.
     fitted : bool
         Whether the tables were fitted to these pairs.  Those that were not err by themselves.
-
-    Returns
-    -------
-    tuple of BetweenNodes
     """
     if pairs.star is None:
         return ()

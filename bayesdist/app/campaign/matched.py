@@ -162,16 +162,6 @@ def campaign_matches(matched: Matched) -> CampaignMatched:
 def load_matched_campaign(
     folder: Path, config: Config, inputs: Inputs, summary: Mapping[str, Any]
 ) -> CampaignMatched:
-    """The matches of an earlier stage.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the run.
-    config : Config
-    inputs : Inputs
-    summary : mapping
-        Content of summary.json.
-    """
+    """The matches of an earlier stage."""
     pairs = read_matches(folder / PAIRS, unit=inputs.catalog.unit)
     return matched_campaign(pairs, config, inputs, facts=summary.get("matching", {}))

@@ -35,18 +35,6 @@ log = logging.getLogger("bayesdist")
 def match_lists(inputs: Inputs, config: CampaignConfig, base: Path) -> CampaignMatched:
     """Star lists matched with a catalogue, exposure by exposure.
 
-    Parameters
-    ----------
-    inputs : Inputs
-        As `read_campaign` reads them.
-    config : CampaignConfig
-    base : Path
-        Folder that its files are relative to.
-
-    Returns
-    -------
-    CampaignMatched
-
     Raises
     ------
     BayesdistError

@@ -95,13 +95,6 @@ def free_rates(config: Config) -> bool:
 def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianPriors | None:
     """Priors on the drift of a model from the posterior of another run; None where it is free.
 
-    Parameters
-    ----------
-    config : Config
-    model : DistortionModel
-    base : Path
-        What the configuration's paths are relative to.
-
     Raises
     ------
     InputError
@@ -128,13 +121,6 @@ def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianP
 
 def rehearse_references(config: Config, unit: str, base: Path) -> None:
     """Read all that a run takes over from others; nothing is fitted.
-
-    Parameters
-    ----------
-    config : Config
-    unit : str
-        Of the catalogue.
-    base : Path
 
     Raises
     ------

@@ -49,10 +49,6 @@ def campaign_results(results: Results) -> CampaignResults:
     ----------
     results : Results
         Of a run that has been assessed.
-
-    Returns
-    -------
-    CampaignResults
     """
     run, config, fitted = results.run, results.config, results.fitted
     matched, matching = campaign_matches(results.matched), Table.read(run / "matching.ecsv")
@@ -86,10 +82,6 @@ def held_parameters(fit: LinearFit, priors: GaussianPriors) -> tuple[str, ...]:
     fit : LinearFit
     priors : GaussianPriors
         As the fit had them.
-
-    Returns
-    -------
-    tuple of str
     """
     share = fit.sigma * np.sqrt(priors.precision)
     return tuple(

@@ -84,10 +84,6 @@ def compare_filters(
         What drifts.
     seed : int
 
-    Returns
-    -------
-    FilterComparison
-
     Raises
     ------
     InputError

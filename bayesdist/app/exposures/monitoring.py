@@ -62,10 +62,6 @@ def read_new_exposures(release: Results, new: Path) -> NewExposures:
         Run directory of a campaign whose stage 'match' has been run, or pairs in a file or folder
         as a run keeps them.
 
-    Returns
-    -------
-    NewExposures
-
     Raises
     ------
     InputError

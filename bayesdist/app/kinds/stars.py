@@ -52,19 +52,6 @@ SAMPLING = 1  # of the random streams that follow from the one seed: that of the
 def match_stars(stars: Matches, config: MatchesConfig, base: Path) -> Matched:
     """Matched stars of a configuration, those that are fitted and those that are held out.
 
-    Parameters
-    ----------
-    stars : Matches
-        As `read_stars` reads them.
-    config : Config
-        With a section [data].
-    base : Path
-        Folder that its files are relative to.
-
-    Returns
-    -------
-    Matched
-
     Raises
     ------
     InputError
@@ -124,10 +111,6 @@ def fit_stars(matched: Matched, config: Config, *, reader: StarReader | None = N
     config : Config
     reader : StarReader, optional
         Has the stars in the end, for the passes that follow.
-
-    Returns
-    -------
-    Fitted
 
     Raises
     ------

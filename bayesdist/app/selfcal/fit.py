@@ -23,14 +23,6 @@ __all__ = ["fit_selfcal", "sample_detections"]
 def fit_selfcal(matched: SelfcalMatched) -> Fitted:
     """Mode and gauge of a self-calibration, in one decision.
 
-    Parameters
-    ----------
-    matched : SelfcalMatched
-
-    Returns
-    -------
-    Fitted
-
     Raises
     ------
     DegenerateError, NotSettledError

@@ -21,14 +21,7 @@ CONVENTION, DETECTIONS, REFERENCES = "convention", "detections", "reference star
 def fixed_by(
     gauge: Gauge, solution: SelfCalibrationMode, pieces: GaugeConstraints
 ) -> dict[str, str]:
-    """What fixes each property of the solution, by its name.
-
-    Parameters
-    ----------
-    gauge : Gauge
-    solution : SelfCalibrationMode
-    pieces : GaugeConstraints
-    """
+    """What fixes each property of the solution, by its name."""
     problem, theta = solution.problem, solution.theta
     alone, known = curvatures(problem, theta, solution.mixture, solution.stars)
     found = {name: piece(theta) for name, piece in pieces.pieces.items()}

@@ -226,12 +226,7 @@ def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
 
 
 def refuse_selfcal(inputs: Inputs) -> None:
-    """Refuse exposures that cannot be laid onto each other, and a start that cannot be read.
-
-    Raises
-    ------
-    BayesdistError
-    """
+    """Refuse exposures that cannot be laid onto each other, and a start that cannot be read."""
     model, _ = inputs.start
     inputs.known_for(model)
 

@@ -123,14 +123,6 @@ def load_matched_selfcal(
 ) -> SelfcalMatched:
     """The detections of an earlier stage.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the run.
-    inputs : Inputs
-    summary : mapping
-        Content of summary.json.
-
     Raises
     ------
     InputError

@@ -35,11 +35,6 @@ MANY = 100_000  # stars, above which there is a Parquet file beside the table
 def write_stars(results: Results) -> dict[str, Any]:
     """Write stars.ecsv, and of many stars stars.parquet.
 
-    Parameters
-    ----------
-    results : Results
-        Of a self-calibration.
-
     Returns
     -------
     dict
