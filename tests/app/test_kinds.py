@@ -36,7 +36,7 @@ def job(finished):
 @pytest.fixture(scope="module")
 def fitted(job):
     config, base = job
-    matched = match_stars(read_stars(config, base), config, base)
+    matched = match_stars(read_stars(config, base), config)
     return matched, fit_stars(matched, config)
 
 
@@ -67,7 +67,7 @@ def test_a_fit_that_is_read_gives_the_same_stars(data, tmp_path):
         holdout={"fraction": 0.3},
     )
     config, _ = load_config(path)
-    matched = match_stars(read_stars(config, path.parent), config, path.parent)
+    matched = match_stars(read_stars(config, path.parent), config)
     found = fit_stars(matched, config)
     found.save(tmp_path)
     summary = as_json(fit_sections(found, matched.stars))

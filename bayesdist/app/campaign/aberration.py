@@ -1,4 +1,4 @@
-"""What is not known of the velocity aberration of an exposure: an error of its scale.
+"""Error of an exposure's scale from what is not known of its velocity aberration.
 
 VAFACTOR holds for an instant, and a telescope in a low orbit turns its velocity while it exposes.
 At which instant the factor was computed no log says: it is taken to lie anywhere in the exposure.

@@ -19,7 +19,7 @@ WARNING = {"matching": "", "deviations": LARGER, "tables": "", "time_dependence"
 
 
 def campaign_remarks(summary: Mapping[str, Any]) -> tuple[Check, ...]:
-    """What the stages found odd."""
+    """Warnings of the stages."""
     return tuple(
         Check(GROUP, level="warn", sentence=text, doubt=doubt)
         for part, doubt in WARNING.items()

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 from bayesdist.app.campaign.gap import gap_priors, with_gap
 from bayesdist.app.campaign.input_validation import frames_not_set
+from bayesdist.app.campaign.inputs import Inputs
 from bayesdist.app.campaign.matched import CampaignMatched
 from bayesdist.app.campaign.reference import rate_priors
 from bayesdist.app.campaign.tables import fit_tables, scatter_by_magnitude, tables_section
-from bayesdist.app.config import Config
 from bayesdist.app.exposures.linear_terms import FIXED, line_sections
 from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.exposures import ExposureScatter
@@ -36,7 +35,7 @@ __all__ = ["fit_campaign"]
 SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
 
 
-def fit_campaign(matched: CampaignMatched, config: Config, base: Path) -> Fitted:
+def fit_campaign(matched: CampaignMatched) -> Fitted:
     """Tables, errors, all exposures jointly, and every one alone.
 
     Raises
@@ -46,23 +45,20 @@ def fit_campaign(matched: CampaignMatched, config: Config, base: Path) -> Fitted
         and stars that have outrun their catalogue.
     """
     with frames_not_set():
-        return _fitted(matched, config, base)
+        return _fitted(matched)
 
 
-def _fitted(matched: CampaignMatched, config: Config, base: Path) -> Fitted:
-    affine = matched.affine_model(config)
-    tables = fit_tables(matched, affine, config, base)
+def _fitted(matched: CampaignMatched) -> Fitted:
+    inputs, config, affine = matched.inputs, matched.inputs.config, matched.affine_model
+    tables = fit_tables(matched)
     pairs = matched.stars
     if tables.stored.tables:
         pairs = on_the_chips(corrected_matches(tables.stored.tables, pairs), affine)
-    _, _, total = scatter_by_magnitude(pairs, affine, matched.inputs)
+    _, _, total = scatter_by_magnitude(pairs, affine, inputs)
     errors = ErrorLaw(by_magnitude=centroid_errors(pairs, total), with_catalogue=True)
     stars = errors.applied(pairs)
     rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs)
-    pixel = 1.0
-    if config.detector.scale_mas is not None:
-        pixel = matched.inputs.pixel_arcsec / matched.inputs.unit_arcsec
-    joint = _joint(stars, affine, config, base, rejection, pixel)
+    joint = _joint(stars, affine, inputs, rejection)
     number = config.chips()[0].number
     alone = fit_exposures(stars, affine, chip=number, skip=True, rejection=rejection)
     facts = {
@@ -85,18 +81,12 @@ def _fitted(matched: CampaignMatched, config: Config, base: Path) -> Fitted:
 
 
 def _joint(
-    stars: Matches,
-    affine: DistortionModel,
-    config: Config,
-    base: Path,
-    rejection: Rejection,
-    pixel: float,
+    stars: Matches, affine: DistortionModel, inputs: Inputs, rejection: Rejection
 ) -> HierarchicalFit:
-    """All exposures jointly, deviating from the model as they are found to scatter.
-
-    `pixel` is the size of one in the unit of u and v.
-    """
-    asked = config.time()
+    """All exposures jointly, deviating from the model as they are found to scatter."""
+    config = inputs.config
+    asked, scale = config.time(), config.detector.scale_mas
+    pixel = 1.0 if scale is None else inputs.pixel_arcsec / inputs.unit_arcsec
     drifting = with_gap(replace(affine, time=asked))
     held = held_in_reference(stars, drifting, config.chips()[0].number)
     model = replace(held, chip_deviations=True)
@@ -104,7 +94,7 @@ def _joint(
         return fit_hierarchical(
             shards,
             model,
-            priors=rate_priors(config, model, base) or gap_priors(model, asked, pixel),
+            priors=rate_priors(config, model, inputs.base) or gap_priors(model, asked, pixel),
             pixel=pixel,
             seed=config.sampler.seed,
             rejection=rejection,

@@ -5,14 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.inputs import Inputs
 from bayesdist.app.campaign.reference import free_rates, rehearse_references
-from bayesdist.app.config import CampaignConfig
 from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.data import StarList
 from bayesdist.data.holdout import refuse_strangers
@@ -44,7 +42,7 @@ NAMED = 5  # exposures in a sentence
 STILL = 1.0  # years over which stars may stand still
 
 
-def refuse_campaign(inputs: Inputs, config: CampaignConfig, base: Path) -> None:
+def refuse_campaign(inputs: Inputs) -> None:
     """Refuse inputs that do not go together, and files of others that cannot be used.
 
     Raises
@@ -52,14 +50,15 @@ def refuse_campaign(inputs: Inputs, config: CampaignConfig, base: Path) -> None:
     BayesdistError
         As `refuse_unsound`, `rehearse_references` and `read_idctab`.
     """
-    refuse_unsound(config, inputs)
+    config, base = inputs.config, inputs.base
+    refuse_unsound(inputs)
     read_idctab(base / config.campaign.initial_distortion)
     rehearse_references(config, inputs.catalog.unit, base)
     if config.products.release is not None:
         read_idctab(base / config.products.release.reference)
 
 
-def refuse_unsound(config: CampaignConfig, inputs: Inputs) -> None:
+def refuse_unsound(inputs: Inputs) -> None:
     """Refuse exposures, lists and catalogue that a run could not use; nothing is matched.
 
     Raises
@@ -73,7 +72,7 @@ def refuse_unsound(config: CampaignConfig, inputs: Inputs) -> None:
     ConfigError
         For periods of the release outside the segment that they are to hold.
     """
-    lists = inputs.star_lists
+    config, lists = inputs.config, inputs.star_lists
     _refuse_chips(lists.lists, config.chips())
     check_campaign(lists.lists, inputs.log, inputs.catalog)
     if inputs.catalog.sigma_u is None:
@@ -96,9 +95,9 @@ def refuse_unsound(config: CampaignConfig, inputs: Inputs) -> None:
         refuse_strangers(held.exposures, inputs.log.names, inputs.log.source)
 
 
-def input_warnings(config: CampaignConfig, inputs: Inputs) -> list[str]:
+def input_warnings(inputs: Inputs) -> list[str]:
     """Warnings of what a campaign cannot tell, or takes on trust, each as a clause."""
-    log, catalog = inputs.log, inputs.catalog
+    config, log, catalog = inputs.config, inputs.log, inputs.catalog
     out = []
     if inputs.unlogged:
         out.append(_unlogged(inputs.unlogged, log.source))
@@ -142,7 +141,7 @@ def _unlogged(names: tuple[str, ...], log: str) -> str:
 
 
 def one_roll_angle(angles: Float) -> bool:
-    """Truth of roll angles (E,), in radians, that see a shear of the catalogue alike.
+    """Boolean: roll angles (E,), in radians, see a shear of the catalogue alike.
 
     An exposure at roll angle a sees a shear of the catalogue as one of its detector turned by 2a:
     at one angle, or at angles half a turn apart, nothing tells the two apart.

@@ -39,7 +39,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """What a campaign begins with.
+    """Catalogue, exposures and star lists of a campaign.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What the look-up tables of a campaign leave between their nodes: measured once, then a term."""
+"""Errors that look-up tables leave between their nodes: measured once, then a term."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def measured_between(
     mixture: ResidualMixture | None = None,
     fitted: bool = True,
 ) -> tuple[BetweenNodes, ...]:
-    """What tables leave of the distortion at a place, for each chip where it can be told.
+    """Distortion that tables leave between their nodes, for each chip where it can be measured.
 
     Parameters
     ----------

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from bayesdist.app.campaign.input_validation import input_warnings, refuse_few, 
 from bayesdist.app.campaign.inputs import Inputs, parities_of
 from bayesdist.app.campaign.matched import CampaignMatched, matched_campaign
 from bayesdist.app.campaign.reference import free_rates
-from bayesdist.app.config import CampaignConfig
 from bayesdist.app.kinds.star_lists import StarLists, positions_by_chip, start_of
 from bayesdist.data import (
     ExposureLog,
@@ -32,7 +30,7 @@ __all__ = ["match_lists"]
 log = logging.getLogger("bayesdist")
 
 
-def match_lists(inputs: Inputs, config: CampaignConfig, base: Path) -> CampaignMatched:
+def match_lists(inputs: Inputs) -> CampaignMatched:
     """Star lists matched with a catalogue, exposure by exposure.
 
     Raises
@@ -41,8 +39,8 @@ def match_lists(inputs: Inputs, config: CampaignConfig, base: Path) -> CampaignM
         For files that cannot be read or do not go together, chips without matches, and too few
         exposures.
     """
-    block, lists = config.campaign, inputs.star_lists
-    tab = read_idctab(base / block.initial_distortion)
+    config, block, lists = inputs.config, inputs.config.campaign, inputs.star_lists
+    tab = read_idctab(inputs.base / block.initial_distortion)
     parities = parities_of(block, inputs.catalog, tab)
     for text in (*([inputs.plane] if inputs.plane else []), *inputs.catalog.notes):
         log.info("match: catalogue: %s", text)
@@ -65,13 +63,13 @@ def match_lists(inputs: Inputs, config: CampaignConfig, base: Path) -> CampaignM
     warnings = [
         *_doubtful_parity(found.mirrored, parities, f"{tab.instrument}/{tab.detector}"),
         *found.warnings(inputs.log),
-        *input_warnings(config, inputs),
+        *input_warnings(inputs),
         # as the stars show them, for the log need not have them
         *shear_warnings(np.asarray(table["rotation"]), "of the matches"),
     ]
     pairs = neutralise_aberration(found.table, inputs.log)
     facts = _facts(found, table, inputs, warnings)
-    matched = matched_campaign(pairs, config, inputs, facts=facts, table=table)
+    matched = matched_campaign(pairs, inputs, facts=facts, table=table)
     if matched.held is not None:
         _refuse_bare(matched.stars, config.chips(), "what is not held out")
         some = inputs.log.select(names=matched.stars.exposure_names)

@@ -1,4 +1,4 @@
-"""What a campaign would begin with."""
+"""Lines of `bayesdist check` on the inputs of a campaign."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from bayesdist.app.campaign.input_validation import (
     shear_warnings,
 )
 from bayesdist.app.campaign.inputs import Inputs
-from bayesdist.app.config import CampaignConfig
 
 __all__ = ["campaign_lines"]
 
 
-def campaign_lines(inputs: Inputs, config: CampaignConfig) -> Iterator[str]:
+def campaign_lines(inputs: Inputs) -> Iterator[str]:
     """Inputs, dates and roll angles of a campaign, as lines of text."""
-    log, catalog, lists = inputs.log, inputs.catalog, inputs.star_lists
+    config, log, catalog, lists = inputs.config, inputs.log, inputs.catalog, inputs.star_lists
     epochs, rolls = log.values("epoch"), log.values("pa_v3")
     yield f"exposures    {len(log.names)} in {', '.join(log.filters)}"
     passed, left = sum(int(good.sum()) for good in lists.passed), lists.cut_words
@@ -38,9 +37,9 @@ def campaign_lines(inputs: Inputs, config: CampaignConfig) -> Iterator[str]:
         yield f"segments     {', '.join(str(k) for k in counts)} exposures"
     chips = ", ".join(chip.name for chip in config.chips())
     yield f"model        order {config.model.order}, chips {chips}, tables: {config.tables.method}"
-    for number, names in _without(inputs, config).items():
+    for number, names in _without(inputs).items():
         yield f"chip {number}       no detections that pass the cuts in {', '.join(names)}"
-    for text in [*input_warnings(config, inputs), *shear_warnings(rolls, "PA_V3")]:
+    for text in [*input_warnings(inputs), *shear_warnings(rolls, "PA_V3")]:
         yield f"WARNING      {text[0].upper() + text[1:]}"
 
 
@@ -53,11 +52,11 @@ def _rolls(rolls: np.ndarray) -> str:
     return text + (f", not known of {missing} exposures" if missing else "")
 
 
-def _without(inputs: Inputs, config: CampaignConfig) -> dict[int, list[str]]:
+def _without(inputs: Inputs) -> dict[int, list[str]]:
     """Exposures that have nothing on a chip, by its number."""
     lists, out = inputs.star_lists, dict[int, list[str]]()
     for one, good in zip(lists.lists, lists.passed, strict=True):
-        for chip in config.chips():
+        for chip in inputs.config.chips():
             if chip.number not in one.chip[good]:
                 out.setdefault(chip.number, []).append(one.exposure)
     return out

@@ -1,4 +1,4 @@
-"""What a run takes over from that of the reference filter: the detector's tables, and its drift."""
+"""Tables of the detector and drift that a run takes over from that of the reference filter."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tupl
 
 
 def free_rates(config: Config) -> bool:
-    """Truth of a drift that is that of this run's own exposures."""
+    """Boolean: the drift is that of this run's own exposures."""
     return config.model.tdd is None or config.model.tdd.rates == FREE
 
 

@@ -1,4 +1,4 @@
-"""What the report shows of a campaign, put together from its results."""
+"""Content of the report of a campaign, from its results."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from bayesdist.app.campaign.inputs import Inputs, read_campaign_catalog
 from bayesdist.app.campaign.matched import CampaignMatched, campaign_matches
-from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.results import Results
 from bayesdist.app.rundir import RunDirectory
@@ -43,7 +42,7 @@ WIDEST = 8  # cells of this many times the size, however few stars there are
 
 
 def campaign_results(results: Results) -> CampaignResults:
-    """What a campaign adds to the report of its run.
+    """Content that a campaign adds to the report of its run.
 
     Parameters
     ----------
@@ -64,7 +63,7 @@ def campaign_results(results: Results) -> CampaignResults:
         centroids=fitted.errors.by_magnitude,
         detections=_detections(inputs),
         footprints=_footprints(results.posterior, matched),
-        residuals=_residuals(results.data, matched, config),
+        residuals=_residuals(results.data, matched),
         tables=fitted.tables.tables,
         series=_series(run, fitted.linear.model, matching),
         overlap=results.diagnostics.overlap,
@@ -161,13 +160,11 @@ def _footprints(posterior: Posterior, matched: CampaignMatched) -> Footprints:
 
 
 @one_thread
-def _residuals(
-    data: FitData, matched: CampaignMatched, config: Config
-) -> tuple[ChipResiduals, ...]:
+def _residuals(data: FitData, matched: CampaignMatched) -> tuple[ChipResiduals, ...]:
     """Pairs of each chip without the tables and with them, along the detector's axes."""
-    pairs, moved, model = matched.stars, data.stars, matched.affine_model(config)
+    pairs, moved, model = matched.stars, data.stars, matched.affine_model
     tables = data.fitted.tables.tables
-    errors, farthest = data.fitted.errors.by_magnitude, config.fit.clip_abs
+    errors, farthest = data.fitted.errors.by_magnitude, matched.inputs.config.fit.clip_abs
     plain = pairs if errors is None else pairs.with_errors(errors, in_quadrature=True)
     if any(table.filter for table in tables):  # those of the detector are not of this run
         detector = [table for table in tables if not table.filter]

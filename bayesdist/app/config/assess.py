@@ -1,4 +1,4 @@
-"""What is assessed: where and when, errors that the data cannot show, requirements."""
+"""Places and dates of the assessment, errors that the data cannot show, requirements."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a model is fitted and sampled, and where; a kind of run has the keys that it uses.
+"""Settings by which a model is fitted and sampled; a kind of run has the keys that it uses.
 
 What a kind does not have is a constant of its class, so that nobody has to ask for the kind.
 """
@@ -136,7 +136,7 @@ class _Sampler(Section):
 
 
 class Sampler(_Sampler):
-    """How to sample, when to stop, and from which seed."""
+    """Method of sampling, when to stop, and from which seed."""
 
     method: Literal["exact", "certified"] = "exact"
     second_stage: Literal["auto", "always", "never"] = "auto"

@@ -1,4 +1,4 @@
-"""What the configurations of all kinds of runs have in common."""
+"""Sections that the configurations of all kinds of runs have in common."""
 
 from __future__ import annotations
 

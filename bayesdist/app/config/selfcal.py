@@ -87,7 +87,7 @@ class ReferenceBlock(Section):
 
 
 class GaugeBlock(Section):
-    """What is known beside the detections: each piece with its error."""
+    """Constraints beside the detections, each with its error."""
 
     offsets: str | None = None
     offset_sigma: PositiveFloat | None = None

@@ -1,4 +1,4 @@
-"""What the stage 'fit' makes: the least-squares solution, and what its stars were given."""
+"""Artefact of the stage 'fit': the least-squares solution, and what its stars were given."""
 
 from __future__ import annotations
 

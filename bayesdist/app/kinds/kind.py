@@ -1,4 +1,4 @@
-"""What the three kinds of runs do in their own way: all that comes before the posterior."""
+"""The three kinds of runs, which differ in all that comes before the posterior."""
 
 from __future__ import annotations
 
@@ -95,53 +95,55 @@ class Kind:
 
 
 MATCHES = Kind(
-    "stars",
-    "least-squares fit",
-    "fit",
-    read_stars,
-    lambda inputs, config, base: None,  # what is wrong shows in their fit
-    match_stars,
-    lambda matched, config, base, reader: fit_stars(matched, config, reader=reader),
-    sample_stars,
-    lambda folder, inputs, config, base, summary: match_stars(inputs, config, base),
-    lambda folder, matched, config, summary: load_fitted(
+    rows="stars",
+    chooser="least-squares fit",
+    begins_with="fit",
+    read=read_stars,
+    refuse=lambda inputs, config, base: None,  # what is wrong shows in their fit
+    match=lambda inputs, config, base: match_stars(inputs, config),
+    fit=lambda matched, config, base, reader: fit_stars(matched, config, reader=reader),
+    sample=sample_stars,
+    load_matched=lambda folder, inputs, config, base, summary: match_stars(inputs, config),
+    load_fitted=lambda folder, matched, config, summary: load_fitted(
         folder, summary, priors=lambda model: priors_of(model, config)
     ),
-    lambda inputs, config: None,
+    lines=lambda inputs, config: None,
 )
 
 CAMPAIGN = Kind(
-    "stars",
-    "least-squares fit",
-    "match",
-    read_campaign,
-    refuse_campaign,
-    match_lists,
-    lambda matched, config, base, reader: fit_campaign(campaign_matches(matched), config, base),
-    sample_stars,
-    lambda folder, inputs, config, base, summary: load_matched_campaign(
-        folder, config, inputs, summary
+    rows="stars",
+    chooser="least-squares fit",
+    begins_with="match",
+    read=read_campaign,
+    refuse=lambda inputs, config, base: refuse_campaign(inputs),
+    match=lambda inputs, config, base: match_lists(inputs),
+    fit=lambda matched, config, base, reader: fit_campaign(campaign_matches(matched)),
+    sample=sample_stars,
+    load_matched=lambda folder, inputs, config, base, summary: load_matched_campaign(
+        folder, inputs, summary
     ),
-    lambda folder, matched, config, summary: load_fitted(folder, summary, joint=True),
-    campaign_lines,
+    load_fitted=lambda folder, matched, config, summary: load_fitted(folder, summary, joint=True),
+    lines=lambda inputs, config: campaign_lines(inputs),
 )
 
 SELFCAL = Kind(
-    "detections",
-    "limits of residuals",
-    "match",
-    read_selfcal,
-    lambda inputs, config, base: refuse_selfcal(inputs),
-    lambda inputs, config, base: match_dithers(inputs),
-    lambda matched, config, base, reader: fit_selfcal(selfcal_matches(matched)),
-    sample_detections,
-    lambda folder, inputs, config, base, summary: load_matched_selfcal(folder, inputs, summary),
-    lambda folder, matched, config, summary: load_fitted(
+    rows="detections",
+    chooser="limits of residuals",
+    begins_with="match",
+    read=read_selfcal,
+    refuse=lambda inputs, config, base: refuse_selfcal(inputs),
+    match=lambda inputs, config, base: match_dithers(inputs),
+    fit=lambda matched, config, base, reader: fit_selfcal(selfcal_matches(matched)),
+    sample=sample_detections,
+    load_matched=lambda folder, inputs, config, base, summary: load_matched_selfcal(
+        folder, inputs, summary
+    ),
+    load_fitted=lambda folder, matched, config, summary: load_fitted(
         folder,
         summary,
         solved=lambda model: solved_of(selfcal_matches(matched()), model, read_solution(folder)),
     ),
-    lambda inputs, config: selfcal_lines(inputs),
+    lines=lambda inputs, config: selfcal_lines(inputs),
 )
 
 

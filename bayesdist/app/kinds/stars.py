@@ -49,7 +49,7 @@ __all__ = [
 SAMPLING = 1  # of the random streams that follow from the one seed: that of the stage 'sample'
 
 
-def match_stars(stars: Matches, config: MatchesConfig, base: Path) -> Matched:
+def match_stars(stars: Matches, config: MatchesConfig) -> Matched:
     """Matched stars of a configuration, those that are fitted and those that are held out.
 
     Raises

@@ -47,20 +47,20 @@ class PlannedChip(ChipBlock):
 
 
 class PlannedSelfcal(Section):
-    """What of a self-calibration matters before there are detections."""
+    """Settings of a self-calibration that matter before there are detections."""
 
     frames: Frames = "shift_rotation"
     min_detections: MinDetections = 2
 
 
 class PlannedScale(Section):
-    """How well the size of a pixel will be known."""
+    """Error with which the size of a pixel will be known."""
 
     sigma: PositiveFloat
 
 
 class PlannedGauge(Section):
-    """What will be known beside the detections: each piece by its error."""
+    """Constraints that there will be beside the detections, each by its error."""
 
     offset_sigma: PositiveFloat | None = None
     roll_sigma_deg: PositiveFloat | None = None
@@ -185,7 +185,7 @@ class PlanConfig(Section):
         return PlannedStars(s.per_detector, s.sigma, s.false, least, s.seed)
 
     def known(self) -> Beforehand:
-        """What will be known beside the detections."""
+        """Constraints that there will be beside the detections."""
         g = self.gauge
         return Beforehand(
             g.offset_sigma,

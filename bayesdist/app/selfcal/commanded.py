@@ -128,7 +128,7 @@ def read_commanded(
 
 
 def _factor(own: str, unit: str, scale_mas: float | None, path: Path) -> float:
-    """What one `own` is in `unit`, pixels among them."""
+    """Factor from a unit `own` to `unit`, pixels among them."""
     if own == unit:
         return 1.0
     if "pix" not in (own, unit):

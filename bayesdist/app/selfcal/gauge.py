@@ -15,13 +15,15 @@ from bayesdist.model import DistortionModel
 
 __all__ = ["CONVENTION", "fixed_by", "gauge_summary", "gauge_table", "gauge_words"]
 
+COLUMNS = ["name", "state", "sigma_detections", "sigma_fixed", "unit", "edge_pix", "fixed_by"]
+
 CONVENTION, DETECTIONS, REFERENCES = "convention", "detections", "reference stars"
 
 
 def fixed_by(
     gauge: Gauge, solution: SelfCalibrationMode, pieces: GaugeConstraints
 ) -> dict[str, str]:
-    """What fixes each property of the solution, by its name."""
+    """Source that fixes each property of the solution, by its name."""
     problem, theta = solution.problem, solution.theta
     alone, known = curvatures(problem, theta, solution.mixture, solution.stars)
     found = {name: piece(theta) for name, piece in pieces.pieces.items()}
@@ -49,15 +51,7 @@ def _fixed_by(direction: NamedDirection, sigmas: Mapping[str, Mapping[str, float
 def gauge_table(gauge: Gauge, fixed: Mapping[str, str], model: DistortionModel) -> Table:
     """One row for each property of the solution, free ones first, then nearly free combinations."""
     rows = [
-        {
-            "name": d.name,
-            "state": _state(d),
-            "sigma_detections": d.sigma,
-            "sigma_fixed": d.sigma_fixed,
-            "unit": d.unit,
-            "edge_pix": d.edge_pix,
-            "fixed_by": fixed[d.name],
-        }
+        _row(d, fixed) | {"edge_pix": d.edge_pix}
         for d in sorted(gauge.directions, key=lambda d: (not d.free, not d.weak))
     ]
     rows += [
@@ -84,11 +78,19 @@ def gauge_table(gauge: Gauge, fixed: Mapping[str, str], model: DistortionModel) 
         }
         for name in gauge.unnamed
     ]
-    return Table(rows)
+    return Table(rows)[COLUMNS]
 
 
-def _state(d: NamedDirection) -> str:
-    return "free" if d.free else "nearly free" if d.weak else "known"
+def _row(d: NamedDirection, fixed: Mapping[str, str]) -> dict[str, object]:
+    """Name of a property, how well it is known, and what fixes it."""
+    return {
+        "name": d.name,
+        "state": "free" if d.free else "nearly free" if d.weak else "known",
+        "sigma_detections": d.sigma,
+        "sigma_fixed": d.sigma_fixed,
+        "unit": d.unit,
+        "fixed_by": fixed[d.name],
+    }
 
 
 def gauge_summary(
@@ -99,17 +101,7 @@ def gauge_summary(
         "n_free": int(gauge.null.shape[1]),
         "n_by_convention": int(gauge.open.shape[1]),
         "held": [model.names[k] for k in gauge.held],
-        "directions": [
-            {
-                "name": d.name,
-                "state": _state(d),
-                "sigma_detections": d.sigma,
-                "sigma_fixed": d.sigma_fixed,
-                "unit": d.unit,
-                "fixed_by": fixed[d.name],
-            }
-            for d in gauge.directions
-        ],
+        "directions": [_row(d, fixed) for d in gauge.directions],
         "unnamed": list(gauge.unnamed),
         "sentences": list(gauge.sentences),
     }

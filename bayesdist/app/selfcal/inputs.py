@@ -1,4 +1,4 @@
-"""What a self-calibration begins with: detections, and all that is known beside them."""
+"""Inputs of a self-calibration: detections, and all that is known beside them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is known beside the detections of a self-calibration, and fixes its gauge."""
+"""Constraints beside the detections of a self-calibration, which fix its gauge."""
 
 from __future__ import annotations
 

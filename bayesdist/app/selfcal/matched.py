@@ -19,12 +19,11 @@ from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
-from bayesdist.infer.selfcal import SelfCalibration
 from bayesdist.infer.selfcal.elimination import Mixture
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import DistortionModel
 
-__all__ = ["SelfcalMatched", "load_matched_selfcal", "matched_of", "selfcal_matches"]
+__all__ = ["SelfcalMatched", "load_matched_selfcal", "selfcal_matched", "selfcal_matches"]
 
 Float = NDArray[np.float64]
 
@@ -49,8 +48,6 @@ class SelfcalMatched(Matched):
         Its stars.
     mixture : Mixture
         Its errors.
-    magnitudes : tuple of ndarray, or None
-        Magnitudes and errors in pixels, where these were measured.
     """
 
     section: ClassVar[str] = "selfcal"
@@ -63,7 +60,6 @@ class SelfcalMatched(Matched):
     theta: Float = field(kw_only=True)
     places: Float = field(kw_only=True)
     mixture: Mixture = field(kw_only=True)
-    magnitudes: tuple[Float, Float] | None = field(kw_only=True, default=None)
 
     @property
     def tangent_point(self) -> None:
@@ -83,26 +79,8 @@ class SelfcalMatched(Matched):
         arrays["mixture"] = np.array([m.jitter, m.fraction])
         text = json.dumps(self.problem.model.to_dict())
         arrays["model"] = np.frombuffer(text.encode(), np.uint8)
-        if self.magnitudes is not None:
-            arrays["magnitudes"] = np.stack(self.magnitudes)
         write_arrays(folder / DETECTIONS, "", arrays)
         super().save(folder)
-
-
-def matched_of(
-    found: SelfCalibration, inputs: Inputs, facts: Mapping[str, Any], table: Table
-) -> SelfcalMatched:
-    """What a self-calibration made of its detections, as later stages take it."""
-    solution = found.mode
-    return _matched(
-        inputs,
-        found.detections,
-        solution.problem.model,
-        (solution.theta, solution.stars, solution.mixture),
-        facts=facts,
-        table=table,
-        magnitudes=found.magnitude_errors,
-    )
 
 
 def selfcal_matches(matched: Matched) -> SelfcalMatched:
@@ -139,10 +117,10 @@ def load_matched_selfcal(
     )
     mixture = Mixture(*(float(value) for value in arrays["mixture"]))
     first = arrays["theta"], arrays["stars"], mixture
-    return _matched(inputs, detections, model, first, facts=summary.get("selfcal", {}))
+    return selfcal_matched(inputs, detections, model, first, facts=summary.get("selfcal", {}))
 
 
-def _matched(
+def selfcal_matched(
     inputs: Inputs,
     detections: Detections,
     model: DistortionModel,
@@ -150,8 +128,8 @@ def _matched(
     *,
     facts: Mapping[str, Any],
     table: Table | None = None,
-    magnitudes: tuple[Float, Float] | None = None,
 ) -> SelfcalMatched:
+    """Detections with codes of stars and errors, by a first solution: parameters, stars, errors."""
     theta, places, mixture = first
     problem = inputs.problem(model, detections, theta, theta)
     unused = facts.get("detections", {}).get("unused", {})
@@ -165,5 +143,4 @@ def _matched(
         theta=theta,
         places=places,
         mixture=mixture,
-        magnitudes=magnitudes,
     )

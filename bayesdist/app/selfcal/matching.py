@@ -1,4 +1,4 @@
-"""How the detections of a self-calibration became stars, exposure by exposure."""
+"""Detections of a self-calibration become stars, exposure by exposure."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.selfcal.inputs import Inputs
-from bayesdist.app.selfcal.matched import SelfcalMatched, matched_of
+from bayesdist.app.selfcal.matched import SelfcalMatched, selfcal_matched
 from bayesdist.data.detections import NO_STAR, Detections
 from bayesdist.data.matching.pairs import hull_of, inside_hull
 from bayesdist.errors import DegenerateError, InputError, NotSettledError
@@ -65,7 +65,15 @@ def match_dithers(inputs: Inputs) -> SelfcalMatched:
     if inputs.tangent_plane is not None:
         moved = facts["tangent_planes_pix"]
         log.info("match: detections moved by up to %.2g pix onto one tangent plane", moved)
-    return matched_of(found, inputs, facts, table)
+    s = found.mode
+    return selfcal_matched(
+        inputs,
+        found.detections,
+        s.problem.model,
+        (s.theta, s.stars, s.mixture),
+        facts=facts,
+        table=table,
+    )
 
 
 def calibrated(inputs: Inputs, report: Callable[[str], None]) -> SelfCalibration:

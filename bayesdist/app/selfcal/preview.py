@@ -1,4 +1,4 @@
-"""What a self-calibration would begin with, and what it could not tell."""
+"""Lines of `bayesdist check` on a self-calibration: its stars, and directions that stay free."""
 
 from __future__ import annotations
 
