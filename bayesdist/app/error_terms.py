@@ -8,7 +8,6 @@ import numpy as np
 
 from bayesdist.app.assessment import assessment_epoch
 from bayesdist.app.campaign.aberration import aberration_term
-from bayesdist.app.campaign.interpolation import interpolation_term
 from bayesdist.app.campaign.matched import campaign_matches
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
@@ -16,6 +15,7 @@ from bayesdist.app.kinds.fitted import required
 from bayesdist.app.kinds.table_file import StoredLookupTables
 from bayesdist.assess import pixel_scale_of
 from bayesdist.assess.error_model import ErrorModel, error_model
+from bayesdist.assess.terms.between_nodes import interpolation_term
 from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorTerm
 from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.assess.terms.parameters import ExposureVariation

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from bayesdist.app.assessment import assessment_rng
-from bayesdist.app.campaign.interpolation import INTERPOLATION as BETWEEN
 from bayesdist.app.config import load_config
 from bayesdist.app.results import Results
 from bayesdist.app.rundir import RunDirectory
@@ -16,6 +15,7 @@ from bayesdist.app.stages.assess import run_diagnose, run_evaluate
 from bayesdist.assess import LocalErrors
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.evaluation import budget_over
+from bayesdist.assess.terms.between_nodes import INTERPOLATION as BETWEEN
 from bayesdist.infer.transforms import reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from bayesdist.app.campaign.inputs import Inputs
 from bayesdist.app.campaign.reference import free_rates, rehearse_references
 from bayesdist.app.config.products import ReleaseBlock
-from bayesdist.data import StarList
+from bayesdist.app.kinds.star_lists import refuse_other_chips
 from bayesdist.data.holdout import refuse_strangers
 from bayesdist.data.matching.reports import check_campaign
 from bayesdist.errors import ConfigError, DegenerateError, InputError
-from bayesdist.model import Chip, TimeDependence
+from bayesdist.model import TimeDependence
 from bayesdist.products import read_idctab
 
 __all__ = [
@@ -36,8 +36,6 @@ FEWEST = 3  # exposures: two of them differ, but do not scatter
 SAME_DAY = 1.0 / 365.25  # years: epochs within say nothing of a rate
 LINEAR_KINDS = 3  # drifting terms from which on scale and both shears drift
 ONE_ROLL = 2.0  # degrees: roll angles that scatter by less are one
-OFF_CHIP = 0.02  # of a list's detections beyond the edge of a chip: more are no stray ones
-EDGE = 1.0  # pixels: half of one to the edge, and half of one for lists that count from 0
 NAMED = 5  # exposures in a sentence
 STILL = 1.0  # years over which stars may stand still
 
@@ -73,7 +71,7 @@ def refuse_unsound(inputs: Inputs) -> None:
         For periods of the release outside the segment that they are to hold.
     """
     config, lists = inputs.config, inputs.star_lists
-    _refuse_chips(lists.lists, config.chips())
+    refuse_other_chips(lists.lists, config.chips(), "campaign.lists")
     check_campaign(lists.lists, inputs.log, inputs.catalog)
     if inputs.catalog.sigma_u is None:
         raise InputError(
@@ -258,43 +256,3 @@ def _refuse_periods(release: ReleaseBlock | None, time: TimeDependence | None) -
                 where=where,
                 do=f"correct the years, or segment = {period.segment} (counted from 0)",
             )
-
-
-def _refuse_chips(lists: tuple[StarList, ...], chips: tuple[Chip, ...]) -> None:
-    known = {chip.number: chip for chip in chips}
-    if not known:
-        return
-    seen: set[int] = set()
-    for one in lists:
-        where = f"{one.source}, exposure {one.exposure}"
-        for number in one.chips:
-            rows = one.chip == number
-            if number not in known:
-                raise InputError(
-                    f"{int(rows.sum())} detections are on chip {number}, which no [[chip]] block "
-                    "describes",
-                    where=where,
-                    do=f"add a block, or leave them out (known: {', '.join(map(str, known))})",
-                )
-            _refuse_off_chip(one.x[rows], one.y[rows], known[number], where)
-        seen.update(one.chips)
-    empty = [chip.name for chip in chips if chip.number not in seen]
-    if empty:
-        raise InputError(
-            f"no exposure has a detection on chip {', '.join(empty)}",
-            where="campaign.lists",
-            do="drop its [[chip]] block, or correct the lists' column 'chip'",
-        )
-
-
-def _refuse_off_chip(x: Float, y: Float, chip: Chip, where: str) -> None:
-    low, (right, top) = 1.0 - EDGE, (size + EDGE for size in chip.size)
-    off = (x < low) | (x > right) | (y < low) | (y > top)
-    if off.mean() > OFF_CHIP:
-        raise InputError(
-            f"{off.mean():.0%} of the detections on chip {chip.name} lie outside its "
-            f"{chip.size[0]:g} x {chip.size[1]:g} pixels (x {x.min():.0f} to {x.max():.0f}, "
-            f"y {y.min():.0f} to {y.max():.0f})",
-            where=where,
-            do="check whether x and y are swapped or are pixels of a mosaic, and [[chip]].size",
-        )

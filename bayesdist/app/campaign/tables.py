@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.inputs import Inputs
-from bayesdist.app.campaign.interpolation import measured_between
 from bayesdist.app.campaign.matched import CampaignMatched
 from bayesdist.app.campaign.outrun import refuse_outrun_stars
 from bayesdist.app.campaign.reference import held_tables
@@ -19,6 +18,7 @@ from bayesdist.app.kinds.table_file import StoredLookupTables
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
+from bayesdist.diagnose.tables.measured import measured_between
 from bayesdist.infer import LinearFit, fit_by_magnitude
 from bayesdist.infer.nodes import (
     Iteration,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 from bayesdist.app.config.campaign import StarListsBlock
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.data import StarCuts, StarList, read_star_lists
+from bayesdist.errors import InputError
 from bayesdist.infer.selfcal.start import Start
+from bayesdist.model import Chip
 from bayesdist.products import IdcTab, read_idctab
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
 
@@ -21,10 +24,14 @@ __all__ = [
     "known_calibration",
     "lists_of",
     "positions_by_chip",
+    "refuse_other_chips",
     "start_of",
 ]
 
 Float = NDArray[np.float64]
+
+OFF_CHIP = 0.02  # of a list's detections beyond the edge of a chip: more are no stray ones
+EDGE = 1.0  # pixels: half of one to the edge, and half of one for lists that count from 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +83,56 @@ def lists_of(block: StarListsBlock, base: Path) -> StarLists:
     names = block.lists if isinstance(block.lists, list) else [block.lists]
     lists = (one for name in names for one in read_star_lists(base / name, block.columns))
     return StarLists(tuple(lists), StarCuts(block.mag, block.saturation, block.q_max))
+
+
+def refuse_other_chips(lists: Sequence[StarList], chips: Sequence[Chip], key: str) -> None:
+    """Refuse detections off the chips of a configuration, and chips without any.
+
+    Nothing is checked without [[chip]] blocks.  `key` is the one of the configuration that names
+    the lists.
+
+    Raises
+    ------
+    InputError
+        Naming the list.
+    """
+    known = {chip.number: chip for chip in chips}
+    if not known:
+        return
+    seen: set[int] = set()
+    for one in lists:
+        where = f"{one.source}, exposure {one.exposure}"
+        for number in one.chips:
+            rows = one.chip == number
+            if number not in known:
+                raise InputError(
+                    f"{int(rows.sum())} detections are on chip {number}, which no [[chip]] block "
+                    "describes",
+                    where=where,
+                    do=f"add a block, or leave them out (known: {', '.join(map(str, known))})",
+                )
+            _refuse_off_chip(one.x[rows], one.y[rows], known[number], where)
+        seen.update(one.chips)
+    empty = [chip.name for chip in chips if chip.number not in seen]
+    if empty:
+        raise InputError(
+            f"no exposure has a detection on chip {', '.join(empty)}",
+            where=key,
+            do="drop its [[chip]] block, or correct the lists' column 'chip'",
+        )
+
+
+def _refuse_off_chip(x: Float, y: Float, chip: Chip, where: str) -> None:
+    low, (right, top) = 1.0 - EDGE, (size + EDGE for size in chip.size)
+    off = (x < low) | (x > right) | (y < low) | (y > top)
+    if off.mean() > OFF_CHIP:
+        raise InputError(
+            f"{off.mean():.0%} of the detections on chip {chip.name} lie outside its "
+            f"{chip.size[0]:g} x {chip.size[1]:g} pixels (x {x.min():.0f} to {x.max():.0f}, "
+            f"y {y.min():.0f} to {y.max():.0f})",
+            where=where,
+            do="check whether x and y are swapped or are pixels of a mosaic, and [[chip]].size",
+        )
 
 
 def known_calibration(tab: IdcTab | Path, filter: str | None) -> Calibration:

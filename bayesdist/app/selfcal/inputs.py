@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.chips import check_chips
 from bayesdist.app.config import SelfcalConfig
-from bayesdist.app.kinds.star_lists import lists_of
+from bayesdist.app.kinds.star_lists import lists_of, refuse_other_chips
 from bayesdist.app.selfcal.commanded import Commanded, read_commanded
 from bayesdist.app.selfcal.known import GaugeConstraints
 from bayesdist.app.selfcal.start import started
@@ -180,8 +179,8 @@ def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
     ------
     InputError
         For files that cannot be read, a list of which nothing passes the cuts, a single exposure,
-        one that stands there twice, chips without stars, exposures that the log does not have, and
-        as `read_commanded`.
+        one that stands there twice, detections off the chips, exposures that the log does not have,
+        and as `read_commanded`.
     """
     block, gauge = config.selfcal, config.gauge
     found = lists_of(block, base)
@@ -200,7 +199,7 @@ def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
             where=used[0].source,
             do="give dithered exposures of one field",
         )
-    check_chips(config.chips(), sorted({int(n) for one in used for n in one.chips}))
+    refuse_other_chips(used, config.chips(), "selfcal.lists")
     refuse_duplicates(
         [np.column_stack([one.x, one.y, one.chip]) for one in used], names, source="selfcal.lists"
     )

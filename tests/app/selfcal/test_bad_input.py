@@ -50,6 +50,18 @@ def test_exposures_that_do_not_overlap(tmp_path):
     _refused(tmp_path, table, "2 groups", "(e000); (e001)")
 
 
+def test_detections_off_the_chips(truth, tmp_path):
+    """Pixels of a mosaic, and a chip that no block describes."""
+    block = {"number": 1, "name": "A", "size": SIZE, "reference_pixel": (512.0, 512.0)}
+    given = {"detector": None, "model": {"order": 3}, "chip": [block]}
+    moved = list_table(truth)
+    moved["x"] += 500.0
+    _refused(tmp_path / "moved", moved, "lists.ecsv", "chip A", "outside", "mosaic", **given)
+    other = list_table(truth)
+    other["chip"] = np.where(np.arange(len(other)) % 9, 1, 3)
+    _refused(tmp_path / "other", other, "chip 3", "[[chip]]", "known: 1", **given)
+
+
 def test_two_groups_of_exposures(tmp_path):
     table = list_table(_pointed([(0, 0), (2.0, 0), (0.1, 0.2), (2.1, 0.1)], n_stars=3000))
     _refused(tmp_path, table, "2 groups", "(e000, e002); (e001, e003)")
