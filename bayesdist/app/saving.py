@@ -9,9 +9,9 @@ from bayesdist.app.assessment.holdout import holdout_summary, holdout_table
 from bayesdist.app.assessment.periods import periods_summary, periods_table
 from bayesdist.app.assessment.rehearsal import rehearse_solution
 from bayesdist.app.assessment.settings import idle_dates
-from bayesdist.app.campaign.lines import line_sections
-from bayesdist.app.campaign.series import write_series_tables
 from bayesdist.app.config import Config
+from bayesdist.app.exposures.linear_terms import line_sections
+from bayesdist.app.exposures.series import write_series_tables
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.summary import fit_sections, log_fit, sample_sections
 from bayesdist.app.matches.added_errors import grouping_sentence

@@ -9,7 +9,6 @@ from unittest.mock import patch
 import numpy as np
 
 from bayesdist.app.assessment.settings import assessment_rng
-from bayesdist.app.campaign.interpolation import INTERPOLATION as BETWEEN
 from bayesdist.app.config import load_config
 from bayesdist.app.results import Results
 from bayesdist.app.run import make_stages
@@ -17,6 +16,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import LocalErrors
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.evaluation import budget_over
+from bayesdist.assess.terms.between_nodes import INTERPOLATION as BETWEEN
 from bayesdist.infer.transforms import reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh

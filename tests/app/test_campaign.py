@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.app.campaign import series
+from bayesdist.app.exposures import series
 from bayesdist.app.kinds.table_file import read_tables
 from bayesdist.data import read_exposures, read_matches
 from bayesdist.data.tables.files import read_table

@@ -110,8 +110,8 @@ def test_what_is_held_out_is_no_part_of_the_fit(run) -> None:
 def test_functions_find_what_the_run_has_found(run) -> None:
     """Lists are matched and fitted without a run's folder, and are prepared as those of the run."""
     config, _ = load_config(run / "config.toml")
-    matched = match_lists(read_campaign(config, run), config, run)
-    fitted = fit_campaign(matched, config, run)
+    matched = match_lists(read_campaign(config, run))
+    fitted = fit_campaign(matched)
     known = load_fit(run / "fit.nc")
     np.testing.assert_array_equal(fitted.linear.mean, known.mean)
     np.testing.assert_array_equal(fitted.linear.cov, known.cov)

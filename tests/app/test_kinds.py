@@ -10,10 +10,10 @@ import pytest
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.kinds.stars import (
     fit_stars,
-    load_fitted_stars,
     match_stars,
     read_stars,
     sample_stars,
@@ -36,7 +36,7 @@ def job(finished):
 @pytest.fixture(scope="module")
 def fitted(job):
     config, base = job
-    matched = match_stars(read_stars(config, base), config, base)
+    matched = match_stars(read_stars(config, base), config)
     return matched, fit_stars(matched, config)
 
 
@@ -67,10 +67,11 @@ def test_a_fit_that_is_read_gives_the_same_stars(data, tmp_path):
         holdout={"fraction": 0.3},
     )
     config, _ = load_config(path)
-    matched = match_stars(read_stars(config, path.parent), config, path.parent)
+    matched = match_stars(read_stars(config, path.parent), config)
     found = fit_stars(matched, config)
     found.save(tmp_path)
-    read = load_fitted_stars(tmp_path, config, as_json(fit_sections(found, matched.stars)))
+    summary = as_json(fit_sections(found, matched.stars))
+    read = kind_of(config).load_fitted(tmp_path, lambda: matched, config, summary)
     assert (found.errors.factor > 20) == (not data)
     for made, again in (
         (FitData(matched, found).stars, FitData(matched, read).stars),

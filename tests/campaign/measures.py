@@ -113,7 +113,7 @@ def node_errors(found: Calibrated, tables: TableFit, step: float) -> Outcome:
         "rms noise": _noise(found),
     }
     pairs = found.matched.stars
-    model = found.matched.affine_model(found.results.config)
+    model = found.matched.affine_model
     _, with_errors, _ = fit_by_magnitude(pairs, model)
     binned = fit_with_tables(with_errors, model, method="binned", step=(step, step))
     others = {table.chip: table for table in binned.tables}

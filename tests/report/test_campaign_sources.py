@@ -64,9 +64,9 @@ def test_residuals_show_the_pattern_of_the_detector_whatever_the_roll(margin):
             inside=lambda stars: kept,
         ),
     )
-    matched = SimpleNamespace(stars=pairs, affine_model=lambda config: model)
-    config = SimpleNamespace(fit=SimpleNamespace(clip_abs=2.0))
-    (found,) = _residuals(data, matched, config)
+    inputs = SimpleNamespace(config=SimpleNamespace(fit=SimpleNamespace(clip_abs=2.0)))
+    matched = SimpleNamespace(stars=pairs, affine_model=model, inputs=inputs)
+    (found,) = _residuals(data, matched)
     pairs = pairs.select(kept)
     without, after = found.binned_without, found.binned_with
     shift = table.evaluate(pairs.x, pairs.y)

@@ -42,7 +42,7 @@ def diagnose_run(posterior: Posterior, data: FitData, config: Config, base: Path
         periods=period_settings(data, config),
         **_of_kind(data, config),
     )
-    overlap = data.matched.overlap(posterior, tables, config, base)
+    overlap = data.matched.overlap(posterior, tables)
     found = replace(found, overlap=overlap)
     if data.held is None:
         return found

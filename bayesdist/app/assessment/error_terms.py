@@ -8,8 +8,6 @@ import numpy as np
 
 from bayesdist.app.assessment.settings import assessment_epoch
 from bayesdist.app.campaign.aberration import aberration_term
-from bayesdist.app.campaign.inputs import campaign_block
-from bayesdist.app.campaign.interpolation import interpolation_term
 from bayesdist.app.campaign.matched import campaign_matches
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
@@ -17,6 +15,7 @@ from bayesdist.app.kinds.fitted import required
 from bayesdist.app.kinds.table_file import StoredLookupTables
 from bayesdist.assess import pixel_scale_of
 from bayesdist.assess.error_model import ErrorModel, error_model
+from bayesdist.assess.terms.between_nodes import interpolation_term
 from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorTerm
 from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.assess.terms.parameters import ExposureVariation
@@ -39,7 +38,7 @@ def errors_of_run(
     terms: list[ErrorTerm] = []
     if found is not None and fitted.scatter is not None:
         assert isinstance(solution, Posterior)
-        terms.append(_variation(solution, data, config))
+        terms.append(_variation(solution, data))
     terms += config.linear_terms(solution)
     if fitted.scatter is not None:
         terms += _table_terms(solution, data, config)
@@ -62,7 +61,7 @@ def errors_of_run(
     )
 
 
-def _variation(solution: Posterior, data: FitData, config: Config) -> ExposureVariation:
+def _variation(solution: Posterior, data: FitData) -> ExposureVariation:
     """How a new exposure deviates: as those at hand scatter, velocity aberration among it."""
     scatter = required(data.fitted.scatter, "joint fit of exposures")
     return ExposureVariation(
@@ -70,12 +69,7 @@ def _variation(solution: Posterior, data: FitData, config: Config) -> ExposureVa
         np.asarray(solution.mean, float),
         scatter.kinds,
         scatter.tau,
-        aberration=aberration_term(
-            scatter,
-            campaign_matches(data.matched).inputs.log,
-            solution,
-            corrected=campaign_block(config).vafactor_source != "earth",
-        ),
+        aberration=aberration_term(scatter, campaign_matches(data.matched).inputs, solution),
     )
 
 

@@ -12,7 +12,7 @@ from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.evaluation import drawn_errors, judged, validity_of
 from bayesdist.assess.requirements.margins import judge
-from bayesdist.assess.requirements.validity import Horizon
+from bayesdist.assess.requirements.validity import ValidityPeriod
 from bayesdist.infer.solution import Solution
 
 __all__ = [
@@ -48,7 +48,7 @@ def margins_of(results: Results, requirements: Sequence[Requirement]) -> tuple[M
 
 def validity_periods_of(
     results: Results, requirements: Sequence[Requirement]
-) -> tuple[Horizon, ...]:
+) -> tuple[ValidityPeriod, ...]:
     """Until when requirements are met by a run, where something depends on time."""
     return validity_of(
         results.errors,

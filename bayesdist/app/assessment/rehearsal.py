@@ -15,7 +15,7 @@ from bayesdist.assess import Requirement, star_sample
 from bayesdist.assess.evaluation import budget_over
 from bayesdist.assess.requirements.margins import judge
 from bayesdist.assess.terms.centroid import centroid_errors
-from bayesdist.diagnose.residuals.centroid import centroid_scatter
+from bayesdist.diagnose.residuals.sample import centroid_scatter
 from bayesdist.errors import InputError
 
 __all__ = ["rehearse", "rehearse_solution"]

@@ -1,4 +1,4 @@
-"""What is not known of the velocity aberration of an exposure: an error of its scale.
+"""Error of an exposure's scale from what is not known of its velocity aberration.
 
 VAFACTOR holds for an instant, and a telescope in a low orbit turns its velocity while it exposes.
 At which instant the factor was computed no log says: it is taken to lie anywhere in the exposure.
@@ -13,9 +13,9 @@ import math
 
 import numpy as np
 
+from bayesdist.app.campaign.inputs import Inputs
 from bayesdist.app.kinds.exposures import ExposureScatter
 from bayesdist.assess.terms.parameters import EXPOSURE_SCATTER, ScaleError
-from bayesdist.data import ExposureLog
 from bayesdist.infer.solution import Solution
 
 __all__ = ["ABERRATION", "aberration_term", "scale_error"]
@@ -48,27 +48,23 @@ def scale_error(exptime: float | None) -> float:
     return min(spread, spread * 2 * math.pi / PERIOD * exptime / math.sqrt(12))
 
 
-def aberration_term(
-    scatter: ExposureScatter, log: ExposureLog, solution: Solution, *, corrected: bool
-) -> ScaleError:
+def aberration_term(scatter: ExposureScatter, inputs: Inputs, solution: Solution) -> ScaleError:
     """The error of the scale that VAFACTOR leaves, at most as large as exposures scatter.
 
     Parameters
     ----------
     scatter : ExposureScatter
-    log : ExposureLog
-        Of the exposures.
+    inputs : Inputs
+        Of the campaign.
     solution : Solution
         Whose positions it moves.
-    corrected : bool
-        The velocity in the orbit is in VAFACTOR.
     """
     source = PUBLISHED
-    if not corrected:
+    if inputs.config.campaign.vafactor_source == "earth":
         sigma = scale_error(None)
         source += ", not corrected"
     else:
-        given = [one.exptime for one in log if one.exptime is not None]
+        given = [one.exptime for one in inputs.log if one.exptime is not None]
         seconds = math.sqrt(np.mean(np.square(given))) if given else LONGEST
         sigma = scale_error(seconds)
         source += f", over {seconds:.0f} s"

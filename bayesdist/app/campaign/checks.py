@@ -19,17 +19,7 @@ WARNING = {"matching": "", "deviations": LARGER, "tables": "", "time_dependence"
 
 
 def campaign_remarks(summary: Mapping[str, Any]) -> tuple[Check, ...]:
-    """What the stages found odd.
-
-    Parameters
-    ----------
-    summary : mapping
-        As summary.json.
-
-    Returns
-    -------
-    tuple of Check
-    """
+    """Warnings of the stages."""
     return tuple(
         Check(GROUP, level="warn", sentence=text, doubt=doubt)
         for part, doubt in WARNING.items()
@@ -46,10 +36,6 @@ def campaign_checks(summary: Mapping[str, Any], remarks: Sequence[Check] = ()) -
         As summary.json.
     remarks : sequence of Check
         What else was found odd: of the stages, and by tests of the residuals.
-
-    Returns
-    -------
-    tuple of Check
     """
     m, tables, time = (summary.get(k) or {} for k in ("matching", "tables", "time_dependence"))
     least = float(m["completeness"]["least"])

@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from bayesdist.app.campaign.gap import gap_priors, with_gap
-from bayesdist.app.campaign.inputs import unit_arcsec_of
-from bayesdist.app.campaign.lines import FIXED, line_sections
+from bayesdist.app.campaign.input_validation import frames_not_set
+from bayesdist.app.campaign.inputs import Inputs
 from bayesdist.app.campaign.matched import CampaignMatched
 from bayesdist.app.campaign.reference import rate_priors
-from bayesdist.app.campaign.soundness import frames_not_set
 from bayesdist.app.campaign.tables import fit_tables, scatter_by_magnitude, tables_section
-from bayesdist.app.config import Config
-from bayesdist.app.kinds.errors import ErrorLaw, read_magnitude_errors
-from bayesdist.app.kinds.exposures import FIT_AGAIN, ExposureScatter, read_hierarchy, read_series
-from bayesdist.app.kinds.fitted import FIT, TABLES, Fitted
-from bayesdist.app.kinds.table_file import read_tables
+from bayesdist.app.exposures.linear_terms import FIXED, line_sections
+from bayesdist.app.kinds.errors import ErrorLaw
+from bayesdist.app.kinds.exposures import ExposureScatter
+from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.data import centroid_errors
 from bayesdist.data.matches import Matches
-from bayesdist.infer import load, load_fit
+from bayesdist.infer import load
 from bayesdist.infer.exposures.alone import ExposureSolutions, fit_exposures
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
 from bayesdist.infer.exposures.trends import trend_p_values
@@ -35,29 +30,13 @@ from bayesdist.limits import TREND
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.frames import RIGID
 
-__all__ = ["fit_campaign", "load_fitted_campaign"]
+__all__ = ["fit_campaign"]
 
 SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
-SECTIONS = (  # of summary.json, which only the making of the fit knows
-    *("gauge", "lines", "tables", "scatter"),
-    *("deviations", "exposures_skipped", "exposures_outlying"),
-)
 
 
-def fit_campaign(matched: CampaignMatched, config: Config, base: Path) -> Fitted:
+def fit_campaign(matched: CampaignMatched) -> Fitted:
     """Tables, errors, all exposures jointly, and every one alone.
-
-    Parameters
-    ----------
-    matched : CampaignMatched
-    config : Config
-        With a section [campaign].
-    base : Path
-        Folder that its files are relative to.
-
-    Returns
-    -------
-    Fitted
 
     Raises
     ------
@@ -66,20 +45,20 @@ def fit_campaign(matched: CampaignMatched, config: Config, base: Path) -> Fitted
         and stars that have outrun their catalogue.
     """
     with frames_not_set():
-        return _fitted(matched, config, base)
+        return _fitted(matched)
 
 
-def _fitted(matched: CampaignMatched, config: Config, base: Path) -> Fitted:
-    affine = matched.affine_model(config)
-    tables = fit_tables(matched, affine, config, base)
+def _fitted(matched: CampaignMatched) -> Fitted:
+    inputs, config, affine = matched.inputs, matched.inputs.config, matched.affine_model
+    tables = fit_tables(matched)
     pairs = matched.stars
     if tables.stored.tables:
         pairs = on_the_chips(corrected_matches(tables.stored.tables, pairs), affine)
-    _, _, total = scatter_by_magnitude(pairs, affine, matched.inputs)
+    _, _, total = scatter_by_magnitude(pairs, affine, inputs)
     errors = ErrorLaw(by_magnitude=centroid_errors(pairs, total), with_catalogue=True)
     stars = errors.applied(pairs)
     rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs)
-    joint = _joint(stars, affine, config, base, rejection)
+    joint = _joint(stars, affine, inputs, rejection)
     number = config.chips()[0].number
     alone = fit_exposures(stars, affine, chip=number, skip=True, rejection=rejection)
     facts = {
@@ -102,51 +81,24 @@ def _fitted(matched: CampaignMatched, config: Config, base: Path) -> Fitted:
 
 
 def _joint(
-    stars: Matches, affine: DistortionModel, config: Config, base: Path, rejection: Rejection
+    stars: Matches, affine: DistortionModel, inputs: Inputs, rejection: Rejection
 ) -> HierarchicalFit:
     """All exposures jointly, deviating from the model as they are found to scatter."""
-    asked = config.time()
+    config = inputs.config
+    asked, scale = config.time(), config.detector.scale_mas
+    pixel = 1.0 if scale is None else inputs.pixel_arcsec / inputs.unit_arcsec
     drifting = with_gap(replace(affine, time=asked))
     held = held_in_reference(stars, drifting, config.chips()[0].number)
     model = replace(held, chip_deviations=True)
-    unit, scale = unit_arcsec_of(affine.unit, config), config.detector.scale_mas
-    pixel = 1.0 if scale is None else scale / 1000 / unit
     with closing(load(model, stars, config.resources())) as shards:
         return fit_hierarchical(
             shards,
             model,
-            priors=rate_priors(config, model, base) or gap_priors(model, asked, pixel),
+            priors=rate_priors(config, model, inputs.base) or gap_priors(model, asked, pixel),
             pixel=pixel,
             seed=config.sampler.seed,
             rejection=rejection,
         )
-
-
-def load_fitted_campaign(folder: Path, summary: Mapping[str, Any]) -> Fitted:
-    """The fit of an earlier stage.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the run.
-    summary : mapping
-        Content of summary.json.
-
-    Raises
-    ------
-    InputError
-        For missing or damaged files.
-    """
-    scatter, priors = read_hierarchy(folder)
-    return Fitted(
-        load_fit(folder / FIT),
-        ErrorLaw(by_magnitude=read_magnitude_errors(folder), with_catalogue=True),
-        priors,
-        tables=read_tables(folder / TABLES, do=FIT_AGAIN),
-        scatter=scatter,
-        alone=read_series(folder),
-        facts={name: summary[name] for name in SECTIONS if name in summary},
-    )
 
 
 def _series(alone: ExposureSolutions, reference: Chip) -> Series:

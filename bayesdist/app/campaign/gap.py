@@ -40,10 +40,6 @@ def gap_priors(
         The configured drift: constant terms that it names have rates as well.
     pixel : float
         Size of a pixel in the unit of u, v.
-
-    Returns
-    -------
-    GaussianPriors
     """
     reference, named = model.chips[0].number, () if asked is None else asked.terms
     held = {

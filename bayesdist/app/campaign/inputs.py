@@ -2,45 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.config import Config
-from bayesdist.app.config.campaign import CampaignBlock, StarListsBlock
-from bayesdist.calibration.calibration import Calibration
+from bayesdist.app.config import CampaignConfig
+from bayesdist.app.config.campaign import CampaignBlock
+from bayesdist.app.kinds.star_lists import StarLists, lists_of
+from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data import (
     ExposureLog,
     ReferenceCatalog,
-    StarCuts,
-    StarList,
     catalog_from_table,
     read_exposures,
-    read_star_lists,
     select_motions,
 )
 from bayesdist.data.sky.tangent import mean_direction, tangent_plane
 from bayesdist.data.tables.files import read_table
-from bayesdist.errors import ConfigError, InputError
+from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_errors import StarErrors
-from bayesdist.products import IdcTab, read_idctab
-from bayesdist.products.formats.idctab.calibration import idctab_calibration
+from bayesdist.products import IdcTab
 from bayesdist.products.formats.idctab.hst import parity_of
 
 __all__ = [
     "Inputs",
-    "campaign_block",
-    "cuts_of",
     "errors_by_star",
-    "lists_of",
     "parities_of",
     "read_campaign",
     "read_campaign_catalog",
-    "start_of",
-    "unit_arcsec_of",
 ]
 
 Float = NDArray[np.float64]
@@ -48,29 +39,34 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """What a campaign begins with.
+    """Catalogue, exposures and star lists of a campaign.
 
     Parameters
     ----------
+    config : CampaignConfig
+    base : Path
+        Folder that its files are relative to.
     catalog : ReferenceCatalog
         Without stars whose proper motions are badly measured, where these were asked to go.
     n_catalog : int
         Stars that the file holds.
     log : ExposureLog
         Of the exposures of the filter, with VAFACTOR.
-    lists : tuple of StarList
+    star_lists : StarLists
         Of these exposures.
-    strangers : tuple of str
+    unlogged : tuple of str
         Exposures that have a list and no entry in the log file, of whatever filter: not used.
     plane : str
         What the catalogue's u and v are, where they come from the sky.
     """
 
+    config: CampaignConfig
+    base: Path
     catalog: ReferenceCatalog
     n_catalog: int
     log: ExposureLog
-    lists: tuple[StarList, ...]
-    strangers: tuple[str, ...] = ()
+    star_lists: StarLists
+    unlogged: tuple[str, ...] = ()
     plane: str = ""
 
     @property
@@ -79,39 +75,23 @@ class Inputs:
         return float(self.log.values("vafactor").max())
 
     @property
+    def pixel_arcsec(self) -> float:
+        """Size of a pixel; that of ACS/WFC where the configuration gives none."""
+        return (self.config.detector.scale_mas or 50.0) / 1000
+
+    @property
+    def unit_arcsec(self) -> float:
+        """Size of a unit of u and v."""
+        return ARCSEC.get(self.catalog.unit, self.pixel_arcsec)
+
+    @property
     def filter(self) -> str:
         """The one filter of the exposures."""
         return self.log.filters[0]
 
 
-def campaign_block(config: Config) -> CampaignBlock:
-    """The campaign's part of a configuration.
-
-    Raises
-    ------
-    ConfigError
-        Where it has none.
-    """
-    if config.campaign is None:
-        raise ConfigError("names no star lists", where="campaign", do="give the section [campaign]")
-    return config.campaign
-
-
-def unit_arcsec_of(unit: str, config: Config) -> float:
-    """Size of a unit of u and v; of pixels that of the detector's, or 0.05 arcsec."""
-    scale = {"arcsec": 1.0, "mas": 1e-3, "deg": 3600.0}.get(unit)
-    return scale or (config.detector.scale_mas or 50.0) / 1000
-
-
-def read_campaign(config: Config, base: Path) -> Inputs:
+def read_campaign(config: CampaignConfig, base: Path) -> Inputs:
     """Read catalogue, exposures and star lists.
-
-    Parameters
-    ----------
-    config : Config
-        With a section [campaign].
-    base : Path
-        Folder that its files are relative to.
 
     Raises
     ------
@@ -119,7 +99,7 @@ def read_campaign(config: Config, base: Path) -> Inputs:
         For files that cannot be read, lists without an entry in the log, a filter without
         exposures, and exposures without VAFACTOR.
     """
-    block = campaign_block(config)
+    block = config.campaign
     log = read_exposures(base / block.exposures)
     catalog, plane = read_campaign_catalog(block, base, log)
     logged = set(log.names)
@@ -141,8 +121,8 @@ def read_campaign(config: Config, base: Path) -> Inputs:
         bare = tuple(replace(one, vafactor=None) for one in log)
         log = ExposureLog(bare, log.source).with_aberration()
     log.require("vafactor")
-    lists = lists_of(block, base)
-    wanted = tuple(one for one in lists if one.exposure in log)
+    found = lists_of(block, base)
+    wanted = tuple(one for one in found.lists if one.exposure in log)
     missing = sorted(set(log.names) - {one.exposure for one in wanted})
     if missing:
         raise InputError(
@@ -151,11 +131,12 @@ def read_campaign(config: Config, base: Path) -> Inputs:
             where=log.source,
             do="add the list, or take the exposure out of the log",
         )
-    strangers = dict.fromkeys(one.exposure for one in lists if one.exposure not in logged)
+    unlogged = dict.fromkeys(one.exposure for one in found.lists if one.exposure not in logged)
     n = len(catalog)
     if block.pm_selection == "reliable" and catalog.sigma_pm_u is not None:
         catalog = select_motions(catalog)
-    return Inputs(catalog, n, log, wanted, tuple(strangers), plane)
+    wanted_lists = replace(found, lists=wanted)
+    return Inputs(config, base, catalog, n, log, wanted_lists, tuple(unlogged), plane)
 
 
 def read_campaign_catalog(
@@ -244,52 +225,6 @@ def parities_of(block: CampaignBlock, catalog: ReferenceCatalog, tab: IdcTab) ->
     return (expected, not expected)
 
 
-def lists_of(block: StarListsBlock, base: Path) -> tuple[StarList, ...]:
-    """All star lists that the configuration names.
-
-    Each place is read alone: a list whose name stands in two is an exposure given twice, not two.
-    """
-    names = block.lists if isinstance(block.lists, list) else [block.lists]
-    return tuple(one for name in names for one in read_star_lists(base / name, block.columns))
-
-
-def cuts_of(block: StarListsBlock) -> StarCuts:
-    """Which detections are used."""
-    return StarCuts(mag=block.mag, saturation=block.saturation, q_max=block.q_max)
-
-
-def start_of(
-    tab: IdcTab | Path, unit_arcsec: float, filter: str | None
-) -> Callable[[Float, Float, NDArray[np.int64], float], Float]:
-    """The known distortion, from pixels to the catalogue's unit up to rotation and shift.
-
-    Parameters
-    ----------
-    tab : IdcTab or Path
-    unit_arcsec : float
-        Size of the catalogue's unit.
-    filter : str or None
-        The table's only one, or any of it, by default.
-    """
-    known = known_calibration(tab, filter)
-
-    def start(x: Float, y: Float, chip: NDArray[np.int64], epoch: float) -> Float:
-        out = np.empty((len(x), 2))
-        for number in np.unique(chip):
-            rows = chip == number
-            out[rows] = known.forward(x[rows], y[rows], chip=int(number))
-        return out / unit_arcsec
-
-    return start
-
-
-def known_calibration(tab: IdcTab | Path, filter: str | None) -> Calibration:
-    """The calibration of an IDCTAB in a filter, or in any where it does not name that one."""
-    known = read_idctab(tab) if isinstance(tab, Path) else tab
-    names = {name for row in known.filters() for name in row}
-    return idctab_calibration(known, filter if filter in names else None)
-
-
 def errors_by_star(catalog: ReferenceCatalog, largest_vafactor: float = 1.0) -> StarErrors | None:
     """Errors of the catalogue by code of the star; None where it has none.
 
@@ -303,21 +238,23 @@ def errors_by_star(catalog: ReferenceCatalog, largest_vafactor: float = 1.0) -> 
     if catalog.sigma_u is None or not (np.any(catalog.sigma_u) or np.any(catalog.sigma_v)):
         return None
 
-    def by_code(name: str) -> Float | None:
-        values = getattr(catalog, name)
-        if values is None:
-            return None
-        out = np.zeros(int(catalog.star.max()) + 1)
-        out[catalog.star] = values
+    size = int(catalog.star.max()) + 1
+
+    def by_code(*names: str) -> Float | None:
+        """Columns of the catalogue side by side (codes, n); None where it lacks one."""
+        out = np.zeros((size, len(names)))
+        for k, name in enumerate(names):
+            values = getattr(catalog, name)
+            if values is None:
+                return None
+            out[catalog.star, k] = values
         return out
 
-    position, motion = (
-        [by_code(f"{name}_{axis}") for axis in "uv"] for name in ("sigma", "sigma_pm")
-    )
+    position, motion = by_code("sigma_u", "sigma_v"), by_code("sigma_pm_u", "sigma_pm_v")
+    epoch = by_code("epoch")
+    assert position is not None
     return StarErrors(
-        np.stack([one for one in position if one is not None], axis=1) / largest_vafactor,
-        None
-        if motion[0] is None or motion[1] is None
-        else np.stack([motion[0], motion[1]], axis=1) / largest_vafactor,
-        by_code("epoch"),
+        position / largest_vafactor,
+        None if motion is None else motion / largest_vafactor,
+        None if epoch is None else epoch[:, 0],
     )

@@ -4,21 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
-
-from bayesdist.app.campaign.inputs import (
-    Inputs,
-    campaign_block,
-    errors_by_star,
-    known_calibration,
-    unit_arcsec_of,
-)
+from bayesdist.app.campaign.inputs import Inputs, errors_by_star
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.split import set_aside
+from bayesdist.app.kinds.star_lists import known_calibration
 from bayesdist.app.tables.star_files import PAIRS, part_files
 from bayesdist.data import read_matches, write_partitioned
 from bayesdist.data.matches import Matches
@@ -54,14 +48,16 @@ class CampaignMatched(Matched):
 
     @property
     def mirrored(self) -> bool:
-        """Truth of a u that has the sign opposite to the catalogue's."""
+        """Boolean: u has the sign opposite to the catalogue's."""
         return self.facts.get("parity") == "mirrored"
 
-    def affine_model(self, config: Config) -> DistortionModel:
+    @cached_property
+    def affine_model(self) -> DistortionModel:
         """The configured polynomial with a free linear part of each exposure.
 
         For tables and errors: whatever drifts or scatters in the linear terms is taken up.
         """
+        config = self.inputs.config
         return DistortionModel(
             config.model.order,
             config.chips(),
@@ -81,55 +77,26 @@ class CampaignMatched(Matched):
         return self.inputs.filter
 
     @property
-    def states_errors(self) -> bool:
-        """Boolean: the catalogue has columns of errors."""
-        return self.inputs.catalog.sigma_u is not None
-
-    @property
-    def states_motion_errors(self) -> bool:
-        """Boolean: the catalogue has columns of errors of proper motions."""
-        return self.inputs.catalog.sigma_pm_u is not None
-
-    @property
     def star_errors(self) -> StarErrors | None:
         """Errors of the catalogue by code of the star; None where it has none."""
         return errors_by_star(self.inputs.catalog, self.inputs.largest_vafactor)
 
-    @property
-    def catalogue_name(self) -> str:
-        """Name of the file of the reference catalogue."""
-        return Path(self.inputs.catalog.source).name
-
-    def with_motions(self, table: Matches) -> Matches:
-        """Matches with what the catalogue states of the motions of their stars."""
-        catalog = self.inputs.catalog
-        if table.star is None or catalog.pm_u is None or catalog.sigma_pm_u is None:
-            return table
-        columns = {}
-        for name in ("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"):
-            by_code = np.zeros(int(catalog.star.max()) + 1)
-            by_code[catalog.star] = getattr(catalog, name)
-            columns[name] = by_code[table.star]
-        return table.with_columns(**columns)
-
-    def overlap(
-        self, posterior: Posterior, tables: tuple[LookupTable, ...], config: Config, base: Path
-    ) -> OverlapTest | None:
+    def overlap(self, posterior: Posterior, tables: tuple[LookupTable, ...]) -> OverlapTest | None:
         """Two exposures far apart in time laid on each other; None where none are known so."""
-        block, mas = campaign_block(config), config.detector.scale_mas
+        inputs, block = self.inputs, self.inputs.config.campaign
         return overlap_test(
             self.stars,
             posterior,
-            known_calibration(base / block.initial_distortion, block.filter),
+            known_calibration(inputs.base / block.initial_distortion, block.filter),
             tables,
-            unit_arcsec=unit_arcsec_of(self.inputs.catalog.unit, config),
-            pixel=0.05 if mas is None else mas / 1000,
-            rolls={one.name: one.pa_v3 for one in self.inputs.log},
+            unit_arcsec=inputs.unit_arcsec,
+            pixel=inputs.pixel_arcsec,
+            rolls={one.name: one.pa_v3 for one in inputs.log},
         )
 
     def reopened(self, folder: Path, config: Config) -> CampaignMatched:
         """Matches as a run that is resumed reads them: rows name the files that they lie in."""
-        return load_matched_campaign(folder, config, self.inputs, {self.section: self.facts})
+        return load_matched_campaign(folder, self.inputs, {self.section: self.facts})
 
     def save(self, folder: Path) -> None:
         """Write the files of a run's folder that belong to it."""
@@ -139,9 +106,7 @@ class CampaignMatched(Matched):
         write_partitioned([self.pairs], folder / PAIRS)
 
 
-def matched_campaign(
-    pairs: Matches, config: Config, inputs: Inputs, **more: Any
-) -> CampaignMatched:
+def matched_campaign(pairs: Matches, inputs: Inputs, **more: Any) -> CampaignMatched:
     """Matches of a campaign, with what the configuration holds out set aside.
 
     Raises
@@ -149,8 +114,8 @@ def matched_campaign(
     InputError
         As `set_aside`.
     """
-    parts = set_aside(config, pairs, GAUGE_EXPOSURES)
-    return CampaignMatched(*parts, inputs=inputs, pairs=pairs, **more)
+    parts = set_aside(inputs.config, pairs, GAUGE_EXPOSURES)
+    return CampaignMatched(*parts, catalogue=inputs.catalog, inputs=inputs, pairs=pairs, **more)
 
 
 def campaign_matches(matched: Matched) -> CampaignMatched:
@@ -167,18 +132,8 @@ def campaign_matches(matched: Matched) -> CampaignMatched:
 
 
 def load_matched_campaign(
-    folder: Path, config: Config, inputs: Inputs, summary: Mapping[str, Any]
+    folder: Path, inputs: Inputs, summary: Mapping[str, Any]
 ) -> CampaignMatched:
-    """The matches of an earlier stage.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the run.
-    config : Config
-    inputs : Inputs
-    summary : mapping
-        Content of summary.json.
-    """
+    """The matches of an earlier stage."""
     pairs = read_matches(folder / PAIRS, unit=inputs.catalog.unit)
-    return matched_campaign(pairs, config, inputs, facts=summary.get("matching", {}))
+    return matched_campaign(pairs, inputs, facts=summary.get("matching", {}))

@@ -3,28 +3,19 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.campaign.inputs import (
-    Inputs,
-    campaign_block,
-    cuts_of,
-    parities_of,
-    start_of,
-    unit_arcsec_of,
-)
+from bayesdist.app.campaign.input_validation import input_warnings, refuse_few, shear_warnings
+from bayesdist.app.campaign.inputs import Inputs, parities_of
 from bayesdist.app.campaign.matched import CampaignMatched, matched_campaign
 from bayesdist.app.campaign.reference import free_rates
-from bayesdist.app.campaign.soundness import input_warnings, refuse_few, shear_warnings
-from bayesdist.app.config import Config
+from bayesdist.app.kinds.star_lists import StarLists, positions_by_chip, start_of
 from bayesdist.data import (
     ExposureLog,
     Matches,
-    StarCuts,
     StarList,
     match_campaign,
     neutralise_aberration,
@@ -39,21 +30,8 @@ __all__ = ["match_lists"]
 log = logging.getLogger("bayesdist")
 
 
-def match_lists(inputs: Inputs, config: Config, base: Path) -> CampaignMatched:
+def match_lists(inputs: Inputs) -> CampaignMatched:
     """Star lists matched with a catalogue, exposure by exposure.
-
-    Parameters
-    ----------
-    inputs : Inputs
-        As `read_campaign` reads them.
-    config : Config
-        With a section [campaign].
-    base : Path
-        Folder that its files are relative to.
-
-    Returns
-    -------
-    CampaignMatched
 
     Raises
     ------
@@ -61,18 +39,18 @@ def match_lists(inputs: Inputs, config: Config, base: Path) -> CampaignMatched:
         For files that cannot be read or do not go together, chips without matches, and too few
         exposures.
     """
-    block = campaign_block(config)
-    cuts = cuts_of(block)
-    tab = read_idctab(base / block.initial_distortion)
+    config, block, lists = inputs.config, inputs.config.campaign, inputs.star_lists
+    tab = read_idctab(inputs.base / block.initial_distortion)
     parities = parities_of(block, inputs.catalog, tab)
     for text in (*([inputs.plane] if inputs.plane else []), *inputs.catalog.notes):
         log.info("match: catalogue: %s", text)
+    start = start_of(tab, inputs.unit_arcsec, block.filter)
     found = match_campaign(
-        _gauge_first(inputs.lists, cuts, config.chips()[0].number),
+        _gauge_first(lists, config.chips()[0].number),
         inputs.log,
         inputs.catalog,
-        start_of(tab, unit_arcsec_of(inputs.catalog.unit, config), block.filter),
-        cuts=cuts,
+        lambda x, y, chip, epoch: positions_by_chip(start, x, y, chip),
+        cuts=lists.cuts,
         radius=block.radius,
         mirrored=parities,
         skip=True,
@@ -85,13 +63,13 @@ def match_lists(inputs: Inputs, config: Config, base: Path) -> CampaignMatched:
     warnings = [
         *_doubtful_parity(found.mirrored, parities, f"{tab.instrument}/{tab.detector}"),
         *found.warnings(inputs.log),
-        *input_warnings(config, inputs),
+        *input_warnings(inputs),
         # as the stars show them, for the log need not have them
         *shear_warnings(np.asarray(table["rotation"]), "of the matches"),
     ]
     pairs = neutralise_aberration(found.table, inputs.log)
     facts = _facts(found, table, inputs, warnings)
-    matched = matched_campaign(pairs, config, inputs, facts=facts, table=table)
+    matched = matched_campaign(pairs, inputs, facts=facts, table=table)
     if matched.held is not None:
         _refuse_bare(matched.stars, config.chips(), "what is not held out")
         some = inputs.log.select(names=matched.stars.exposure_names)
@@ -117,7 +95,7 @@ def _facts(
     false = np.sum(table["false_share"] * table["matched"]) / table["matched"].sum()
     return {
         "n_exposures": len(found.reports),
-        "n_detections": sum(len(one) for one in inputs.lists),
+        "n_detections": len(inputs.star_lists),
         "n_pairs": len(found.table),
         "n_catalog": inputs.n_catalog,
         "n_catalog_used": len(inputs.catalog),
@@ -165,13 +143,15 @@ def _doubtful_parity(mirrored: bool, parities: tuple[bool, ...], detector: str) 
     ]
 
 
-def _gauge_first(lists: tuple[StarList, ...], cuts: StarCuts, chip: int) -> tuple[StarList, ...]:
+def _gauge_first(star_lists: StarLists, chip: int) -> tuple[StarList, ...]:
     """The lists, led by one with enough stars on the reference chip.
 
     The first exposure's stars there define the gauge of the joint fit.  The order stays where the
     first list has at least half of what the others have.
     """
-    counts = np.array([int((one.chip[cuts.passed(one)[0]] == chip).sum()) for one in lists])
+    lists = star_lists.lists
+    pairs = zip(lists, star_lists.passed, strict=True)
+    counts = np.array([int((one.chip[good] == chip).sum()) for one, good in pairs])
     usual = np.median(counts[counts > 0]) if counts.any() else 0.0
     if counts[0] >= 0.5 * usual:
         return lists

@@ -1,4 +1,4 @@
-"""What a run takes over from that of the reference filter: the detector's tables, and its drift."""
+"""Tables of the detector and drift that a run takes over from that of the reference filter."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from bayesdist.app.campaign.gap import with_gap
 from bayesdist.app.config import Config
-from bayesdist.app.config.campaign import TablesBlock
+from bayesdist.app.config.model import TablesBlock
 from bayesdist.app.kinds.table_file import read_tables
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Posterior, load_posterior
@@ -88,19 +88,12 @@ def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tupl
 
 
 def free_rates(config: Config) -> bool:
-    """Truth of a drift that is that of this run's own exposures."""
+    """Boolean: the drift is that of this run's own exposures."""
     return config.model.tdd is None or config.model.tdd.rates == FREE
 
 
 def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianPriors | None:
     """Priors on the drift of a model from the posterior of another run; None where it is free.
-
-    Parameters
-    ----------
-    config : Config
-    model : DistortionModel
-    base : Path
-        What the configuration's paths are relative to.
 
     Raises
     ------
@@ -128,13 +121,6 @@ def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianP
 
 def rehearse_references(config: Config, unit: str, base: Path) -> None:
     """Read all that a run takes over from others; nothing is fitted.
-
-    Parameters
-    ----------
-    config : Config
-    unit : str
-        Of the catalogue.
-    base : Path
 
     Raises
     ------

@@ -1,22 +1,13 @@
-"""What the report shows of a campaign, put together from its results."""
+"""Content of the report of a campaign, from its results."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.inputs import (
-    Inputs,
-    campaign_block,
-    cuts_of,
-    read_campaign_catalog,
-)
+from bayesdist.app.campaign.inputs import Inputs, read_campaign_catalog
 from bayesdist.app.campaign.matched import CampaignMatched, campaign_matches
-from bayesdist.app.config import Config
-from bayesdist.app.config.campaign import CampaignBlock
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.results import Results
 from bayesdist.app.store import as_json
@@ -51,31 +42,28 @@ WIDEST = 8  # cells of this many times the size, however few stars there are
 
 
 def campaign_results(results: Results) -> CampaignResults:
-    """What a campaign adds to the report of its run.
+    """Content that a campaign adds to the report of its run.
 
     Parameters
     ----------
     results : Results
         Of a run that has been assessed.
-
-    Returns
-    -------
-    CampaignResults
     """
     run, config, fitted = results.run, results.config, results.fitted
     matched, matching = campaign_matches(results.matched), Table.read(run / "matching.ecsv")
+    inputs = matched.inputs
     return CampaignResults(
         summary=dict(run.summary),
         config=as_json(config.model_dump(exclude_none=True)),
-        filter=campaign_block(config).filter or matched.filter,
+        filter=matched.filter,
         matching=matching,
         chips=tuple(results.posterior.model.chips),
         unit=results.posterior.model.unit,
-        catalog=_catalog_stars(matched.inputs, campaign_block(config), results.base, matching),
+        catalog=_catalog_stars(inputs, matching),
         centroids=fitted.errors.by_magnitude,
-        detections=_detections(matched.inputs, campaign_block(config)),
+        detections=_detections(inputs),
         footprints=_footprints(results.posterior, matched),
-        residuals=_residuals(results.data, matched, config),
+        residuals=_residuals(results.data, matched),
         tables=fitted.tables.tables,
         series=_series(run, fitted.linear.model, matching),
         overlap=results.diagnostics.overlap,
@@ -93,10 +81,6 @@ def held_parameters(fit: LinearFit, priors: GaussianPriors) -> tuple[str, ...]:
     fit : LinearFit
     priors : GaussianPriors
         As the fit had them.
-
-    Returns
-    -------
-    tuple of str
     """
     share = fit.sigma * np.sqrt(priors.precision)
     return tuple(
@@ -111,10 +95,9 @@ def _some(n: int, most: int) -> slice:
     return slice(None, None, max(1, -(-n // most)))
 
 
-def _catalog_stars(
-    inputs: Inputs, block: CampaignBlock, base: Path, matching: Table
-) -> CatalogStars | None:
-    catalog, _ = read_campaign_catalog(block, base, inputs.log)
+def _catalog_stars(inputs: Inputs, matching: Table) -> CatalogStars | None:
+    block = inputs.config.campaign
+    catalog, _ = read_campaign_catalog(block, inputs.base, inputs.log)
     if catalog.mag is None or (catalog.sigma_u is None and catalog.sigma_pm_u is None):
         return None
     shift = float(np.nan_to_num(np.nanmedian(np.asarray(matching["zero_point"], float))))
@@ -137,14 +120,13 @@ def _catalog_stars(
     )
 
 
-def _detections(inputs: Inputs, block: CampaignBlock) -> Detections | None:
+def _detections(inputs: Inputs) -> Detections | None:
     """Quality against magnitude, of some detections of every exposure."""
-    lists, cuts = inputs.lists, cuts_of(block)
+    star_lists = inputs.star_lists
+    lists, cuts, passed = star_lists.lists, star_lists.cuts, star_lists.passed
     if any(one.mag is None or one.q is None for one in lists):
         return None
-    passed = [cuts.passed(one)[0] for one in lists]
-    n_total = sum(len(one) for one in lists)
-    every = max(1, -(-n_total // DRAWN))
+    every = max(1, -(-len(star_lists) // DRAWN))
     mag, q, kept = (
         np.concatenate([np.asarray(a)[::every] for a in columns])
         for columns in ([one.mag for one in lists], [one.q for one in lists], passed)
@@ -154,10 +136,10 @@ def _detections(inputs: Inputs, block: CampaignBlock) -> Detections | None:
         mag=mag,
         q=q,
         kept=kept.astype(bool),
-        n_total=n_total,
+        n_total=len(star_lists),
         n_kept=int(sum(p.sum() for p in passed)),
         mag_cuts=(*edges, *(() if cuts.saturation is None else (cuts.saturation,))),
-        q_max=block.q_max,
+        q_max=inputs.config.campaign.q_max,
     )
 
 
@@ -178,13 +160,11 @@ def _footprints(posterior: Posterior, matched: CampaignMatched) -> Footprints:
 
 
 @one_thread
-def _residuals(
-    data: FitData, matched: CampaignMatched, config: Config
-) -> tuple[ChipResiduals, ...]:
+def _residuals(data: FitData, matched: CampaignMatched) -> tuple[ChipResiduals, ...]:
     """Pairs of each chip without the tables and with them, along the detector's axes."""
-    pairs, moved, model = matched.stars, data.stars, matched.affine_model(config)
+    pairs, moved, model = matched.stars, data.stars, matched.affine_model
     tables = data.fitted.tables.tables
-    errors, farthest = data.fitted.errors.by_magnitude, config.fit.clip_abs
+    errors, farthest = data.fitted.errors.by_magnitude, matched.inputs.config.fit.clip_abs
     plain = pairs if errors is None else pairs.with_errors(errors, in_quadrature=True)
     if any(table.filter for table in tables):  # those of the detector are not of this run
         detector = [table for table in tables if not table.filter]

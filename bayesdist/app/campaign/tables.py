@@ -5,22 +5,20 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.inputs import Inputs
-from bayesdist.app.campaign.interpolation import measured_between
 from bayesdist.app.campaign.matched import CampaignMatched
 from bayesdist.app.campaign.outrun import refuse_outrun_stars
 from bayesdist.app.campaign.reference import held_tables
 from bayesdist.app.config import Config
-from bayesdist.app.config.campaign import TablesBlock
 from bayesdist.app.kinds.table_file import StoredLookupTables
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
+from bayesdist.diagnose.tables.measured import measured_between
 from bayesdist.infer import LinearFit, fit_by_magnitude
 from bayesdist.infer.nodes import (
     Iteration,
@@ -59,24 +57,15 @@ class FittedTables:
     fit: TableFit | None = None
 
 
-def fit_tables(
-    matched: CampaignMatched, model: DistortionModel, config: Config, base: Path
-) -> FittedTables:
+def fit_tables(matched: CampaignMatched) -> FittedTables:
     """The look-up tables that are asked for, and those that are held.
 
-    Fitted are the detector's, unless these are taken from another run: then the filter's.
-
-    Parameters
-    ----------
-    matched : CampaignMatched
-    model : DistortionModel
-        With a free linear part of each exposure.
-    config : Config
-    base : Path
-        Folder that the configuration's files are relative to.
+    Fitted are the detector's, unless these are taken from another run: then the filter's.  The
+    linear part of each exposure is free.
     """
-    block, grid, filter = config.tables, config.assess.grid, matched.inputs.filter
-    held = held_tables(block, config.chips(), base)
+    config, model, filter = matched.inputs.config, matched.affine_model, matched.inputs.filter
+    block, grid = config.tables, config.assess.grid
+    held = held_tables(block, config.chips(), matched.inputs.base)
     if block.method == "none":
         if not held:
             return FittedTables(StoredLookupTables())
@@ -86,7 +75,7 @@ def fit_tables(
         between = measured_between(pairs, fit, held, filter=filter, fitted=False)
         of_nodes = _on_the_grid(model, grid, _errors_of(held, fit))
         return FittedTables(_stored(held, of_nodes, between))
-    pairs = _with_errors(matched, model, held, block)
+    pairs = _with_errors(matched, held)
     found = fit_with_tables(
         pairs,
         model,
@@ -130,18 +119,14 @@ def scatter_by_magnitude(
     return fit, scattered, errors
 
 
-def _with_errors(
-    matched: CampaignMatched,
-    model: DistortionModel,
-    held: tuple[LookupTable, ...],
-    block: TablesBlock,
-) -> Matches:
+def _with_errors(matched: CampaignMatched, held: tuple[LookupTable, ...]) -> Matches:
     """Pairs with errors by magnitude, free of the pattern that the tables are to describe.
 
     The scatter of the residuals before any table is twice that of the stars: with errors from
     there the tables would be smoothed too much, and their own errors twice too large.
     """
-    pairs, inputs = matched.stars, matched.inputs
+    pairs, inputs, model = matched.stars, matched.inputs, matched.affine_model
+    block = inputs.config.tables
     _, rough_errors, _ = scatter_by_magnitude(pairs, model, inputs)
     rough = fit_with_tables(
         rough_errors,

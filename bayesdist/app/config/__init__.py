@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from bayesdist.app.config.assess import CATALOGUE_WORDS, require_own_names
-from bayesdist.app.config.data import Data
+from bayesdist.app.config.campaign import CampaignConfig
+from bayesdist.app.config.data import Data, MatchesConfig
 from bayesdist.app.config.detector import (
     ChipBlock,
     Detector,
     chips_of,
+    one_chip,
     reference_first,
     require_detector,
 )
-from bayesdist.app.config.kinds import (
-    KINDS,
-    CampaignConfig,
-    Config,
-    MatchesConfig,
-    SelfcalConfig,
-)
+from bayesdist.app.config.kinds import KINDS, Config
 from bayesdist.app.config.reading import (
     config_of_record,
     load_config,
@@ -26,6 +22,7 @@ from bayesdist.app.config.reading import (
     parse_config,
     validated,
 )
+from bayesdist.app.config.selfcal import SelfcalConfig
 
 __all__ = [
     "CATALOGUE_WORDS",
@@ -42,6 +39,7 @@ __all__ = [
     "load_config",
     "load_requirements",
     "load_text",
+    "one_chip",
     "parse_config",
     "reference_first",
     "require_detector",

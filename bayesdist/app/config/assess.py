@@ -1,4 +1,4 @@
-"""What is assessed: where and when, errors that the data cannot show, requirements."""
+"""Places and dates of the assessment, errors that the data cannot show, requirements."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, PositiveFloat, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from bayesdist.app.config.data import Unit
-from bayesdist.app.config.section import Section
+from bayesdist.app.config.section import Section, Unit
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.assess.terms.forms import GIVEN
 from bayesdist.assess.terms.given import TERM_KINDS
@@ -21,7 +20,6 @@ __all__ = [
     "MEASURED_TERMS",
     "Assess",
     "BudgetBlock",
-    "Periods",
     "RequirementBlock",
     "require_own_names",
 ]
@@ -49,13 +47,6 @@ def require_own_names(block: str, names: Sequence[str]) -> None:
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise ValueError(f"two [[{block}]] blocks have the name {twice!r}; give each its own")
-
-
-class Periods(Section):
-    """Periods whose models are compared."""
-
-    centres: list[float]
-    days: PositiveFloat
 
 
 class Assess(Section):

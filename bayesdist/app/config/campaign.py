@@ -1,16 +1,24 @@
-"""What the configuration says of a campaign."""
+"""A run that begins with star lists and a catalogue: its configuration."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import ClassVar, Literal
 
-from pydantic import Field, PositiveFloat
+from pydantic import PositiveFloat, model_validator
 
-from bayesdist.app.config.section import Section
+from bayesdist.app.config.fit import (
+    CampaignFit,
+    CampaignOutliers,
+    ComputeBlock,
+    HoldoutBlock,
+    Sampler,
+)
+from bayesdist.app.config.model import CampaignModel, PriorBlock, TablesBlock
+from bayesdist.app.config.products import CampaignProducts
+from bayesdist.app.config.run import RunConfig
+from bayesdist.app.config.section import Section, Unit
 
-__all__ = ["CampaignBlock", "ReleaseBlock", "StarListsBlock", "TablesBlock"]
-
-Between = tuple[float, float]
+__all__ = ["CampaignBlock", "CampaignConfig", "StarListsBlock"]
 
 
 class StarListsBlock(Section):
@@ -18,7 +26,7 @@ class StarListsBlock(Section):
 
     lists: str | list[str]
     columns: dict[str, str] | None = None
-    mag: Between | None = None
+    mag: tuple[float, float] | None = None
     saturation: float | None = None
     q_max: PositiveFloat | None = None
     simulated: bool = False
@@ -31,7 +39,7 @@ class CampaignBlock(StarListsBlock):
     exposures: str
     initial_distortion: str
     catalog_columns: dict[str, str] | None = None
-    unit: Literal["pix", "arcsec", "mas", "deg"] | None = None
+    unit: Unit | None = None
     catalogue_epoch: float | None = None
     parity: Literal["auto", "direct", "mirrored"] = "auto"
     filter: str | None = None
@@ -40,32 +48,31 @@ class CampaignBlock(StarListsBlock):
     vafactor_source: Literal["log", "earth"] = "log"
 
 
-class TablesBlock(Section):
-    """Look-up tables that are fitted: the detector's, or the filter's over those of a detector."""
+class CampaignConfig(RunConfig):
+    """A run that begins with star lists and a catalogue."""
 
-    detector: str | None = None
-    method: Literal["field", "binned", "none"] = "field"
-    step: tuple[PositiveFloat, PositiveFloat] = (64.0, 64.0)
-    max_iterations: Annotated[int, Field(ge=1)] = 8
+    data: ClassVar[None] = None
+    selfcal: ClassVar[None] = None
+    periods: ClassVar[None] = None
+    prior: ClassVar[tuple[PriorBlock, ...]] = ()
 
+    campaign: CampaignBlock
+    tables: TablesBlock = TablesBlock()
+    model: CampaignModel
+    fit: CampaignFit = CampaignFit()
+    outliers: CampaignOutliers = CampaignOutliers()
+    sampler: Sampler = Sampler()
+    compute: ComputeBlock = ComputeBlock()
+    holdout: HoldoutBlock | None = None
+    products: CampaignProducts = CampaignProducts()
 
-class PeriodBlock(Section):
-    """The years that one IDCTAB serves, and the segment of the drift that it holds."""
+    @model_validator(mode="after")
+    def _has_chips(self) -> CampaignConfig:
+        if not self.chip:
+            raise ValueError("a [campaign] has no [[chip]] blocks; give them, one as the reference")
+        return self
 
-    name: str
-    years: Between
-    segment: Annotated[int, Field(ge=0)] = 0
-    useafter: str | None = None
-    pedigree: str | None = None
-
-
-class ReleaseBlock(Section):
-    """IDCTABs, D2IMFILE and NPOLFILE, along V2 and V3 as an existing IDCTAB lies."""
-
-    name: str
-    reference: str
-    period: Annotated[list[PeriodBlock], Field(min_length=1)]
-    instrument: str = "ACS"
-    detector: str = "WFC"
-    scale_arcsec: PositiveFloat = 0.05
-    limit_mas: PositiveFloat = 0.1
+    @property
+    def named_detector(self) -> str:
+        """Empty: formats of one detector do not know those of campaigns by name."""
+        return ""

@@ -1,4 +1,4 @@
-"""The section [data]: files of matched stars, and how they are read.
+"""A run that begins with matched stars: its configuration, and how the files are read.
 
 A format that a mission adds may have keys of its own: its section is a subclass of `Data`.
 """
@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
+    Field,
     PositiveFloat,
     SerializeAsAny,
     ValidationInfo,
@@ -18,14 +19,18 @@ from pydantic import (
     model_validator,
 )
 
-from bayesdist.app.config.section import Section
+from bayesdist.app.config.fit import ComputeBlock, Fit, HoldoutBlock, Outliers, Sampler
+from bayesdist.app.config.model import MatchedModel, PriorBlock, TablesBlock
+from bayesdist.app.config.products import MatchedProducts
+from bayesdist.app.config.run import RunConfig
+from bayesdist.app.config.section import Section, Unit
 from bayesdist.data import FORMATS
 from bayesdist.data.tables.units import length_advice
+from bayesdist.errors import InputError
+from bayesdist.infer.compare.period_dates import check_periods, mjd_periods
 from bayesdist.mission import load_object, missions
 
-__all__ = ["Data", "DataOfFormat", "Unit", "data_sections", "names_nominal"]
-
-Unit = Literal["pix", "arcsec", "mas", "deg"]
+__all__ = ["Data", "MatchesConfig", "data_sections", "names_nominal"]
 
 
 class Data(Section):
@@ -116,3 +121,130 @@ def _require_known(format: str, known: tuple[str, ...]) -> None:
 
 
 DataOfFormat = Annotated[SerializeAsAny[Data], WrapValidator(_of_its_format)]
+
+
+class Periods(Section):
+    """Periods whose models are compared."""
+
+    centres: list[float]
+    days: PositiveFloat
+
+
+class MatchesConfig(RunConfig):
+    """A run that begins with matched stars."""
+
+    campaign: ClassVar[None] = None
+    selfcal: ClassVar[None] = None
+    tables: ClassVar[TablesBlock] = TablesBlock()
+
+    data: DataOfFormat
+    model: MatchedModel
+    fit: Fit = Fit()
+    outliers: Outliers = Outliers()
+    sampler: Sampler = Sampler()
+    compute: ComputeBlock = ComputeBlock()
+    periods: Periods | None = None
+    holdout: HoldoutBlock | None = None
+    prior: list[PriorBlock] = Field(default_factory=list)
+    products: MatchedProducts = MatchedProducts()
+
+    @model_validator(mode="after")
+    def _one_array(self) -> MatchesConfig:
+        if self.data.one_array and self.chip:
+            raise ValueError(
+                f"matches of the format {self.data.format!r} are of one array; give "
+                "detector.size in place of [[chip]] blocks"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _jitter_beyond_quoted_errors(self) -> MatchesConfig:
+        by = self.outliers.jitter_by
+        if by != "auto" and self.data.sigma == "by_magnitude":
+            raise ValueError(
+                f"outliers.jitter_by is {by!r}, which is of quoted errors, and data.sigma = "
+                "'by_magnitude' takes errors of both axes from the residuals; leave it out, or "
+                "give columns of errors or a number"
+            )
+        if by == "chip" and not self.chip:
+            raise ValueError(
+                "outliers.jitter_by is 'chip', and there is one chip; leave it out, or give "
+                "[[chip]] blocks"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _matched_in_a_circle(self) -> MatchesConfig:
+        if self.data.has_nominal:
+            self.refuse_circle()
+        return self
+
+    @model_validator(mode="after")
+    def _periods_of_polynomials(self) -> MatchesConfig:
+        if self.periods is None:
+            return self
+        if self.model.frames != "none" or self.model.tdd is not None:
+            key = "tdd" if self.model.tdd is not None else "frames"
+            raise ValueError(
+                f"[periods] compares polynomials alone, and model.{key} is given; drop one of them"
+            )
+        if (self.data.columns or {}).get("epoch") == "":
+            raise ValueError(
+                "[periods] needs an epoch for every pair, and data.columns leaves the epoch out; "
+                "name its column there"
+            )
+        return self
+
+    @property
+    def compares_jitters(self) -> bool:
+        """Boolean: groups of stars may have jitters of their own, if the data ask for it."""
+        quoted = self.data.sigma != "by_magnitude"
+        return quoted and self.outliers.jitter == "fit" and self.outliers.jitter_by != "one"
+
+    def refuse_circle(self) -> None:
+        """Refuse what cannot go with matches in a circle about their nominal positions.
+
+        Raises
+        ------
+        ValueError
+            As validators raise it.
+        """
+        if self.outliers.match_radius is None:
+            return
+        head = "matches with nominal positions and outliers.match_radius are"
+        if self.data.sigma == "by_magnitude":
+            raise ValueError(
+                f"{head} cut by the match circle, and so are residuals, from which data.sigma = "
+                "'by_magnitude' takes the errors; give columns of errors, or a number"
+            )
+        if self.outliers.jitter_by not in ("auto", "one"):
+            raise ValueError(
+                f"{head} cut by the match circle, and so are residuals, from which "
+                "outliers.jitter_by takes the jitters of groups; leave it out"
+            )
+        if self.holdout is not None:
+            raise ValueError(
+                f"{head} cut by the match circle, which the prediction of [holdout] does not "
+                "know; leave [holdout] out, or the nominal positions"
+            )
+        if self.periods is not None:
+            raise ValueError(
+                f"{head} cut by the match circle, which draws the least-squares fits of [periods] "
+                "to the nominal solution; leave [periods] out, or the nominal positions"
+            )
+
+    def spans(self) -> dict[str, tuple[float, float]]:
+        """Begin and end of each of the periods, decimal years; empty where none are asked for."""
+        if self.periods is None:
+            return {}
+        centres = self.periods.centres
+        twice = next((c for c in centres if centres.count(c) > 1), None)
+        if twice is not None:
+            raise InputError(
+                f"the period centred on {twice:.10g} is given twice",
+                where="periods.centres",
+                do="give each once",
+            )
+        spans = mjd_periods(centres, self.periods.days)
+        check_periods(spans)
+        return spans

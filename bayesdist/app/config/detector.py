@@ -9,7 +9,15 @@ from pydantic import PositiveFloat
 from bayesdist.app.config.section import Section
 from bayesdist.model import Chip
 
-__all__ = ["ChipBlock", "Detector", "Pair", "chips_of", "reference_first", "require_detector"]
+__all__ = [
+    "ChipBlock",
+    "Detector",
+    "Pair",
+    "chips_of",
+    "one_chip",
+    "reference_first",
+    "require_detector",
+]
 
 Pair = tuple[PositiveFloat, PositiveFloat]
 
@@ -67,3 +75,11 @@ def chips_of(chips: Sequence[ChipBlock]) -> tuple[Chip, ...]:
     """Chips of the model."""
     blocks = reference_first(chips)
     return tuple(Chip(c.number, c.name, c.size, c.reference_pixel) for c in blocks)
+
+
+def one_chip(detector: Detector, reference_pixel: Pair | None, number: int, name: str) -> Chip:
+    """The chip of a detector that has one; its middle where no pixel is named."""
+    assert detector.size is not None  # `require_detector`
+    nx, ny = detector.size
+    middle = ((nx + 1) / 2, (ny + 1) / 2)
+    return Chip(number, detector.name or name, detector.size, reference_pixel or middle)

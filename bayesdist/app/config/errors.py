@@ -95,7 +95,7 @@ def as_config_error(
 
 
 def _unknown_key(kinds: Mapping[str, Kind], kind: str, location: Location) -> tuple[str, str]:
-    """What is wrong with a key that a kind does not know, and what to do."""
+    """Cause and advice for a key that a kind does not know."""
     parts = [part for part in location if isinstance(part, str) and not _is_branch(part)]
     name, path = parts[-1], ".".join(parts)
     if path in RENAMED:
@@ -111,7 +111,7 @@ def _unknown_key(kinds: Mapping[str, Kind], kind: str, location: Location) -> tu
 
 
 def _wanted(detail: Any) -> str:
-    """What would fit, in words."""
+    """Values that would fit, in words."""
     if detail["type"] == "list_type" and isinstance(detail["input"], dict):
         return "its header double brackets, for there may be several"
     if detail["type"] in _KINDS:

@@ -1,37 +1,23 @@
-"""The distortion model, and what is fitted with it; a kind of run has the keys that it uses.
-
-What a kind does not have is a constant of its class, so that nobody has to ask for the kind.
-"""
+"""The distortion model, its priors, and look-up tables; a kind of run has the keys that it uses."""
 
 from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, PositiveFloat
 
 from bayesdist.app.config.detector import Pair
 from bayesdist.app.config.section import Section
-from bayesdist.diagnose.correlated import DiscrepancyPriors
-from bayesdist.infer import Compute, OutlierMixture
 from bayesdist.model import FRAME_KINDS, TimeDependence
 
 __all__ = [
-    "CampaignFit",
     "CampaignModel",
-    "CampaignOutliers",
-    "ComputeBlock",
-    "DiscrepancyBlock",
-    "Fit",
     "MatchedModel",
-    "Outliers",
+    "Polynomials",
     "PriorBlock",
-    "Sampler",
     "SelfcalModel",
-    "SelfcalOutliers",
-    "SelfcalSampler",
+    "TablesBlock",
 ]
-
-# -- structure ------------------------------------------------------------------------------------
 
 
 class _Drift(Section):
@@ -59,19 +45,21 @@ class CampaignTdd(_Drift):
     rates: str = "free"
 
 
-class _Model(Section):
+class Polynomials(Section):
+    """Order of the polynomials, and where they are centred."""
+
     order: Annotated[int, Field(ge=1, le=9)]
     reference_pixel: Pair | None = None
 
 
-class MatchedModel(_Model):
+class MatchedModel(Polynomials):
     """Structure of the distortion model, with the frames of the exposures."""
 
     frames: Literal[FRAME_KINDS] = "none"  # type: ignore[valid-type]
     tdd: Tdd | None = None
 
 
-class CampaignModel(_Model):
+class CampaignModel(Polynomials):
     """Structure of the distortion model; the frames of the exposures are the campaign's own."""
 
     frames: ClassVar[Literal["none"]] = "none"
@@ -79,7 +67,7 @@ class CampaignModel(_Model):
     tdd: CampaignTdd | None = None
 
 
-class SelfcalModel(_Model):
+class SelfcalModel(Polynomials):
     """Structure of the distortion model; the frames of the exposures are in [selfcal]."""
 
     frames: ClassVar[Literal["none"]] = "none"
@@ -95,154 +83,10 @@ class PriorBlock(Section):
     sigma: PositiveFloat
 
 
-# -- fit and posterior ----------------------------------------------------------------------------
+class TablesBlock(Section):
+    """Look-up tables that are fitted: the detector's, or the filter's over those of a detector."""
 
-
-class _Fit(Section):
-    clip_chi2: PositiveFloat = 25.0
-    clip_abs: PositiveFloat = 2.0
-    skew: bool = False
-
-
-class Fit(_Fit):
-    """The linear fit."""
-
-    radial_weight: PositiveFloat = 1.0
-
-
-class CampaignFit(_Fit):
-    """The linear fit of a campaign."""
-
-    radial_weight: ClassVar[float] = 1.0
-
-
-class _Outliers(Section):
-    """Errors beyond the quoted ones, and the fraction of false matches."""
-
-    jitter: Literal["fit"] | Annotated[float, Field(ge=0)] = "fit"
-    fraction_prior: Pair = (1.0, 9.0)
-    jitter_scale: PositiveFloat | None = None
-
-
-class SelfcalOutliers(_Outliers):
-    """False detections, which are uniform within the radius of the match."""
-
-    match_radius: ClassVar[None] = None
-    outlier_scale: ClassVar[None] = None
-    jitter_by: ClassVar[Literal["auto"]] = "auto"
-
-    model: Literal["uniform"] = "uniform"
-
-    def mixture(self, match_radius: float | None = None) -> OutlierMixture:
-        """The outlier mixture within a radius of the match."""
-        return _mixture_of(self, match_radius)
-
-
-class _Mixture(_Outliers):
-    model: Literal["gaussian", "uniform", "none"] = "gaussian"
-    match_radius: PositiveFloat | None = None
-    outlier_scale: PositiveFloat | None = None
-
-    def mixture(self) -> OutlierMixture:
-        """The outlier mixture."""
-        return _mixture_of(self, self.match_radius)
-
-
-class CampaignOutliers(_Mixture):
-    """The outlier mixture of a campaign."""
-
-    jitter_by: ClassVar[Literal["auto"]] = "auto"
-
-
-class Outliers(_Mixture):
-    """The outlier mixture, with jitters of groups of stars."""
-
-    jitter_by: Literal["auto", "one", "chip", "exposure", "filter"] = "auto"
-
-    @model_validator(mode="after")
-    def _groups_of_what_is_fitted(self) -> Outliers:
-        if self.jitter_by not in ("auto", "one") and self.jitter != "fit":
-            raise ValueError(
-                f"outliers.jitter_by is {self.jitter_by!r}, and outliers.jitter gives the one "
-                "jitter of all stars; leave one of the two out"
-            )
-        return self
-
-
-def _mixture_of(block: SelfcalOutliers | _Mixture, match_radius: float | None) -> OutlierMixture:
-    """The outlier mixture of a block."""
-    return OutlierMixture(
-        model=block.model,
-        match_radius=match_radius,
-        jitter=None if block.jitter == "fit" else block.jitter,
-        fraction_prior=block.fraction_prior,
-        jitter_scale=block.jitter_scale,
-        outlier_scale=block.outlier_scale,
-    )
-
-
-class _Sampler(Section):
-    seed: Annotated[int, Field(ge=0)] = 1
-    ensembles: Annotated[int, Field(ge=2)] = 4
-    target_ess: PositiveFloat = 400.0
-    target_rhat: Annotated[float, Field(gt=1)] = 1.01
-    max_steps: PositiveInt = 20_000
-    checkpoint_every: PositiveInt = 200
-
-
-class Sampler(_Sampler):
-    """How to sample, when to stop, and from which seed."""
-
-    method: Literal["exact", "certified"] = "exact"
-    second_stage: Literal["auto", "always", "never"] = "auto"
-    walkers: PositiveInt | None = None
-
-
-class SelfcalSampler(_Sampler):
-    """When to stop, and from which seed."""
-
-    method: ClassVar[Literal["exact"]] = "exact"
-    second_stage: ClassVar[Literal["auto"]] = "auto"
-    walkers: ClassVar[None] = None
-
-
-class ComputeBlock(Section):
-    """Where the work is done."""
-
-    engine: Literal["threads", "dask"] = "threads"
-    scheduler: str | None = None
-    workers: PositiveInt | None = None
-    memory_mb: PositiveFloat = 1000.0
-
-    @model_validator(mode="after")
-    def _only_of_a_cluster(self) -> ComputeBlock:
-        for key in ("scheduler", "workers"):
-            if self.engine != "dask" and getattr(self, key) is not None:
-                raise ValueError(
-                    f"compute.{key} is given, but compute.engine is {self.engine!r}; set the "
-                    f"engine to 'dask', or leave {key} out"
-                )
-        if self.scheduler is not None and self.workers is not None:
-            raise ValueError(
-                "compute.workers is given, but the cluster of compute.scheduler has its own; "
-                "leave one of the two out"
-            )
-        return self
-
-    def resources(self) -> Compute:
-        """Where the work is done."""
-        return Compute(**self.model_dump())
-
-
-class DiscrepancyBlock(Section):
-    """Prior medians of what the model may leave out."""
-
-    higher_order: PositiveFloat = DiscrepancyPriors.higher_order
-    structure: PositiveFloat = DiscrepancyPriors.structure
-    exposure: PositiveFloat = DiscrepancyPriors.exposure
-    curvature: PositiveFloat = DiscrepancyPriors.curvature
-    star: PositiveFloat = DiscrepancyPriors.star
-
-    def priors(self) -> DiscrepancyPriors:
-        """The block as priors."""
-        return DiscrepancyPriors(**self.model_dump())
+    detector: str | None = None
+    method: Literal["field", "binned", "none"] = "field"
+    step: tuple[PositiveFloat, PositiveFloat] = (64.0, 64.0)
+    max_iterations: Annotated[int, Field(ge=1)] = 8

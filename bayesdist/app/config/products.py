@@ -2,16 +2,37 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
-from pydantic import create_model
+from pydantic import Field, PositiveFloat, create_model
 
-from bayesdist.app.config.campaign import ReleaseBlock
 from bayesdist.app.config.section import Section
 from bayesdist.products.formats.common.document import FormatSettings
 from bayesdist.products.registry import product_settings
 
-__all__ = ["CampaignProducts", "MatchedProducts", "Products", "SelfcalProducts"]
+__all__ = ["CampaignProducts", "MatchedProducts", "Products", "ReleaseBlock", "SelfcalProducts"]
+
+
+class PeriodBlock(Section):
+    """The years that one IDCTAB serves, and the segment of the drift that it holds."""
+
+    name: str
+    years: tuple[float, float]
+    segment: Annotated[int, Field(ge=0)] = 0
+    useafter: str | None = None
+    pedigree: str | None = None
+
+
+class ReleaseBlock(Section):
+    """IDCTABs, D2IMFILE and NPOLFILE, along V2 and V3 as an existing IDCTAB lies."""
+
+    name: str
+    reference: str
+    period: Annotated[list[PeriodBlock], Field(min_length=1)]
+    instrument: str = "ACS"
+    detector: str = "WFC"
+    scale_arcsec: PositiveFloat = 0.05
+    limit_mas: PositiveFloat = 0.1
 
 
 class Products(Section):

@@ -34,10 +34,6 @@ class _RequirementFile(Section):
 def load_config(path: str | Path) -> tuple[Config, str]:
     """Read a configuration file.
 
-    Parameters
-    ----------
-    path : path
-
     Returns
     -------
     config : Config
@@ -84,12 +80,7 @@ def config_of_record(settings: Mapping[str, Any], where: str) -> Config:
 
 
 def load_requirements(path: str | Path) -> tuple[Requirement, ...]:
-    """Read a file of ``[[requirement]]`` blocks.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Read a file of ``[[requirement]]`` blocks."""
     text, begin = load_text(path), "give it [[requirement]] blocks"
     blocks = validated(_RequirementFile, text, str(path), begin=begin).requirement
     try:
@@ -99,12 +90,7 @@ def load_requirements(path: str | Path) -> tuple[Requirement, ...]:
 
 
 def load_text(path: str | Path) -> str:
-    """Text of a file as it stands, with its line ends.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Text of a file as it stands, with its line ends."""
     try:
         with open(path, encoding="utf-8", newline="") as stream:
             return stream.read()
@@ -126,10 +112,6 @@ def validated(kind: type[Section], text: str, where: str, *, begin: str) -> Any:
         The file, for errors.
     begin : str
         What to do about an empty one.
-
-    Raises
-    ------
-    ConfigError
     """
     return _validated(TypeAdapter(kind), kind, _settings(text, where, begin=begin), where)
 

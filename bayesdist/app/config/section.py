@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict
 
-__all__ = ["Section"]
+__all__ = ["Section", "Unit"]
+
+Unit = Literal["pix", "arcsec", "mas", "deg"]
 
 
 class Section(BaseModel):

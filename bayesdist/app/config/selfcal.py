@@ -1,15 +1,46 @@
-"""What the configuration says of a self-calibration, and of what fixes its gauge."""
+"""A run that begins with star lists alone: its configuration, and what fixes its gauge."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, PositiveFloat, model_validator
 
 from bayesdist.app.config.campaign import StarListsBlock
-from bayesdist.app.config.section import Section
+from bayesdist.app.config.data import names_nominal
+from bayesdist.app.config.fit import ComputeBlock, Fit, SelfcalOutliers, SelfcalSampler
+from bayesdist.app.config.model import PriorBlock, SelfcalModel, TablesBlock
+from bayesdist.app.config.products import SelfcalProducts
+from bayesdist.app.config.run import RunConfig
+from bayesdist.app.config.section import Section, Unit
+from bayesdist.infer import OutlierMixture
 
-__all__ = ["GaugeBlock", "SelfcalBlock"]
+__all__ = [
+    "Frames",
+    "GaugeBlock",
+    "MinDetections",
+    "SelfcalBlock",
+    "SelfcalConfig",
+    "require_scales",
+]
+
+Frames = Literal["shift", "shift_rotation", "shift_rotation_scale"]
+MinDetections = Annotated[int, Field(ge=2)]
+
+
+def require_scales(sigma: float | None, frames: Frames) -> None:
+    """Refuse a scatter of the scales of exposures that have none.
+
+    Raises
+    ------
+    ValueError
+        As validators raise it.
+    """
+    if sigma is not None and "scale" not in frames:
+        raise ValueError(
+            "gauge.exposure_scale_sigma is given, and the exposures have no scales; set "
+            "selfcal.frames to 'shift_rotation_scale'"
+        )
 
 
 class SelfcalBlock(StarListsBlock):
@@ -19,10 +50,10 @@ class SelfcalBlock(StarListsBlock):
     sigma: Literal["measured"] | PositiveFloat = "measured"
     initial_distortion: str | None = None
     unit: Literal["pix", "arcsec", "mas"] = "pix"
-    frames: Literal["shift", "shift_rotation", "shift_rotation_scale"] = "shift_rotation"
+    frames: Frames = "shift_rotation"
     match_radius: PositiveFloat = 0.5
     start_radius: PositiveFloat | None = None
-    min_detections: Annotated[int, Field(ge=2)] = 2
+    min_detections: MinDetections = 2
     max_iterations: Annotated[int, Field(ge=2)] = 12
     motion: Literal["none", "proper_motion", "parallax"] = "none"
 
@@ -49,14 +80,14 @@ class ReferenceBlock(Section):
 
     catalog: str
     columns: dict[str, str] | None = None
-    unit: Literal["pix", "arcsec", "mas", "deg"] | None = None
+    unit: Unit | None = None
     epoch: float | None = None
     tangent_point: tuple[float, float] | None = None
     radius: PositiveFloat = 2.0
 
 
 class GaugeBlock(Section):
-    """What is known beside the detections: each piece with its error."""
+    """Constraints beside the detections, each with its error."""
 
     offsets: str | None = None
     offset_sigma: PositiveFloat | None = None
@@ -74,3 +105,55 @@ class GaugeBlock(Section):
                     f"offsets, or leave {key} out"
                 )
         return self
+
+
+class SelfcalConfig(RunConfig):
+    """A run that begins with star lists alone."""
+
+    data: ClassVar[None] = None
+    campaign: ClassVar[None] = None
+    tables: ClassVar[TablesBlock] = TablesBlock()
+    fit: ClassVar[Fit] = Fit()
+    compute: ClassVar[ComputeBlock] = ComputeBlock()
+    periods: ClassVar[None] = None
+    holdout: ClassVar[None] = None
+
+    selfcal: SelfcalBlock
+    gauge: GaugeBlock = GaugeBlock()
+    model: SelfcalModel
+    outliers: SelfcalOutliers = SelfcalOutliers()
+    sampler: SelfcalSampler = SelfcalSampler()
+    prior: list[PriorBlock] = Field(default_factory=list)
+    products: SelfcalProducts = SelfcalProducts()
+
+    @model_validator(mode="after")
+    def _no_nominal_positions(self) -> SelfcalConfig:
+        if names_nominal(self.selfcal.columns):
+            raise ValueError(
+                "nominal positions are of matches in [data], and a [selfcal] finds its matches "
+                "itself; leave u_nominal and v_nominal out"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _errors_of_frames_that_are_fitted(self) -> SelfcalConfig:
+        require_scales(self.gauge.exposure_scale_sigma, self.selfcal.frames)
+        if self.gauge.roll_sigma_deg is not None and "rotation" not in self.selfcal.frames:
+            raise ValueError(
+                "gauge.roll_sigma_deg is given, and the exposures have no rotations; set "
+                "selfcal.frames to 'shift_rotation'"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _size_of_a_pixel(self) -> SelfcalConfig:
+        angles = self.gauge.scale is not None or self.gauge.reference is not None
+        if (angles or self.selfcal.unit != "pix") and self.detector.scale_mas is None:
+            raise ValueError(
+                "detector.scale_mas is missing, which turns pixels into seconds of arc; give it"
+            )
+        return self
+
+    def mixture(self) -> OutlierMixture:
+        """The outlier mixture."""
+        return self.outliers.mixture(self.selfcal.match_radius)

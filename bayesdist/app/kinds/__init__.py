@@ -1,1 +1,1 @@
-"""What `match`, `fit` and `sample` make of each kind of run, as values and pure functions."""
+"""Values and pure functions of `match`, `fit` and `sample`, for each kind of run."""

@@ -21,7 +21,7 @@ COLUMNS = ("mag", "sigma_u", "sigma_v", "n", "scatter_u", "scatter_v")
 
 @dataclass(frozen=True, eq=False)
 class ErrorLaw:
-    """How errors of stars follow from those that their table quotes.
+    """Law by which errors of stars follow from those that their table quotes.
 
     Parameters
     ----------

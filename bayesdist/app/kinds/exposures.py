@@ -1,4 +1,4 @@
-"""What a joint fit of exposures finds of their linear terms: how they scatter, and each alone."""
+"""Linear terms of exposures that were fitted jointly: their scatter, and those of each alone."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FIT_AGAIN = "run the stage 'fit' again"
 
 @dataclass(frozen=True, eq=False)
 class ExposureScatter:
-    """How the linear terms of exposures scatter about those of the model.
+    """Scatter of the linear terms of exposures about those of the model.
 
     Parameters
     ----------

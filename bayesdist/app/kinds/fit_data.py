@@ -101,7 +101,7 @@ class FitData:
 
     @property
     def error_scale_sentence(self) -> str:
-        """What was done to quoted errors that are far too small; empty where they will do."""
+        """Sentence on quoted errors that are far too small; empty where they will do."""
         if self.fitted.errors.factor == 1.0:
             return ""
         return error_scale_sentence(

@@ -1,8 +1,8 @@
-"""What the stage 'fit' makes: the least-squares solution, and what its stars were given."""
+"""Artefact of the stage 'fit': the least-squares solution, and what its stars were given."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -10,20 +10,34 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.kinds.errors import ErrorLaw
-from bayesdist.app.kinds.exposures import FIT_AGAIN, ExposureScatter, write_hierarchy, write_series
-from bayesdist.app.kinds.table_file import StoredLookupTables, write_tables
+from bayesdist.app.kinds.errors import ErrorLaw, read_magnitude_errors
+from bayesdist.app.kinds.exposures import (
+    FIT_AGAIN,
+    ExposureScatter,
+    read_hierarchy,
+    read_series,
+    write_hierarchy,
+    write_series,
+)
+from bayesdist.app.kinds.table_file import StoredLookupTables, read_tables, write_tables
+from bayesdist.app.matches.added_errors import grouped_errors_of
 from bayesdist.app.selfcal.solved import SelfCalibrated
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
-from bayesdist.infer import GaussianPriors, LinearFit, save_fit
+from bayesdist.infer import GaussianPriors, LinearFit, load_fit, save_fit
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.nodes import corrected_matches, inside_chips, on_the_chips
 from bayesdist.infer.series import Series
+from bayesdist.model import DistortionModel
 
-__all__ = ["FIT", "TABLES", "Fitted", "required"]
+__all__ = ["Fitted", "load_fitted", "required"]
 
 FIT, TABLES = "fit.nc", "tables.h5"
+
+SECTIONS = (  # of summary.json, which only the making of the fit knows
+    *("gauge", "lines", "tables", "scatter"),
+    *("deviations", "exposures_skipped", "exposures_outlying", "selfcal"),
+)
 
 T = TypeVar("T")
 
@@ -90,6 +104,55 @@ class Fitted:
             write_series(folder, self.alone)
         if self.solved is not None:
             self.solved.save(folder)
+
+
+def load_fitted(
+    folder: Path,
+    summary: Mapping[str, Any],
+    *,
+    joint: bool = False,
+    priors: Callable[[DistortionModel], GaussianPriors] = GaussianPriors.none,
+    solved: Callable[[DistortionModel], SelfCalibrated] | None = None,
+) -> Fitted:
+    """The fit of an earlier stage.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the run.
+    summary : mapping
+        Content of summary.json.
+    joint : bool
+        Exposures were fitted jointly.
+    priors : callable
+        Of the model, where they were not.
+    solved : callable, optional
+        Of the model: the solution of detections, where the fit has one.
+
+    Raises
+    ------
+    InputError
+        For missing or damaged files.
+    """
+    linear, known = load_fit(folder / FIT), summary.get("fit", {})
+    grouped = grouped_errors_of(known.get("added_errors"))
+    scatter, own_priors = read_hierarchy(folder) if joint else (None, priors(linear.model))
+    return Fitted(
+        linear,
+        ErrorLaw(
+            float(known.get("error_scale", 1.0)),
+            read_magnitude_errors(folder),
+            None if grouped is None else grouped.added,
+            with_catalogue=joint,
+        ),
+        own_priors,
+        grouped,
+        read_tables(folder / TABLES, do=FIT_AGAIN),
+        scatter,
+        read_series(folder) if joint else None,
+        None if solved is None else solved(linear.model),
+        {name: summary[name] for name in SECTIONS if name in summary},
+    )
 
 
 def required(part: T | None, what: str) -> T:

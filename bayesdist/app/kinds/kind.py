@@ -1,4 +1,4 @@
-"""What the three kinds of runs do in their own way: all that comes before the posterior."""
+"""The three kinds of runs, which differ in all that comes before the posterior."""
 
 from __future__ import annotations
 
@@ -7,29 +7,30 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from bayesdist.app.campaign.check import campaign_lines
-from bayesdist.app.campaign.fit import fit_campaign, load_fitted_campaign
+from bayesdist.app.campaign.fit import fit_campaign
+from bayesdist.app.campaign.input_validation import refuse_campaign
 from bayesdist.app.campaign.inputs import read_campaign
 from bayesdist.app.campaign.matched import campaign_matches, load_matched_campaign
 from bayesdist.app.campaign.matching import match_lists
-from bayesdist.app.campaign.soundness import refuse_campaign
+from bayesdist.app.campaign.preview import campaign_lines
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.kinds.fitted import Fitted, load_fitted
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.kinds.stars import (
     fit_stars,
-    load_fitted_stars,
     match_stars,
+    priors_of,
     read_stars,
     sample_stars,
 )
-from bayesdist.app.selfcal.check import selfcal_lines
-from bayesdist.app.selfcal.fit import fit_selfcal, load_fitted_selfcal, sample_detections
-from bayesdist.app.selfcal.given import read_given, refuse_given
+from bayesdist.app.selfcal.fit import fit_selfcal, sample_detections
+from bayesdist.app.selfcal.inputs import read_selfcal, refuse_selfcal
 from bayesdist.app.selfcal.matched import load_matched_selfcal, selfcal_matches
 from bayesdist.app.selfcal.matching import match_dithers
+from bayesdist.app.selfcal.preview import selfcal_lines
+from bayesdist.app.selfcal.solved import read_solution, solved_of
 from bayesdist.infer import Posterior
 
 __all__ = ["Kind", "kind_of"]
@@ -50,7 +51,7 @@ class Sampler(Protocol):
 
 @dataclass(frozen=True)
 class Kind:
-    """Matched stars, a campaign, or a self-calibration.
+    """Matched stars, a campaign, or a self-calibration; each takes configurations of its own type.
 
     Parameters
     ----------
@@ -83,60 +84,66 @@ class Kind:
     rows: str
     chooser: str
     begins_with: str
-    read: Callable[[Config, Path], Any]
-    refuse: Callable[[Any, Config, Path], None]
-    match: Callable[[Any, Config, Path], Matched]
+    read: Callable[[Any, Path], Any]
+    refuse: Callable[[Any, Any, Path], None]
+    match: Callable[[Any, Any, Path], Matched]
     fit: Callable[[Matched, Config, Path, StarReader], Fitted]
     sample: Sampler
-    load_matched: Callable[[Path, Any, Config, Path, Mapping[str, Any]], Matched]
+    load_matched: Callable[[Path, Any, Any, Path, Mapping[str, Any]], Matched]
     load_fitted: Callable[[Path, Callable[[], Matched], Config, Mapping[str, Any]], Fitted]
-    lines: Callable[[Any, Config], Iterator[str] | None]
+    lines: Callable[[Any, Any], Iterator[str] | None]
 
 
 MATCHES = Kind(
-    "stars",
-    "least-squares fit",
-    "fit",
-    read_stars,
-    lambda inputs, config, base: None,  # what is wrong shows in their fit
-    match_stars,
-    lambda matched, config, base, reader: fit_stars(matched, config, reader=reader),
-    sample_stars,
-    lambda folder, inputs, config, base, summary: match_stars(inputs, config, base),
-    lambda folder, matched, config, summary: load_fitted_stars(folder, config, summary),
-    lambda inputs, config: None,
+    rows="stars",
+    chooser="least-squares fit",
+    begins_with="fit",
+    read=read_stars,
+    refuse=lambda inputs, config, base: None,  # what is wrong shows in their fit
+    match=lambda inputs, config, base: match_stars(inputs, config),
+    fit=lambda matched, config, base, reader: fit_stars(matched, config, reader=reader),
+    sample=sample_stars,
+    load_matched=lambda folder, inputs, config, base, summary: match_stars(inputs, config),
+    load_fitted=lambda folder, matched, config, summary: load_fitted(
+        folder, summary, priors=lambda model: priors_of(model, config)
+    ),
+    lines=lambda inputs, config: None,
 )
 
 CAMPAIGN = Kind(
-    "stars",
-    "least-squares fit",
-    "match",
-    read_campaign,
-    refuse_campaign,
-    match_lists,
-    lambda matched, config, base, reader: fit_campaign(campaign_matches(matched), config, base),
-    sample_stars,
-    lambda folder, inputs, config, base, summary: load_matched_campaign(
-        folder, config, inputs, summary
+    rows="stars",
+    chooser="least-squares fit",
+    begins_with="match",
+    read=read_campaign,
+    refuse=lambda inputs, config, base: refuse_campaign(inputs),
+    match=lambda inputs, config, base: match_lists(inputs),
+    fit=lambda matched, config, base, reader: fit_campaign(campaign_matches(matched)),
+    sample=sample_stars,
+    load_matched=lambda folder, inputs, config, base, summary: load_matched_campaign(
+        folder, inputs, summary
     ),
-    lambda folder, matched, config, summary: load_fitted_campaign(folder, summary),
-    campaign_lines,
+    load_fitted=lambda folder, matched, config, summary: load_fitted(folder, summary, joint=True),
+    lines=lambda inputs, config: campaign_lines(inputs),
 )
 
 SELFCAL = Kind(
-    "detections",
-    "limits of residuals",
-    "match",
-    read_given,
-    refuse_given,
-    match_dithers,
-    lambda matched, config, base, reader: fit_selfcal(selfcal_matches(matched)),
-    sample_detections,
-    lambda folder, inputs, config, base, summary: load_matched_selfcal(folder, inputs, summary),
-    lambda folder, matched, config, summary: load_fitted_selfcal(
-        folder, selfcal_matches(matched()), summary
+    rows="detections",
+    chooser="limits of residuals",
+    begins_with="match",
+    read=read_selfcal,
+    refuse=lambda inputs, config, base: refuse_selfcal(inputs),
+    match=lambda inputs, config, base: match_dithers(inputs),
+    fit=lambda matched, config, base, reader: fit_selfcal(selfcal_matches(matched)),
+    sample=sample_detections,
+    load_matched=lambda folder, inputs, config, base, summary: load_matched_selfcal(
+        folder, inputs, summary
     ),
-    lambda inputs, config: selfcal_lines(inputs),
+    load_fitted=lambda folder, matched, config, summary: load_fitted(
+        folder,
+        summary,
+        solved=lambda model: solved_of(selfcal_matches(matched()), model, read_solution(folder)),
+    ),
+    lines=lambda inputs, config: selfcal_lines(inputs),
 )
 
 

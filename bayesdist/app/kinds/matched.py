@@ -1,4 +1,4 @@
-"""What the stage 'match' makes: the stars of a run, and what is known of their matching."""
+"""Artefact of the stage 'match': the stars of a run, and what is known of their matching."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.config import Config
 from bayesdist.app.tables.output import write_table
+from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.infer import Posterior
@@ -38,6 +40,8 @@ class Matched:
         Section of summary.json; empty for stars that were given as matches.
     table : astropy.table.Table or None
         One row for each exposure; None for stars that were given as matches.
+    catalogue : ReferenceCatalog or None
+        That the stars were matched with; None where only the matches are known.
 
     Attributes
     ----------
@@ -55,10 +59,11 @@ class Matched:
     whole: tuple[str, ...] = ()
     facts: Mapping[str, Any] = field(default_factory=dict)
     table: Table | None = None
+    catalogue: ReferenceCatalog | None = None
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What was odd in the matching, each as a clause."""
+        """Warnings of the matching, each as a clause."""
         return tuple(self.facts.get("warnings", ()))
 
     @property
@@ -74,12 +79,12 @@ class Matched:
     @property
     def states_errors(self) -> bool:
         """Boolean: the catalogue has columns of errors."""
-        return False
+        return self.catalogue is not None and self.catalogue.sigma_u is not None
 
     @property
     def states_motion_errors(self) -> bool:
         """Boolean: the catalogue has columns of errors of proper motions."""
-        return False
+        return self.catalogue is not None and self.catalogue.sigma_pm_u is not None
 
     @property
     def star_errors(self) -> StarErrors | None:
@@ -89,15 +94,23 @@ class Matched:
     @property
     def catalogue_name(self) -> str:
         """Name of the file of the reference catalogue, or what it is."""
-        return "catalogue"
+        return "catalogue" if self.catalogue is None else Path(self.catalogue.source).name
 
     def with_motions(self, table: Matches) -> Matches:
         """Matches with what the catalogue states of the motions of their stars."""
-        return table
+        catalog = self.catalogue
+        if catalog is None or catalog.pm_u is None or catalog.sigma_pm_u is None:
+            return table
+        if table.star is None:
+            return table
+        columns = {}
+        for name in ("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"):
+            by_code = np.zeros(int(catalog.star.max()) + 1)
+            by_code[catalog.star] = getattr(catalog, name)
+            columns[name] = by_code[table.star]
+        return table.with_columns(**columns)
 
-    def overlap(
-        self, posterior: Posterior, tables: tuple[LookupTable, ...], config: Config, base: Path
-    ) -> OverlapTest | None:
+    def overlap(self, posterior: Posterior, tables: tuple[LookupTable, ...]) -> OverlapTest | None:
         """Two exposures far apart in time laid on each other; None where none are known so."""
         return None
 

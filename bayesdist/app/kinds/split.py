@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bayesdist.app.config import Config
-from bayesdist.app.config.holdout import HoldoutBlock
+from bayesdist.app.config.fit import HoldoutBlock
 from bayesdist.data.holdout import HoldoutSpec, exposures_drawn, split_matches
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError

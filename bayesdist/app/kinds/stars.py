@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from bayesdist.app.config import Config
-from bayesdist.app.kinds.errors import QUOTED, ErrorLaw, read_magnitude_errors
+from bayesdist.app.config import Config, MatchesConfig
+from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.fitted import FIT, Fitted
+from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.kinds.split import set_aside
-from bayesdist.app.matches.added_errors import compared_errors, grouped_errors_of, knows_circle
+from bayesdist.app.matches.added_errors import compared_errors, knows_circle
 from bayesdist.app.matches.reading import check_chips
 from bayesdist.app.matches.sources import read_configured
 from bayesdist.assess import SAMPLE
 from bayesdist.data import Matches
 from bayesdist.diagnose.residuals.quoted import error_scale
-from bayesdist.errors import ConfigError, DegenerateError, InputError, NotSettledError
+from bayesdist.errors import ConfigError, DegenerateError, NotSettledError
 from bayesdist.infer import (
     GaussianPriors,
     LinearFit,
@@ -31,7 +30,6 @@ from bayesdist.infer import (
     build_model,
     fit_by_magnitude,
     fit_linear,
-    load_fit,
     sample,
 )
 from bayesdist.infer.exposures.frame_choice import frames_that_help
@@ -40,7 +38,6 @@ from bayesdist.model import DistortionModel
 
 __all__ = [
     "fit_stars",
-    "load_fitted_stars",
     "match_stars",
     "model_of",
     "priors_of",
@@ -52,21 +49,8 @@ __all__ = [
 SAMPLING = 1  # of the random streams that follow from the one seed: that of the stage 'sample'
 
 
-def match_stars(stars: Matches, config: Config, base: Path) -> Matched:
+def match_stars(stars: Matches, config: MatchesConfig) -> Matched:
     """Matched stars of a configuration, those that are fitted and those that are held out.
-
-    Parameters
-    ----------
-    stars : Matches
-        As `read_stars` reads them.
-    config : Config
-        With a section [data].
-    base : Path
-        Folder that its files are relative to.
-
-    Returns
-    -------
-    Matched
 
     Raises
     ------
@@ -84,7 +68,7 @@ def match_stars(stars: Matches, config: Config, base: Path) -> Matched:
     return Matched(*set_aside(config, stars))
 
 
-def read_stars(config: Config, base: Path) -> Matches:
+def read_stars(config: MatchesConfig, base: Path) -> Matches:
     """The matched stars that a configuration names.
 
     Raises
@@ -92,10 +76,7 @@ def read_stars(config: Config, base: Path) -> Matches:
     InputError
         For a configuration that names none, and for files that cannot be read.
     """
-    data = config.data
-    if data is None:
-        raise InputError("names no matched stars", where="data", do="give data.matches")
-    names = data.matches
+    data, names = config.data, config.data.matches
     path = base / names if isinstance(names, str) else [base / name for name in names]
     return read_configured(path, data, size=config.detector.size, chips=config.chip)
 
@@ -130,10 +111,6 @@ def fit_stars(matched: Matched, config: Config, *, reader: StarReader | None = N
     config : Config
     reader : StarReader, optional
         Has the stars in the end, for the passes that follow.
-
-    Returns
-    -------
-    Fitted
 
     Raises
     ------
@@ -207,28 +184,6 @@ def priors_of(model: DistortionModel, config: Config) -> GaussianPriors:
     return GaussianPriors.of(model, {p.parameter: (p.mean, p.sigma) for p in config.prior})
 
 
-def load_fitted_stars(folder: Path, config: Config, summary: Mapping[str, Any]) -> Fitted:
-    """The fit of an earlier stage.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the run.
-    config : Config
-    summary : mapping
-        Content of summary.json.
-    """
-    linear, known = load_fit(folder / FIT), summary.get("fit", {})
-    by_magnitude = config.data is not None and config.data.sigma == "by_magnitude"
-    grouped = grouped_errors_of(known.get("added_errors"))
-    errors = ErrorLaw(
-        float(known.get("error_scale", 1.0)),
-        read_magnitude_errors(folder) if by_magnitude else None,
-        None if grouped is None else grouped.added,
-    )
-    return Fitted(linear, errors, priors_of(linear.model, config), grouped)
-
-
 def sample_stars(
     data: FitData,
     config: Config,
@@ -236,39 +191,18 @@ def sample_stars(
     folder: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Posterior:
-    """The posterior of a fit; of exposures that were fitted jointly with the chips averaged.
-
-    Parameters
-    ----------
-    data : FitData
-    config : Config
-    folder : Path, optional
-        For checkpoints.
-    progress : callable, optional
-        Called with (steps made, most steps).
-
-    Returns
-    -------
-    Posterior
-    """
-    s = config.sampler
+    """The posterior of a fit; of exposures that were fitted jointly with the chips averaged."""
     posterior = sample(
         data.fit,
         data.shards,
         outliers=config.mixture(),
         priors=data.fitted.priors,
-        seed=s.seed,
-        ensembles=s.ensembles,
-        walkers=s.walkers,
-        target_ess=s.target_ess,
-        target_rhat=s.target_rhat,
-        max_steps=s.max_steps,
-        checkpoint_every=s.checkpoint_every,
         folder=folder,
         progress=progress,
-        method=s.method,
-        second_stage=s.second_stage,
+        **config.sampler.model_dump(),
     )
     if data.fitted.scatter is None:
         return posterior
-    return data.fitted.scatter.averaged(posterior, np.random.default_rng([s.seed, SAMPLING]))
+    return data.fitted.scatter.averaged(
+        posterior, np.random.default_rng([config.sampler.seed, SAMPLING])
+    )

@@ -132,7 +132,7 @@ def _table(found: Sequence[PlannedPattern]) -> Table:
 
 
 def _record(one: PlannedPattern) -> dict[str, Any]:
-    """What scripts read of a pattern; what is unbounded is null there."""
+    """Record of a pattern for scripts; what is unbounded is null there."""
     gauge, problem = one.solution.gauge, one.solution.problem
     return {
         "name": one.pattern.name,

@@ -14,12 +14,15 @@ from bayesdist.app.config import (
     Detector,
     chips_of,
     load_text,
+    one_chip,
     reference_first,
     require_detector,
     require_own_names,
     validated,
 )
+from bayesdist.app.config.model import Polynomials
 from bayesdist.app.config.section import Section
+from bayesdist.app.config.selfcal import Frames, MinDetections, require_scales
 from bayesdist.assess.planning.dithers import Camera, PlannedStars, PriorInformation
 from bayesdist.model import Chip
 from bayesdist.simulate.dithers import dither_pattern
@@ -43,28 +46,21 @@ class PlannedChip(ChipBlock):
     place: tuple[float, float] | None = None
 
 
-class PlannedModel(Section):
-    """The polynomials."""
-
-    order: Annotated[int, Field(ge=1, le=9)]
-    reference_pixel: Pair | None = None
-
-
 class PlannedSelfcal(Section):
-    """What of a self-calibration matters before there are detections."""
+    """Settings of a self-calibration that matter before there are detections."""
 
-    frames: Literal["shift", "shift_rotation", "shift_rotation_scale"] = "shift_rotation"
-    min_detections: Annotated[int, Field(ge=2)] = 2
+    frames: Frames = "shift_rotation"
+    min_detections: MinDetections = 2
 
 
 class PlannedScale(Section):
-    """How well the size of a pixel will be known."""
+    """Error with which the size of a pixel will be known."""
 
     sigma: PositiveFloat
 
 
 class PlannedGauge(Section):
-    """What will be known beside the detections: each piece by its error."""
+    """Constraints that there will be beside the detections, each by its error."""
 
     offset_sigma: PositiveFloat | None = None
     roll_sigma_deg: PositiveFloat | None = None
@@ -134,7 +130,7 @@ class PlanConfig(Section):
 
     detector: Detector = Detector()
     chip: list[PlannedChip] = Field(default_factory=list)
-    model: PlannedModel
+    model: Polynomials
     selfcal: PlannedSelfcal = PlannedSelfcal()
     gauge: PlannedGauge = PlannedGauge()
     stars: StarsBlock
@@ -148,11 +144,7 @@ class PlanConfig(Section):
             raise ValueError(
                 "some [[chip]] blocks have a place and some have none; give all or none"
             )
-        if self.gauge.exposure_scale_sigma is not None and "scale" not in self.selfcal.frames:
-            raise ValueError(
-                "gauge.exposure_scale_sigma is given, and the exposures have no scales; set "
-                "selfcal.frames to 'shift_rotation_scale'"
-            )
+        require_scales(self.gauge.exposure_scale_sigma, self.selfcal.frames)
         return self
 
     @model_validator(mode="after")
@@ -177,9 +169,7 @@ class PlanConfig(Section):
         """Chips of the model, also for a detector of one."""
         if self.chip:
             return chips_of(self.chip)
-        nx, ny = size = self.detector.size  # type: ignore[misc]
-        middle = self.model.reference_pixel or ((nx + 1) / 2, (ny + 1) / 2)
-        return (Chip(1, self.detector.name or "detector", size, middle),)  # type: ignore[arg-type]
+        return (one_chip(self.detector, self.model.reference_pixel, 1, "detector"),)
 
     def camera(self) -> Camera:
         """The detector that is planned for."""
@@ -195,7 +185,7 @@ class PlanConfig(Section):
         return PlannedStars(s.per_detector, s.sigma, s.false, least, s.seed)
 
     def known(self) -> PriorInformation:
-        """What will be known beside the detections."""
+        """Constraints that there will be beside the detections."""
         g = self.gauge
         return PriorInformation(
             g.offset_sigma,

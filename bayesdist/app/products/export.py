@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.app.assessment.error_terms import published_tables
-from bayesdist.app.campaign.release import write_files
 from bayesdist.app.config import Config
+from bayesdist.app.exposures.release_files import write_files
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.products.made_files import ProductInput, made_files
 from bayesdist.app.products.sky_closure import sky_closure

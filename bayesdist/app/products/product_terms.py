@@ -17,8 +17,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.release import write_files
 from bayesdist.app.config import Config
+from bayesdist.app.exposures.release_files import write_files
 from bayesdist.app.products.file_positions import sip_positions
 from bayesdist.app.products.made_files import ProductInput, made_files
 from bayesdist.assess.solution import place_of

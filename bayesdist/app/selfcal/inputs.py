@@ -1,158 +1,247 @@
-"""What a self-calibration begins with: detections of all exposures, dates, VAFACTOR, offsets."""
+"""Inputs of a self-calibration: detections, and all that is known beside them."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.inputs import cuts_of, lists_of
-from bayesdist.app.config import Config
-from bayesdist.app.config.selfcal import SelfcalBlock
-from bayesdist.app.matches.reading import check_chips
-from bayesdist.data import ReferenceCatalog, StarList, read_catalog, read_exposures
+from bayesdist.app.campaign.inputs import lists_of
+from bayesdist.app.config import SelfcalConfig
+from bayesdist.app.kinds.star_lists import lists_of, refuse_other_chips
+from bayesdist.app.selfcal.commanded import Commanded, read_commanded
+from bayesdist.app.selfcal.known import GaugeConstraints
+from bayesdist.app.selfcal.start import started
+from bayesdist.calibration.plane import ARCSEC
+from bayesdist.data import ReferenceCatalog, read_catalog, read_exposures
 from bayesdist.data.detections import Detections, detections_of
 from bayesdist.data.matching.frames import refuse_duplicates
-from bayesdist.data.tables.column import SourceColumn
-from bayesdist.data.tables.files import read_table
-from bayesdist.data.tables.names import find_columns
-from bayesdist.data.tables.units import conversion
-from bayesdist.errors import ConfigError, InputError
+from bayesdist.data.sky.earth import parallax_factors
+from bayesdist.errors import InputError
+from bayesdist.infer.selfcal import ReferenceStars
+from bayesdist.infer.selfcal.problem import Problem, prepare
+from bayesdist.infer.selfcal.tangent import TangentPlane
+from bayesdist.model import DistortionModel
 
-__all__ = [
-    "Commanded",
-    "Inputs",
-    "read_commanded",
-    "read_inputs",
-    "read_references",
-    "selfcal_block",
-]
+__all__ = ["Inputs", "read_selfcal", "refuse_selfcal"]
 
 log = logging.getLogger("bayesdist")
 
 Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-
-_COLUMNS = {
-    "exposure": ("exposure", "name", "rootname"),
-    "du": ("du", "postarg1", "dx"),
-    "dv": ("dv", "postarg2", "dy"),
-    "sigma": ("sigma",),
-    "roll": ("roll",),
-    "group": ("group", "guide_stars"),
-}
 
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Detections of all exposures.
+    """Detections, and what is known of exposures and stars.
 
     Parameters
     ----------
+    config : SelfcalConfig
+    base : Path
+        Folder that its files are relative to.
     detections : Detections
         That pass the cuts; without star codes.
     n_read : int
         Detections of the lists.
-    rejected : dict of str to int
+    rejected : mapping of str to int
         Those that were cut, by reason.
-    sources : tuple of str
     dilation : ndarray, shape (E,), or None
         VAFACTOR, where the log has it.
+    catalog : ReferenceCatalog or None
+        Reference stars, where there are any.
+    commanded : Commanded or None
+        Commanded offsets and rolls, where there are any.
     """
 
+    config: SelfcalConfig
+    base: Path
     detections: Detections
     n_read: int
-    rejected: dict[str, int]
-    sources: tuple[str, ...]
-    dilation: Float | None
+    rejected: Mapping[str, int]
+    dilation: Float | None = None
+    catalog: ReferenceCatalog | None = None
+    commanded: Commanded | None = None
+
+    @property
+    def unit_arcsec(self) -> float | None:
+        """Size of the unit of u, v; None where nobody says what a pixel is."""
+        return _unit_arcsec(self.config)
+
+    @property
+    def jitter(self) -> float | None:
+        """The jitter in pixels that is held; None where it is fitted."""
+        jitter = self.config.outliers.jitter
+        return None if jitter == "fit" else float(jitter)
+
+    @property
+    def references(self) -> ReferenceStars | None:
+        """Reference stars among the detected ones; None where there are none."""
+        reference = self.config.gauge.reference
+        if self.catalog is None or reference is None:
+            return None
+        return ReferenceStars(self.catalog, reference.radius)
+
+    @property
+    def tangent_plane(self) -> TangentPlane | None:
+        """Tangent plane of the reference stars, or of the first exposure; None without a scale."""
+        if self.unit_arcsec is None:
+            return None
+        point = None if self.config.gauge.reference is None else (0.0, 0.0)
+        return TangentPlane(self.unit_arcsec, point)
+
+    @cached_property
+    def parallax_factors(self) -> Float | None:
+        """Parallax factors (E, 2) of exposures along u and v; None where stars have no parallax.
+
+        Raises
+        ------
+        InputError
+            Where the field's place on the sky is not known, or the exposures have no dates.
+        """
+        if self.config.selfcal.motion != "parallax":
+            return None
+        epoch = self.detections.epoch
+        if self.catalog is None or self.catalog.tangent_point is None:
+            raise InputError(
+                "asks for parallaxes, and nothing says where on the sky the field lies",
+                where="selfcal.motion",
+                do="give reference stars with ra and dec in gauge.reference",
+            )
+        if epoch is None:
+            raise InputError(
+                "asks for parallaxes, and the exposures have no dates",
+                where="selfcal.motion",
+                do="give an exposure log with epochs",
+            )
+        return parallax_factors(epoch, *self.catalog.tangent_point)
+
+    @cached_property
+    def start(self) -> tuple[DistortionModel, Float]:
+        """Model, and parameters (D,) by which the detections of a star lie near each other.
+
+        Raises
+        ------
+        InputError
+            As `started`.
+        """
+        given = self.detections, self.unit_arcsec, self.catalog, self.commanded
+        return started(self.config, self.base, *given)
+
+    def known_for(self, model: DistortionModel) -> GaugeConstraints:
+        """Constraints on the gauge beside the detections.
+
+        Raises
+        ------
+        InputError
+            As `GaugeConstraints.of`.
+        """
+        return GaugeConstraints.of(self.config, model, self.commanded, self.unit_arcsec)
+
+    def problem(
+        self, model: DistortionModel, detections: Detections, theta: Float, first: Float
+    ) -> Problem:
+        """Detections of stars, linearised at parameters (D,) near the solution.
+
+        Parameters
+        ----------
+        model : DistortionModel
+        detections : Detections
+            With codes of stars and errors.
+        theta : ndarray, shape (D,)
+        first : ndarray, shape (D,)
+            By which reference stars are found among the detected ones.
+        """
+        block = self.config.selfcal
+        problem = prepare(
+            model,
+            detections,
+            theta,
+            match_radius=block.match_radius,
+            min_detections=block.min_detections,
+            motion=block.motion,
+            parallax_factors=self.parallax_factors,
+            dilation=self.dilation,
+        )
+        references = self.references
+        if references is None:
+            return problem
+        return replace(problem, priors=references(problem, first))
 
 
-@dataclass(frozen=True, eq=False)
-class Commanded:
-    """Where exposures were to point.
-
-    Parameters
-    ----------
-    offsets : ndarray, shape (E, 2)
-        Along u and v, NaN where there is none; None in a file of rolls alone.
-    sigma : ndarray, shape (E,)
-        Of each, on one axis.
-    roll : ndarray, shape (E,), or None
-        Radians, from u to v.
-    group : ndarray of int, shape (E,)
-        Exposures with the same guide stars.
-    """
-
-    offsets: Float | None
-    sigma: Float
-    roll: Float | None
-    group: Int
-
-
-def selfcal_block(config: Config) -> SelfcalBlock:
-    """The self-calibration's part of a configuration.
-
-    Raises
-    ------
-    ConfigError
-        Where it has none.
-    """
-    if config.selfcal is None:
-        raise ConfigError("names no star lists", where="selfcal", do="give the section [selfcal]")
-    return config.selfcal
-
-
-def read_inputs(config: Config, base: Path) -> Inputs:
-    """Read the lists of a self-calibration.
+def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
+    """Read all that a self-calibration begins with; paths are relative to `base`.
 
     Raises
     ------
     InputError
-        For files that cannot be read, a single exposure, one that stands there twice, chips without
-        stars, and exposures that the log does not have.
+        For files that cannot be read, a list of which nothing passes the cuts, a single exposure,
+        one that stands there twice, detections off the chips, exposures that the log does not have,
+        and as `read_commanded`.
     """
-    block = selfcal_block(config)
-    cuts, rejected, used = cuts_of(block), dict[str, int](), list[StarList]()
-    lists = lists_of(block, base)
-    for one in lists:
-        good, reasons = cuts.passed(one)
-        for reason, count in reasons.items():
-            rejected[reason] = rejected.get(reason, 0) + count
+    block, gauge = config.selfcal, config.gauge
+    found = lists_of(block, base)
+    for one, good in zip(found.lists, found.passed, strict=True):
         if not good.any():
             raise InputError(
                 f"no detection of exposure {one.exposure} passes the cuts",
                 where=one.source,
                 do="widen them, or leave the exposure out",
             )
-        used.append(one.select(good))
+    used = [one.select(good) for one, good in zip(found.lists, found.passed, strict=True)]
+    names = [one.exposure for one in used]
     if len(used) < 2:
         raise InputError(
-            f"there is one exposure, {used[0].exposure}, and distortion shows between exposures",
+            f"there is one exposure, {names[0]}, and distortion shows between exposures",
             where=used[0].source,
             do="give dithered exposures of one field",
         )
-    check_chips(config.chips(), sorted({int(n) for one in used for n in one.chips}))
+    refuse_other_chips(used, config.chips(), "selfcal.lists")
     refuse_duplicates(
-        [np.column_stack([one.x, one.y, one.chip]) for one in used],
-        [one.exposure for one in used],
-        source="selfcal.lists",
+        [np.column_stack([one.x, one.y, one.chip]) for one in used], names, source="selfcal.lists"
     )
-    epoch, dilation = _of_log(config, base, [one.exposure for one in used])
+    epoch, dilation = _of_log(config, base, names)
     if epoch is None and all(one.epoch is not None for one in used):
-        epoch = np.array([one.epoch for one in used], float)
+        epoch = [one.epoch for one in used if one.epoch is not None]
     sigma = None if block.sigma == "measured" else float(block.sigma)
-    detections = detections_of(used, epoch=epoch, sigma=sigma)
-    sources = tuple(dict.fromkeys(one.source for one in used))
-    return Inputs(detections, sum(len(one) for one in lists), rejected, sources, dilation)
+    commanded, catalog = None, _read_references(config, base)
+    if gauge.offsets is not None:
+        commanded = read_commanded(
+            base / gauge.offsets, names, block.unit, config.detector.scale_mas, gauge.offset_sigma
+        )
+    return Inputs(
+        config,
+        base,
+        detections_of(used, epoch=epoch, sigma=sigma),
+        len(found),
+        found.cut,
+        dilation,
+        catalog,
+        commanded,
+    )
 
 
-def _of_log(config: Config, base: Path, names: Sequence[str]) -> tuple[Float | None, Float | None]:
+def refuse_selfcal(inputs: Inputs) -> None:
+    """Refuse exposures that cannot be laid onto each other, and a start that cannot be read."""
+    model, _ = inputs.start
+    inputs.known_for(model)
+
+
+def _unit_arcsec(config: SelfcalConfig) -> float | None:
+    """Size of the unit of u and v; None for pixels of a size that nobody gives."""
+    scale = config.detector.scale_mas
+    return ARCSEC.get(config.selfcal.unit, None if scale is None else scale / 1000)
+
+
+def _of_log(
+    config: SelfcalConfig, base: Path, names: Sequence[str]
+) -> tuple[list[float] | None, Float | None]:
     """Dates and VAFACTOR of the exposures, where there is a log."""
-    exposures = selfcal_block(config).exposures
+    exposures = config.selfcal.exposures
     if exposures is None:
         return None, None
     log = read_exposures(base / exposures)
@@ -165,104 +254,10 @@ def _of_log(config: Config, base: Path, names: Sequence[str]) -> tuple[Float | N
             where=log.source,
             do="give it for all exposures, or for none",
         )
-    return np.array([one.epoch for one in found]), factors if known.all() else None
+    return [one.epoch for one in found], factors if known.all() else None
 
 
-def read_commanded(
-    path: Path, names: Sequence[str], unit: str, scale_mas: float | None, sigma: float | None
-) -> Commanded:
-    """Commanded offsets and rolls of exposures from a table.
-
-    Parameters
-    ----------
-    path : Path
-        Columns exposure, du and dv along u and v, sigma, roll in degrees from u to v, group.
-    names : sequence of str
-        Exposures, in their order.
-    unit : str
-        Of u and v, for columns without one.
-    scale_mas : float, optional
-        Size of a pixel, where units have to be converted.
-    sigma : float, optional
-        Of the offsets, where the table has no such column.
-
-    Raises
-    ------
-    InputError
-        For files that cannot be read, missing columns or values, and units that do not go together.
-    """
-    table = read_table(path)
-    found = find_columns(table.colnames, None, _COLUMNS, source=str(path))
-    if "exposure" not in found or ("du" in found) != ("dv" in found):
-        raise InputError(
-            f"no columns exposure, du and dv among {', '.join(table.colnames) or 'none'}",
-            where=str(path),
-            do="name the exposures and their offsets along u and v",
-        )
-
-    def column(key: str) -> SourceColumn:
-        return SourceColumn(table[found[key]], str(path), found[key])
-
-    def length(key: str) -> Float:
-        own = column(key).unit
-        return column(key).numbers() * (1.0 if own is None else _factor(own, unit, scale_mas, path))
-
-    codes, labels = column("exposure").labels()
-    row_of = {labels[code]: k for k, code in enumerate(codes)}
-    if len(row_of) < len(codes):
-        twice = labels[int(np.argmax(np.bincount(codes)))]
-        raise InputError(
-            f"exposure {twice} stands there twice", where=str(path), do="keep one row of each"
-        )
-    rows = np.array([row_of.get(name, -1) for name in names])
-    if (rows < 0).all():
-        raise InputError(
-            f"has none of the exposures {', '.join(names[:3])}, ...",
-            where=str(path),
-            do="name them as the lists do",
-        )
-
-    def of_each(values: Float, missing: float = np.nan) -> Float:
-        return np.where(rows >= 0, values[rows], missing)
-
-    offsets, error = None, np.full(len(names), np.nan if sigma is None else sigma)
-    if "du" in found:
-        offsets = np.stack([of_each(length("du")), of_each(length("dv"))], axis=1)
-        if "sigma" in found and sigma is None:
-            error = of_each(length("sigma"), 1.0)
-        if not (error > 0).all():
-            raise InputError(
-                "the offsets have no errors",
-                where=str(path),
-                do="give a column sigma above zero, or gauge.offset_sigma",
-            )
-    group = np.zeros(len(names), np.int64)
-    if "group" in found:
-        group = np.where(rows >= 0, column("group").labels()[0][rows], -1)
-    roll = np.radians(of_each(column("roll").numbers())) if "roll" in found else None
-    return Commanded(offsets, error, roll, group)
-
-
-def _factor(own: str, unit: str, scale_mas: float | None, path: Path) -> float:
-    """What one `own` is in `unit`, pixels among them."""
-    if own == unit:
-        return 1.0
-    if "pix" not in (own, unit):
-        return conversion(own, unit, where=str(path))
-    if scale_mas is None:
-        raise InputError(
-            f"offsets are in {own}, and u and v in {unit}",
-            where=str(path),
-            do="give detector.scale_mas, by which one is the other",
-        )
-    if own == "pix":
-        return conversion("mas", unit, where=str(path)) * scale_mas
-    return conversion(own, "mas", where=str(path)) / scale_mas
-
-
-def read_references(
-    config: Config, base: Path, unit_arcsec: float | None
-) -> ReferenceCatalog | None:
+def _read_references(config: SelfcalConfig, base: Path) -> ReferenceCatalog | None:
     """The reference stars, in the unit of u and v; None where there are none.
 
     Raises
@@ -270,7 +265,7 @@ def read_references(
     InputError
         As `read_catalog`, and for stars without errors.
     """
-    block = config.gauge.reference
+    block, unit_arcsec = config.gauge.reference, _unit_arcsec(config)
     if block is None or unit_arcsec is None:  # the configuration asks for a scale with references
         return None
     catalog = read_catalog(
@@ -291,8 +286,8 @@ def read_references(
             "a reference star has the error zero", where=catalog.source, do="drop it, or correct it"
         )
     catalog = _with_motions(catalog)
-    own = {"arcsec": 1.0, "mas": 1e-3, "deg": 3600.0}.get(catalog.unit, unit_arcsec)
-    return catalog.rescaled(own / unit_arcsec, selfcal_block(config).unit)
+    own = ARCSEC.get(catalog.unit, unit_arcsec)
+    return catalog.rescaled(own / unit_arcsec, config.selfcal.unit)
 
 
 def _with_motions(catalog: ReferenceCatalog) -> ReferenceCatalog:

@@ -13,18 +13,17 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.kinds.matched import Matched
-from bayesdist.app.selfcal.given import Given
+from bayesdist.app.selfcal.inputs import Inputs
 from bayesdist.app.selfcal.matches import matches_of
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
-from bayesdist.infer.selfcal import SelfCalibration
 from bayesdist.infer.selfcal.elimination import Mixture
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import DistortionModel
 
-__all__ = ["SelfcalMatched", "load_matched_selfcal", "matched_of", "selfcal_matches"]
+__all__ = ["SelfcalMatched", "load_matched_selfcal", "selfcal_matched", "selfcal_matches"]
 
 Float = NDArray[np.float64]
 
@@ -38,7 +37,7 @@ class SelfcalMatched(Matched):
 
     Parameters
     ----------
-    given : Given
+    inputs : Inputs
     detections : Detections
         With their stars and errors, on one tangent plane.
     problem : Problem
@@ -49,21 +48,18 @@ class SelfcalMatched(Matched):
         Its stars.
     mixture : Mixture
         Its errors.
-    magnitudes : tuple of ndarray, or None
-        Magnitudes and errors in pixels, where these were measured.
     """
 
     section: ClassVar[str] = "selfcal"
     has_catalogue: ClassVar[bool] = False
 
     stars: Matches
-    given: Given = field(kw_only=True)
+    inputs: Inputs = field(kw_only=True)
     detections: Detections = field(kw_only=True)
     problem: Problem = field(kw_only=True)
     theta: Float = field(kw_only=True)
     places: Float = field(kw_only=True)
     mixture: Mixture = field(kw_only=True)
-    magnitudes: tuple[Float, Float] | None = field(kw_only=True, default=None)
 
     @property
     def tangent_point(self) -> None:
@@ -83,26 +79,8 @@ class SelfcalMatched(Matched):
         arrays["mixture"] = np.array([m.jitter, m.fraction])
         text = json.dumps(self.problem.model.to_dict())
         arrays["model"] = np.frombuffer(text.encode(), np.uint8)
-        if self.magnitudes is not None:
-            arrays["magnitudes"] = np.stack(self.magnitudes)
         write_arrays(folder / DETECTIONS, "", arrays)
         super().save(folder)
-
-
-def matched_of(
-    found: SelfCalibration, given: Given, facts: Mapping[str, Any], table: Table
-) -> SelfcalMatched:
-    """What a self-calibration made of its detections, as later stages take it."""
-    solution = found.mode
-    return _matched(
-        given,
-        found.detections,
-        solution.problem.model,
-        (solution.theta, solution.stars, solution.mixture),
-        facts=facts,
-        table=table,
-        magnitudes=found.magnitude_errors,
-    )
 
 
 def selfcal_matches(matched: Matched) -> SelfcalMatched:
@@ -118,16 +96,10 @@ def selfcal_matches(matched: Matched) -> SelfcalMatched:
     return matched
 
 
-def load_matched_selfcal(folder: Path, given: Given, summary: Mapping[str, Any]) -> SelfcalMatched:
+def load_matched_selfcal(
+    folder: Path, inputs: Inputs, summary: Mapping[str, Any]
+) -> SelfcalMatched:
     """The detections of an earlier stage.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the run.
-    given : Given
-    summary : mapping
-        Content of summary.json.
 
     Raises
     ------
@@ -137,7 +109,7 @@ def load_matched_selfcal(folder: Path, given: Given, summary: Mapping[str, Any])
     arrays = read_arrays(folder / DETECTIONS, "", ARRAYS, do="run the stage 'match' again")
     model = DistortionModel.from_dict(json.loads(arrays["model"].astype(np.uint8).tobytes()))
     detections = replace(
-        given.inputs.detections,
+        inputs.detections,
         x=arrays["x"],
         y=arrays["y"],
         star=arrays["star"].astype(np.int64),
@@ -145,31 +117,30 @@ def load_matched_selfcal(folder: Path, given: Given, summary: Mapping[str, Any])
     )
     mixture = Mixture(*(float(value) for value in arrays["mixture"]))
     first = arrays["theta"], arrays["stars"], mixture
-    return _matched(given, detections, model, first, facts=summary.get("selfcal", {}))
+    return selfcal_matched(inputs, detections, model, first, facts=summary.get("selfcal", {}))
 
 
-def _matched(
-    given: Given,
+def selfcal_matched(
+    inputs: Inputs,
     detections: Detections,
     model: DistortionModel,
     first: tuple[Float, Float, Mixture],
     *,
     facts: Mapping[str, Any],
     table: Table | None = None,
-    magnitudes: tuple[Float, Float] | None = None,
 ) -> SelfcalMatched:
+    """Detections with codes of stars and errors, by a first solution: parameters, stars, errors."""
     theta, places, mixture = first
-    problem = given.problem(model, detections, theta, theta)
+    problem = inputs.problem(model, detections, theta, theta)
     unused = facts.get("detections", {}).get("unused", {})
     return SelfcalMatched(
-        matches_of(problem, places, detections, given.inputs, unused),
+        matches_of(problem, places, detections, inputs, unused),
         facts=facts,
         table=table,
-        given=given,
+        inputs=inputs,
         detections=detections,
         problem=problem,
         theta=theta,
         places=places,
         mixture=mixture,
-        magnitudes=magnitudes,
     )

@@ -78,7 +78,7 @@ def matches_of(
 
 
 def _axes(W: Float) -> Float:
-    """What a pixel of error is along u and along v, (N, 2): of W^-1."""
+    """Error along u and along v (N, 2) of a pixel of error: of W^-1."""
     det = W[:, 0] * W[:, 2] - W[:, 1] ** 2
     return np.sqrt(np.stack([W[:, 2], W[:, 0]], axis=1) / det[:, None])
 

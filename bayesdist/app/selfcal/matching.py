@@ -1,21 +1,17 @@
-"""How the detections of a self-calibration became stars, exposure by exposure."""
+"""Detections of a self-calibration become stars, exposure by exposure."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.app.config import Config
-from bayesdist.app.selfcal.given import Given
 from bayesdist.app.selfcal.inputs import Inputs
-from bayesdist.app.selfcal.matched import SelfcalMatched, matched_of
+from bayesdist.app.selfcal.matched import SelfcalMatched, selfcal_matched
 from bayesdist.data.detections import NO_STAR, Detections
 from bayesdist.data.matching.pairs import hull_of, inside_hull
 from bayesdist.errors import DegenerateError, InputError, NotSettledError
@@ -25,112 +21,67 @@ from bayesdist.infer.selfcal.elimination import memberships
 from bayesdist.infer.selfcal.tangent import places_of
 from bayesdist.model import DistortionModel
 
-__all__ = ["Matching", "calibrated", "half_turned", "match_dithers", "matching_of"]
+__all__ = [
+    "calibrated",
+    "exposure_table",
+    "match_dithers",
+    "matching_facts",
+    "refuse_unconnected",
+    "rolled_180",
+]
 
 log = logging.getLogger("bayesdist")
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-STRANGE = 0.5  # of the usual share of common detections: an exposure that does not fit
+FEW_COMMON = 0.5  # of the usual fraction of common detections: an exposure that does not fit
 HALF_TURN = np.radians(10.0)  # from half a turn
 TURN_BACK = "turn its pixels back by 180 degrees if they were turned, or leave it out"
-AMBIGUOUS = 0.05  # share of groups of which it is not clear what they are, that is worth a warning
+AMBIGUOUS = 0.05  # fraction of groups that may be of one star or several, worth a warning
 
 
-@dataclass(frozen=True, eq=False)
-class Matching:
-    """How detections became stars.
-
-    Parameters
-    ----------
-    table : astropy.table.Table
-        One row for each exposure: detections, those that lie where other exposures look, those that
-        are of a common star, that share, rms in pixels, shift and rotation.
-    summary : dict
-        For summary.json.
-    """
-
-    table: Table
-    summary: dict[str, Any]
-
-    @property
-    def sentence(self) -> str:
-        """Stars, detections and exposures, in a line."""
-        n = self.summary
-        return (
-            f"{n['n_stars']} stars of {n['detections']['used']} of {n['detections']['read']} "
-            f"detections in {n['n_exposures']} exposures, {n['n_ambiguous']} ambiguous groups"
-        )
-
-    def refuse_strangers(self) -> None:
-        """Refuse an exposure that hardly shares stars with the others where they overlap.
-
-        Raises
-        ------
-        InputError
-            Naming it, and whether it lies half a turn from the others.
-        """
-        share = np.asarray(self.table["share_common"], float)
-        if len(share) < 3:  # of two nobody knows which one is wrong
-            return
-        usual = np.array([np.nanmedian(np.delete(share, k)) for k in range(len(share))])
-        strange = share < STRANGE * usual
-        if not strange.any():
-            return
-        k = int(np.nanargmin(np.where(strange, share / usual, np.nan)))
-        name = str(self.table["exposure"][k])
-        half = k in half_turned(np.radians(np.asarray(self.table["rotation"], float)))
-        turned = ", and it lies half a turn from all the others" if half else ""
-        raise InputError(
-            f"exposure {name} has {100 * share[k]:.0f} % of its detections where others look in "
-            f"common with them, and the usual share is {100 * usual[k]:.0f} %{turned}",
-            where="selfcal.lists",
-            do=TURN_BACK
-            if half
-            else "check its pixels and its commanded offset and roll, or leave it out",
-        )
-
-
-def match_dithers(given: Given, config: Config, base: Path) -> SelfcalMatched:
+def match_dithers(inputs: Inputs) -> SelfcalMatched:
     """Detections of dithered exposures with their stars, and a first solution.
-
-    Parameters
-    ----------
-    given : Given
-        As `read_given` reads it.
-    config : Config
-        With a section [selfcal].
-    base : Path
-        Folder that its files are relative to.
-
-    Returns
-    -------
-    SelfcalMatched
 
     Raises
     ------
     BayesdistError
         As `calibrated`, and for an exposure that hardly shares stars with the others.
     """
-    found = calibrated(given, lambda text: log.info("match: %s", text))
-    matching = matching_of(found, given.inputs, given.block.min_detections)
-    matching.refuse_strangers()
-    for text in matching.summary["warnings"]:
+    found = calibrated(inputs, lambda text: log.info("match: %s", text))
+    table, facts = exposure_table(found, inputs), matching_facts(found, inputs)
+    refuse_unconnected(table)
+    for text in facts["warnings"]:
         log.warning("match: WARNING: %s", text)
-    log.info("match: %s", matching.sentence)
-    if given.tangent_plane is not None:
-        moved = matching.summary["tangent_planes_pix"]
+    log.info(
+        "match: %d stars of %d of %d detections in %d exposures, %d ambiguous groups",
+        facts["n_stars"],
+        facts["detections"]["used"],
+        facts["detections"]["read"],
+        facts["n_exposures"],
+        facts["n_ambiguous"],
+    )
+    if inputs.tangent_plane is not None:
+        moved = facts["tangent_planes_pix"]
         log.info("match: detections moved by up to %.2g pix onto one tangent plane", moved)
-    return matched_of(found, given, matching.summary, matching.table)
+    s = found.mode
+    return selfcal_matched(
+        inputs,
+        found.detections,
+        s.problem.model,
+        (s.theta, s.stars, s.mixture),
+        facts=facts,
+        table=table,
+    )
 
 
-def calibrated(given: Given, report: Callable[[str], None]) -> SelfCalibration:
+def calibrated(inputs: Inputs, report: Callable[[str], None]) -> SelfCalibration:
     """Stars and solution of a self-calibration.
 
     Parameters
     ----------
-    given : Given
+    inputs : Inputs
     report : callable
         Called with what happens, in words.
 
@@ -140,28 +91,28 @@ def calibrated(given: Given, report: Callable[[str], None]) -> SelfCalibration:
         As `self_calibrate`; where that does not settle and one exposure lies half a turn from
         all the others, naming it.
     """
-    (model, theta), block = given.start, given.block
+    (model, theta), block = inputs.start, inputs.config.selfcal
     try:
         return self_calibrate(
             model,
-            given.inputs.detections,
+            inputs.detections,
             theta,
-            prior_at=given.known_for(model),
+            prior_at=inputs.known_for(model),
             match_radius=block.match_radius,
             start_radius=block.start_radius,
             min_detections=block.min_detections,
             motion=block.motion,
-            parallax_factors=given.parallax_factors,
-            dilation=given.inputs.dilation,
-            jitter=given.jitter,
-            references=given.references,
-            plane=given.tangent_plane,
+            parallax_factors=inputs.parallax_factors,
+            dilation=inputs.dilation,
+            jitter=inputs.jitter,
+            references=inputs.references,
+            plane=inputs.tangent_plane,
             max_iterations=block.max_iterations,
             log=report,
         )
     except (NotSettledError, DegenerateError) as error:
         frames = [model.frame(theta, e)[0] for e in range(len(model.exposures))]
-        turned = half_turned(np.array([np.arctan2(M[1, 0], M[0, 0]) for M in frames]))
+        turned = rolled_180(np.array([np.arctan2(M[1, 0], M[0, 0]) for M in frames]))
         if not turned:
             raise
         name = model.exposures[turned[0]]
@@ -172,7 +123,7 @@ def calibrated(given: Given, report: Callable[[str], None]) -> SelfCalibration:
         ) from error
 
 
-def half_turned(rolls: Float) -> list[int]:
+def rolled_180(rolls: Float) -> list[int]:
     """Exposures that lie half a turn from all the others, of at least three."""
     if len(rolls) < 3:
         return []
@@ -181,24 +132,18 @@ def half_turned(rolls: Float) -> list[int]:
     return np.flatnonzero((np.abs(off) < HALF_TURN).all(axis=1)).tolist()
 
 
-def matching_of(found: SelfCalibration, inputs: Inputs, least: int) -> Matching:
-    """Count what a self-calibration made of its detections.
+def exposure_table(found: SelfCalibration, inputs: Inputs) -> Table:
+    """One row for each exposure: its detections, those in common with others, rms, and its frame.
 
-    Parameters
-    ----------
-    found : SelfCalibration
-    inputs : Inputs
-    least : int
-        Fewest detections of a star.
+    'overlapping' are detections that lie where other exposures look, 'common' those of them that
+    are of a common star, 'share_common' is that fraction; rms in pixels.
     """
-    s, d, friends = found.mode, found.detections, found.friends
-    p, model = s.problem, s.problem.model
-    E = len(d.exposure_names)
+    s, d = found.mode, found.detections
+    p, model, E = s.problem, s.problem.model, len(d.exposure_names)
     used = np.zeros(len(d), bool)
     used[p.rows] = True
-    seen = _seen_by_others(
-        model, s.theta, places_of(model, d, s.theta, inputs.dilation), d.exposure
-    )
+    places = places_of(model, d, s.theta, inputs.dilation)
+    seen = _seen_by_others(model, s.theta, places, d.exposure)
     total, overlap, common = (
         np.bincount(d.exposure[which], minlength=E)
         for which in (np.ones(len(d), bool), seen, used & seen)
@@ -209,27 +154,59 @@ def matching_of(found: SelfCalibration, inputs: Inputs, least: int) -> Matching:
     weight = np.bincount(exposure, w, minlength=E)
     rms = np.sqrt(np.bincount(exposure, w * square, minlength=E) / np.maximum(2 * weight, 1e-9))
     frames = [model.frame(s.theta, e) for e in range(E)]
-    table = Table(
-        {
-            "exposure": list(d.exposure_names),
-            "detections": total,
-            "overlapping": overlap,
-            "common": common,
-            "share_common": common / np.maximum(overlap, 1),
-            "rms": rms,
-            "shift_u": [shift[0] for _, shift in frames],
-            "shift_v": [shift[1] for _, shift in frames],
-            "rotation": [np.degrees(np.arctan2(M[1, 0], M[0, 0])) for M, _ in frames],
-        }
+    units = {"rms": "pix", "shift_u": model.unit, "shift_v": model.unit, "rotation": "deg"}
+    columns = {
+        "exposure": list(d.exposure_names),
+        "detections": total,
+        "overlapping": overlap,
+        "common": common,
+        "share_common": common / np.maximum(overlap, 1),
+        "rms": rms,
+        "shift_u": [shift[0] for _, shift in frames],
+        "shift_v": [shift[1] for _, shift in frames],
+        "rotation": [np.degrees(np.arctan2(M[1, 0], M[0, 0])) for M, _ in frames],
+    }
+    return Table(columns, units=units)
+
+
+def refuse_unconnected(table: Table) -> None:
+    """Refuse an exposure that hardly shares stars with the others where they overlap.
+
+    `table` is as `exposure_table` makes it.
+
+    Raises
+    ------
+    InputError
+        Naming it, and whether it lies half a turn from the others.
+    """
+    share = np.asarray(table["share_common"], float)
+    if len(share) < 3:  # of two nobody knows which one is wrong
+        return
+    usual = np.array([np.nanmedian(np.delete(share, k)) for k in range(len(share))])
+    few = share < FEW_COMMON * usual
+    if not few.any():
+        return
+    k = int(np.nanargmin(np.where(few, share / usual, np.nan)))
+    name = str(table["exposure"][k])
+    half = k in rolled_180(np.radians(np.asarray(table["rotation"], float)))
+    turned = ", and it lies half a turn from all the others" if half else ""
+    raise InputError(
+        f"exposure {name} has {100 * share[k]:.0f} % of its detections where others look in "
+        f"common with them, and the usual share is {100 * usual[k]:.0f} %{turned}",
+        where="selfcal.lists",
+        do=TURN_BACK
+        if half
+        else "check its pixels and its commanded offset and roll, or leave it out",
     )
-    table["rms"].unit, table["rotation"].unit = "pix", "deg"
-    for name in ("shift_u", "shift_v"):
-        table[name].unit = model.unit
+
+
+def matching_facts(found: SelfCalibration, inputs: Inputs) -> dict[str, Any]:
+    """Section 'selfcal' of summary.json: how detections became stars."""
+    d, friends, p = found.detections, found.friends, found.mode.problem
     counts = np.bincount(d.star[d.star != NO_STAR], minlength=friends.n_stars)
-    few = (counts > 1) & (counts < least)
-    alone = int((counts == 1).sum())
+    few = (counts > 1) & (counts < inputs.config.selfcal.min_detections)
     unused = {
-        "of a star that one exposure alone has": alone,
+        "of a star that one exposure alone has": int((counts == 1).sum()),
         "of a star with too few detections": int(counts[few].sum()),
         "second detection of a star in an exposure": friends.n_dropped,
         "in a chain of several stars": int((d.star == NO_STAR).sum()) - friends.n_dropped,
@@ -240,15 +217,15 @@ def matching_of(found: SelfCalibration, inputs: Inputs, least: int) -> Matching:
             f"{friends.n_ambiguous} groups of detections are ambiguous beside {p.n_stars} stars: "
             "the field is crowded for this match radius"
         )
-    summary = {
-        "n_exposures": E,
+    return {
+        "n_exposures": len(d.exposure_names),
         "n_stars": p.n_stars,
         "n_ambiguous": friends.n_ambiguous,
         "n_doubled": friends.n_doubled,
         "n_chains": friends.n_chains,
         "rounds": found.iterations,
         "match_radius": p.match_radius,
-        "tangent_planes_pix": _moved(d, inputs),
+        "tangent_planes_pix": _moved(d, inputs.detections),
         "detections": {
             "read": inputs.n_read,
             "cut": dict(inputs.rejected),
@@ -258,12 +235,10 @@ def matching_of(found: SelfCalibration, inputs: Inputs, least: int) -> Matching:
         "per_star": {"median": float(np.median(p.counts)), "most": int(p.counts.max())},
         "warnings": warnings,
     }
-    return Matching(table, summary)
 
 
-def _moved(detections: Detections, inputs: Inputs) -> float:
-    """How far a detection was moved at most to lie on the tangent plane of all, pixels."""
-    raw = inputs.detections
+def _moved(detections: Detections, raw: Detections) -> float:
+    """Largest distance, in pixels, by which a detection was moved onto the common tangent plane."""
     return float(np.hypot(detections.x - raw.x, detections.y - raw.y).max())
 
 

@@ -1,4 +1,4 @@
-"""What the report shows of a self-calibration, put together from its results."""
+"""Content of the report of a self-calibration, from its results."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["selfcal_results"]
 
 
 def selfcal_results(results: Results) -> SelfcalResults:
-    """What a self-calibration adds to the report of its run.
+    """Content that a self-calibration adds to the report of its run.
 
     Parameters
     ----------

@@ -10,18 +10,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.selfcal.gauge import gauge_table, gauge_words
+from bayesdist.app.selfcal.gauge import fixed_by, gauge_table, gauge_words
+from bayesdist.app.selfcal.matched import SelfcalMatched
+from bayesdist.app.selfcal.matches import matches_of
 from bayesdist.app.tables.output import write_table
 from bayesdist.data.matches import Matches
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal import Gauge, SelfCalibrationMode
+from bayesdist.infer.selfcal.elimination import Mixture, expand
+from bayesdist.infer.selfcal.gauge import Decision
+from bayesdist.infer.selfcal.mode import gauge_of
+from bayesdist.model import DistortionModel
 
-__all__ = ["SelfCalibrated", "arrays_of", "read_solution"]
+__all__ = ["SelfCalibrated", "arrays_of", "read_solution", "solved_of"]
 
 Float = NDArray[np.float64]
 
 SOLUTION, GAUGE = "solution.h5", "gauge.ecsv"
 ARRAYS = ("theta", "stars", "mixture", "held", "n_free", "reference")
+RELINEARISED = 3  # times a problem is linearised anew about a solution that is read
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,3 +93,38 @@ def read_solution(folder: Path) -> dict[str, NDArray[Any]]:
         For a missing or damaged file.
     """
     return read_arrays(folder / SOLUTION, "", ARRAYS, do="run the stage 'fit' again")
+
+
+def solved_of(
+    matched: SelfcalMatched, model: DistortionModel, arrays: Mapping[str, NDArray[Any]]
+) -> SelfCalibrated:
+    """The solution that `arrays_of` made arrays of: what the fit has is what later stages read."""
+    inputs, held = matched.inputs, arrays["held"].astype(np.int64)
+    theta, stars = arrays["theta"], arrays["stars"]
+    jitter, fraction = (float(v) for v in arrays["mixture"])
+    n_null, n_open = (int(n) for n in arrays["n_free"])
+    mixture, known = Mixture(jitter, fraction), inputs.known_for(model)
+    problem = inputs.problem(model, matched.detections, theta, matched.theta)
+    for _ in range(RELINEARISED):
+        problem = problem.at(theta, stars)
+    found = expand(problem, theta, mixture, stars)
+    solution = SelfCalibrationMode(
+        problem,
+        theta,
+        problem.found_again(theta, found.stars),
+        mixture,
+        np.setdiff1d(np.arange(model.n_params), held),
+        found,
+        known(arrays["reference"]),
+        Decision(n_null, n_open, held),
+    )
+    gauge = gauge_of(problem, theta, known(theta), solution)
+    places = solution.stars
+    return SelfCalibrated(
+        solution,
+        gauge,
+        fixed_by(gauge, solution, known),
+        matches_of(problem, places, matched.detections, inputs, matched.unused),
+        arrays,
+        tuple(known.contradictions(theta)),
+    )

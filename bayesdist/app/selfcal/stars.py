@@ -35,18 +35,13 @@ MANY = 100_000  # stars, above which there is a Parquet file beside the table
 def write_stars(results: Results) -> dict[str, Any]:
     """Write stars.ecsv, and of many stars stars.parquet.
 
-    Parameters
-    ----------
-    results : Results
-        Of a self-calibration.
-
     Returns
     -------
     dict
         For summary.json.
     """
     solved = required(results.fitted.solved, "solution of detections")
-    solution, references = solved.mode, selfcal_matches(results.matched).given.catalog
+    solution, references = solved.mode, selfcal_matches(results.matched).inputs.catalog
     correlated = results.diagnostics.correlated
     cov = None if correlated is None else correlated.covariance
     found = star_catalogue(solution, cov)

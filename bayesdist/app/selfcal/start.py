@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.inputs import start_of
-from bayesdist.app.config import Config
-from bayesdist.app.selfcal.inputs import Commanded, Inputs, selfcal_block
+from bayesdist.app.config import SelfcalConfig, one_chip
+from bayesdist.app.kinds.star_lists import positions_by_chip, start_of
+from bayesdist.app.selfcal.commanded import Commanded
 from bayesdist.data import ReferenceCatalog
+from bayesdist.data.detections import Detections
 from bayesdist.data.matching.frames import mutual_frames
 from bayesdist.data.matching.linear_map import LinearMap, best_similarity
 from bayesdist.data.matching.similarity import Similarity, find_similarity, pattern_index
@@ -25,25 +26,15 @@ from bayesdist.infer.selfcal.start import (
 )
 from bayesdist.model import Chip, DistortionModel
 
-__all__ = ["chips_of", "started"]
+__all__ = ["started"]
 
 Float = NDArray[np.float64]
 
 
-def chips_of(config: Config, number: int) -> tuple[Chip, ...]:
-    """The chips of the configuration; a detector of one chip has the number of the data."""
-    size, reference = config.detector.size, config.model.reference_pixel
-    if size is None:
-        return config.chips()
-    centre = ((size[0] + 1) / 2, (size[1] + 1) / 2)
-    name = config.detector.name or f"chip {number}"
-    return (Chip(number, name, size, reference or centre),)
-
-
 def started(
-    config: Config,
+    config: SelfcalConfig,
     base: Path,
-    inputs: Inputs,
+    d: Detections,
     unit_arcsec: float | None,
     references: ReferenceCatalog | None,
     commanded: Commanded | None,
@@ -55,9 +46,10 @@ def started(
 
     Parameters
     ----------
-    config : Config
+    config : SelfcalConfig
     base : Path
-    inputs : Inputs
+        Folder that its files are relative to.
+    d : Detections
     unit_arcsec : float or None
         Size of the unit of u, v, where it is known.
     references : ReferenceCatalog or None
@@ -69,23 +61,26 @@ def started(
         Naming exposures that have no stars in common; for a start that cannot be read, and
         reference stars that are not found again.
     """
-    block, d = selfcal_block(config), inputs.detections
-    chips = chips_of(config, int(d.chip[0]))
+    block, number = config.selfcal, int(d.chip[0])  # of a detector of one chip, as in the data
+    chips = config.chips()
+    if not chips:
+        pixel = config.model.reference_pixel
+        chips = (one_chip(config.detector, pixel, number, f"chip {number}"),)
     start = _first(config, base, chips, unit_arcsec)
     # each chip of each exposure by itself: without a start nobody knows how the chips lie
     several = len(chips) > 1 and block.initial_distortion is None
-    exposure, number, rows = _lists(inputs, apart=several)
+    exposure, chip, rows = _lists(d, apart=several)
     names = [d.exposure_names[e] for e in exposure]
     mags = None if d.mag is None else [d.mag[r] for r in rows]
 
     def planes(of: Start) -> list[Float]:
-        return [_placed(of, d.x[r], d.y[r], d.chip[r]) for r in rows]
+        return [positions_by_chip(of, d.x[r], d.y[r], d.chip[r]) for r in rows]
 
     if several:
-        labels = [f"{name} chip {n}" for name, n in zip(names, number, strict=True)]
+        labels = [f"{name} chip {n}" for name, n in zip(names, chip, strict=True)]
         apart = mutual_frames(planes(start), mags, labels, source="selfcal.lists")
-        start = chips_side_by_side(start, chips, apart, exposure, number)
-        exposure, number, rows = _lists(inputs, apart=False)
+        start = chips_side_by_side(start, chips, apart, exposure, chip)
+        exposure, chip, rows = _lists(d, apart=False)
         names, mags = list(d.exposure_names), None if d.mag is None else [d.mag[r] for r in rows]
     on = planes(start)
     onto = _onto_references(on[0], None if mags is None else mags[0], references, block.frames)
@@ -112,9 +107,8 @@ def started(
     return model, start_parameters(model, coefficients, frames, middles)
 
 
-def _lists(inputs: Inputs, *, apart: bool) -> tuple[NDArray[np.int64], NDArray[np.int64], list]:
+def _lists(d: Detections, *, apart: bool) -> tuple[NDArray[np.int64], NDArray[np.int64], list]:
     """Exposure and chip of each list, and the rows of its detections."""
-    d = inputs.detections
     found = []
     for e in range(len(d.exposure_names)):
         here = np.flatnonzero(d.exposure == e)
@@ -126,17 +120,11 @@ def _lists(inputs: Inputs, *, apart: bool) -> tuple[NDArray[np.int64], NDArray[n
     return np.array(exposure), np.array(number), list(rows)
 
 
-def _placed(start: Start, x: Float, y: Float, chip: NDArray[np.int64]) -> Float:
-    out = np.empty((len(x), 2))
-    for number in np.unique(chip):
-        rows = chip == number
-        out[rows] = start(x[rows], y[rows], int(number))
-    return out
-
-
-def _first(config: Config, base: Path, chips: tuple[Chip, ...], unit_arcsec: float | None) -> Start:
+def _first(
+    config: SelfcalConfig, base: Path, chips: tuple[Chip, ...], unit_arcsec: float | None
+) -> Start:
     """The known distortion: of an earlier run, an IDCTAB, or none."""
-    block, scale = selfcal_block(config), config.detector.scale_mas
+    block, scale = config.selfcal, config.detector.scale_mas
     pixel = 1.0
     if block.unit != "pix" and scale is not None and unit_arcsec is not None:
         pixel = scale / 1000 / unit_arcsec
@@ -163,8 +151,7 @@ def _first(config: Config, base: Path, chips: tuple[Chip, ...], unit_arcsec: flo
             where=str(path),
             do="give detector.scale_mas",
         )
-    tab = start_of(path, unit_arcsec, None)
-    return lambda x, y, chip: np.asarray(tab(x, y, np.full(np.shape(x), chip), 0.0))
+    return start_of(path, unit_arcsec)
 
 
 def _onto_references(

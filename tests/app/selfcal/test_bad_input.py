@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from astropy.table import Table, vstack
 
-from bayesdist.app.selfcal.matching import Matching
+from bayesdist.app.selfcal.matching import refuse_unconnected
 from bayesdist.errors import InputError
 from bayesdist.simulate.dithers import simulate_dithers, smooth_distortion
 from tests.app.selfcal.support import list_table, small, write_selfcal
@@ -48,6 +48,18 @@ def _refused_by_the_match(folder, table, *words, **sections):
 def test_exposures_that_do_not_overlap(tmp_path):
     table = list_table(_pointed([(0, 0), (1.5, 0)]))
     _refused(tmp_path, table, "2 groups", "(e000); (e001)")
+
+
+def test_detections_off_the_chips(truth, tmp_path):
+    """Pixels of a mosaic, and a chip that no block describes."""
+    block = {"number": 1, "name": "A", "size": SIZE, "reference_pixel": (512.0, 512.0)}
+    given = {"detector": None, "model": {"order": 3}, "chip": [block]}
+    moved = list_table(truth)
+    moved["x"] += 500.0
+    _refused(tmp_path / "moved", moved, "lists.ecsv", "chip A", "outside", "mosaic", **given)
+    other = list_table(truth)
+    other["chip"] = np.where(np.arange(len(other)) % 9, 1, 3)
+    _refused(tmp_path / "other", other, "chip 3", "[[chip]]", "known: 1", **given)
 
 
 def test_two_groups_of_exposures(tmp_path):
@@ -94,10 +106,10 @@ def test_an_exposure_that_shares_hardly_a_star(roll, words):
     rolls, shares = np.array([0.0, 0.1, roll, 0.0]), np.array([0.7, 0.8, 0.1, 0.75])
     table = Table({"exposure": list("abcd"), "share_common": shares, "rotation": rolls})
     with pytest.raises(InputError, match="exposure c ") as caught:
-        Matching(table, {}).refuse_strangers()
+        refuse_unconnected(table)
     for word in words:
         assert word in str(caught.value)
-    Matching(table[[0, 1, 3]], {}).refuse_strangers()
+    refuse_unconnected(table[[0, 1, 3]])
 
 
 def test_a_duplicated_exposure(truth, tmp_path):

@@ -15,7 +15,7 @@ from bayesdist.app.config import load_config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.results import results_of
 from bayesdist.app.selfcal.fit import fit_selfcal
-from bayesdist.app.selfcal.given import read_given
+from bayesdist.app.selfcal.inputs import read_selfcal
 from bayesdist.app.selfcal.matching import match_dithers
 from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
@@ -81,15 +81,13 @@ def test_functions_find_what_the_run_has_found(one_roll):
     """Lists become stars and a solution without a run's folder, the very ones that a run reads."""
     config, _ = load_config(one_roll.config)
     base = one_roll.config.parent
-    matched = match_dithers(read_given(config, base), config, base)
+    matched = match_dithers(read_selfcal(config, base))
     fitted = fit_selfcal(matched)
     known = load_fit(one_roll.path / "fit.nc")
     np.testing.assert_array_equal(fitted.linear.mean, known.mean)
     np.testing.assert_array_equal(fitted.linear.cov, known.cov)
     results = results_of(RunDirectory.open(one_roll.path))
-    np.testing.assert_array_equal(
-        fitted.solved.mode.stars, results.fitted.solved.mode.stars
-    )
+    np.testing.assert_array_equal(fitted.solved.mode.stars, results.fitted.solved.mode.stars)
     np.testing.assert_array_equal(fitted.solved.gauge.held, results.fitted.solved.gauge.held)
     assert fitted.solved.fixed == results.fitted.solved.fixed
     made, read = FitData(matched, fitted).stars, results.data.stars

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.campaign.monitoring import fit_exposures_of, read_new_exposures
 from bayesdist.app.commands.on_runs.comparison_files import joined
 from bayesdist.app.config import Config, load_config
+from bayesdist.app.exposures.monitoring import fit_exposures_of, read_new_exposures
 from bayesdist.app.kinds.errors import read_magnitude_errors
 from bayesdist.app.matches.sources import read_configured
 from bayesdist.app.results import results_of

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from bayesdist.app.assessment.error_terms import published_tables
-from bayesdist.app.campaign.filter_figures import draw_filters
-from bayesdist.app.campaign.filters import FilterComparison, compare_filters, comparison_table
-from bayesdist.app.campaign.release import write_files
+from bayesdist.app.exposures.filter_figures import draw_filters
+from bayesdist.app.exposures.filters import FilterComparison, compare_filters, comparison_table
+from bayesdist.app.exposures.release_files import write_files
 from bayesdist.app.kinds.fitted import Fitted, required
 from bayesdist.app.results import Results, results_of
 from bayesdist.app.screen import table_text

@@ -1,19 +1,15 @@
-"""What the look-up tables of a campaign leave between their nodes: measured once, then a term."""
+"""Errors that look-up tables leave between their nodes, from neighbours in different exposures."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.solution import place_of
-from bayesdist.assess.terms.forms import MEASURED
-from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.data import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes, between_nodes
-from bayesdist.diagnose.tables.mean_square import MeanSquare
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import LinearFit
 from bayesdist.infer.nodes import (
@@ -24,16 +20,11 @@ from bayesdist.infer.nodes import (
     held_sigma,
     pixel_shifts,
 )
-from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, LookupTable
-from bayesdist.model.grid import grid_pixels, mesh
 
-__all__ = ["INTERPOLATION", "interpolation_term", "measured_between"]
+__all__ = ["measured_between"]
 
 Float = NDArray[np.float64]
-
-INTERPOLATION = "look-up tables, between nodes"
-SOURCE = f"{MEASURED}: neighbours in different exposures"
 
 FAR = 6.0  # standard deviations
 
@@ -50,7 +41,7 @@ def measured_between(
     mixture: ResidualMixture | None = None,
     fitted: bool = True,
 ) -> tuple[BetweenNodes, ...]:
-    """What tables leave of the distortion at a place, for each chip where it can be told.
+    """Distortion that tables leave between their nodes, for each chip where it can be measured.
 
     Parameters
     ----------
@@ -67,10 +58,6 @@ def measured_between(
         Of the pairs; by default that of their residuals.
     fitted : bool
         Whether the tables were fitted to these pairs.  Those that were not err by themselves.
-
-    Returns
-    -------
-    tuple of BetweenNodes
     """
     if pairs.star is None:
         return ()
@@ -135,40 +122,3 @@ def _on(chip: Chip, x: Float, y: Float) -> tuple[Float, Float]:
     """The nearest pixels of the chip: cells at its edge have their middle beyond."""
     nx, ny = chip.size
     return np.clip(x, 0.5, nx + 0.5), np.clip(y, 0.5, ny + 0.5)
-
-
-def interpolation_term(
-    between: Mapping[int, BetweenNodes],
-    solution: Solution,
-    *,
-    grid: tuple[int, int],
-    epoch: float | None,
-) -> tuple[LocalErrors, ...]:
-    """The term of the budget; nothing where a chip has not been measured.
-
-    Parameters
-    ----------
-    between : mapping of int to BetweenNodes
-        By chip number.
-    solution : Solution
-        Its derivatives bring pixels to u and v, along the axes of the polynomials.
-    grid : tuple of int
-        Points on x and y of each chip.
-    epoch : float or None
-        Decimal years.
-    """
-    chips = solution.model.chips
-    if not between or any(chip.number not in between for chip in chips):
-        return ()
-    sigma, squares = {}, {}
-    for chip in chips:
-        place = place_of(solution.model, epoch=epoch, chip=chip.number)
-        P = place.polynomial(solution.mean)
-        by_x, by_y = place.gradient(*mesh(*grid_pixels(chip.size, grid)))
-        J = np.stack([by_x @ P.T, by_y @ P.T], axis=-1)
-        found, into = between[chip.number], np.mean(J**2, axis=0)
-        variance = J**2 @ found.left.mean
-        sigma[chip.number] = np.sqrt(variance).reshape(grid[1], grid[0], 2)
-        error = np.sqrt(into**2 @ found.error**2)
-        squares[chip.number] = MeanSquare(into @ found.square, error)
-    return (LocalErrors.on_grid(INTERPOLATION, sigma, solution.model, SOURCE, squares),)

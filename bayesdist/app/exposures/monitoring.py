@@ -8,21 +8,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.inputs import campaign_block
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.errors import read_magnitude_errors
-from bayesdist.app.kinds.fitted import Fitted, required
+from bayesdist.app.kinds.fitted import required
 from bayesdist.app.results import Results
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.star_files import PAIRS, part_files
-from bayesdist.data import MagnitudeErrors, Matches, read_matches
+from bayesdist.data import Matches, read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.compare.monitoring import NewFit, fit_new, with_star_errors_of
 from bayesdist.infer.linear import Rejection
-from bayesdist.infer.nodes.pixels import on_the_chips
-from bayesdist.model import corrected
 
 __all__ = ["NewExposures", "fit_exposures_of", "read_new_exposures"]
 
@@ -65,10 +62,6 @@ def read_new_exposures(release: Results, new: Path) -> NewExposures:
         Run directory of a campaign whose stage 'match' has been run, or pairs in a file or folder
         as a run keeps them.
 
-    Returns
-    -------
-    NewExposures
-
     Raises
     ------
     InputError
@@ -93,33 +86,18 @@ def read_new_exposures(release: Results, new: Path) -> NewExposures:
         )
     pairs = pairs.select(fresh)
     pairs = pairs.with_exposure_names(pairs.exposures)
-    own = None if run is None else read_magnitude_errors(run.path)
+    placed, errors = release.fitted.placed(pairs), release.fitted.errors.by_magnitude
+    if run is not None:
+        errors = read_magnitude_errors(run.path) or errors
+    if placed.mag is not None and errors is not None:
+        placed = placed.with_errors(errors, in_quadrature=True)
     return NewExposures(
         released,
-        prepared(release.fitted, pairs, own or release.fitted.errors.by_magnitude),
+        placed,
         _catalogue_errors(pairs),
         run is not None and _catalogue_of(run) == _catalogue_of(release.run),
         left_out,
     )
-
-
-def prepared(release: Fitted, pairs: Matches, errors: MagnitudeErrors | None) -> Matches:
-    """Pairs at the pixels that the release's tables have corrected, with errors of centroids."""
-    tables = release.tables.tables
-    if tables:
-        names = np.asarray(pairs.filter_names)[pairs.filter]
-        own = next((table.filter for table in tables if table.filter), "")
-        x, y = corrected(
-            tables,
-            pairs.x,
-            pairs.y,
-            chip=pairs.chip_number,
-            filter=np.where(names == "", own, names),
-        )
-        pairs = on_the_chips(pairs.with_columns(x=x, y=y), release.linear.model)
-    if pairs.mag is None or errors is None:
-        return pairs
-    return pairs.with_errors(errors, in_quadrature=True)
 
 
 def fit_exposures_of(release: Results, new: NewExposures) -> NewFit:
@@ -169,7 +147,7 @@ def _pairs(run: RunDirectory | None, new: Path, unit: str) -> Matches:
 
 
 def _refuse_other_filters(config: Config, pairs: Matches, where: str) -> None:
-    mine = campaign_block(config).filter
+    mine = None if config.campaign is None else config.campaign.filter
     others = sorted({name for name in pairs.filter_names if name} - {mine})
     if mine is not None and others:
         raise InputError(

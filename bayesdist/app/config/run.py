@@ -1,10 +1,10 @@
-"""What the configurations of all kinds of runs have in common."""
+"""Sections that the configurations of all kinds of runs have in common."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from bayesdist.app.config.assess import (
     MEASURED_TERMS,
@@ -14,24 +14,23 @@ from bayesdist.app.config.assess import (
     require_own_names,
 )
 from bayesdist.app.config.detector import ChipBlock, Detector, chips_of, require_detector
-from bayesdist.app.config.model import (
-    CampaignModel,
+from bayesdist.app.config.fit import (
     CampaignOutliers,
+    ComputeBlock,
     DiscrepancyBlock,
-    MatchedModel,
     Outliers,
     Sampler,
-    SelfcalModel,
     SelfcalOutliers,
     SelfcalSampler,
 )
+from bayesdist.app.config.model import CampaignModel, MatchedModel, SelfcalModel
 from bayesdist.app.config.products import Products
 from bayesdist.app.config.section import Section
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.terms.given import said_by_user
 from bayesdist.assess.terms.parameters import one_size_term
-from bayesdist.infer import OutlierMixture
+from bayesdist.infer import Compute, OutlierMixture
 from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, TimeDependence
 
@@ -39,19 +38,23 @@ __all__ = ["RunConfig"]
 
 
 class RunConfig(Section):
-    """What every configuration of a run has; each kind lists its sections with their types."""
+    """Sections of every configuration of a run; each kind adds those that are of its own type."""
 
     if TYPE_CHECKING:
         model: MatchedModel | CampaignModel | SelfcalModel
-        detector: Detector
-        chip: list[ChipBlock]
         outliers: Outliers | CampaignOutliers | SelfcalOutliers
         sampler: Sampler | SelfcalSampler
-        assess: Assess
-        budget: list[BudgetBlock]
-        requirement: list[RequirementBlock]
-        discrepancy: DiscrepancyBlock
         products: Products
+
+        @property
+        def compute(self) -> ComputeBlock: ...
+
+    detector: Detector = Detector()
+    chip: list[ChipBlock] = Field(default_factory=list)
+    assess: Assess = Assess()
+    budget: list[BudgetBlock] = Field(default_factory=list)
+    requirement: list[RequirementBlock] = Field(default_factory=list)
+    discrepancy: DiscrepancyBlock = DiscrepancyBlock()
 
     @model_validator(mode="after")
     def _names_of_their_own(self) -> RunConfig:
@@ -86,15 +89,6 @@ class RunConfig(Section):
         """Boolean: groups of stars may have jitters of their own, if the data ask for it."""
         return False
 
-    def refuse_circle(self) -> None:
-        """Refuse what cannot go with matches in a circle about their nominal positions.
-
-        Raises
-        ------
-        ValueError
-            As validators raise it.
-        """
-
     def chips(self) -> tuple[Chip, ...]:
         """Chips of the model; empty for a detector of one chip."""
         return chips_of(self.chip)
@@ -106,6 +100,10 @@ class RunConfig(Section):
     def mixture(self) -> OutlierMixture:
         """The outlier mixture."""
         return self.outliers.mixture()
+
+    def resources(self) -> Compute:
+        """Where the work is done."""
+        return self.compute.resources()
 
     def spans(self) -> dict[str, tuple[float, float]]:
         """Begin and end of each of the periods, decimal years; empty where none are asked for."""

@@ -30,7 +30,7 @@ POWERS = {"2": (1, 0), "3": (0, 1)}
 
 @dataclass(frozen=True, eq=False)
 class FilterComparison:
-    """What the exposures, each fitted alone, say of the filters.
+    """Differences between filters, as exposures that were each fitted alone show them.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class FilterComparison:
 
     @property
     def alike(self) -> bool:
-        """Whether one drift serves all filters."""
+        """Boolean: one drift serves all filters."""
         return not self.depends and DIFFERENCE.met_by(self.p_value)
 
     @property
@@ -83,10 +83,6 @@ def compare_filters(
     time : TimeDependence or None
         What drifts.
     seed : int
-
-    Returns
-    -------
-    FilterComparison
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a self-calibration would begin with, and what it could not tell."""
+"""Lines of `bayesdist check` on a self-calibration: its stars, and directions that stay free."""
 
 from __future__ import annotations
 
@@ -8,20 +8,25 @@ import numpy as np
 
 from bayesdist.app.screen import number
 from bayesdist.app.selfcal.gauge import CONVENTION, fixed_by
-from bayesdist.app.selfcal.given import Given
-from bayesdist.app.selfcal.matching import calibrated, matching_of
+from bayesdist.app.selfcal.inputs import Inputs
+from bayesdist.app.selfcal.matching import (
+    calibrated,
+    exposure_table,
+    matching_facts,
+    refuse_unconnected,
+)
+from bayesdist.infer.selfcal.gauge import NamedDirection
 
 __all__ = ["selfcal_lines"]
 
 
-def selfcal_lines(given: Given) -> Iterator[str]:
+def selfcal_lines(inputs: Inputs) -> Iterator[str]:
     """Stars and free directions of a self-calibration, as lines of text: nothing is sampled."""
-    found = calibrated(given, lambda text: None)
+    found = calibrated(inputs, lambda text: None)
     s, gauge, model = found.mode, found.gauge, found.mode.problem.model
-    matching = matching_of(found, given.inputs, given.block.min_detections)
-    matching.refuse_strangers()
-    summary = matching.summary
-    fixed = fixed_by(gauge, s, given.known_for(model))
+    refuse_unconnected(exposure_table(found, inputs))
+    summary = matching_facts(found, inputs)
+    fixed = fixed_by(gauge, s, inputs.known_for(model))
     d = summary["detections"]
     cut = "".join(f", {count} {reason}" for reason, count in d["cut"].items())
     yield f"exposures    {summary['n_exposures']}"
@@ -33,7 +38,7 @@ def selfcal_lines(given: Given) -> Iterator[str]:
         f"{number(summary['per_star']['median'])} at the median; "
         f"{summary['n_ambiguous']} ambiguous groups"
     )
-    if given.tangent_plane is None:
+    if inputs.tangent_plane is None:
         yield "sky          taken as flat: detector.scale_mas, the size of a pixel, is not given"
     else:
         moved = summary["tangent_planes_pix"]
@@ -45,14 +50,15 @@ def selfcal_lines(given: Given) -> Iterator[str]:
     yield f"null space   {n} directions are free, {held} of them held by convention"
     for one in gauge.directions:
         if one.free or one.weak:
-            yield f"             {_told(one, fixed[one.name])}"
+            yield f"             {_state_words(one, fixed[one.name])}"
     for sigma, k in gauge.weakest:
         yield f"nearly free  {number(sigma)} pix at the edge, led by {model.names[int(k)]}"
     for text in (*gauge.sentences, *summary["warnings"]):
         yield f"WARNING      {text[0].upper() + text[1:]}"
 
 
-def _told(one, by: str) -> str:  # type: ignore[no-untyped-def]
+def _state_words(one: NamedDirection, by: str) -> str:
+    """Error of a direction by the detections, what fixes it, and its error then."""
     known = "" if one.free else f", {number(one.sigma)} {one.unit} from detections".rstrip()
     how = "held by convention" if by == CONVENTION else f"fixed by {by}"
     size = "" if by == CONVENTION else f", sigma {number(one.sigma_fixed)} {one.unit}".rstrip()

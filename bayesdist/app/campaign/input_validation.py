@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.inputs import Inputs, campaign_block, cuts_of
+from bayesdist.app.campaign.inputs import Inputs
 from bayesdist.app.campaign.reference import free_rates, rehearse_references
-from bayesdist.app.config import Config
-from bayesdist.app.config.campaign import ReleaseBlock
-from bayesdist.data import StarCuts, StarList
+from bayesdist.app.config.products import ReleaseBlock
+from bayesdist.app.kinds.star_lists import refuse_other_chips
 from bayesdist.data.holdout import refuse_strangers
 from bayesdist.data.matching.reports import check_campaign
 from bayesdist.errors import ConfigError, DegenerateError, InputError
-from bayesdist.model import Chip, TimeDependence
+from bayesdist.model import TimeDependence
 from bayesdist.products import read_idctab
 
 __all__ = [
@@ -39,35 +36,27 @@ FEWEST = 3  # exposures: two of them differ, but do not scatter
 SAME_DAY = 1.0 / 365.25  # years: epochs within say nothing of a rate
 LINEAR_KINDS = 3  # drifting terms from which on scale and both shears drift
 ONE_ROLL = 2.0  # degrees: roll angles that scatter by less are one
-OFF_CHIP = 0.02  # of a list's detections beyond the edge of a chip: more are no stray ones
-EDGE = 1.0  # pixels: half of one to the edge, and half of one for lists that count from 0
 NAMED = 5  # exposures in a sentence
 STILL = 1.0  # years over which stars may stand still
 
 
-def refuse_campaign(inputs: Inputs, config: Config, base: Path) -> None:
+def refuse_campaign(inputs: Inputs) -> None:
     """Refuse inputs that do not go together, and files of others that cannot be used.
-
-    Parameters
-    ----------
-    inputs : Inputs
-    config : Config
-    base : Path
-        Folder that its files are relative to.
 
     Raises
     ------
     BayesdistError
         As `refuse_unsound`, `rehearse_references` and `read_idctab`.
     """
-    refuse_unsound(config, inputs)
-    read_idctab(base / campaign_block(config).initial_distortion)
+    config, base = inputs.config, inputs.base
+    refuse_unsound(inputs)
+    read_idctab(base / config.campaign.initial_distortion)
     rehearse_references(config, inputs.catalog.unit, base)
     if config.products.release is not None:
         read_idctab(base / config.products.release.reference)
 
 
-def refuse_unsound(config: Config, inputs: Inputs) -> None:
+def refuse_unsound(inputs: Inputs) -> None:
     """Refuse exposures, lists and catalogue that a run could not use; nothing is matched.
 
     Raises
@@ -81,15 +70,22 @@ def refuse_unsound(config: Config, inputs: Inputs) -> None:
     ConfigError
         For periods of the release outside the segment that they are to hold.
     """
-    _refuse_chips(inputs.lists, config.chips())
-    check_campaign(inputs.lists, inputs.log, inputs.catalog)
+    config, lists = inputs.config, inputs.star_lists
+    refuse_other_chips(lists.lists, config.chips(), "campaign.lists")
+    check_campaign(lists.lists, inputs.log, inputs.catalog)
     if inputs.catalog.sigma_u is None:
         raise InputError(
             "has no errors of the positions",
             where=inputs.catalog.source,
             do="give the columns sigma_u and sigma_v",
         )
-    _refuse_cuts(inputs.lists, cuts_of(campaign_block(config)))
+    if not any(good.any() for good in lists.passed):  # of one exposure: left out when it matches
+        raise InputError(
+            f"the cuts leave none of {len(lists)} detections in {len(lists.lists)} exposures "
+            f"({lists.cut_words})",
+            where="campaign",
+            do="widen mag, saturation or q_max, or correct the columns that they go by",
+        )
     refuse_few(inputs.log.values("epoch"), config.time() if free_rates(config) else None)
     _refuse_periods(config.products.release, config.time())
     held = config.holdout
@@ -97,12 +93,12 @@ def refuse_unsound(config: Config, inputs: Inputs) -> None:
         refuse_strangers(held.exposures, inputs.log.names, inputs.log.source)
 
 
-def input_warnings(config: Config, inputs: Inputs) -> list[str]:
+def input_warnings(inputs: Inputs) -> list[str]:
     """Warnings of what a campaign cannot tell, or takes on trust, each as a clause."""
-    log, catalog = inputs.log, inputs.catalog
+    config, log, catalog = inputs.config, inputs.log, inputs.catalog
     out = []
-    if inputs.strangers:
-        out.append(_unlogged(inputs.strangers, log.source))
+    if inputs.unlogged:
+        out.append(_unlogged(inputs.unlogged, log.source))
     epochs = log.values("epoch")
     span = float(np.ptp(epochs))
     if catalog.pm_u is None and span > STILL:
@@ -124,7 +120,7 @@ def input_warnings(config: Config, inputs: Inputs) -> list[str]:
                 f"{where} asks for {epoch:g}, and the exposures are from {epochs.min():.2f} to "
                 f"{epochs.max():.2f}: the drift is extrapolated by more than they span"
             )
-    if campaign_block(config).vafactor_source == "earth":
+    if config.campaign.vafactor_source == "earth":
         out.append(
             "VAFACTOR was computed from the motion of the Earth: that of the telescope about it, "
             "up to 2.5e-5, is in the scales of the exposures"
@@ -143,7 +139,7 @@ def _unlogged(names: tuple[str, ...], log: str) -> str:
 
 
 def one_roll_angle(angles: Float) -> bool:
-    """Truth of roll angles (E,), in radians, that see a shear of the catalogue alike.
+    """Boolean: roll angles (E,), in radians, see a shear of the catalogue alike.
 
     An exposure at roll angle a sees a shear of the catalogue as one of its detector turned by 2a:
     at one angle, or at angles half a turn apart, nothing tells the two apart.
@@ -176,8 +172,13 @@ def frames_not_set() -> Iterator[None]:
 
 def segment_counts(epochs: Float, time: TimeDependence) -> list[int]:
     """Exposures in each segment of the drift."""
-    edges = [-np.inf, *time.breaks, np.inf]
-    return [int(((epochs >= a) & (epochs < b)).sum()) for a, b in pairwise(edges)]
+    counts = np.bincount(_segment(epochs, time), minlength=time.n_segments)
+    return [int(n) for n in counts]
+
+
+def _segment(epochs: Float, time: TimeDependence) -> NDArray[np.int64]:
+    """Number of the segment of the drift, from 0, of each epoch (E,)."""
+    return np.searchsorted(time.breaks, epochs, side="right")
 
 
 def segment_text(time: TimeDependence, number: int) -> str:
@@ -210,9 +211,9 @@ def refuse_few(epochs: Float, time: TimeDependence | None) -> None:
         )
     if time is None:
         return
-    edges = [-np.inf, *time.breaks, np.inf]
-    for k, (a, b) in enumerate(pairwise(edges)):
-        inside = epochs[(epochs >= a) & (epochs < b)]
+    segment = _segment(epochs, time)
+    for k in range(time.n_segments):
+        inside = epochs[segment == k]
         fault = ""
         if not len(inside):
             fault = f"holds no exposure: they are from {epochs.min():.2f} to {epochs.max():.2f}"
@@ -255,62 +256,3 @@ def _refuse_periods(release: ReleaseBlock | None, time: TimeDependence | None) -
                 where=where,
                 do=f"correct the years, or segment = {period.segment} (counted from 0)",
             )
-
-
-def _refuse_chips(lists: tuple[StarList, ...], chips: tuple[Chip, ...]) -> None:
-    known = {chip.number: chip for chip in chips}
-    if not known:
-        return
-    seen: set[int] = set()
-    for one in lists:
-        where = f"{one.source}, exposure {one.exposure}"
-        for number in one.chips:
-            rows = one.chip == number
-            if number not in known:
-                raise InputError(
-                    f"{int(rows.sum())} detections are on chip {number}, which no [[chip]] block "
-                    "describes",
-                    where=where,
-                    do=f"add a block, or leave them out (known: {', '.join(map(str, known))})",
-                )
-            _refuse_off_chip(one.x[rows], one.y[rows], known[number], where)
-        seen.update(one.chips)
-    empty = [chip.name for chip in chips if chip.number not in seen]
-    if empty:
-        raise InputError(
-            f"no exposure has a detection on chip {', '.join(empty)}",
-            where="campaign.lists",
-            do="drop its [[chip]] block, or correct the lists' column 'chip'",
-        )
-
-
-def _refuse_off_chip(x: Float, y: Float, chip: Chip, where: str) -> None:
-    low, (right, top) = 1.0 - EDGE, (size + EDGE for size in chip.size)
-    off = (x < low) | (x > right) | (y < low) | (y > top)
-    if off.mean() > OFF_CHIP:
-        raise InputError(
-            f"{off.mean():.0%} of the detections on chip {chip.name} lie outside its "
-            f"{chip.size[0]:g} x {chip.size[1]:g} pixels (x {x.min():.0f} to {x.max():.0f}, "
-            f"y {y.min():.0f} to {y.max():.0f})",
-            where=where,
-            do="check whether x and y are swapped or are pixels of a mosaic, and [[chip]].size",
-        )
-
-
-def _refuse_cuts(lists: Sequence[StarList], cuts: StarCuts) -> None:
-    """Refuse cuts that leave nothing anywhere; single exposures are left out when they match."""
-    total: dict[str, int] = {}
-    n = 0
-    for one in lists:
-        good, rejected = cuts.passed(one)
-        if good.any():
-            return
-        n += len(one)
-        for reason, count in rejected.items():
-            total[reason] = total.get(reason, 0) + count
-    counts = ", ".join(f"{count} {reason}" for reason, count in total.items())
-    raise InputError(
-        f"the cuts leave none of {n} detections in {len(lists)} exposures ({counts})",
-        where="campaign",
-        do="widen mag, saturation or q_max, or correct the columns that they go by",
-    )

@@ -11,14 +11,7 @@ FIXED = ("A_1", "B_1", "A_3")  # by the gauge, on the reference chip
 
 
 def line_sections(solution: Solution, chip: int) -> dict[str, object]:
-    """Sections 'gauge' and 'lines' of summary.json: alpha and beta of each term.
-
-    Parameters
-    ----------
-    solution : Solution
-    chip : int
-        Number of the reference chip.
-    """
+    """Sections 'gauge' and 'lines' of summary.json: alpha and beta of each term."""
     view = reference_gauge(without_frames(solution), chip)
     return {"gauge": _gauge(view.gauge), "lines": _lines(view)}
 

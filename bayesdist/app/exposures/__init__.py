@@ -1,0 +1,1 @@
+"""Exposures that were fitted jointly and each alone: series, drift, new ones, filters, releases."""
