@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.app.matches.reading import reading as app_matches
+from bayesdist.app.matches import reading as app_matches
 from bayesdist.data import write_partitioned
 from tests.app.support import (
     SIZE,

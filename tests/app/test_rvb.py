@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from astropy.table import Table, vstack
 
-from bayesdist.app.matches.reading import reading
+from bayesdist.app.matches import reading
 from bayesdist.data import open_matches
 from bayesdist.infer import load_fit
 from bayesdist.missions.wise.pairs.read import read_rvb

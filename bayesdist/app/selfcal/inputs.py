@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.inputs import lists_of
 from bayesdist.app.config import SelfcalConfig
 from bayesdist.app.kinds.star_lists import lists_of, refuse_other_chips
 from bayesdist.app.selfcal.commanded import Commanded, read_commanded
