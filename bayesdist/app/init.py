@@ -18,6 +18,7 @@ from bayesdist.app.matches import load_matches
 from bayesdist.app.output import refuse_existing
 from bayesdist.data import FORMATS, Matches
 from bayesdist.data.reading.layout import TableLayout, table_layout
+from bayesdist.data.reading.mission_formats import mission_formats
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 
@@ -172,7 +173,9 @@ def _of_matches(
     names = dict(zip(table.chip_numbers, _chip_names(table), strict=True))
     blocks = [_CHIP.format(number=n, name=quoted(names[n]), **one) for n, one in chips.items()]
     return len(table), {
-        "format": _AUTO.format(formats=" | ".join((*FORMATS, *data_sections()))),
+        "format": _AUTO.format(
+            formats=" | ".join((*FORMATS, *mission_formats(), *data_sections()))
+        ),
         "columns": column_lines(layout, columns),
         "unit_line": unit_line,
         "sigma": sigma,

@@ -20,6 +20,7 @@ from pydantic import (
 
 from bayesdist.app.config.section import Section
 from bayesdist.data import FORMATS
+from bayesdist.data.reading.mission_formats import mission_formats
 from bayesdist.data.tables.units import length_advice
 from bayesdist.mission import load_object, missions
 
@@ -94,7 +95,7 @@ def _of_its_format(raw: Any, handler: Any, info: ValidationInfo) -> Data:
     kind = Data
     if format not in FORMATS or raw.keys() - Data.model_fields.keys():
         sections = data_sections()
-        _require_known(format, (*FORMATS, *sections))
+        _require_known(format, (*FORMATS, *mission_formats(), *sections))
         kind = sections.get(format, Data)
         for name, other in sections.items():
             for key in raw.keys() & other.model_fields.keys() - kind.model_fields.keys():

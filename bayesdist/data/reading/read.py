@@ -61,7 +61,7 @@ def read_matches(
         'table' (.ecsv, .csv, .fits, .parquet, .vot, .tbl and text of several kinds),
         'hst1pass' (lists with raw and corrected positions),
         'matchup' (such lists with the MATCHUP master that they are then matched with),
-        'astrometry.net' (corr.fits), or 'auto': by name and content.
+        'astrometry.net' (corr.fits), one that a mission adds, or 'auto': by name and content.
     columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
         As `ReadOptions`.
 
@@ -74,9 +74,10 @@ def read_matches(
     InputError
         For all that is wrong with a file or an option, in one sentence.
     """
-    if format not in FORMATS:
+    known = (*FORMATS, *mission_formats())
+    if format not in known:
         raise InputError(
-            f"format is {format!r}", where="data.format", do=f"choose one of {', '.join(FORMATS)}"
+            f"format is {format!r}", where="data.format", do=f"choose one of {', '.join(known)}"
         )
     options = ReadOptions(
         columns,

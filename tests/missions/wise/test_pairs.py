@@ -17,7 +17,8 @@ from bayesdist.missions.wise.pairs import files as rvb_files
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit, radial_rows
 from bayesdist.missions.wise.pairs.read import read_rvb, rvb_bands, stream_rvb
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs, colour_of
-from bayesdist.missions.wise.pairs.selection import RvbSelection, SelectedPairs
+from bayesdist.missions.wise.pairs.section import RvbBlock
+from bayesdist.missions.wise.pairs.selection import SelectedPairs
 
 SIZE = (1016.0, 1016.0)
 BANDS = ("W1", "W2", "W4")
@@ -205,8 +206,17 @@ def pairs_with(colour, frame) -> RvbPairs:
     return RvbPairs(matches, np.asarray(colour, float))
 
 
-def taken(pairs: RvbPairs, **limits) -> Matches:
-    return SelectedPairs(lambda: [pairs], RvbSelection(**limits), SIZE).table()
+def taken(
+    pairs: RvbPairs,
+    *,
+    offset: RadialLimit | None = None,
+    chi2: RadialLimit | None = None,
+    **limits,
+) -> Matches:
+    for name, limit in (("accept", offset), ("accept_chi2", chi2)):
+        if limit is not None:
+            limits |= {f"{name}_centre": limit.centre, f"{name}_corner": limit.corner}
+    return SelectedPairs(lambda: [pairs], RvbBlock(**limits), SIZE).table()
 
 
 def test_selection_by_colour_against_a_loop_over_the_frames(rng):

@@ -55,14 +55,13 @@ class RvbInput:
             _require_array(data.band, size)
         if "pairs" in self.run.record and part_files(self.run / PAIRS):
             return self._opened(self.run / PAIRS, self.run.record["pairs"])
-        selection = data.rvb.selection()
-        if selection.takes_all:
+        if data.rvb.takes_all:
             opened = open_rvb(path, **options)
             if opened is not None:
                 for band in opened.filter_names:
                     _require_array(band or data.band, size)
                 return opened
-        return self._written(SelectedPairs(lambda: stream_rvb(path, **options), selection, size))
+        return self._written(SelectedPairs(lambda: stream_rvb(path, **options), data.rvb, size))
 
     @property
     def _settings(self) -> tuple[RvbData, tuple[float, float]]:
@@ -153,7 +152,7 @@ def load_rvb(
         _require_array(data.band, size)
     batches = list(stream_rvb(path, **_options(data, size)))
     _require_array(batches[0].band, size)
-    return SelectedPairs(lambda: batches, data.rvb.selection(), size).table()
+    return SelectedPairs(lambda: batches, data.rvb, size).table()
 
 
 def _options(data: RvbData, size: tuple[float, float]) -> dict[str, Any]:
