@@ -74,5 +74,5 @@ def _without(inputs: Inputs, config: Config) -> dict[int, list[str]]:
         seen = set(one.chip[cuts.passed(one)[0]].tolist())
         for chip in config.chips():
             if chip.number not in seen:
-                out.setdefault(chip.number, []).append(one.exposure)
+                out.setdefault(chip.number, []).append(one.name)
     return out

@@ -13,10 +13,10 @@ from bayesdist.app.config import Config
 from bayesdist.app.config.campaign import CampaignBlock, StarListsBlock
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.data import (
+    Detections,
     ExposureLog,
     ReferenceCatalog,
     StarCuts,
-    StarList,
     catalog_from_table,
     read_exposures,
     read_star_lists,
@@ -58,7 +58,7 @@ class Inputs:
         Stars that the file holds.
     log : ExposureLog
         Of the exposures of the filter, with VAFACTOR.
-    lists : tuple of StarList
+    lists : tuple of Detections
         Of these exposures.
     strangers : tuple of str
         Exposures that have a list and no entry in the log file, of whatever filter: not used.
@@ -69,7 +69,7 @@ class Inputs:
     catalog: ReferenceCatalog
     n_catalog: int
     log: ExposureLog
-    lists: tuple[StarList, ...]
+    lists: tuple[Detections, ...]
     strangers: tuple[str, ...] = ()
     plane: str = ""
 
@@ -142,8 +142,8 @@ def read_campaign(config: Config, base: Path) -> Inputs:
         log = ExposureLog(bare, log.source).with_aberration()
     log.require("vafactor")
     lists = lists_of(block, base)
-    wanted = tuple(one for one in lists if one.exposure in log)
-    missing = sorted(set(log.names) - {one.exposure for one in wanted})
+    wanted = tuple(one for one in lists if one.name in log)
+    missing = sorted(set(log.names) - {one.name for one in wanted})
     if missing:
         raise InputError(
             f"there is no star list of exposure {missing[0]!r}"
@@ -151,7 +151,7 @@ def read_campaign(config: Config, base: Path) -> Inputs:
             where=log.source,
             do="add the list, or take the exposure out of the log",
         )
-    strangers = dict.fromkeys(one.exposure for one in lists if one.exposure not in logged)
+    strangers = dict.fromkeys(one.name for one in lists if one.name not in logged)
     n = len(catalog)
     if block.pm_selection == "reliable" and catalog.sigma_pm_u is not None:
         catalog = select_motions(catalog)
@@ -244,7 +244,7 @@ def parities_of(block: CampaignBlock, catalog: ReferenceCatalog, tab: IdcTab) ->
     return (expected, not expected)
 
 
-def lists_of(block: StarListsBlock, base: Path) -> tuple[StarList, ...]:
+def lists_of(block: StarListsBlock, base: Path) -> tuple[Detections, ...]:
     """All star lists that the configuration names.
 
     Each place is read alone: a list whose name stands in two is an exposure given twice, not two.

@@ -22,10 +22,10 @@ from bayesdist.app.campaign.reference import free_rates
 from bayesdist.app.campaign.soundness import input_warnings, refuse_few, shear_warnings
 from bayesdist.app.config import Config
 from bayesdist.data import (
+    Detections,
     ExposureLog,
     Matches,
     StarCuts,
-    StarList,
     match_campaign,
     neutralise_aberration,
 )
@@ -165,7 +165,9 @@ def _doubtful_parity(mirrored: bool, parities: tuple[bool, ...], detector: str) 
     ]
 
 
-def _gauge_first(lists: tuple[StarList, ...], cuts: StarCuts, chip: int) -> tuple[StarList, ...]:
+def _gauge_first(
+    lists: tuple[Detections, ...], cuts: StarCuts, chip: int
+) -> tuple[Detections, ...]:
     """The lists, led by one with enough stars on the reference chip.
 
     The first exposure's stars there define the gauge of the joint fit.  The order stays where the

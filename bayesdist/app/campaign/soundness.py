@@ -15,7 +15,7 @@ from bayesdist.app.campaign.inputs import Inputs, campaign_block, cuts_of
 from bayesdist.app.campaign.reference import free_rates, rehearse_references
 from bayesdist.app.config import Config
 from bayesdist.app.config.campaign import ReleaseBlock
-from bayesdist.data import StarCuts, StarList
+from bayesdist.data import Detections, StarCuts
 from bayesdist.data.holdout import refuse_strangers
 from bayesdist.data.matching.reports import check_campaign
 from bayesdist.errors import ConfigError, DegenerateError, InputError
@@ -257,23 +257,22 @@ def _refuse_periods(release: ReleaseBlock | None, time: TimeDependence | None) -
             )
 
 
-def _refuse_chips(lists: tuple[StarList, ...], chips: tuple[Chip, ...]) -> None:
+def _refuse_chips(lists: tuple[Detections, ...], chips: tuple[Chip, ...]) -> None:
     known = {chip.number: chip for chip in chips}
     if not known:
         return
     seen: set[int] = set()
     for one in lists:
-        where = f"{one.source}, exposure {one.exposure}"
         for number in one.chips:
             rows = one.chip == number
             if number not in known:
                 raise InputError(
                     f"{int(rows.sum())} detections are on chip {number}, which no [[chip]] block "
                     "describes",
-                    where=where,
+                    where=one.where,
                     do=f"add a block, or leave them out (known: {', '.join(map(str, known))})",
                 )
-            _refuse_off_chip(one.x[rows], one.y[rows], known[number], where)
+            _refuse_off_chip(one.x[rows], one.y[rows], known[number], one.where)
         seen.update(one.chips)
     empty = [chip.name for chip in chips if chip.number not in seen]
     if empty:
@@ -297,7 +296,7 @@ def _refuse_off_chip(x: Float, y: Float, chip: Chip, where: str) -> None:
         )
 
 
-def _refuse_cuts(lists: Sequence[StarList], cuts: StarCuts) -> None:
+def _refuse_cuts(lists: Sequence[Detections], cuts: StarCuts) -> None:
     """Refuse cuts that leave nothing anywhere; single exposures are left out when they match."""
     total: dict[str, int] = {}
     n = 0

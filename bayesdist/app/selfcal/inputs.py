@@ -14,7 +14,7 @@ from bayesdist.app.campaign.inputs import cuts_of, lists_of
 from bayesdist.app.chips import check_chips
 from bayesdist.app.config import Config
 from bayesdist.app.config.selfcal import SelfcalBlock
-from bayesdist.data import ReferenceCatalog, StarList, read_catalog, read_exposures
+from bayesdist.data import ReferenceCatalog, read_catalog, read_exposures
 from bayesdist.data.detections import Detections, detections_of
 from bayesdist.data.matching.frames import refuse_duplicates
 from bayesdist.data.tables.column import SourceColumn
@@ -116,7 +116,7 @@ def read_inputs(config: Config, base: Path) -> Inputs:
         stars, and exposures that the log does not have.
     """
     block = selfcal_block(config)
-    cuts, rejected, used = cuts_of(block), dict[str, int](), list[StarList]()
+    cuts, rejected, used = cuts_of(block), dict[str, int](), list[Detections]()
     lists = lists_of(block, base)
     for one in lists:
         good, reasons = cuts.passed(one)
@@ -124,26 +124,27 @@ def read_inputs(config: Config, base: Path) -> Inputs:
             rejected[reason] = rejected.get(reason, 0) + count
         if not good.any():
             raise InputError(
-                f"no detection of exposure {one.exposure} passes the cuts",
+                f"no detection of exposure {one.name} passes the cuts",
                 where=one.source,
                 do="widen them, or leave the exposure out",
             )
         used.append(one.select(good))
     if len(used) < 2:
         raise InputError(
-            f"there is one exposure, {used[0].exposure}, and distortion shows between exposures",
+            f"there is one exposure, {used[0].name}, and distortion shows between exposures",
             where=used[0].source,
             do="give dithered exposures of one field",
         )
     check_chips(config.chips(), sorted({int(n) for one in used for n in one.chips}))
     refuse_duplicates(
         [np.column_stack([one.x, one.y, one.chip]) for one in used],
-        [one.exposure for one in used],
+        [one.name for one in used],
         source="selfcal.lists",
     )
-    epoch, dilation = _of_log(config, base, [one.exposure for one in used])
-    if epoch is None and all(one.epoch is not None for one in used):
-        epoch = np.array([one.epoch for one in used], float)
+    epoch, dilation = _of_log(config, base, [one.name for one in used])
+    own = [one.epoch for one in used if one.epoch is not None]
+    if epoch is None and len(own) == len(used):
+        epoch = np.concatenate(own)
     sigma = None if block.sigma == "measured" else float(block.sigma)
     detections = detections_of(used, epoch=epoch, sigma=sigma)
     sources = tuple(dict.fromkeys(one.source for one in used))
