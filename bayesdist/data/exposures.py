@@ -17,7 +17,6 @@ from bayesdist.data.sky.earth import velocity_aberration
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import find_columns
-from bayesdist.data.tables.units import conversion
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 
@@ -322,9 +321,8 @@ def _filled(column: SourceColumn) -> list[str]:
 def _known_numbers(column: SourceColumn, unit: str | None) -> list[float | None]:
     """Numbers of a column, None where they are missing."""
     numbers = column.known_numbers()
-    own = column.unit
-    if own is not None and unit is not None and not np.isnan(numbers).all():
-        numbers = numbers * conversion(own, unit, where=column.where)
+    if unit is not None and not np.isnan(numbers).all():
+        numbers = numbers * column.factor(unit)
     return [None if np.isnan(value) else value for value in numbers.tolist()]
 
 

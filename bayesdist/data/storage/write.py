@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +19,10 @@ from bayesdist.files import atomic_path, made_folder
 if TYPE_CHECKING:
     import pyarrow
 
-__all__ = ["write_columns", "write_partitioned"]
+__all__ = ["write_columns", "write_partitioned", "write_parts"]
 
 Labelled = tuple[NDArray[np.int64], tuple[str, ...]]
+Part = tuple[Mapping[str, NDArray[Any] | Labelled], Mapping[str, str]]
 
 _NUMBERS = (
     *("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour"),
@@ -73,29 +74,43 @@ def write_partitioned(
     if rows_per_group < 1:
         raise InputError(f"rows_per_group is {rows_per_group}", do="give 1 or more")
     _make_empty(folder)
+    written = write_parts(folder, _parts(tables, folder), rows_per_group=rows_per_group)
+    if not written:
+        raise InputError("there are no tables to write", where=str(folder), do="give at least one")
+    return written
+
+
+def _parts(tables: Iterable[Matches], folder: Path) -> Iterator[Part]:
+    """Columns and units of tables, which must have those of the first."""
+    names: list[str] = []
+    unit = ""
+    for number, table in enumerate(tables, 1):
+        columns = _columns(table, names)
+        if number == 1:
+            names, unit = list(columns), table.unit
+        elif list(columns) != names or table.unit != unit:
+            raise InputError(
+                f"table {number} has another unit or other columns than the first",
+                where=str(folder),
+                do="give tables of one kind",
+            )
+        yield columns, dict.fromkeys(_LENGTHS, unit) | {"x": "pix", "y": "pix", "epoch": "yr"}
+
+
+def write_parts(
+    folder: Path, parts: Iterable[Part], *, rows_per_group: int | None = None
+) -> list[Path]:
+    """Files part-00000.parquet and so on of columns and units; none is left if one fails."""
     written: list[Path] = []
-    names: list[str] = []  # columns of the first table
     try:
-        for table in tables:
+        for columns, units in parts:
             path = folder / f"part-{len(written):05d}.parquet"
-            columns = _columns(table, names)
-            if not written:
-                names, unit = list(columns), table.unit
-            elif list(columns) != names or table.unit != unit:
-                raise InputError(
-                    f"table {len(written) + 1} has another unit or other columns than the first",
-                    where=str(folder),
-                    do="give tables of one kind",
-                )
-            units = dict.fromkeys(_LENGTHS, unit) | {"x": "pix", "y": "pix", "epoch": "yr"}
             write_columns(path, columns, units, rows_per_group=rows_per_group)
             written.append(path)
     except BaseException:
         for path in written:
             path.unlink(missing_ok=True)
         raise
-    if not written:
-        raise InputError("there are no tables to write", where=str(folder), do="give at least one")
     return written
 
 
