@@ -17,8 +17,8 @@ from bayesdist.app.match_sources import mission_template
 from bayesdist.app.matches import load_matches
 from bayesdist.app.output import refuse_existing
 from bayesdist.data import FORMATS, Matches
+from bayesdist.data.reading.formats import mission_formats
 from bayesdist.data.reading.layout import TableLayout, table_layout
-from bayesdist.data.reading.mission_formats import mission_formats
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 

@@ -20,7 +20,7 @@ from pydantic import (
 
 from bayesdist.app.config.section import Section
 from bayesdist.data import FORMATS
-from bayesdist.data.reading.mission_formats import mission_formats
+from bayesdist.data.reading.formats import mission_formats
 from bayesdist.data.tables.units import length_advice
 from bayesdist.mission import load_object, missions
 

@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from bayesdist.app.config import Data
+from bayesdist.app.match_sources import MatchSource
 from bayesdist.app.matches import is_large
 from bayesdist.app.named_files import named_files
 from bayesdist.app.rundir import RunDirectory
@@ -22,9 +23,10 @@ from bayesdist.missions.wise.pairs.read import stream_rvb
 from bayesdist.missions.wise.pairs.section import RvbData
 from bayesdist.missions.wise.pairs.selection import SelectedPairs
 from bayesdist.missions.wise.pairs.stored import open_rvb
+from bayesdist.missions.wise.pairs.template import rvb_template
 from bayesdist.missions.wise.published import WISE_ARRAYS
 
-__all__ = ["RvbInput", "load_rvb"]
+__all__ = ["SOURCE", "RvbInput", "load_rvb"]
 
 
 @dataclass
@@ -178,3 +180,6 @@ def _require_array(label: str | None, size: tuple[float, float]) -> None:
             where="detector.size",
             do="give the size of the band's array, or choose the band that it belongs to",
         )
+
+
+SOURCE = MatchSource(read=load_rvb, input_of=RvbInput, template=rvb_template)
