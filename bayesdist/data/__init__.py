@@ -14,8 +14,13 @@ from bayesdist.lazy import lazy_name
 
 _HOMES = {
     "bayesdist.data.catalog": ("ReferenceCatalog", "catalog_from_table", "read_catalog"),
-    "bayesdist.data.exposure_log": ("Exposure", "ExposureLog"),
-    "bayesdist.data.exposures": ("read_exposures", "write_exposures"),
+    "bayesdist.data.detections": ("Detections",),
+    "bayesdist.data.exposures": (
+        "Exposure",
+        "ExposureLog",
+        "read_exposures",
+        "write_exposures",
+    ),
     "bayesdist.data.formats.hst1pass": ("Hst1passList", "read_hst1pass", "read_matchup"),
     "bayesdist.data.magnitude_errors": ("MagnitudeErrors",),
     "bayesdist.data.matches": ("Matches",),
@@ -31,19 +36,13 @@ _HOMES = {
         "centroid_errors",
         "neutralise_aberration",
     ),
-    "bayesdist.data.reading.formats": ("FORMATS", "input_files"),
-    "bayesdist.data.reading.mission_formats": ("MatchFormat",),
+    "bayesdist.data.reading.formats": ("FORMATS", "MatchFormat", "input_files"),
     "bayesdist.data.reading.options": ("ReadOptions",),
     "bayesdist.data.reading.read": ("read_matches",),
     "bayesdist.data.reading.table": ("matches_from_table",),
     "bayesdist.data.sky.earth": ("velocity_aberration",),
     "bayesdist.data.sky.tangent": ("mean_direction", "tangent_plane"),
-    "bayesdist.data.starlists": (
-        "StarCuts",
-        "StarList",
-        "read_star_lists",
-        "star_list_of_hst1pass",
-    ),
+    "bayesdist.data.starlists": ("StarCuts", "read_star_lists"),
     "bayesdist.data.tables.units": ("UNITS",),
     "bayesdist.data.storage.write": ("write_partitioned",),
 }

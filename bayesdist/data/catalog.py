@@ -21,7 +21,7 @@ from bayesdist.data.tables.column import SourceColumn, row_number
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import ALIASES, find_columns
 from bayesdist.data.tables.quantities import Quantities
-from bayesdist.data.tables.units import check_unit, conversion
+from bayesdist.data.tables.units import check_unit
 from bayesdist.errors import InputError
 
 __all__ = ["ReferenceCatalog", "catalog_from_table", "read_catalog"]
@@ -364,18 +364,16 @@ def catalog_from_table(
         base = position_unit((column("u"), column("v")), unit)
 
     def values(key: str, per_year: str = "") -> Float:
-        own, where = column(key).unit, column(key).where
-        if own is None and on_sky:
+        if on_sky and column(key).unit is None:
             # catalogues write degrees for positions and mas for the rest: no guess is safe
             raise InputError(
                 "has no unit",
-                where=where,
+                where=column(key).where,
                 do="write mas or mas / yr into the file, or leave the column out by an empty name "
                 "in the option 'columns'",
             )
-        factor = 1.0 if own is None else conversion(own, base + per_year, where=where)
         numbers = column(key).numbers_or(0.0) if key in _SPARED else column(key).numbers()
-        return numbers * factor
+        return numbers * column(key).factor(base + per_year)
 
     out: dict[str, Any] = {}
     if not on_sky:

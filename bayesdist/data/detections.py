@@ -1,4 +1,4 @@
-"""Detections of stars on many exposures, where the positions of the stars are not known."""
+"""Detections of stars on one exposure or on many."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.starlists import StarList
 from bayesdist.data.tables.checks import check_columns, columns_of
 from bayesdist.errors import InputError
 
@@ -20,42 +19,103 @@ Int = NDArray[np.int64]
 
 NO_STAR = -1
 
-_CODES = ("exposure", "chip", "star")
-_COLUMNS = ("x", "y", "sigma", "mag", *_CODES)
+_CODES = ("exposure", "chip", "star", "row")
+_COLUMNS = ("x", "y", "sigma", "mag", "q", *_CODES)
 
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Raw positions of all exposures, arrays of length N unless stated otherwise.
+    """Raw positions of stars on some exposures, arrays of length N unless stated otherwise.
 
-    `star` groups the detections of one star by its code, with `NO_STAR` where it is not known;
-    `chip` is 1 by default.  Refused are no detections, unequal lengths, values that are not finite,
-    and errors that are not positive.
+    Parameters
+    ----------
+    x, y : ndarray
+        Raw detector position, FITS 1-based pixels of the chip.
+    exposure : ndarray of int, optional
+        Codes into `exposure_names`; by default 0.
+    exposure_names : tuple of str, optional
+        By default the codes.
+    chip : ndarray of int, optional
+        Chip *numbers* (not codes); by default 1.
+    epoch : ndarray, shape (E,), optional
+        Decimal year of each exposure.
+    sigma : ndarray, optional
+        Standard error of x and of y, pixels; positive.
+    mag : ndarray, optional
+        Instrumental magnitudes, -2.5 log10(flux / exposure time).
+    star : ndarray of int, optional
+        Code of the star; by default it is not known, -1.
+    source : str
+        File.
+    q : ndarray, optional
+        Quality of the PSF fit: 0 is perfect, large is poor.
+    row : ndarray of int, optional
+        0-based row in the file.
+
+    Raises
+    ------
+    InputError
+        For no detections, unequal lengths, values that are not finite, or errors that are not
+        positive.
     """
 
-    x: Float  # FITS 1-based pixels of the chip
+    x: Float
     y: Float
-    exposure: Int  # codes, from 0
-    exposure_names: tuple[str, ...]
+    exposure: Int = None  # type: ignore[assignment]
+    exposure_names: tuple[str, ...] = None  # type: ignore[assignment]
     chip: Int = None  # type: ignore[assignment]
-    epoch: Float | None = None  # (E,), decimal years
-    sigma: Float | None = None  # error of x and of y, pixels
-    mag: Float | None = None  # instrumental
+    epoch: Float | None = None
+    sigma: Float | None = None
+    mag: Float | None = None
     star: Int = None  # type: ignore[assignment]
     source: str = "detections"
+    q: Float | None = None
+    row: Int = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        n = len(self.x)
+        n = np.size(self.x)
+        for name, value in (("exposure", 0), ("chip", 1), ("star", NO_STAR)):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, np.full(n, value))
+        if self.row is None:
+            object.__setattr__(self, "row", np.arange(n))
+        if self.exposure_names is None:
+            codes = range(int(np.max(self.exposure, initial=0)) + 1)
+            object.__setattr__(self, "exposure_names", tuple(map(str, codes)))
         if n == 0:
-            raise InputError("holds no detections", where=self.source, do="give lists with stars")
-        if self.chip is None:
-            object.__setattr__(self, "chip", np.ones(n, np.int64))
-        if self.star is None:
-            object.__setattr__(self, "star", np.full(n, NO_STAR))
-        check_columns(self, _COLUMNS, integers=_CODES, where=self.source, positive=("sigma",))
+            raise InputError("holds no detections", where=self.where, do="give a list with stars")
+        check_columns(
+            self,
+            _COLUMNS,
+            integers=_CODES,
+            where=self.where,
+            place=lambda index: f"{self.source}, row {self.row[index] + 1}",
+            positive=("sigma",),
+        )
 
     def __len__(self) -> int:
         return len(self.x)
+
+    @property
+    def name(self) -> str:
+        """Name of the exposure, of a list of one; else of the first."""
+        return self.exposure_names[0]
+
+    @property
+    def where(self) -> str:
+        """File, for messages, and exposure where there is only one."""
+        one = len(self.exposure_names) == 1
+        return f"{self.source}, exposure {self.name}" if one else self.source
+
+    @property
+    def points(self) -> Float:
+        """Positions (N, 2)."""
+        return np.column_stack([self.x, self.y])
+
+    @property
+    def chips(self) -> tuple[int, ...]:
+        """Numbers of the chips that have detections."""
+        return tuple(np.unique(self.chip).tolist())
 
     @property
     def n_stars(self) -> int:
@@ -63,18 +123,27 @@ class Detections:
         return int(self.star.max()) + 1
 
     def select(self, which: NDArray[Any]) -> Detections:
-        """Detections by mask or indices; the exposures stay."""
+        """Detections by mask or indices; the exposures stay.
+
+        Parameters
+        ----------
+        which : ndarray of bool or int
+
+        Returns
+        -------
+        Detections
+        """
         columns = columns_of(self, _COLUMNS)
         return replace(self, **{name: values[which] for name, values in columns.items()})
 
 
 def detections_of(
-    lists: Sequence[StarList],
+    lists: Sequence[Detections],
     *,
-    epoch: Sequence[float] | None = None,
+    epoch: Float | None = None,
     sigma: float | None = None,
 ) -> Detections:
-    """Detections of star lists, one for each exposure, with epochs (years) and one error (pixels).
+    """Detections of lists of one exposure each, with epochs (E,) in years and one error (pixels).
 
     Refused where only some of the lists have magnitudes.
     """
@@ -87,9 +156,9 @@ def detections_of(
         np.concatenate([one.x for one in lists]),
         np.concatenate([one.y for one in lists]),
         np.repeat(np.arange(len(lists)), n),
-        tuple(one.exposure for one in lists),
+        tuple(one.name for one in lists),
         np.concatenate([one.chip for one in lists]),
-        None if epoch is None else np.asarray(epoch, float),
+        epoch,
         None if sigma is None else np.full(sum(n), sigma),
         np.concatenate([one.mag for one in lists if one.mag is not None])
         if all(with_mag)

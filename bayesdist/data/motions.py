@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +14,6 @@ from bayesdist.errors import InputError
 __all__ = ["MotionErrorLine", "motion_error_line", "select_motions"]
 
 Float = NDArray[np.float64]
-Line: TypeAlias = "float | Callable[[Float], ArrayLike]"
 
 _STARS_IN_BIN = 200  # stars of a bin in magnitude
 _MAX_BINS = 40
@@ -69,8 +66,7 @@ def motion_error_line(catalog: ReferenceCatalog) -> MotionErrorLine:
         raise InputError(
             "has no magnitudes to tell badly measured motions by",
             where=catalog.source,
-            do="give them, or one largest error for all, or keep all stars "
-            "(campaign.pm_selection = 'all')",
+            do="give them, or keep all stars (campaign.pm_selection = 'all')",
         )
     count = int(np.clip(len(catalog) // _STARS_IN_BIN, 1, _MAX_BINS))
     parts = np.array_split(np.argsort(catalog.mag, kind="stable"), count)
@@ -86,48 +82,27 @@ def motion_error_line(catalog: ReferenceCatalog) -> MotionErrorLine:
     return MotionErrorLine(mag, line)
 
 
-def select_motions(catalog: ReferenceCatalog, max_sigma: Line | None = None) -> ReferenceCatalog:
+def select_motions(catalog: ReferenceCatalog) -> ReferenceCatalog:
     """Stars with well measured proper motions (the red line of ACS ISR 2015-06, Figure 3).
 
     Parameters
     ----------
     catalog : ReferenceCatalog
-    max_sigma : float or callable, optional
-        Largest error in the catalogue's unit per year, of the worse axis: a number, or a function
-        of an array of magnitudes; by default `motion_error_line`.
 
     Returns
     -------
     ReferenceCatalog
-        The stars at or below the line; they keep their codes.
+        The stars at or below the line of `motion_error_line`, by the worse axis; they keep their
+        codes.
 
     Raises
     ------
     InputError
-        Without errors of the motions, without magnitudes where the line needs them, or when no star
-        is left.
+        As `motion_error_line`.
     """
-    sigma = _motion_errors(catalog)
-    if max_sigma is None:
-        max_sigma = motion_error_line(catalog)
-    if callable(max_sigma):
-        if catalog.mag is None:
-            raise InputError(
-                "has no magnitudes, and the largest error depends on them",
-                where=catalog.source,
-                do="give them, or one largest error for all",
-            )
-        limit = np.asarray(max_sigma(catalog.mag), float)
-    else:
-        limit = np.full(len(catalog), float(max_sigma))
-    good = sigma <= limit
-    if not good.any():
-        raise InputError(
-            "no star has a proper motion measured so well",
-            where=catalog.source,
-            do="allow larger errors",
-        )
-    return catalog.select(good)
+    line = motion_error_line(catalog)
+    assert catalog.mag is not None
+    return catalog.select(_motion_errors(catalog) <= line(catalog.mag))
 
 
 def _motion_errors(catalog: ReferenceCatalog) -> Float:

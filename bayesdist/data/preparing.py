@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from bayesdist.data.exposures import ExposureLog
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import Matches
+from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError
 
 __all__ = ["centroid_errors", "neutralise_aberration"]
@@ -60,22 +61,18 @@ def centroid_errors(table: Matches, total: MagnitudeErrors) -> MagnitudeErrors:
     return replace(total, sigma_u=left[0], sigma_v=left[1])
 
 
-def neutralise_aberration(
-    table: Matches, log: ExposureLog, origin: tuple[float, float] = (0.0, 0.0)
-) -> Matches:
+def neutralise_aberration(table: Matches, log: ExposureLog) -> Matches:
     """Matches with catalogue positions as an aberration-free scale gives them.
 
     A true offset on the sky is VAFACTOR times that by the aberration-free scale of the detector,
-    so that offsets from an origin, and their errors, are divided by it.  Another origin shifts all
-    stars of an exposure alike.
+    so that positions and their errors are divided by it.  Any other origin would shift all stars of
+    an exposure alike.
 
     Parameters
     ----------
     table : Matches
     log : ExposureLog
         With VAFACTOR of each exposure of the table.
-    origin : tuple of float, optional
-        In the unit of u, v.
 
     Returns
     -------
@@ -94,15 +91,6 @@ def neutralise_aberration(
     factor = np.array(
         [used[name].vafactor if name in used else 1.0 for name in table.exposure_names], float
     )[table.exposure]
-    changes: dict[str, Float] = {
-        "u": origin[0] + (table.u - origin[0]) / factor,
-        "v": origin[1] + (table.v - origin[1]) / factor,
-    }
-    if table.sigma_u is not None and table.sigma_v is not None:
-        changes |= {"sigma_u": table.sigma_u / factor, "sigma_v": table.sigma_v / factor}
-    if table.u_nominal is not None and table.v_nominal is not None:
-        changes |= {
-            "u_nominal": origin[0] + (table.u_nominal - origin[0]) / factor,
-            "v_nominal": origin[1] + (table.v_nominal - origin[1]) / factor,
-        }
-    return table.with_columns(**changes)
+    lengths = ("u", "v", "sigma_u", "sigma_v", "u_nominal", "v_nominal")
+    columns = columns_of(table, lengths)
+    return table.with_columns(**{name: values / factor for name, values in columns.items()})

@@ -1,6 +1,5 @@
 """Data sets of known truth."""
 
-from bayesdist.simulate.matches import Truth, simulate_matches
-from bayesdist.simulate.partitioned import simulate_partitioned
+from bayesdist.simulate.matches import Truth, simulate_matches, simulate_partitioned
 
 __all__ = ["Truth", "simulate_matches", "simulate_partitioned"]

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayesdist.data.batches import even_edges
 from bayesdist.data.matches import Matches
+from bayesdist.data.storage.write import write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 
-__all__ = ["Truth", "simulate_matches"]
+__all__ = ["Truth", "simulate_matches", "simulate_partitioned"]
 
 Float = NDArray[np.float64]
 
 _AT_ONCE, _STEP = 65_536, 8192
+CHUNK = 1_000_000  # matches in memory at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +135,42 @@ def simulate_matches(
         sources=("simulation",),
     )
     return matches, Truth(model, theta, fraction, jitter, outlier_scale, false)
+
+
+def simulate_partitioned(
+    folder: str | os.PathLike[str], n: int, simulate: Callable[[int], tuple[Matches, Truth]]
+) -> Truth:
+    """Truth of matched stars that are written to a folder of Parquet files as they come.
+
+    Parameters
+    ----------
+    folder : path-like
+        As `write_partitioned`.
+    n : int
+    simulate : callable
+        Makes so many matches, at most `CHUNK`, and their truth.
+
+    Returns
+    -------
+    Truth
+        `false` has one byte for each pair, in the order of the files.
+
+    Raises
+    ------
+    InputError
+        As `simulate` and `write_partitioned`.
+    """
+    truths: list[Truth] = []
+    edges = even_edges(n, CHUNK)
+
+    def chunks() -> Iterator[Matches]:
+        for size in np.diff(edges).tolist():
+            matches, truth = simulate(size)
+            truths.append(truth)
+            yield matches
+
+    write_partitioned(chunks(), folder)
+    return replace(truths[0], false=np.concatenate([truth.false for truth in truths]))
 
 
 def _positions(

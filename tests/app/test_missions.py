@@ -88,6 +88,12 @@ def test_a_package_adds_a_format_of_matches(tmp_path):
     config = tomllib.loads((tmp_path / "c.toml").read_text())
     assert max(config["detector"]["size"]) <= 1024  # a tenth of the numbers in the file
     assert config["data"].get("unit", "arcsec") == "arcsec"
+    text = (tmp_path / "c.toml").read_text()
+    for format, refused in (("tenths", False), ("tents", True)):
+        (tmp_path / "c.toml").write_text(text.replace("[data]", f'[data]\nformat = "{format}"', 1))
+        checked = called(tmp_path, "check", "c.toml")
+        assert ("which is no format" in checked.stderr) is refused
+        assert ("'tenths'" in checked.stderr) is refused
 
 
 def test_a_mission_that_cannot_be_loaded_is_named(tmp_path):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from bayesdist.data import ReferenceCatalog
+from bayesdist.data.detections import Detections
 from bayesdist.data.exposures import Exposure, ExposureLog
-from bayesdist.data.starlists import StarList
 
 FRAME = (4096.0, 4146.0)  # two chips of 2048 rows, and a gap of 50 between them
 GAP = (2048.5, 2098.5)
@@ -75,9 +75,15 @@ def campaign(rng, n, *, stars=12_000, side=6000.0, motion=0.01, **options):
         p, m, rows = frame(rng, uv + pm.T * (epoch - 2004.5), mag, roll, centre, **options)
         chip = np.where(p[:, 1] > GAP[0], 1, 2)
         lists.append(
-            StarList(f"e{k}", p[:, 0], p[:, 1] - np.where(chip == 1, GAP[1], 0.0), chip, m,
-                     source=f"e{k}.parquet")
-        )  # fmt: skip
+            Detections(
+                p[:, 0],
+                p[:, 1] - np.where(chip == 1, GAP[1], 0.0),
+                exposure_names=(f"e{k}",),
+                chip=chip,
+                mag=m,
+                source=f"e{k}.parquet",
+            )
+        )
         log.append(Exposure(f"e{k}", epoch, "F606W" if k % 2 else "F814W", vafactor=1 + 1e-5 * k))
         truth.append(rows)
         rolls.append(np.degrees(roll))

@@ -52,7 +52,6 @@ def test_selection_and_order():
     assert LOG.filters == ("F606W", "F814W", "")
     assert LOG.names == ("j1", "j2", "j3") and len(LOG) == 3 and "j2" in LOG
     assert LOG.select(filter="F814W").names == ("j2",)
-    assert LOG.select(epochs=(2003.25, 2011.75)).names == ("j1", "j2")
     assert LOG.select(names=["j3", "j1"]).names == ("j1", "j3")
     np.testing.assert_array_equal(LOG.values("pa_v3"), [12.5, np.nan, np.nan])
     with pytest.raises(InputError, match="no exposure has filter F475W"):

@@ -11,7 +11,7 @@ from scipy import stats
 from bayesdist.data import Matches, open_matches, read_matches
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.simulate import simulate_wise, simulate_wise_partitioned, wise_solution
-from bayesdist.simulate import partitioned as partitioned_module
+from bayesdist.simulate import matches as simulated_matches
 
 NAMES = ("x", "y", "u", "v", "sigma_u", "sigma_v", "mag")
 
@@ -27,7 +27,7 @@ def test_reading_back_gives_the_same_numbers(tmp_path):
 
 
 def test_chunks_follow_one_generator(tmp_path, monkeypatch):
-    monkeypatch.setattr(partitioned_module, "CHUNK", 1000)
+    monkeypatch.setattr(simulated_matches, "CHUNK", 1000)
     truth = simulate_wise_partitioned(tmp_path, 2500, rng=np.random.default_rng(3))
     assert len(os.listdir(tmp_path)) == 3
     rng = np.random.default_rng(3)
@@ -42,7 +42,7 @@ def test_chunks_follow_one_generator(tmp_path, monkeypatch):
 
 
 def test_pairs_scatter_about_the_published_solution_across_chunks(tmp_path, monkeypatch):
-    monkeypatch.setattr(partitioned_module, "CHUNK", 7000)
+    monkeypatch.setattr(simulated_matches, "CHUNK", 7000)
     truth = simulate_wise_partitioned(tmp_path, 40_000, rng=np.random.default_rng(8), fraction=0.1)
     model, theta = wise_solution()
     m = read_matches(tmp_path)

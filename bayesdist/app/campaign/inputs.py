@@ -122,8 +122,8 @@ def read_campaign(config: CampaignConfig, base: Path) -> Inputs:
         log = ExposureLog(bare, log.source).with_aberration()
     log.require("vafactor")
     found = lists_of(block, base)
-    wanted = tuple(one for one in found.lists if one.exposure in log)
-    missing = sorted(set(log.names) - {one.exposure for one in wanted})
+    wanted = tuple(one for one in found.lists if one.name in log)
+    missing = sorted(set(log.names) - {one.name for one in wanted})
     if missing:
         raise InputError(
             f"there is no star list of exposure {missing[0]!r}"
@@ -131,7 +131,7 @@ def read_campaign(config: CampaignConfig, base: Path) -> Inputs:
             where=log.source,
             do="add the list, or take the exposure out of the log",
         )
-    unlogged = dict.fromkeys(one.exposure for one in found.lists if one.exposure not in logged)
+    unlogged = dict.fromkeys(one.name for one in found.lists if one.name not in logged)
     n = len(catalog)
     if block.pm_selection == "reliable" and catalog.sigma_pm_u is not None:
         catalog = select_motions(catalog)

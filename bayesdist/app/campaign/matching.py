@@ -14,9 +14,9 @@ from bayesdist.app.campaign.matched import CampaignMatched, matched_campaign
 from bayesdist.app.campaign.reference import free_rates
 from bayesdist.app.kinds.star_lists import StarLists, positions_by_chip, start_of
 from bayesdist.data import (
+    Detections,
     ExposureLog,
     Matches,
-    StarList,
     match_campaign,
     neutralise_aberration,
 )
@@ -143,7 +143,7 @@ def _doubtful_parity(mirrored: bool, parities: tuple[bool, ...], detector: str) 
     ]
 
 
-def _gauge_first(star_lists: StarLists, chip: int) -> tuple[StarList, ...]:
+def _gauge_first(star_lists: StarLists, chip: int) -> tuple[Detections, ...]:
     """The lists, led by one with enough stars on the reference chip.
 
     The first exposure's stars there define the gauge of the joint fit.  The order stays where the

@@ -58,5 +58,5 @@ def _without(inputs: Inputs) -> dict[int, list[str]]:
     for one, good in zip(lists.lists, lists.passed, strict=True):
         for chip in inputs.config.chips():
             if chip.number not in one.chip[good]:
-                out.setdefault(chip.number, []).append(one.exposure)
+                out.setdefault(chip.number, []).append(one.name)
     return out

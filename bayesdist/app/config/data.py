@@ -25,6 +25,7 @@ from bayesdist.app.config.products import MatchedProducts
 from bayesdist.app.config.run import RunConfig
 from bayesdist.app.config.section import Section, Unit
 from bayesdist.data import FORMATS
+from bayesdist.data.reading.formats import mission_formats
 from bayesdist.data.tables.units import length_advice
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.period_dates import check_periods, mjd_periods
@@ -99,7 +100,7 @@ def _of_its_format(raw: Any, handler: Any, info: ValidationInfo) -> Data:
     kind = Data
     if format not in FORMATS or raw.keys() - Data.model_fields.keys():
         sections = data_sections()
-        _require_known(format, (*FORMATS, *sections))
+        _require_known(format, (*FORMATS, *mission_formats(), *sections))
         kind = sections.get(format, Data)
         for name, other in sections.items():
             for key in raw.keys() & other.model_fields.keys() - kind.model_fields.keys():

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bayesdist.app.config.campaign import StarListsBlock
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.data import StarCuts, StarList, read_star_lists
+from bayesdist.data import Detections, StarCuts, read_star_lists
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal.start import Start
 from bayesdist.model import Chip
@@ -40,11 +40,11 @@ class StarLists:
 
     Parameters
     ----------
-    lists : tuple of StarList
+    lists : tuple of Detections
     cuts : StarCuts
     """
 
-    lists: tuple[StarList, ...]
+    lists: tuple[Detections, ...]
     cuts: StarCuts
 
     def __len__(self) -> int:
@@ -85,7 +85,7 @@ def lists_of(block: StarListsBlock, base: Path) -> StarLists:
     return StarLists(tuple(lists), StarCuts(block.mag, block.saturation, block.q_max))
 
 
-def refuse_other_chips(lists: Sequence[StarList], chips: Sequence[Chip], key: str) -> None:
+def refuse_other_chips(lists: Sequence[Detections], chips: Sequence[Chip], key: str) -> None:
     """Refuse detections off the chips of a configuration, and chips without any.
 
     Nothing is checked without [[chip]] blocks.  `key` is the one of the configuration that names
@@ -101,17 +101,16 @@ def refuse_other_chips(lists: Sequence[StarList], chips: Sequence[Chip], key: st
         return
     seen: set[int] = set()
     for one in lists:
-        where = f"{one.source}, exposure {one.exposure}"
         for number in one.chips:
             rows = one.chip == number
             if number not in known:
                 raise InputError(
                     f"{int(rows.sum())} detections are on chip {number}, which no [[chip]] block "
                     "describes",
-                    where=where,
+                    where=one.where,
                     do=f"add a block, or leave them out (known: {', '.join(map(str, known))})",
                 )
-            _refuse_off_chip(one.x[rows], one.y[rows], known[number], where)
+            _refuse_off_chip(one.x[rows], one.y[rows], known[number], one.where)
         seen.update(one.chips)
     empty = [chip.name for chip in chips if chip.number not in seen]
     if empty:

@@ -187,12 +187,12 @@ def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
     for one, good in zip(found.lists, found.passed, strict=True):
         if not good.any():
             raise InputError(
-                f"no detection of exposure {one.exposure} passes the cuts",
+                f"no detection of exposure {one.name} passes the cuts",
                 where=one.source,
                 do="widen them, or leave the exposure out",
             )
     used = [one.select(good) for one, good in zip(found.lists, found.passed, strict=True)]
-    names = [one.exposure for one in used]
+    names = [one.name for one in used]
     if len(used) < 2:
         raise InputError(
             f"there is one exposure, {names[0]}, and distortion shows between exposures",
@@ -205,7 +205,7 @@ def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
     )
     epoch, dilation = _of_log(config, base, names)
     if epoch is None and all(one.epoch is not None for one in used):
-        epoch = [one.epoch for one in used if one.epoch is not None]
+        epoch = np.concatenate([one.epoch for one in used if one.epoch is not None])
     sigma = None if block.sigma == "measured" else float(block.sigma)
     commanded, catalog = None, _read_references(config, base)
     if gauge.offsets is not None:
@@ -238,7 +238,7 @@ def _unit_arcsec(config: SelfcalConfig) -> float | None:
 
 def _of_log(
     config: SelfcalConfig, base: Path, names: Sequence[str]
-) -> tuple[list[float] | None, Float | None]:
+) -> tuple[Float | None, Float | None]:
     """Dates and VAFACTOR of the exposures, where there is a log."""
     exposures = config.selfcal.exposures
     if exposures is None:

@@ -29,11 +29,7 @@ def is_astrometrynet(names: Iterable[str]) -> bool:
 
 
 def matches_from_corr(
-    table: Table,
-    options: ReadOptions | None = None,
-    *,
-    source: str = "corr.fits",
-    exposure_name: str | None = None,
+    table: Table, options: ReadOptions, *, source: str, exposure_name: str | None
 ) -> Matches:
     """Matches from the columns of a `corr.fits`; missing columns or values are refused.
 
@@ -43,5 +39,5 @@ def matches_from_corr(
     must not.
     """
     columns = COLUMNS | ({"flux": "FLUX"} if "FLUX" in table.colnames else {})
-    options = replace(options or ReadOptions(), columns=columns, unit=None, sigma="by_magnitude")
+    options = replace(options, columns=columns, unit=None, sigma="by_magnitude")
     return matches_from_table(table, options, source=source, exposure_name=exposure_name)

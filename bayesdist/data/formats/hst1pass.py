@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.catalog import ReferenceCatalog
+from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
 from bayesdist.data.tables.files import read_lines
 from bayesdist.errors import FormatError
@@ -76,13 +77,7 @@ class Hst1passList:
         FormatError
             When the list lacks one of X, Y, u, v.
         """
-        for letter in "XYuv":
-            if letter not in self.columns:
-                raise FormatError(
-                    f"has no column {letter!r} (it has {' '.join(self.columns)})",
-                    where=self.source,
-                    do="run hst1pass with OUT=uvwXYMpq",
-                )
+        self._require("XYuv")
         n = len(self.columns["X"])
         return Matches(
             x=self.columns["X"],
@@ -95,6 +90,43 @@ class Hst1passList:
             filter_names=(self.filter,),
             sources=(self.source,),
         )
+
+    def detections(self, *, name: str | None = None) -> Detections:
+        """Raw pixels, instrumental magnitudes M and qualities q of the detections.
+
+        Parameters
+        ----------
+        name : str, optional
+            Name of the exposure.
+
+        Returns
+        -------
+        Detections
+
+        Raises
+        ------
+        FormatError
+            When the list lacks X or Y.
+        """
+        self._require("XY")
+        return Detections(
+            x=self.columns["X"],
+            y=self.columns["Y"],
+            exposure_names=(self.name if name is None else name,),
+            mag=self.columns.get("M"),
+            q=self.columns.get("q"),
+            source=self.source,
+        )
+
+    def _require(self, letters: str) -> None:
+        """Refuse a list without one of these columns."""
+        for letter in letters:
+            if letter not in self.columns:
+                raise FormatError(
+                    f"has no column {letter!r} (it has {' '.join(self.columns)})",
+                    where=self.source,
+                    do="run hst1pass with OUT=uvwXYMpq",
+                )
 
 
 def is_hst1pass(lines: list[str]) -> bool:

@@ -19,6 +19,7 @@ from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.catalog import ReferenceCatalog
+from bayesdist.data.detections import Detections
 from bayesdist.data.exposures import ExposureLog
 from bayesdist.data.labels import merged_counts
 from bayesdist.data.matches import Matches
@@ -33,7 +34,7 @@ from bayesdist.data.matching.reports import (
     too_many,
 )
 from bayesdist.data.matching.similarity import PatternIndex, mismatch_reason, pattern_index
-from bayesdist.data.starlists import StarCuts, StarList
+from bayesdist.data.starlists import StarCuts
 from bayesdist.data.tables.column import encoded
 from bayesdist.errors import InputError
 
@@ -102,7 +103,7 @@ class CampaignMatches:
 
 
 def match_campaign(
-    lists: Sequence[StarList],
+    lists: Sequence[Detections],
     log: ExposureLog,
     catalog: ReferenceCatalog,
     start: Start,
@@ -116,7 +117,7 @@ def match_campaign(
 
     Parameters
     ----------
-    lists : sequence of StarList
+    lists : sequence of Detections
         One for each exposure.
     log : ExposureLog
         With their epochs and filters.
@@ -157,17 +158,16 @@ def match_campaign(
     cuts = StarCuts() if cuts is None else cuts
     passed = [cuts.passed(one) for one in lists]
     chips = sorted({chip for one in lists for chip in one.chips})
-    mean_epoch = float(np.mean([log[one.exposure].epoch for one in lists]))
+    mean_epoch = float(np.mean([log[one.name].epoch for one in lists]))
     views = [_View(catalog, one, mean_epoch) for one in mirrored]
     found: list[ExposureMatch] = []
     failed: dict[str, InputError] = {}
     for one, (good, rejected) in zip(lists, passed, strict=True):
-        where = f"{one.source}, exposure {one.exposure}"
-        exposure = log[one.exposure]
+        exposure = log[one.name]
         plane = _started(start, one, exposure.epoch)
         try:
             if not good.any():
-                raise all_cut(one, rejected, where)
+                raise all_cut(one, rejected)
             match = partial(
                 match_exposure,
                 one,
@@ -177,7 +177,7 @@ def match_campaign(
                 chips=chips,
                 rejected=rejected,
                 radius=radius,
-                source=where,
+                source=one.where,
             )
             pairs, view = _matched(match, views, exposure.epoch)
             views = [view]
@@ -185,13 +185,13 @@ def match_campaign(
             reason = ""
             if good.any() and not found and not failed:
                 reason = mismatch_reason(plane, one.mag, views[0].index)
-            failed[one.exposure] = error
+            failed[one.name] = error
             if reason or not skip or too_many(len(failed), len(found), len(lists)):
                 raise failure(failed, reason, len(lists), mirrored) from error
             continue
         found.append(pairs)
     refuse_astray([one.report for one in found], catalog)
-    matched = [one for one in lists if one.exposure not in failed]
+    matched = [one for one in lists if one.name not in failed]
     shown = catalog.mirrored() if views[0].mirrored else catalog
     table = _table(matched, log, shown, found)
     if failed:
@@ -243,20 +243,20 @@ def _matched(
     raise InputError(cause, where=first.where, do=first.do.replace(", the parity and", " and"))
 
 
-def _started(start: Start, stars: StarList, epoch: float) -> Float:
+def _started(start: Start, stars: Detections, epoch: float) -> Float:
     plane = np.ascontiguousarray(start(stars.x, stars.y, stars.chip, epoch), np.float64)
     if plane.shape != (len(stars), 2) or not np.isfinite(plane).all():
         raise InputError(
             f"the known distortion gives shape {plane.shape} or values that are not finite, "
             f"where ({len(stars)}, 2) finite ones are expected",
-            where=f"{stars.source}, exposure {stars.exposure}",
+            where=stars.where,
             do="correct the function 'start'",
         )
     return plane
 
 
 def _table(
-    lists: Sequence[StarList],
+    lists: Sequence[Detections],
     log: ExposureLog,
     catalog: ReferenceCatalog,
     found: Sequence[ExposureMatch],
@@ -269,7 +269,7 @@ def _table(
         return np.concatenate([one[m.index] for one, m in zip(values, found, strict=True)])
 
     each = np.repeat(np.arange(len(lists)), sizes)
-    filters, filter_names = encoded(np.array([log[one.exposure].filter for one in lists]))
+    filters, filter_names = encoded(np.array([log[one.name].filter for one in lists]))
     files, sources = encoded(np.array([one.source for one in lists]))
     chip, chip_numbers = encoded(joined([one.chip for one in lists]), ordered=True)
     with_mag = all(one.mag is not None for one in lists)
@@ -278,7 +278,7 @@ def _table(
     if unmatched:
         rejected[_UNMATCHED] = unmatched
     star = np.concatenate([match.catalog_index for match in found])
-    sigmas: dict[str, Float] = {}
+    sigmas: dict[str, Any] = {}
     if catalog.sigma_u is not None:
         sigmas["sigma_u"] = np.concatenate([m.sigma[0] for m in found])  # type: ignore[index]
         sigmas["sigma_v"] = np.concatenate([m.sigma[1] for m in found])  # type: ignore[index]
@@ -289,10 +289,10 @@ def _table(
         v=np.concatenate([match.v for match in found]),
         **sigmas,
         unit=catalog.unit,
-        epoch=np.array([log[one.exposure].epoch for one in lists])[each],
+        epoch=np.array([log[one.name].epoch for one in lists])[each],
         mag=joined([one.mag for one in lists]) if with_mag else None,  # type: ignore[misc]
         exposure=each,
-        exposure_names=tuple(one.exposure for one in lists),
+        exposure_names=tuple(one.name for one in lists),
         chip=chip,
         chip_numbers=chip_numbers,
         filter=filters[each],

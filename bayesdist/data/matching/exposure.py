@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.exposure_log import Exposure
+from bayesdist.data.detections import Detections
+from bayesdist.data.exposures import Exposure
 from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, best_similarity, iterated_map
 from bayesdist.data.matching.pairs import (
     beats_chance,
@@ -24,7 +25,6 @@ from bayesdist.data.matching.reports import ExposureReport
 from bayesdist.data.matching.search_radius import SearchRadius, search_radius
 from bayesdist.data.matching.similarity import PatternIndex, find_similarity, grown_map
 from bayesdist.data.matching.smooth_map import smooth_map
-from bayesdist.data.starlists import StarList
 from bayesdist.errors import InputError
 
 __all__ = ["ExposureMatch", "match_exposure"]
@@ -59,7 +59,7 @@ class ExposureMatch:
 
 
 def match_exposure(
-    stars: StarList,
+    stars: Detections,
     good: Bool,
     plane: Float,
     catalog: ReferenceCatalog,
@@ -238,7 +238,7 @@ def _false_rate(pairs: _Pairs, rho: Float, reference: Float, step: float) -> flo
 
 
 def _by_patterns(
-    stars: StarList,
+    stars: Detections,
     good: Bool,
     plane: Float,
     catalog: ReferenceCatalog,
@@ -284,7 +284,7 @@ def _around(points: Float, catalog: ReferenceCatalog) -> Int:
 
 
 def _range(
-    stars: StarList, rows: Int, index: Int, catalog: ReferenceCatalog, partner: Int
+    stars: Detections, rows: Int, index: Int, catalog: ReferenceCatalog, partner: Int
 ) -> tuple[float | None, Bool]:
     """Zero point, and a mask of the catalogue stars within the magnitudes of the detections."""
     if stars.mag is None or catalog.mag is None:

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.exposure_log import ExposureLog
+from bayesdist.data.detections import Detections
+from bayesdist.data.exposures import ExposureLog
 from bayesdist.data.magnitude_errors import MAD_TO_SIGMA
 from bayesdist.data.matching.similarity import MIRRORED
-from bayesdist.data.starlists import StarList
 from bayesdist.errors import InputError
 
 __all__ = [
@@ -101,7 +101,9 @@ class ExposureReport:
     coincidences: int
 
 
-def check_campaign(lists: Sequence[StarList], log: ExposureLog, catalog: ReferenceCatalog) -> None:
+def check_campaign(
+    lists: Sequence[Detections], log: ExposureLog, catalog: ReferenceCatalog
+) -> None:
     """Refuse lists, log and catalogue that do not fit together; nothing is matched.
 
     InputError for no lists, an exposure that is not in the log or stands in two lists, errors of 0,
@@ -109,18 +111,17 @@ def check_campaign(lists: Sequence[StarList], log: ExposureLog, catalog: Referen
     """
     if not lists:
         raise InputError("there are no star lists to match", do="give at least one")
-    names = [one.exposure for one in lists]
+    names = [one.name for one in lists]
     for k, one in enumerate(lists):
-        if one.exposure not in log:
+        if one.name not in log:
             raise InputError(
-                f"exposure {one.exposure} is not in {log.source}",
+                f"exposure {one.name} is not in {log.source}",
                 where=one.source,
                 do="add it to the log, or leave the list out",
             )
-        if one.exposure in names[:k]:
+        if one.name in names[:k]:
             raise InputError(
-                f"exposure {one.exposure} has a list in {lists[names.index(one.exposure)].source}, "
-                "too",
+                f"exposure {one.name} has a list in {lists[names.index(one.name)].source}, too",
                 where=one.source,
                 do="give one list for each exposure",
             )
@@ -137,12 +138,12 @@ def check_campaign(lists: Sequence[StarList], log: ExposureLog, catalog: Referen
         catalog.at(log[names[0]].epoch)
 
 
-def all_cut(stars: StarList, rejected: Mapping[str, int], where: str) -> InputError:
+def all_cut(stars: Detections, rejected: Mapping[str, int]) -> InputError:
     """Error of a list of which the cuts leave nothing, with the counts of each cut."""
     counts = ", ".join(f"{count} {reason}" for reason, count in rejected.items())
     return InputError(
         f"the cuts leave none of {len(stars)} detections ({counts})",
-        where=where,
+        where=stars.where,
         do="widen the cuts, or correct the columns that they go by",
     )
 

@@ -18,7 +18,7 @@ from bayesdist.data.tables.checks import refuse_half
 from bayesdist.data.tables.column import SourceColumn, year_of
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
 from bayesdist.data.tables.quantities import Quantities
-from bayesdist.data.tables.units import check_unit, conversion
+from bayesdist.data.tables.units import check_unit
 from bayesdist.errors import InputError
 
 __all__ = [
@@ -163,7 +163,7 @@ def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any
             out[key] = _sigma(column(key), out["unit"])
     at = options.tangent_point
     for key in nominal_columns(found, source=quantities.source, tangent_point=at):
-        out[key] = _in_unit(column(key), out["unit"])
+        out[key] = column(key).numbers() * column(key).factor(out["unit"])
     if "mag" in found:
         out["mag"] = column("mag").numbers()
     elif "flux" in found:
@@ -256,15 +256,9 @@ def nominal_columns(
     return keys
 
 
-def _in_unit(column: SourceColumn, unit: str) -> Float:
-    """Numbers in the unit of u, v."""
-    own = column.unit
-    return column.numbers() * (1.0 if own is None else conversion(own, unit, where=column.where))
-
-
 def _sigma(column: SourceColumn, unit: str) -> Float:
     """Standard errors in the unit of u, v."""
-    sigma = _in_unit(column, unit)
+    sigma = column.numbers() * column.factor(unit)
     good = sigma > 0
     if not good.all():
         bad = int(np.argmin(good))

@@ -4,21 +4,57 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+
+from astropy.table import Table
 
 from bayesdist.data.formats.astrometrynet import is_astrometrynet
 from bayesdist.data.formats.hst1pass import is_hst1pass, is_matchup
-from bayesdist.data.reading.mission_formats import mission_formats
 from bayesdist.data.tables.files import TABLE_SUFFIXES, is_binary, is_fits, read_lines, read_table
 from bayesdist.data.tables.text import is_text_table
 from bayesdist.errors import FormatError, InputError
+from bayesdist.mission import load_object, missions
 
-__all__ = ["FORMATS", "exposure_names", "input_files", "kind_of"]
+__all__ = [
+    "FORMATS",
+    "MatchFormat",
+    "exposure_names",
+    "input_files",
+    "kind_of",
+    "mission_formats",
+]
 
 PathLike = str | os.PathLike[str]
 
 FORMATS = ("auto", "table", "hst1pass", "matchup", "astrometry.net")
+
+
+@dataclass(frozen=True)
+class MatchFormat:
+    """A format of files of matches that a mission names in `match_formats`.
+
+    Parameters
+    ----------
+    recognizes : callable
+        Given the path of a file: whether it is of this format.
+    read : callable
+        Given the path: its matches as a table whose columns have the names and units that
+        `read_matches` knows.
+    """
+
+    recognizes: Callable[[Path], bool]
+    read: Callable[[Path], Table]
+
+
+def mission_formats() -> dict[str, MatchFormat]:
+    """Formats of all missions that are installed, by name."""
+    return {
+        name: load_object(where)
+        for mission in missions().values()
+        for name, where in mission.match_formats.items()
+    }
 
 
 def input_files(path: PathLike | Sequence[PathLike]) -> list[Path]:

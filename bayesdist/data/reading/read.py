@@ -17,8 +17,13 @@ from bayesdist.data.formats.hst1pass import is_matchup, read_hst1pass, read_matc
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.table import match_table
 from bayesdist.data.reading.chips import numbered, text_labels
-from bayesdist.data.reading.formats import FORMATS, exposure_names, input_files, kind_of
-from bayesdist.data.reading.mission_formats import mission_formats
+from bayesdist.data.reading.formats import (
+    FORMATS,
+    exposure_names,
+    input_files,
+    kind_of,
+    mission_formats,
+)
 from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
 from bayesdist.data.reading.table import matches_from_table, sky_positions
 from bayesdist.data.sky.tangent import mean_direction
@@ -61,7 +66,7 @@ def read_matches(
         'table' (.ecsv, .csv, .fits, .parquet, .vot, .tbl and text of several kinds),
         'hst1pass' (lists with raw and corrected positions),
         'matchup' (such lists with the MATCHUP master that they are then matched with),
-        'astrometry.net' (corr.fits), or 'auto': by name and content.
+        'astrometry.net' (corr.fits), one that a mission adds, or 'auto': by name and content.
     columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
         As `ReadOptions`.
 
@@ -74,9 +79,10 @@ def read_matches(
     InputError
         For all that is wrong with a file or an option, in one sentence.
     """
-    if format not in FORMATS:
+    known = (*FORMATS, *mission_formats())
+    if format not in known:
         raise InputError(
-            f"format is {format!r}", where="data.format", do=f"choose one of {', '.join(FORMATS)}"
+            f"format is {format!r}", where="data.format", do=f"choose one of {', '.join(known)}"
         )
     options = ReadOptions(
         columns,

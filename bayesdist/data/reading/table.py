@@ -22,14 +22,14 @@ from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns
 from bayesdist.data.tables.quantities import Quantities
 from bayesdist.errors import InputError
 
-__all__ = ["as_table", "matches_from_table", "own_epoch", "sky_positions", "with_sky_columns"]
+__all__ = ["matches_from_table", "own_epoch", "sky_positions", "with_sky_columns"]
 
 Float = NDArray[np.float64]
 
 _SPARED = frozenset((*SPARED, "colour", "flux"))  # optional: a star may lack them
 
 
-def as_table(data: Any, source: str) -> Table:
+def _as_table(data: Any, source: str) -> Table:
     """Astropy Table from any object with columns."""
     if isinstance(data, Table):
         return data
@@ -44,10 +44,10 @@ def as_table(data: Any, source: str) -> Table:
 
 
 def sky_positions(
-    data: Any, columns: Mapping[str, str] | None = None, *, source: str = "table"
+    table: Table, columns: Mapping[str, str] | None, *, source: str
 ) -> tuple[Float, Float] | None:
     """Degrees (N,) of ra and of dec where the reference positions are on the sky, else None."""
-    table = with_sky_columns(as_table(data, source))
+    table = with_sky_columns(table)
     found = find_columns(table.colnames, columns, ALIASES, source=source, pairs=PAIRS)
     if not is_on_sky(table.colnames, found, columns, source):
         return None
@@ -104,7 +104,7 @@ def matches_from_table(
         or contradict each other, no rows, and all that `Matches` refuses.
     """
     options = options or ReadOptions()
-    table = with_sky_columns(as_table(data, source))
+    table = with_sky_columns(_as_table(data, source))
     found, options, notes = columns_read(table.colnames, table.meta, options, source=source)
     if len(table) == 0:
         raise InputError("holds no rows", where=source, do="give a table with matched stars")

@@ -18,7 +18,6 @@ from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.data.sky.tangent import mean_direction
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.quantities import Quantities
-from bayesdist.data.tables.units import conversion
 from bayesdist.errors import InputError
 
 __all__ = ["MOTIONS", "SKY_QUANTITIES", "SPARED", "ReferenceSky", "reference_sky", "sky_columns"]
@@ -60,9 +59,7 @@ def _degrees(column: SourceColumn, key: str) -> Float:
     values = np.asarray(column.values) if hasattr(column.values, "dtype") else np.zeros(0)
     if values.dtype.kind in "SU" and any(mark in str(values.flat[0]) for mark in ": hd"):
         return _sexagesimal(column, values.astype(str), key)
-    unit = column.unit
-    factor = 1.0 if unit is None else conversion(unit, "deg", where=column.where)
-    return column.numbers() * factor
+    return column.numbers() * column.factor("deg")
 
 
 def _sexagesimal(column: SourceColumn, texts: NDArray[np.str_], key: str) -> Float:
@@ -158,8 +155,7 @@ def _optional(quantities: Quantities, key: str, unit: str) -> Float | None:
 
 
 def _in_unit(column: SourceColumn, key: str, unit: str, *, missing: bool) -> Float:
-    own = column.unit
-    if own is None and unit:
+    if column.unit is None and unit:
         # catalogues write degrees for positions and mas for the rest: no guess is safe
         raise InputError(
             "has no unit, and its name is that of no known catalogue",
@@ -167,7 +163,7 @@ def _in_unit(column: SourceColumn, key: str, unit: str, *, missing: bool) -> Flo
             do="write it into the file (mas, or mas / yr), or leave the column out: "
             f'columns = {{{key} = ""}}',
         )
-    factor = conversion(own, unit, where=column.where) if unit and own is not None else 1.0
+    factor = column.factor(unit) if unit else 1.0
     return factor * (column.numbers_or(0.0) if missing else column.numbers())
 
 

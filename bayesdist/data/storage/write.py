@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,20 +12,23 @@ from numpy.typing import NDArray
 
 from bayesdist.data.batches import BATCH
 from bayesdist.data.matches import Matches
+from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path, made_folder
 
 if TYPE_CHECKING:
     import pyarrow
 
-__all__ = ["write_columns", "write_partitioned"]
+__all__ = ["write_columns", "write_partitioned", "write_parts"]
 
 Labelled = tuple[NDArray[np.int64], tuple[str, ...]]
+Part = tuple[Mapping[str, NDArray[Any] | Labelled], Mapping[str, str]]
 
 _NUMBERS = (
     *("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour"),
     *("u_nominal", "v_nominal"),
 )
+_LENGTHS = ("u", "v", "sigma_u", "sigma_v", "u_nominal", "v_nominal")
 _LABELS = {
     "exposure": ("exposure_names", ("1",)),
     "chip": ("chip_numbers", (1,)),
@@ -71,27 +74,43 @@ def write_partitioned(
     if rows_per_group < 1:
         raise InputError(f"rows_per_group is {rows_per_group}", do="give 1 or more")
     _make_empty(folder)
+    written = write_parts(folder, _parts(tables, folder), rows_per_group=rows_per_group)
+    if not written:
+        raise InputError("there are no tables to write", where=str(folder), do="give at least one")
+    return written
+
+
+def _parts(tables: Iterable[Matches], folder: Path) -> Iterator[Part]:
+    """Columns and units of tables, which must have those of the first."""
+    names: list[str] = []
+    unit = ""
+    for number, table in enumerate(tables, 1):
+        columns = _columns(table, names)
+        if number == 1:
+            names, unit = list(columns), table.unit
+        elif list(columns) != names or table.unit != unit:
+            raise InputError(
+                f"table {number} has another unit or other columns than the first",
+                where=str(folder),
+                do="give tables of one kind",
+            )
+        yield columns, dict.fromkeys(_LENGTHS, unit) | {"x": "pix", "y": "pix", "epoch": "yr"}
+
+
+def write_parts(
+    folder: Path, parts: Iterable[Part], *, rows_per_group: int | None = None
+) -> list[Path]:
+    """Files part-00000.parquet and so on of columns and units; none is left if one fails."""
     written: list[Path] = []
-    schema: pyarrow.Schema | None = None
     try:
-        for table in tables:
+        for columns, units in parts:
             path = folder / f"part-{len(written):05d}.parquet"
-            if schema is None:
-                schema = _schema(table)
-            elif _schema(table, like=schema) != schema:
-                raise InputError(
-                    f"table {len(written) + 1} has another unit or other columns than the first",
-                    where=str(folder),
-                    do="give tables of one kind",
-                )
-            _write(table, schema, path, rows_per_group)
+            write_columns(path, columns, units, rows_per_group=rows_per_group)
             written.append(path)
     except BaseException:
         for path in written:
             path.unlink(missing_ok=True)
         raise
-    if not written:
-        raise InputError("there are no tables to write", where=str(folder), do="give at least one")
     return written
 
 
@@ -103,79 +122,35 @@ def _make_empty(folder: Path) -> None:
         )
 
 
-def _schema(table: Matches, *, like: pyarrow.Schema | None = None) -> pyarrow.Schema:
-    """Columns of a table with their types and units.
-
-    Labels are columns where there are other than the default, or where `like` has them.
-    """
-    import pyarrow
-
-    units = {"x": "pix", "y": "pix", "epoch": "yr"}
-    units |= dict.fromkeys(("u", "v", "sigma_u", "sigma_v", "u_nominal", "v_nominal"), table.unit)
-    out = []
-    for name in _NUMBERS:
-        if getattr(table, name) is not None:
-            metadata = {"unit": units[name]} if name in units else None
-            out.append(pyarrow.field(name, pyarrow.float64(), metadata=metadata))
-    if table.star is not None:
-        out.append(pyarrow.field("star", pyarrow.int64()))
+def _columns(table: Matches, names: Collection[str]) -> dict[str, NDArray[Any] | Labelled]:
+    """Columns of a table; labels where there are other than the default, or `names` has them."""
+    columns: dict[str, Any] = columns_of(table, (*_NUMBERS, "star"))
     for name, (labels, default) in _LABELS.items():
-        if getattr(table, labels) != default or (like is not None and name in like.names):
-            kind = pyarrow.int64() if name == "chip" else pyarrow.string()
-            out.append(pyarrow.field(name, pyarrow.dictionary(pyarrow.int32(), kind)))
-    return pyarrow.schema(out)
-
-
-def _write(table: Matches, schema: pyarrow.Schema, path: Path, rows_per_group: int) -> None:
-    import pyarrow
-
-    columns = []
-    for one in schema:
-        values = getattr(table, one.name)
-        if pyarrow.types.is_dictionary(one.type):
-            columns.append(labelled(values, getattr(table, _LABELS[one.name][0])))
-        else:
-            columns.append(pyarrow.array(values))
-    save_parquet(pyarrow.table(columns, schema=schema), path, rows_per_group=rows_per_group)
+        if getattr(table, labels) != default or name in names:
+            columns[name] = (getattr(table, name), getattr(table, labels))
+    return columns
 
 
 def write_columns(
     path: str | os.PathLike[str],
     columns: Mapping[str, NDArray[Any] | Labelled],
     units: Mapping[str, str],
+    *,
+    rows_per_group: int | None = None,
 ) -> None:
     """Write a Parquet file, with units in the metadata of its fields; replaced atomically.
 
     `columns` are arrays (N,), or codes and the labels that they stand for, stored as a dictionary.
     """
-    import pyarrow
+    import pyarrow.parquet
 
     fields, arrays = [], []
     for name, values in columns.items():
-        array = labelled(*values) if isinstance(values, tuple) else pyarrow.array(values)
+        array = _labelled(*values) if isinstance(values, tuple) else pyarrow.array(values)
         metadata = {"unit": units[name]} if name in units else None
         fields.append(pyarrow.field(name, array.type, nullable=False, metadata=metadata))
         arrays.append(array)
-    save_parquet(pyarrow.table(arrays, schema=pyarrow.schema(fields)), path)
-    pyarrow.default_memory_pool().release_unused()
-
-
-def labelled(codes: NDArray[np.int64], labels: Sequence[str | int]) -> pyarrow.DictionaryArray:
-    """A column of labels, by codes into them."""
-    import pyarrow
-
-    return pyarrow.DictionaryArray.from_arrays(
-        pyarrow.array(codes, pyarrow.int32()), pyarrow.array(labels)
-    )
-
-
-def save_parquet(
-    table: pyarrow.Table, path: str | os.PathLike[str], *, rows_per_group: int | None = None
-) -> None:
-    """Write a table; pages carry checksums, so that damage is seen."""
-    import pyarrow
-    import pyarrow.parquet
-
+    table = pyarrow.table(arrays, schema=pyarrow.schema(fields))
     with atomic_path(path) as temporary:
         pyarrow.parquet.write_table(
             table,
@@ -183,9 +158,17 @@ def save_parquet(
             row_group_size=rows_per_group,
             # measured numbers do not compress; labels are run-length encoded all the same
             compression="none",
-            use_dictionary=[
-                one.name for one in table.schema if pyarrow.types.is_dictionary(one.type)
-            ],
+            use_dictionary=[name for name, v in columns.items() if isinstance(v, tuple)],
             write_statistics=False,
-            write_page_checksum=True,
+            write_page_checksum=True,  # so that damage is seen
         )
+    pyarrow.default_memory_pool().release_unused()
+
+
+def _labelled(codes: NDArray[np.int64], labels: Sequence[str | int]) -> pyarrow.DictionaryArray:
+    """A column of labels, by codes into them."""
+    import pyarrow
+
+    return pyarrow.DictionaryArray.from_arrays(
+        pyarrow.array(codes, pyarrow.int32()), pyarrow.array(labels)
+    )

@@ -13,7 +13,7 @@ from astropy.time import Time
 from numpy.typing import NDArray
 
 from bayesdist.data.tables.checks import absent
-from bayesdist.data.tables.units import unit_of
+from bayesdist.data.tables.units import conversion, unit_of
 from bayesdist.errors import InputError
 
 __all__ = ["EncodedColumn", "Place", "SourceColumn", "encoded", "row_number", "year_of"]
@@ -77,6 +77,11 @@ class SourceColumn:
         """Unit that the file gives, else the usual one, or None."""
         own = unit_of(self.values, where=self.where)
         return apu.Unit(self.usual_unit) if own is None and self.usual_unit else own
+
+    def factor(self, unit: str) -> float:
+        """Factor from the column's numbers to a unit; 1 where the column has none of its own."""
+        own = self.unit
+        return 1.0 if own is None else conversion(own, unit, where=self.where)
 
     def fail(self, index: int, cause: str, do: str = "correct the row or drop it") -> InputError:
         """Error about one value."""

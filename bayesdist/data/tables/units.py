@@ -62,10 +62,10 @@ def unit_of(column: Any, *, where: str) -> apu.UnitBase | None:
     return None if parsed == apu.dimensionless_unscaled else parsed
 
 
-def conversion(unit: apu.UnitBase, to: str, *, where: str) -> float:
+def conversion(unit: apu.UnitBase | str, to: str, *, where: str) -> float:
     """Factor from values of `unit` to those of `to`; units of different quantities are refused."""
     try:
-        return float(unit.to(apu.Unit(to)))
+        return float(apu.Unit(unit).to(apu.Unit(to)))
     except apu.UnitConversionError:
         raise InputError(
             f"unit {unit} cannot be brought to {to}",

@@ -17,6 +17,6 @@ MISSION = Mission(
     },
     simulate={"wise": f"{_COMMANDS}:simulate"},
     data_sections={"rvb": f"{_PAIRS}.section:RvbData"},
-    match_sources={"rvb": f"{_PAIRS}.source:SOURCE"},
+    match_sources={"rvb": f"{_PAIRS}.run_input:SOURCE"},
     beside_core={"demo": f"{_COMMANDS}:demo"},
 )

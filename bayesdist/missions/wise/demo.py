@@ -19,7 +19,7 @@ from bayesdist.infer import LinearFit, Posterior
 from bayesdist.missions.wise.simulate import simulate_wise
 from bayesdist.simulate import Truth
 
-__all__ = ["demo", "simulation_config", "write_simulation"]
+__all__ = ["demo", "write_simulation"]
 
 SEED = 20110201  # the date of the report that the coefficients come from
 N_STARS = 6000
@@ -74,13 +74,8 @@ sip = {{inverse_order = 5, linear = "sip"}}
 """
 
 
-def simulation_config(band: str) -> str:
-    """Configuration for a simulated band."""
-    return _CONFIG.format(band=band)
-
-
-def write_simulation(folder: Path, matches: Matches, truth: Truth, config: str) -> None:
-    """Write stars.ecsv, truth.ecsv and config.toml of a simulation.
+def write_simulation(folder: Path, matches: Matches, truth: Truth, band: str) -> None:
+    """Write stars.ecsv, truth.ecsv and config.toml of a simulated band.
 
     InputError when the folder cannot be made or written.
     """
@@ -89,12 +84,7 @@ def write_simulation(folder: Path, matches: Matches, truth: Truth, config: str) 
     for name in ("x", "y", "u", "v", "sigma_u", "sigma_v"):
         stars[name] = getattr(matches, name)
         stars[name].unit = "pix"
-    if matches.mag is not None:
-        stars["mag"] = matches.mag
-    if matches.epoch is not None:
-        stars["epoch"] = matches.epoch
-    if len(matches.exposure_names) > 1:
-        stars["exposure"] = np.array(matches.exposure_names)[matches.exposure]
+    stars["mag"] = matches.mag
     true = QTable({"name": list(truth.model.names), "value": truth.theta})
     true.meta = {
         "fraction": truth.fraction,
@@ -106,7 +96,7 @@ def write_simulation(folder: Path, matches: Matches, truth: Truth, config: str) 
         with atomic_path(folder / name) as temporary:
             table.write(temporary, format="ascii.ecsv")
     with atomic_path(folder / "config.toml") as temporary:
-        temporary.write_text(config, encoding="utf-8")
+        temporary.write_text(_CONFIG.format(band=band), encoding="utf-8")
 
 
 def demo(folder: str | Path, *, force: bool = False, command: str = "") -> str:
@@ -124,7 +114,7 @@ def demo(folder: str | Path, *, force: bool = False, command: str = "") -> str:
             "the folder holds another demo", where=str(folder), do="replace it by --force"
         )
     matches, truth = simulate_wise(N_STARS, rng=np.random.default_rng(SEED))
-    write_simulation(folder / "input", matches, truth, simulation_config("W2"))
+    write_simulation(folder / "input", matches, truth, "W2")
     run(folder / "input" / "config.toml", folder / "run", force=force, command=command)
     finished = RunDirectory.open(folder / "run")
     results = results_of(finished)

@@ -11,7 +11,7 @@ import numpy as np
 from bayesdist.app.screen import table_text
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
-from bayesdist.missions.wise.demo import simulation_config, write_simulation
+from bayesdist.missions.wise.demo import write_simulation
 from bayesdist.missions.wise.simulate import WiseSet, simulate_wise, wise_set, write_wise_set
 from bayesdist.missions.wise.simulate.optical import DELIVERED_TURN, write_optical_model
 
@@ -86,7 +86,7 @@ def simulate_table(
         )
     rng = np.random.default_rng(seed)
     matches, truth = simulate_wise(stars, band=band, fraction=fraction, rng=rng)
-    write_simulation(folder, matches, truth, simulation_config(band))
+    write_simulation(folder, matches, truth, band)
     return (
         f"{len(matches)} pairs, {int(truth.false.sum())} of them false: {folder / 'stars.ecsv'}\n"
         f"calibrate them:  bayesdist run {folder / 'config.toml'} -o {folder / 'run'}"

@@ -34,13 +34,11 @@ def detections(campaign, e):
     """List of an exposure, truth of its detections, and true pixels of its stars (N, 2)."""
     one, truth = campaign.lists[e], campaign.truth
     star = truth.detections[e].star
-    u, v = truth.stars.at(truth.log[one.exposure].epoch)
+    u, v = truth.stars.at(truth.log[one.name].epoch)
     out = np.full((len(one), 2), np.nan)
     for chip in (1, 2):
         rows = (star >= 0) & (one.chip == chip)
-        out[rows] = np.column_stack(
-            truth.to_pixels(one.exposure, u[star[rows]], v[star[rows]], chip)
-        )
+        out[rows] = np.column_stack(truth.to_pixels(one.name, u[star[rows]], v[star[rows]], chip))
     return one, truth.detections[e], out
 
 
@@ -122,7 +120,7 @@ def test_the_way_to_the_catalogue_step_by_step(small, rng):
 def measured_linear_terms(campaign, e, stars):
     """Both chips' linear terms from a list: monomials by least squares, turned to the gauge."""
     one, found = campaign.lists[e], campaign.truth.detections[e]
-    va = campaign.log[one.exposure].vafactor
+    va = campaign.log[one.name].vafactor
     fits = {}
     for chip in (1, 2):
         rows = (found.star >= 0) & (one.chip == chip)
@@ -348,14 +346,14 @@ def test_pairs_scatter_as_their_errors_say(campaign):
     pairs = match_campaign(some, campaign.log, campaign.catalog, start, cuts=cuts).table
     wrong, pulls, expected = 0, [], 0
     for one in some:
-        rows = pairs.exposure == pairs.exposure_names.index(one.exposure)
-        found = campaign.truth.detections[campaign.log.names.index(one.exposure)]
+        rows = pairs.exposure == pairs.exposure_names.index(one.name)
+        found = campaign.truth.detections[campaign.log.names.index(one.name)]
         index = {x: k for k, x in enumerate(one.x)}
         k = np.array([index[x] for x in pairs.x[rows]])
         wrong += np.sum(found.star[k] != pairs.star[rows])
         expected += np.sum((found.star >= 0) & cuts.passed(one)[0])
         chip = one.chip[k]
-        sky = campaign.truth.to_catalog(one.exposure, pairs.x[rows], pairs.y[rows], chip)
+        sky = campaign.truth.to_catalog(one.name, pairs.x[rows], pairs.y[rows], chip)
         centroid = centroid_error(campaign.truth.stars.mag[pairs.star[rows]])
         off = np.column_stack([pairs.u[rows], pairs.v[rows]]) - sky
         sigma = np.hypot(

@@ -20,7 +20,8 @@ from bayesdist.missions.acs.simulate import read_acs, simulate_acs, write_acs
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("acs") / "campaign"
-    campaign = simulate_acs(folder, n_exposures=4, n_stars=2000, filters=("F606W", "F435W"))
+    campaign = simulate_acs(n_exposures=4, n_stars=2000, filters=("F606W", "F435W"))
+    write_acs(campaign, folder)
     return folder, campaign
 
 
@@ -42,10 +43,10 @@ def test_readers_of_the_package_read_it(written):
     assert log.exposures == campaign.log.exposures
     log.require("filter", "exptime", "vafactor", "pa_v3", "ra", "dec")
     lists = read_star_lists(folder / "lists")  # in the order of the names
-    assert {one.exposure for one in lists} == set(log.names)
-    by_name = {one.exposure: one for one in lists}
+    assert {one.name for one in lists} == set(log.names)
+    by_name = {one.name: one for one in lists}
     for one in campaign.lists:
-        equal(by_name[one.exposure], one, ("x", "y", "chip", "mag", "q"))
+        equal(by_name[one.name], one, ("x", "y", "chip", "mag", "q"))
     good, rejected = StarCuts(mag=(-14.0, -10.0), q_max=0.1).passed(lists[0])
     assert good.any() and rejected["poor fit"] > 0
 
@@ -92,7 +93,8 @@ def test_the_readme_names_every_column(written):
 
 
 def test_nothing_is_replaced_unasked_and_nothing_old_stays(tmp_path):
-    first = simulate_acs(tmp_path, n_exposures=3, n_stars=200)
+    first = simulate_acs(n_exposures=3, n_stars=200)
+    write_acs(first, tmp_path)
     with pytest.raises(InputError, match="holds a campaign"):
         write_acs(first, tmp_path)
     write_acs(simulate_acs(n_exposures=2, n_stars=200, fine_scale=False), tmp_path, force=True)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy.table import Table
 from scipy import stats
 
+from bayesdist.data.detections import Detections
 from bayesdist.data.matching.pairs import mutual_pairs
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bring_up.iterate import bring_up
-from bayesdist.missions.wise.frame_stars import FrameStars
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.missions.wise.pairs.read import read_rvb
 from bayesdist.missions.wise.simulate import wise_solution
@@ -135,7 +137,7 @@ def test_few_pairs_in_the_corners_at_first(scene):
     radius = RULE.at(x, y, (1016.0, 1016.0))
     stars, others = scene.detections, scene.reference
     index, partner, _ = mutual_pairs(
-        stars.points, others.points, radius, frame=stars.frame, reference_frame=others.frame
+        stars.points, others.points, radius, frame=stars.exposure, reference_frame=others.exposure
     )
     true = np.zeros(len(x), bool)
     true[index] = scene.partner[index] == partner
@@ -157,15 +159,15 @@ def test_the_number_of_false_pairs_is_foretold(scene, ups):
 def test_mutual_pairs_in_frames_by_brute_force():
     rng = np.random.default_rng(3)
     n, m = 80, 120
-    stars = FrameStars(*rng.uniform(0, 20, (2, n)), np.ones(n), rng.integers(3, size=n))
-    others = FrameStars(*rng.uniform(0, 20, (2, m)), np.ones(m), rng.integers(3, size=m))
+    stars = Detections(*rng.uniform(0, 20, (2, n)), rng.integers(3, size=n))
+    others = Detections(*rng.uniform(0, 20, (2, m)), rng.integers(3, size=m))
     radius = rng.uniform(0.5, 2.0, n)
     d = np.hypot(stars.x[:, None] - others.x, stars.y[:, None] - others.y)
-    d[stars.frame[:, None] != others.frame] = np.inf
+    d[stars.exposure[:, None] != others.exposure] = np.inf
     near, back = d.argmin(axis=1), d.argmin(axis=0)
     expected = [(k, near[k]) for k in range(n) if back[near[k]] == k and d[k, near[k]] <= radius[k]]
     index, partner, distance = mutual_pairs(
-        stars.points, others.points, radius, frame=stars.frame, reference_frame=others.frame
+        stars.points, others.points, radius, frame=stars.exposure, reference_frame=others.exposure
     )
     np.testing.assert_allclose(distance, d[index, partner])
     assert len(expected) > 20
@@ -182,7 +184,7 @@ def test_acceptance_is_that_of_the_centre_and_of_the_corners():
 def test_strangers_give_no_calibration(scene):
     """Another field: the reference stars are shifted by more than any radius."""
     other = scene.reference
-    wrong = FrameStars(other.x + 15.0, other.y - 9.0, other.sigma, other.frame)
+    wrong = replace(other, x=other.x + 15.0, y=other.y - 9.0)
     with pytest.raises(InputError, match="no place on the detector stands out"):
         bring_up(scene.detections, wrong, scene.model, acceptance=RULE)
 
@@ -190,10 +192,7 @@ def test_strangers_give_no_calibration(scene):
 def test_what_is_not_covered_is_said():
     """A catalogue that ends before the detector does."""
     scene = simulate_unpaired(12, rng=np.random.default_rng(9))
-    inside = scene.reference.x < 760
-    part = FrameStars(
-        *(getattr(scene.reference, name)[inside] for name in ("x", "y", "sigma", "frame"))
-    )
+    part = scene.reference.select(scene.reference.x < 760)
     up = bring_up(scene.detections, part, scene.model, acceptance=RULE)
     assert 0.6 < up.rounds[-1].coverage < 0.85
     assert "bins are not covered: there it is a guess" in up.sentence
@@ -211,7 +210,7 @@ def write_lists(scene, folder):
     for name in ("detections", "reference"):
         stars = getattr(scene, name)
         table = Table({key: getattr(stars, key) for key in ("x", "y", "sigma")})
-        table["frame"] = [f"{k:02d}a" for k in stars.frame]
+        table["frame"] = [f"{k:02d}a" for k in stars.exposure]
         table.write(folder / f"{name}.ecsv")
     write_optical_model(folder / "optical.hdr")
     return folder / "detections.ecsv", folder / "reference.ecsv"
@@ -245,7 +244,7 @@ def test_lists_without_errors_are_refused(scene, tmp_path):
 def test_wrong_requests_are_refused(scene):
     with pytest.raises(InputError, match="start has shape"):
         bring_up(scene.detections, scene.reference, scene.model, np.zeros(3), acceptance=RULE)
-    far = FrameStars(np.array([5.0, 1030.0]), np.ones(2), np.ones(2), np.zeros(2, int))
+    far = Detections(np.array([5.0, 1030.0]), np.ones(2), sigma=np.ones(2))
     with pytest.raises(InputError, match=r"detection 2 lies at pixel \(1030.00, 1.00\)"):
         bring_up(far, scene.reference, scene.model, acceptance=RULE)
     two = (Chip(1, "a", (9.0, 9.0), (5.0, 5.0)), Chip(2, "b", (9.0, 9.0), (5.0, 5.0)))
@@ -254,6 +253,8 @@ def test_wrong_requests_are_refused(scene):
     with pytest.raises(InputError, match="turned by 45"):
         optical_model(turn=45)
     with pytest.raises(InputError, match="row 2, column 'sigma'"):
-        FrameStars(np.ones(2), np.ones(2), np.array([1.0, 0.0]), np.zeros(2, int))
+        Detections(np.ones(2), np.ones(2), sigma=np.array([1.0, 0.0]))
+    with pytest.raises(InputError, match="carries no errors"):
+        bring_up(replace(far, sigma=None), scene.reference, scene.model, acceptance=RULE)
     with pytest.raises(InputError, match="share of common stars"):
         simulate_unpaired(1, rng=np.random.default_rng(1), common=1.5)

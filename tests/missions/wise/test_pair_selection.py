@@ -9,10 +9,10 @@ import pytest
 from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs import files as rvb_files
-from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.missions.wise.pairs.read import read_rvb, stream_rvb
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
-from bayesdist.missions.wise.pairs.selection import RvbSelection, SelectedPairs
+from bayesdist.missions.wise.pairs.section import RvbBlock
+from bayesdist.missions.wise.pairs.selection import SelectedPairs
 from bayesdist.missions.wise.pairs.stored import open_rvb
 from bayesdist.missions.wise.pairs.write import write_rvb
 from tests.missions.wise.test_pairs import assert_same, rvb_table, write
@@ -51,8 +51,14 @@ def cut(pairs: RvbPairs, size: int) -> list[RvbPairs]:
 @pytest.mark.parametrize("size", [1, 37, 400])
 def test_pieces_pass_as_the_whole_does(rng, size):
     pairs = pairs_of(rng)
-    limit, chi2 = RadialLimit(0.8, 2.5), RadialLimit(6.0, 12.0)
-    selection = RvbSelection((-0.3, 0.6), 40, limit, chi2)
+    selection = RvbBlock(
+        colour=(-0.3, 0.6),
+        bluest=40,
+        accept_centre=0.8,
+        accept_corner=2.5,
+        accept_chi2_centre=6.0,
+        accept_chi2_corner=12.0,
+    )
     whole = SelectedPairs(lambda: [pairs], selection, SIZE).table()
     pieces = cut(pairs, size)
     table = SelectedPairs(lambda: pieces, selection, SIZE).table()
@@ -63,8 +69,8 @@ def test_pieces_pass_as_the_whole_does(rng, size):
 
 def test_without_limits_all_pass(rng):
     pairs = pairs_of(rng)
-    assert RvbSelection().takes_all and not RvbSelection(bluest=3).takes_all
-    found = SelectedPairs(lambda: [pairs], RvbSelection(), SIZE)
+    assert RvbBlock().takes_all and not RvbBlock(bluest=3).takes_all
+    found = SelectedPairs(lambda: [pairs], RvbBlock(), SIZE)
     assert list(found) == [pairs] and found.rejected == {}
 
 
@@ -77,15 +83,15 @@ def test_what_leaves_nothing_or_cannot_be_done_is_refused(rng):
 
     unknown = int(np.isnan(pairs.colour).sum())
     refused(rf"no pair of 400 is left .* no colour \({unknown}\), colour \({400 - unknown}\)",
-            RvbSelection(colour=(8.0, 9.0)))  # fmt: skip
-    refused("hence no colours", RvbSelection(bluest=3), RvbPairs(pairs.matches))
+            RvbBlock(colour=(8.0, 9.0)))  # fmt: skip
+    refused("hence no colours", RvbBlock(bluest=3), RvbPairs(pairs.matches))
     m = pairs.matches
     nameless = RvbPairs(Matches(m.x, m.y, m.u, m.v), pairs.colour)
-    refused("no column of frames", RvbSelection(bluest=3), nameless)
-    with pytest.raises(InputError, match="colours from 1 to 0"):
-        RvbSelection(colour=(1.0, 0.0))
-    with pytest.raises(InputError, match="the 0 bluest"):
-        RvbSelection(bluest=0)
+    refused("no column of frames", RvbBlock(bluest=3), nameless)
+    with pytest.raises(ValueError, match=r"colour goes from 1 to 0"):
+        RvbBlock(colour=(1.0, 0.0))
+    with pytest.raises(ValueError, match=r"bluest\n.*greater than 0"):
+        RvbBlock(bluest=0)
 
 
 def test_written_pairs_are_read_again(rng, tmp_path, monkeypatch):

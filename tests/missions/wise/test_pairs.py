@@ -17,7 +17,8 @@ from bayesdist.missions.wise.pairs import files as rvb_files
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit, radial_rows
 from bayesdist.missions.wise.pairs.read import read_rvb, rvb_bands, stream_rvb
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs, colour_of
-from bayesdist.missions.wise.pairs.selection import RvbSelection, SelectedPairs
+from bayesdist.missions.wise.pairs.section import RvbBlock
+from bayesdist.missions.wise.pairs.selection import SelectedPairs
 
 SIZE = (1016.0, 1016.0)
 BANDS = ("W1", "W2", "W4")
@@ -205,8 +206,17 @@ def pairs_with(colour, frame) -> RvbPairs:
     return RvbPairs(matches, np.asarray(colour, float))
 
 
-def taken(pairs: RvbPairs, **limits) -> Matches:
-    return SelectedPairs(lambda: [pairs], RvbSelection(**limits), SIZE).table()
+def taken(
+    pairs: RvbPairs,
+    *,
+    offset: RadialLimit | None = None,
+    chi2: RadialLimit | None = None,
+    **limits,
+) -> Matches:
+    for name, limit in (("accept", offset), ("accept_chi2", chi2)):
+        if limit is not None:
+            limits |= {f"{name}_centre": limit.centre, f"{name}_corner": limit.corner}
+    return SelectedPairs(lambda: [pairs], RvbBlock(**limits), SIZE).table()
 
 
 def test_selection_by_colour_against_a_loop_over_the_frames(rng):
@@ -253,7 +263,7 @@ def test_false_matches_pass_in_proportion_to_the_area_within_the_limit(rng):
     assert kept.rejected == {"offset beyond the radial limit": n - len(kept)}
 
 
-def test_limits_are_judged_about_the_expected_positions(rng):
+def test_both_limits_are_judged(rng):
     n = 5000
     x, y = rng.uniform(0.5, 1016.5, (2, n))
     distorted = np.column_stack([x + 3e-6 * (x - 508.5) ** 2, y])
@@ -261,12 +271,13 @@ def test_limits_are_judged_about_the_expected_positions(rng):
     u, v = (distorted + noise).T
     matches = Matches(x, y, u, v, sigma_u=np.full(n, 0.1), sigma_v=np.full(n, 0.1))
     tight = RadialLimit(0.6, 0.6)
-    # undistorted, what is beyond 0.6 px is lost towards the edges; expected, nothing is
+    # what distortion moves beyond 0.6 px is lost towards the edges
     lost = taken(RvbPairs(matches), offset=tight)
     assert np.abs(lost.x - 508.5).max() < np.sqrt((0.6 + 0.5) / 3e-6) and len(lost) < 0.95 * n
     # chi-square of two axes: exp(-q / 2) lies beyond q
     limit = RadialLimit(4.0, 4.0)
-    near, likely = radial_rows(matches, SIZE, offset=tight, chi2=limit, expected=distorted)
+    still = Matches(x, y, *(np.column_stack([x, y]) + noise).T, *[np.full(n, 0.1)] * 2)
+    near, likely = radial_rows(still, SIZE, offset=tight, chi2=limit)
     assert near.all()
     assert abs((~likely).mean() - np.exp(-2)) < 4 * np.sqrt(np.exp(-2) / n)
     both = taken(RvbPairs(matches), offset=tight, chi2=limit)
@@ -285,7 +296,5 @@ def test_acceptance_refuses_what_it_cannot_judge():
     in_mas = RvbPairs(Matches(one, one, one, one, unit="mas"))
     with pytest.raises(InputError, match="u, v are in mas"):
         taken(in_mas, offset=RadialLimit(1, 2))
-    with pytest.raises(InputError, match=r"shape \(3, 2\) for 2 pairs"):
-        radial_rows(matches, SIZE, offset=RadialLimit(1, 2), expected=np.zeros((3, 2)))
     with pytest.raises(InputError, match="corner is -1"):
         RadialLimit(1.0, -1.0)

@@ -16,6 +16,7 @@ from bayesdist.app.matches.reading import load_matches
 from bayesdist.app.matches.sources import mission_template
 from bayesdist.app.tables.output import refuse_existing
 from bayesdist.data import FORMATS, Matches
+from bayesdist.data.reading.formats import mission_formats
 from bayesdist.data.reading.layout import TableLayout, table_layout
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
@@ -152,7 +153,9 @@ def _of_matches(
     names = dict(zip(table.chip_numbers, _chip_names(table), strict=True))
     blocks = [_CHIP.format(number=n, name=quoted(names[n]), **one) for n, one in chips.items()]
     return len(table), {
-        "format": _AUTO.format(formats=" | ".join((*FORMATS, *data_sections()))),
+        "format": _AUTO.format(
+            formats=" | ".join((*FORMATS, *mission_formats(), *data_sections()))
+        ),
         "columns": column_lines(layout, columns),
         "unit_line": unit_line,
         "sigma": sigma,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.starlists import StarList
+from bayesdist.data.detections import Detections
 from bayesdist.missions.acs.simulate.stars import FAINT, centroid_error
 from bayesdist.missions.acs.simulate.truth import AcsTruth, DetectionTruth
 from bayesdist.model import Chip
@@ -50,7 +50,7 @@ def cte_shift(chip: int, y: Float, mag: Float, epoch: float) -> Float:
 
 def star_list(
     truth: AcsTruth, exposure: str, detector: Detector, rng: np.random.Generator
-) -> tuple[StarList, DetectionTruth]:
+) -> tuple[Detections, DetectionTruth]:
     """Simulated detections of an exposure, in no order, and their truth."""
     e = truth.frames.names.index(exposure)
     epoch = truth.log[exposure].epoch
@@ -72,7 +72,7 @@ def star_list(
     order = rng.permutation(len(columns["x"]))
     columns = {key: values[order] for key, values in columns.items()}
     star, blended = columns.pop("star"), columns.pop("blended")
-    return StarList(exposure=exposure, **columns), DetectionTruth(star, blended)
+    return Detections(exposure_names=(exposure,), **columns), DetectionTruth(star, blended)
 
 
 def _inside(x: Float, y: Float, chip: Chip) -> NDArray[np.bool_]:

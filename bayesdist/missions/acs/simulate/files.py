@@ -100,7 +100,7 @@ def write_acs(
     out.append(folder / "exposures.ecsv")
     write_exposures(campaign.log, out[-1])
     for one in campaign.lists:
-        out.append(folder / "lists" / f"{one.exposure}.parquet")
+        out.append(folder / "lists" / f"{one.name}.parquet")
         columns = {key: getattr(one, key) for key in ("x", "y", "chip", "mag", "q")}
         write_columns(out[-1], columns, {"x": "pix", "y": "pix"})
     write_truth(campaign.truth, folder / "truth")

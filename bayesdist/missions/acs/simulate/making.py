@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -12,7 +11,6 @@ from bayesdist.data.exposures import Exposure, ExposureLog
 from bayesdist.errors import InputError
 from bayesdist.missions.acs.simulate.detections import Detector, star_list
 from bayesdist.missions.acs.simulate.distortion import ACS_FILTERS, acs_solution
-from bayesdist.missions.acs.simulate.files import write_acs
 from bayesdist.missions.acs.simulate.pointings import exposures_of, frames_of
 from bayesdist.missions.acs.simulate.stars import measured_catalogs, true_stars
 from bayesdist.missions.acs.simulate.tables import detector_tables, filter_tables
@@ -26,7 +24,6 @@ SCATTER = 7e-6  # of the linear terms: 7e-6 / sqrt(60) is the sigma(alpha) of Ta
 
 
 def simulate_acs(
-    folder: str | os.PathLike[str] | None = None,
     *,
     seed: int = 1,
     n_exposures: int = 110,
@@ -50,8 +47,6 @@ def simulate_acs(
 
     Parameters
     ----------
-    folder : path-like, optional
-        Folder to write it to, as `write_acs`.
     seed : int, optional
     n_exposures : int, optional
         In F606W.
@@ -88,8 +83,8 @@ def simulate_acs(
     Raises
     ------
     InputError
-        For an unknown or repeated filter, too few exposures or stars, fractions outside [0, 1), a
-        negative size, and as `write_acs`.
+        For an unknown or repeated filter, too few exposures or stars, fractions outside [0, 1), or
+        a negative size.
     """
     _check(filters, n_exposures=n_exposures, n_other=n_other)
     if n_stars < FEWEST:
@@ -152,10 +147,7 @@ def simulate_acs(
             progress(k + 1, len(log))
     lists, detections = zip(*measured, strict=True)
     truth = replace(truth, detections=detections)
-    campaign = AcsCampaign(catalog, early, late, log, lists, truth)
-    if folder is not None:
-        write_acs(campaign, folder)
-    return campaign
+    return AcsCampaign(catalog, early, late, log, lists, truth)
 
 
 def _check(filters: Sequence[str], **counts: int) -> None:

@@ -10,8 +10,8 @@ from numpy.polynomial import polynomial
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data import ReferenceCatalog
+from bayesdist.data.detections import Detections
 from bayesdist.data.exposures import ExposureLog
-from bayesdist.data.starlists import StarList
 from bayesdist.missions.acs.simulate.pointings import AcsFrames
 from bayesdist.missions.acs.simulate.stars import TrueStars
 from bayesdist.model import DistortionModel, PolynomialBasis
@@ -190,7 +190,7 @@ class AcsCampaign:
     early, late : ReferenceCatalog
         Mean positions before and after SM4, of the same stars in the same order.
     log : ExposureLog
-    lists : tuple of StarList
+    lists : tuple of Detections
         Raw detections of each exposure, in the order of the log.
     truth : AcsTruth
     """
@@ -199,7 +199,7 @@ class AcsCampaign:
     early: ReferenceCatalog
     late: ReferenceCatalog
     log: ExposureLog
-    lists: tuple[StarList, ...]
+    lists: tuple[Detections, ...]
     truth: AcsTruth
 
 

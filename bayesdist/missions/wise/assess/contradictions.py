@@ -50,8 +50,6 @@ def contradictions_across(
     fitting: Mapping[str, PrintedRow],
     band_to_band: Mapping[str, PrintedRow],
     multiframe: Mapping[str, PrintedRow],
-    *,
-    arcsec: Mapping[str, float] = WISE_ARCSEC,
 ) -> list[str]:
     """Sentences on numbers of Tables 5-2 and 5-3 that do not follow from Table 5-1.
 
@@ -59,13 +57,13 @@ def contradictions_across(
     bands have the difference of the means, and a sigma within what theirs allow.  And within Table
     5-2 a difference must be what the way over any third band gives.
 
-    `fitting`, `band_to_band`, `multiframe`: Tables 5-1 (pixels), 5-2 and 5-3 (arcsec). `arcsec`:
-    arcsec per pixel of each band. Returns one sentence for each contradiction beyond the rounding
-    of the digits, with the value that the other numbers imply.
+    `fitting`, `band_to_band`, `multiframe`: Tables 5-1 (pixels), 5-2 and 5-3 (arcsec). Returns one
+    sentence for each contradiction beyond the rounding of the digits, with the value that the other
+    numbers imply.
     """
     out = []
     for label, row in multiframe.items():
-        one, scale = fitting[label], arcsec[label.partition("/")[0]]
+        one, scale = fitting[label], WISE_ARCSEC[label.partition("/")[0]]
         sigma = np.sqrt(2) * scale * one.value["sigma"]
         slack = np.sqrt(2) * scale * one.rounding["sigma"]
         out += _unequal(row, "sigma", float(sigma), float(slack))
@@ -73,7 +71,7 @@ def contradictions_across(
         out += _unequal(row, "max", extent, scale * (one.rounding["max"] + one.rounding["min"]))
     for label, row in band_to_band.items():
         bands, _, axis = label.partition("/")
-        scaled = [(arcsec[name], fitting[f"{name}/{axis}"]) for name in bands.split("-")]
+        scaled = [(WISE_ARCSEC[name], fitting[f"{name}/{axis}"]) for name in bands.split("-")]
         (a, first), (b, second) = scaled
         mean = a * first.value["mean"] - b * second.value["mean"]
         slack = a * first.rounding["mean"] + b * second.rounding["mean"]

@@ -67,14 +67,14 @@ class DistortionField:
         own = replace(self.basis, order=basis.order)
         return DistortionField(own, mine - ratio * theirs, self.to_pixels)
 
-    def vectors(self, grid: tuple[int, int], part_note: str = "") -> VectorMap:
+    def vectors(self, grid: tuple[int, int]) -> VectorMap:
         """Vectors on a grid from pixel 1 to the last, both ends.
 
-        `grid`: points on x and y. `part_note`: for people. The result is in pixels.
+        `grid`: points on x and y. The result is in pixels.
         """
         x, y = grid_pixels(self.basis.size, grid)
         du, dv = self.at_scaled(*np.meshgrid(*self.basis.scaled(x, y)))
-        return VectorMap(x, y, du, dv, "pix", "no_constant", part_note)
+        return VectorMap(x, y, du, dv, "pix", "no_constant")
 
 
 def field_of_solution(solution: Solution, *, epoch: float | None = None) -> DistortionField:

@@ -38,7 +38,7 @@ class Printed:
     """Numbers of a band that a published report gives."""
 
     longest_vector: float  # printed, found over the same part of the array, and printed; pixels
-    longest_here: float
+    longest_vector_here: float
     formal_radius: float
     # error of a pair that the radius implies, with all pairs evenly over the array; pixels
     implied_sigma: float

@@ -48,9 +48,9 @@ def _overview(b: BandResult, *, wise: bool) -> Iterator[str]:
     yield count(b.n_pairs)
     yield _structure(b)
     here = b.printed
-    yield number(b.vectors.length_max if here is None else here.longest_here, 4)
+    yield number(b.vectors.length_max if here is None else here.longest_vector_here, 4)
     if wise and here is not None:
-        apart = here.longest_here / here.longest_vector - 1
+        apart = here.longest_vector_here / here.longest_vector - 1
         yield number(here.longest_vector, 4)
         error = 2 * b.posterior_map.radius_max / here.longest_vector
         mark = "✗" if abs(apart) > error else "(within 2 σ)"

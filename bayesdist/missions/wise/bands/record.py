@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,7 @@ def record_of(inputs: BandsInput) -> dict[str, Any]:
 def _band(b: BandResult) -> dict[str, Any]:
     c, p = b.correlation, b.partition
     count = b.sums.bins.count
-    out: dict[str, Any] = {
+    return {
         "name": b.name,
         "run": b.path,
         "converged": b.converged,
@@ -96,16 +97,8 @@ def _band(b: BandResult) -> dict[str, Any]:
             "dof": count.size - 1,
         },
         "minus_optical_max": None if b.minus_optical is None else b.minus_optical.length_max,
-        "printed": None,
+        "printed": None if b.printed is None else asdict(b.printed),
     }
-    if b.printed is not None:
-        out["printed"] = {
-            "longest_vector": b.printed.longest_vector,
-            "longest_vector_here": b.printed.longest_here,
-            "formal_radius": b.printed.formal_radius,
-            "implied_sigma": b.printed.implied_sigma,
-        }
-    return out
 
 
 def _histogram(h: ResidualHistogram) -> dict[str, Any]:

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from bayesdist.app.screen import table_text
 from bayesdist.app.tables.output import atomic_directory, write_table
+from bayesdist.data.detections import Detections
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bands.optical import optical_models
 from bayesdist.missions.wise.bring_up.iterate import BringUp, bring_up
-from bayesdist.missions.wise.frame_stars import FrameStars
 from bayesdist.missions.wise.pairs.files import RVB_ALIASES, band_name
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
@@ -89,7 +89,7 @@ def _start(model: DistortionModel, band: str, optical: str | Path, rotation: flo
     return coefficients.ravel()
 
 
-def _read_lists(*paths: Path) -> list[FrameStars]:
+def _read_lists(*paths: Path) -> list[Detections]:
     """Lists of stars with one numbering of their frames."""
     columns, frames = [], []
     for path in paths:
@@ -103,12 +103,16 @@ def _read_lists(*paths: Path) -> list[FrameStars]:
                 do="give x, y, sigma and frame",
             )
         one = {name: SourceColumn(table[key], str(path), key) for name, key in found.items()}
-        columns.append({name: one[name].numbers() for name in ("x", "y", "sigma")})
+        columns.append([one[name].numbers() for name in ("x", "y", "sigma")])
         codes, names = one["frame"].labels()
         frames.append(np.array(names, str)[codes])
-    code = np.unique(np.concatenate(frames), return_inverse=True)[1]
+    unique, code = np.unique(np.concatenate(frames), return_inverse=True)
     parts = np.split(code, np.cumsum([len(one) for one in frames])[:-1])
-    return [FrameStars(**one, frame=part) for one, part in zip(columns, parts, strict=True)]
+    numbers = tuple(map(str, range(len(unique))))
+    return [
+        Detections(x, y, part, numbers, sigma=sigma, source=str(path))
+        for (x, y, sigma), part, path in zip(columns, parts, paths, strict=True)
+    ]
 
 
 def _pairs(up: BringUp, band: str) -> RvbPairs:

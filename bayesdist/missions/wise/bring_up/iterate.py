@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.missions.wise.bring_up.pairs import Field
-from bayesdist.missions.wise.frame_stars import FrameStars
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.model import Chip, DistortionModel
 
@@ -116,8 +116,8 @@ class BringUp:
 
 
 def bring_up(
-    detections: FrameStars,
-    reference: FrameStars,
+    detections: Detections,
+    reference: Detections,
     model: DistortionModel,
     start: Float | None = None,
     *,
@@ -133,10 +133,10 @@ def bring_up(
 
     Parameters
     ----------
-    detections : FrameStars
-        Pixel positions on the detector.
-    reference : FrameStars
-        Undistorted positions in the frames.
+    detections : Detections
+        Pixel positions on the detector, with errors; the exposures are the frames.
+    reference : Detections
+        Undistorted positions in the frames, with errors in their unit.
     model : DistortionModel
         One chip, without frames and time dependence.
     start : ndarray, shape (n_params,), optional
@@ -157,8 +157,9 @@ def bring_up(
     Raises
     ------
     InputError
-        For a model of several chips or with frames, a start of another length, a detection outside
-        the detector, or when nowhere on the detector more matches are found than chance gives.
+        For a model of several chips or with frames, a start of another length, stars without
+        errors, a detection outside the detector, or when nowhere on the detector more matches are
+        found than chance gives.
     DegenerateError
         As `fit_linear`, when in the end too little of the detector is covered.
     """

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import poisson
 
+from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.pairs import mutual_pairs
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.frame_stars import FrameStars
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.model import DistortionModel
 
@@ -44,9 +44,10 @@ class Field:
     """Detections, reference stars and the bins of the detector."""
 
     def __init__(
-        self, detections: FrameStars, reference: FrameStars, model: DistortionModel, bins: int
+        self, detections: Detections, reference: Detections, model: DistortionModel, bins: int
     ) -> None:
         self.detections, self.reference, self.model, self.bins = detections, reference, model, bins
+        self.sigma = _errors(detections), _errors(reference)
         size = model.chips[0].size
         out = np.zeros(len(detections), bool)
         for z, n in zip((detections.x, detections.y), size, strict=True):
@@ -66,9 +67,9 @@ class Field:
         self.code = iy * bins + ix
         self.size = size
         x, y = (g.ravel() for g in np.meshgrid(*(np.linspace(1.0, n, GRID) for n in size)))
-        self.grid = FrameStars(x, y, np.ones(len(x)), np.zeros(len(x), np.int64))
+        self.grid = Detections(x, y)
 
-    def positions(self, theta: Float | None, stars: FrameStars) -> Float:
+    def positions(self, theta: Float | None, stars: Detections) -> Float:
         """Undistorted positions (N, 2); without parameters the pixel positions themselves."""
         return stars.points if theta is None else self.model.predict(theta, stars.x, stars.y)
 
@@ -81,7 +82,11 @@ class Field:
         """Rows of detections (n,) and reference stars (n,) that are each other's nearest."""
         stars, others = self.detections, self.reference
         index, partner, _ = mutual_pairs(
-            position, others.points, radius, frame=stars.frame, reference_frame=others.frame
+            position,
+            others.points,
+            radius,
+            frame=stars.exposure,
+            reference_frame=others.exposure,
         )
         return index, partner
 
@@ -123,8 +128,8 @@ class Field:
     def table(self, found: Believed) -> Matches:
         """Match table of the accepted matches, with the frames as exposures."""
         stars, others = self.detections, self.reference
-        sigma = np.hypot(stars.sigma[found.index], others.sigma[found.partner])
-        frames, exposure = np.unique(stars.frame[found.index], return_inverse=True)
+        sigma = np.hypot(self.sigma[0][found.index], self.sigma[1][found.partner])
+        frames, exposure = np.unique(stars.exposure[found.index], return_inverse=True)
         return Matches.of_distinct_rows(  # no detection has two reference stars
             x=stars.x[found.index],
             y=stars.y[found.index],
@@ -134,10 +139,17 @@ class Field:
             sigma_v=sigma,
             unit=self.model.unit,
             exposure=exposure,
-            exposure_names=tuple(str(f) for f in frames),
+            exposure_names=tuple(stars.exposure_names[f] for f in frames),
             chip_numbers=(self.model.chips[0].number,),
             sources=("bring-up",),
         )
+
+
+def _errors(stars: Detections) -> Float:
+    """Errors (N,) of stars that must have them."""
+    if stars.sigma is None:
+        raise InputError("carries no errors", where=stars.source, do="give sigma")
+    return stars.sigma
 
 
 def _covered(count: Int, there: Int, chance: Float) -> Bool:

@@ -59,17 +59,13 @@ def radial_rows(
     *,
     offset: RadialLimit | None = None,
     chi2: RadialLimit | None = None,
-    expected: ArrayLike | None = None,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Boolean masks of the pairs whose reference position lies near enough to the expected one.
+    """Boolean masks of the pairs whose reference position lies near enough to the detection.
 
     `matches`: with u, v in pixels of the array. `size`: columns and rows of the array. `offset`: on
-    the distance from the expected position, in pixels. `chi2`: on the chi-square of both axes, with
-    the quoted errors. `expected`: (N, 2), where the reference stars should be, such as
-    `DistortionModel.predict` of the previous iteration; by default where the detections are, which
-    assumes no distortion. Returns `near`, `likely`: (N,), within the limit on the offset, and
-    within that on chi-square. InputError for u, v in another unit, a chi-square limit without
-    errors, and expected positions of another length.
+    the distance, in pixels. `chi2`: on the chi-square of both axes, with the quoted errors. Returns
+    `near`, `likely`: (N,), within the limit on the offset, and within that on chi-square.
+    InputError for u, v in another unit, and a chi-square limit without errors.
     """
     where = ", ".join(matches.sources)
     if matches.unit != "pix":
@@ -78,14 +74,7 @@ def radial_rows(
             where=where,
             do="bring u, v to pixels of the array",
         )
-    at = np.column_stack([matches.x, matches.y]) if expected is None else np.asarray(expected)
-    if at.shape != (len(matches), 2):
-        raise InputError(
-            f"expected positions have shape {at.shape} for {len(matches)} pairs",
-            where=where,
-            do="give u and v of each pair",
-        )
-    du, dv = matches.u - at[:, 0], matches.v - at[:, 1]
+    du, dv = matches.u - matches.x, matches.v - matches.y
     near = np.ones(len(matches), bool)
     if offset is not None:
         near = np.hypot(du, dv) <= offset.at(matches.x, matches.y, size)

@@ -38,15 +38,13 @@ Float = NDArray[np.float64]
 PathLike = str | os.PathLike[str]
 
 
-def rvb_bands(
-    path: PathLike | Sequence[PathLike], *, columns: Mapping[str, str] | None = None
-) -> dict[str, int]:
+def rvb_bands(path: PathLike | Sequence[PathLike]) -> dict[str, int]:
     """Number of pairs of each band in some files.
 
-    `path`, `columns`: as `stream_rvb`. Returns bands in the order of their wavelength. InputError
-    without a column of bands, and for what is no band.
+    `path`: as `stream_rvb`. Returns bands in the order of their wavelength. InputError without a
+    column of bands, and for what is no band.
     """
-    return _bands_of(open_rvb_files(path, columns))
+    return _bands_of(open_rvb_files(path, None))
 
 
 def _bands_of(files: Sequence[RvbFile]) -> dict[str, int]:

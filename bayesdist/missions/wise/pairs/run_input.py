@@ -11,6 +11,7 @@ from typing import Any
 
 from bayesdist.app.config import Data
 from bayesdist.app.matches.reading import is_large
+from bayesdist.app.matches.sources import MatchSource
 from bayesdist.app.store.named_files import named_files
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.star_files import PAIRS, part_files
@@ -22,9 +23,10 @@ from bayesdist.missions.wise.pairs.read import stream_rvb
 from bayesdist.missions.wise.pairs.section import RvbData
 from bayesdist.missions.wise.pairs.selection import SelectedPairs
 from bayesdist.missions.wise.pairs.stored import open_rvb
+from bayesdist.missions.wise.pairs.template import rvb_template
 from bayesdist.missions.wise.published import WISE_ARRAYS
 
-__all__ = ["RvbInput", "load_rvb"]
+__all__ = ["SOURCE", "RvbInput", "load_rvb"]
 
 
 @dataclass
@@ -55,14 +57,13 @@ class RvbInput:
             _require_array(data.band, size)
         if "pairs" in self.run.facts and part_files(self.run / PAIRS):
             return self._opened(self.run / PAIRS, self.run.facts["pairs"])
-        selection = data.rvb.selection()
-        if selection.takes_all:
+        if data.rvb.takes_all:
             opened = open_rvb(path, **options)
             if opened is not None:
                 for band in opened.filter_names:
                     _require_array(band or data.band, size)
                 return opened
-        return self._written(SelectedPairs(lambda: stream_rvb(path, **options), selection, size))
+        return self._written(SelectedPairs(lambda: stream_rvb(path, **options), data.rvb, size))
 
     @property
     def _settings(self) -> tuple[RvbData, tuple[float, float]]:
@@ -153,7 +154,7 @@ def load_rvb(
         _require_array(data.band, size)
     batches = list(stream_rvb(path, **_options(data, size)))
     _require_array(batches[0].band, size)
-    return SelectedPairs(lambda: batches, data.rvb.selection(), size).table()
+    return SelectedPairs(lambda: batches, data.rvb, size).table()
 
 
 def _options(data: RvbData, size: tuple[float, float]) -> dict[str, Any]:
@@ -179,3 +180,6 @@ def _require_array(label: str | None, size: tuple[float, float]) -> None:
             where="detector.size",
             do="give the size of the band's array, or choose the band that it belongs to",
         )
+
+
+SOURCE = MatchSource(read=load_rvb, input_of=RvbInput, template=rvb_template)

@@ -9,13 +9,16 @@ from pydantic import PositiveFloat, PositiveInt, model_validator
 from bayesdist.app.config.data import Data
 from bayesdist.app.config.section import Section
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
-from bayesdist.missions.wise.pairs.selection import RvbSelection
 
 __all__ = ["RvbBlock", "RvbData"]
 
 
 class RvbBlock(Section):
-    """Limits on colour, and on offset and chi-square at the array's centre and in its corners."""
+    """Limits that pairs have to meet, all of those that are given.
+
+    On colour, and on offset and chi-square at the array's centre and in its corners; `bluest` is
+    how many of each frame are taken at most, those of the smallest colour.
+    """
 
     colour: tuple[float, float] | None = None
     bluest: PositiveInt | None = None
@@ -41,14 +44,25 @@ class RvbBlock(Section):
                 )
         return self
 
-    def selection(self) -> RvbSelection:
-        """Limits that decide which pairs are taken."""
-        return RvbSelection(
-            colour=self.colour,
-            bluest=self.bluest,
-            offset=self._limit("accept"),
-            chi2=self._limit("accept_chi2"),
-        )
+    @property
+    def offset(self) -> RadialLimit | None:
+        """Limit on the distance of the reference position from the detection, in pixels."""
+        return self._limit("accept")
+
+    @property
+    def chi2(self) -> RadialLimit | None:
+        """Limit on the chi-square of that distance; a pair beyond both counts under the first."""
+        return self._limit("accept_chi2")
+
+    @property
+    def takes_all(self) -> bool:
+        """True if no limit is given."""
+        return not self.by_colour and self.offset is None and self.chi2 is None
+
+    @property
+    def by_colour(self) -> bool:
+        """True if a pair needs a colour."""
+        return self.colour is not None or self.bluest is not None
 
     def _limit(self, name: str) -> RadialLimit | None:
         centre, corner = (self._at(name, end) for end in ("centre", "corner"))

@@ -16,7 +16,7 @@ from bayesdist.data.labels import merged_counts
 from bayesdist.data.matches import Matches
 from bayesdist.data.tables.checks import counted
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.pairs.radial_limit import CHI2, OFFSET, RadialLimit, radial_rows
+from bayesdist.missions.wise.pairs.radial_limit import CHI2, OFFSET, radial_rows
 from bayesdist.missions.wise.pairs.rvb_pairs import (
     COLOUR,
     NO_COLOUR,
@@ -24,54 +24,15 @@ from bayesdist.missions.wise.pairs.rvb_pairs import (
     bluest_rows,
     colours_of,
 )
+from bayesdist.missions.wise.pairs.section import RvbBlock
 
-__all__ = ["RvbSelection", "SelectedPairs"]
+__all__ = ["SelectedPairs"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Rows = NDArray[np.bool_]
 
 MOST_COLOURS = 100_000_000  # rows whose colours are compared with each other, 1.6 GB of them
-
-
-@dataclass(frozen=True)
-class RvbSelection:
-    """Limits that pairs have to meet, all of those that are given.
-
-    InputError for colours that are no range, and less than one pair.
-    """
-
-    colour: tuple[float, float] | None = None  # lowest and highest colour, both included
-    bluest: int | None = None  # of each frame at most so many, those of the smallest colour
-    # on the distance of the reference position from the detection, in pixels, and on its chi-square
-    # with the quoted errors; a pair beyond both counts under the first
-    offset: RadialLimit | None = None
-    chi2: RadialLimit | None = None
-
-    def __post_init__(self) -> None:
-        if self.colour is not None and not self.colour[0] <= self.colour[1]:
-            low, high = self.colour
-            raise InputError(f"colours from {low:g} to {high:g} are asked for", do="give a range")
-        if self.bluest is not None and self.bluest < 1:
-            raise InputError(
-                f"the {self.bluest} bluest of each frame are asked for", do="ask for one or more"
-            )
-
-    @property
-    def takes_all(self) -> bool:
-        """True if no limit is given."""
-        return self == RvbSelection()
-
-    @property
-    def by_colour(self) -> bool:
-        """True if a pair needs a colour."""
-        return self.colour is not None or self.bluest is not None
-
-    def right_colour(self, pairs: RvbPairs) -> Rows:
-        """Boolean mask (N,) of the pairs with a colour within the limits."""
-        colour = colours_of(pairs)
-        low, high = self.colour or (-np.inf, np.inf)
-        return np.asarray((colour >= low) & (colour <= high))
 
 
 @dataclass
@@ -81,7 +42,7 @@ class SelectedPairs:
     # gives the pairs of one band batch by batch: once more where the bluest of each frame are asked
     # for, which takes the colours of all
     batches: Callable[[], Iterable[RvbPairs]]
-    selection: RvbSelection
+    selection: RvbBlock
     size: tuple[float, float]  # columns and rows of the array
     n_rows: int = 0  # pairs so far
     # those of them that were dropped, by reason
@@ -123,7 +84,7 @@ class SelectedPairs:
         """Boolean masks of the pairs that pass, by the reason to drop the others."""
         rules = {}
         if self.selection.by_colour:
-            right = self.selection.right_colour(pairs)
+            right = self._right_colour(pairs)
             if bluest is not None:
                 right = right & bluest[self.n_rows : self.n_rows + len(pairs)]
             rules = {NO_COLOUR: ~np.isnan(colours_of(pairs)), COLOUR: right}
@@ -133,6 +94,12 @@ class SelectedPairs:
             rules |= {OFFSET: near, CHI2: likely}
         return rules
 
+    def _right_colour(self, pairs: RvbPairs) -> Rows:
+        """Boolean mask (N,) of the pairs with a colour within the limits."""
+        colour = colours_of(pairs)
+        low, high = self.selection.colour or (-np.inf, np.inf)
+        return np.asarray((colour >= low) & (colour <= high))
+
     def _bluest(self) -> Rows | None:
         """Boolean mask of the rows among the bluest of their frames; None without that rule."""
         if self.selection.bluest is None:
@@ -141,7 +108,7 @@ class SelectedPairs:
         frames: list[Int] = []
         codes: dict[str, int] = {}
         for pairs in self.batches():
-            colour = np.where(self.selection.right_colour(pairs), colours_of(pairs), np.nan)
+            colour = np.where(self._right_colour(pairs), colours_of(pairs), np.nan)
             names = pairs.matches.exposure_names
             code = np.array([codes.setdefault(name, len(codes)) for name in names])
             colours.append(colour)

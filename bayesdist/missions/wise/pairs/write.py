@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bayesdist.data.storage.write import write_columns
+from bayesdist.data.storage.write import Part, write_parts
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
@@ -38,21 +38,20 @@ def write_rvb(batches: Iterable[RvbPairs], folder: str | os.PathLike[str]) -> in
         raise InputError("there are no pairs to write", where=str(folder), do="give some")
     made = not folder.exists()
     made_folder(folder)
-    written: list[Path] = []
-    n = 0
-    try:
+    sizes: list[int] = []
+
+    def parts() -> Iterator[Part]:
         for pairs in chain(first, batches):
-            path = folder / f"part-{len(written):05d}.parquet"
-            write_columns(path, _columns(pairs), _units(pairs))
-            written.append(path)
-            n += len(pairs)
+            yield _columns(pairs), _units(pairs)
+            sizes.append(len(pairs))
+
+    try:
+        write_parts(folder, parts())
     except BaseException:
-        for path in written:
-            path.unlink(missing_ok=True)
         if made:
             folder.rmdir()
         raise
-    return n
+    return sum(sizes)
 
 
 def _columns(pairs: RvbPairs) -> dict[str, Any]:

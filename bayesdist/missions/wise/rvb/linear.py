@@ -5,7 +5,6 @@ It takes constant and linear offsets out of a set of pairs (TRSrvb in WSDC D-T03
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +15,6 @@ from bayesdist.errors import DegenerateError, InputError
 from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform
 
 __all__ = [
-    "FIVE",
     "LinearMoments",
     "TransformFit",
     "fit_transform",
@@ -25,7 +23,7 @@ __all__ = [
 
 Float = NDArray[np.float64]
 
-FIVE = PARAMETERS[:5]
+FREE = 5  # parameters that are fitted, the first of `PARAMETERS`
 
 _RANK = 1e-12  # eigenvalues of the unit-diagonal normal matrix below this are zero
 
@@ -86,8 +84,8 @@ class TransformFit:
     """A fitted linear transformation from reference stars to detections."""
 
     transform: RvbTransform
-    # (6, 6), formal covariance in the order of `PARAMETERS`; zero for what was held.  Distortion
-    # that is not yet corrected is no noise: where chi2 / dof is far from one it says more than this
+    # (6, 6), formal covariance in the order of `PARAMETERS`; zero for the skew.  Distortion that is
+    # not yet corrected is no noise: where chi2 / dof is far from one it says more than this
     cov: Float
     chi2: float
     dof: int
@@ -105,31 +103,13 @@ class TransformFit:
         return f"fitted: {found} (pixels, radians, relative); chi-square {self.chi2:.4g}/{self.dof}"
 
 
-def fit_transform(
-    moments: LinearMoments,
-    *,
-    free: Sequence[str] = FIVE,
-    start: RvbTransform | None = None,
-) -> TransformFit:
-    """Weighted least squares for up to six parameters of the map from (u, v) to (x, y).
+def fit_transform(moments: LinearMoments) -> TransformFit:
+    """Weighted least squares for the five parameters, no skew, of the map from (u, v) to (x, y).
 
-    `free`: of `PARAMETERS`; five by default. `start`: values of the parameters that are held; the
-    identity by default. Returns `transformed` with its transform takes constant and linear offsets
-    out of the pairs. InputError for unknown parameters, or none. DegenerateError when the pairs do
-    not determine the free ones, as when they lie on a line.
+    `transformed` with its transform takes constant and linear offsets out of the pairs.
+    DegenerateError when the pairs do not determine the parameters, as when they lie on a line.
     """
-    unknown = [name for name in free if name not in PARAMETERS]
-    if unknown or not free:
-        raise InputError(
-            f"{unknown[0]!r} is no parameter of a linear transformation"
-            if unknown
-            else "no parameter of the linear transformation is free",
-            where="free",
-            do=f"choose among {', '.join(PARAMETERS)}",
-        )
-    which = [k for k, name in enumerate(PARAMETERS) if name in free]
-    centre = moments.centre
-    now = RvbTransform(centre=centre) if start is None else start.about(centre)
+    now = RvbTransform(centre=moments.centre)
     # the affine coefficients of x and y in the order of `jacobian`: shift, then matrix by rows
     order = np.array([[0, 2, 3], [1, 4, 5]])
     weight, right = np.zeros((6, 6)), np.zeros(6)
@@ -137,12 +117,12 @@ def fit_transform(
         weight[np.ix_(order[axis], order[axis])] = moments.weight[axis]
         right[order[axis]] = moments.right[axis]
     for _ in range(30):
-        by = now.jacobian()[:, which]
+        by = now.jacobian()[:, :FREE]
         normal = by.T @ weight @ by
-        _require_rank(normal, [PARAMETERS[k] for k in which])
+        _require_rank(normal)
         step = np.linalg.solve(normal, by.T @ (right - weight @ _offset(now)))
         values = now.values
-        values[which] += step
+        values[:FREE] += step
         now = replace(now, **dict(zip(PARAMETERS, values.tolist(), strict=True)))
         # in units of the errors: far below what matters, or what rounding leaves of the offsets
         if step @ normal @ step < max(1e-16, 1e-28 * moments.chi2):
@@ -150,14 +130,14 @@ def fit_transform(
     else:
         raise DegenerateError(
             "the linear transformation does not converge",
-            where=", ".join(free),
+            where="linear transformation",
             do="check that x, y and u, v are positions on the same array",
         )
     cov = np.zeros((6, 6))
-    cov[np.ix_(which, which)] = np.linalg.inv(normal)
+    cov[:FREE, :FREE] = np.linalg.inv(normal)
     offset = _offset(now)
     chi2 = moments.chi2 - 2 * right @ offset + offset @ weight @ offset
-    return TransformFit(now, cov, float(chi2), 2 * moments.n - len(which))
+    return TransformFit(now, cov, float(chi2), 2 * moments.n - FREE)
 
 
 def _offset(transform: RvbTransform) -> Float:
@@ -165,15 +145,15 @@ def _offset(transform: RvbTransform) -> Float:
     return np.concatenate([transform.shift, (transform.matrix - np.eye(2)).ravel()])
 
 
-def _require_rank(normal: Float, names: Sequence[str]) -> None:
+def _require_rank(normal: Float) -> None:
     scale = np.sqrt(np.diag(normal))
     dead = scale == 0
     values, vectors = np.linalg.eigh(normal / np.outer(*[np.where(dead, 1.0, scale)] * 2))
     if values[0] < _RANK * values[-1]:
         parts = np.abs(vectors[:, 0])
-        free = [name for name, part in zip(names, parts, strict=True) if part > 0.1 * parts.max()]
+        free = [n for n, part in zip(PARAMETERS, parts, strict=False) if part > 0.1 * parts.max()]
         raise DegenerateError(
             f"the pairs do not determine {', '.join(free)}",
             where="linear transformation",
-            do="give pairs all over the array, or hold some of these",
+            do="give pairs all over the array",
         )

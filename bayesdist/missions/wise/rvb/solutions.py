@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,30 +24,27 @@ SOLUTION_ALIASES: dict[str, tuple[str, ...]] = {
 
 
 def read_solutions(
-    path: str | os.PathLike[str],
-    *,
-    centre: tuple[float, float],
-    columns: Mapping[str, str] | None = None,
+    path: str | os.PathLike[str], *, centre: tuple[float, float]
 ) -> dict[str, RvbTransform]:
     """Solutions of the frames of one band, as `rereference` takes them.
 
-    `path`: an IPAC table or any other that `read_matches` knows, with a row for each frame.
-    `centre`: point about which the frames were solved: the centre of the array, FITS 1-based
-    pixels. `columns`: column of each quantity: frame shift_u shift_v rotation scale_u scale_v skew.
-    A parameter without a column is zero in all frames; scales are relative to one, the rotation in
-    radians unless the column has a unit. InputError for a missing column of frames, no parameter at
-    all, a frame that stands twice, and for what is no number.
+    `path`: an IPAC table or any other that `read_matches` knows, with a row for each frame, the
+    column frame, and some of shift_u shift_v rotation scale_u scale_v skew. `centre`: point about
+    which the frames were solved: the centre of the array, FITS 1-based pixels. A parameter without
+    a column is zero in all frames; scales are relative to one, the rotation in radians unless the
+    column has a unit. InputError for a missing column of frames, no parameter at all, a frame that
+    stands twice, and for what is no number.
     """
     file = Path(path)
     table = read_table(file)
-    found = find_columns(table.colnames, columns, SOLUTION_ALIASES, source=str(file))
+    found = find_columns(table.colnames, None, SOLUTION_ALIASES, source=str(file))
     given = [name for name in PARAMETERS if name in found]
     if "frame" not in found or not given:
         missing = "frames" if "frame" not in found else "parameters"
         raise InputError(
             f"no column of {missing} among {', '.join(table.colnames)}",
             where=str(file),
-            do="name it in the option 'columns'",
+            do="rename the columns",
         )
     codes, names = SourceColumn(table[found["frame"]], str(file), found["frame"]).labels()
     first = np.unique(codes, return_index=True)[1]

@@ -1,15 +1,14 @@
 """Linear transformations of RvB pairs, from one set of frame solutions to another.
 
 What TRSrvb and RERrvb do in WSDC D-T033, section 3: up to five parameters (two shifts, a rotation,
-two scales), and pairs brought from frame solutions with free scales to those with fixed ones.  A
-sixth parameter, the skew that the report's gnDSTR holds at zero, makes the transformations a group:
-what two of them do one after the other is one of them.
+two scales), and pairs brought from frame solutions with free scales to those with fixed ones.  The
+sixth parameter of a solution is the skew, which the report's gnDSTR holds at zero.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -80,44 +79,6 @@ class RvbTransform:
         offset = np.asarray(points, float) - self.centre
         return offset @ self.matrix.T + self.centre + self.shift
 
-    @staticmethod
-    def of_matrix(matrix: ArrayLike, shift: ArrayLike, centre: tuple[float, float]) -> RvbTransform:
-        """The transformation with a given matrix and shift.
-
-        `matrix`: (2, 2), without a mirror: its determinant is positive. `shift`: (2,).
-        """
-        matrix, shift = np.asarray(matrix, float), np.asarray(shift, float)
-        along = float(np.hypot(*matrix[:, 0]))
-        area = float(np.linalg.det(matrix))
-        if not area > 0:
-            raise InputError(
-                f"a linear transformation has the determinant {area:g}",
-                do="give one that neither mirrors nor flattens",
-            )
-        across = area / along
-        skew = float(matrix[:, 0] @ matrix[:, 1]) / along / across
-        rotation = float(np.arctan2(matrix[1, 0], matrix[0, 0]))
-        return RvbTransform(
-            float(shift[0]), float(shift[1]), rotation, along - 1, across - 1, skew, centre
-        )
-
-    def about(self, centre: tuple[float, float]) -> RvbTransform:
-        """Transformation of the same positions about another centre."""
-        away = np.subtract(centre, self.centre)
-        shift = self.shift + (self.matrix - np.eye(2)) @ away
-        return replace(self, shift_u=float(shift[0]), shift_v=float(shift[1]), centre=centre)
-
-    def then(self, after: RvbTransform) -> RvbTransform:
-        """This one first, then another."""
-        after = after.about(self.centre)
-        shift = after.matrix @ self.shift + after.shift
-        return RvbTransform.of_matrix(after.matrix @ self.matrix, shift, self.centre)
-
-    def inverse(self) -> RvbTransform:
-        """The way back, about the same centre."""
-        back = np.linalg.inv(self.matrix)
-        return RvbTransform.of_matrix(back, -back @ self.shift, self.centre)
-
     def jacobian(self) -> Float:
         """Derivatives of shift and matrix by the parameters.
 
@@ -169,8 +130,8 @@ def rereference(
 
     `matches`: made with the free solutions. `free`, `fixed`: solution of each frame: from nominal
     pixels, which are common to both, to the band frame. Those of other bands than the one that is
-    solved for are its solution, then the band's translation and rotation known beforehand
-    (`RvbTransform.then`). InputError for a frame without a solution, and as `transformed`.
+    solved for are its solution, then the band's translation and rotation known beforehand.
+    InputError for a frame without a solution, and as `transformed`.
     """
     moves = []
     used, code = np.unique(matches.exposure, return_inverse=True)
@@ -182,14 +143,14 @@ def rereference(
                     where=", ".join(matches.sources),
                     do="give the solutions of all frames, or leave its pairs out",
                 )
-        moves.append(free[name].inverse().then(fixed[name]))
-    return _moved(
-        matches,
-        code,
-        np.array([one.matrix for one in moves]),
-        np.array([one.shift for one in moves]),
-        np.array([one.centre for one in moves]),
-    )
+        old, new = free[name], fixed[name]
+        # back to nominal pixels, then on by the other solution, as one map about the first centre
+        matrix = new.matrix @ np.linalg.inv(old.matrix)
+        away = np.subtract(old.centre, new.centre)
+        moves.append(
+            (matrix, new.shift + new.matrix @ away - away - matrix @ old.shift, old.centre)
+        )
+    return _moved(matches, code, *map(np.array, zip(*moves, strict=True)))
 
 
 def _moved(

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.frame_stars import FrameStars
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import DistortionModel
 
@@ -28,9 +28,9 @@ class UnpairedStars:
 
     Parameters
     ----------
-    detections : FrameStars
-        On the detector, pixels.
-    reference : FrameStars
+    detections : Detections
+        On the detector, pixels; the exposures are the frames.
+    reference : Detections
         Undistorted positions in the frames, pixels.
     partner : ndarray of int, shape (N,)
         Row of each detection's own reference star; -1 where the catalogue has none.
@@ -39,8 +39,8 @@ class UnpairedStars:
         The true distortion.
     """
 
-    detections: FrameStars
-    reference: FrameStars
+    detections: Detections
+    reference: Detections
     partner: Int
     model: DistortionModel
     theta: Float
@@ -102,13 +102,15 @@ def simulate_unpaired(
     shuffled = rng.permutation(len(points))
     partner = np.full(n, -1, np.int64)
     partner[has] = np.argsort(shuffled)[: len(seen)]
+    names = tuple(map(str, range(n_frames)))
     return UnpairedStars(
-        detections=FrameStars(x, y, sigma, frame),
-        reference=FrameStars(
+        detections=Detections(x, y, frame, names, sigma=sigma),
+        reference=Detections(
             points[shuffled, 0],
             points[shuffled, 1],
-            np.full(len(points), REFERENCE_SIGMA),
             frames[shuffled],
+            names,
+            sigma=np.full(len(points), REFERENCE_SIGMA),
         ),
         partner=partner,
         model=model,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +12,7 @@ from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.published import SAMPLE_SIZES, WISE_ARRAYS, WISE_COEFFICIENTS
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.simulate.matches import Truth, simulate_matches
-from bayesdist.simulate.partitioned import simulate_partitioned
+from bayesdist.simulate.matches import Truth, simulate_matches, simulate_partitioned
 
 __all__ = ["simulate_wise", "simulate_wise_partitioned", "wise_solution"]
 
@@ -145,15 +145,12 @@ def simulate_wise_partitioned(
     InputError
         As `simulate_wise` and `write_partitioned`.
     """
-
-    def simulate(size: int) -> tuple[Matches, Truth]:
-        return simulate_wise(
-            size,
-            band=band,
-            rng=rng,
-            fraction=fraction,
-            jitter=jitter,
-            outlier_scale=outlier_scale,
-        )
-
+    simulate = partial(
+        simulate_wise,
+        band=band,
+        rng=rng,
+        fraction=fraction,
+        jitter=jitter,
+        outlier_scale=outlier_scale,
+    )
     return simulate_partitioned(folder, n, simulate)
