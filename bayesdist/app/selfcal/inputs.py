@@ -253,7 +253,7 @@ def _of_log(
             where=log.source,
             do="give it for all exposures, or for none",
         )
-    return [one.epoch for one in found], factors if known.all() else None
+    return np.array([one.epoch for one in found]), factors if known.all() else None
 
 
 def _read_references(config: SelfcalConfig, base: Path) -> ReferenceCatalog | None:

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.stars.likelihood import Likelihood
-from bayesdist.infer.stars.stars import Stars, cell_of
+from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.sums import Sums
 from bayesdist.model import Groups
+from bayesdist.model.grid import cell_index
 
 __all__ = ["CellSums", "cell_sums", "cells_per_side"]
 
@@ -60,7 +61,7 @@ def cell_sums(stars: Stars, likelihood: Likelihood, side: int) -> CellSums:
     good = (h_uu > 0) & (h_vv > 0)
     h_uu, h_uv, h_vv = (np.where(good, h, 0.0) for h in (h_uu, h_uv, h_vv))
     columns = (None, g_u, g_v, h_uu, h_uv, h_vv, g_u**2, g_u * g_v, g_v**2)
-    code, C, G = cell_of(stars.X, stars.Y, side), side * side, len(stars.groups)
+    code, C, G = cell_index(stars.X, stars.Y, (side, side)), side * side, len(stars.groups)
     sums = np.zeros((G, C, COLUMNS))
     position = np.zeros((len(stars.model.chips), C, 3))
     for g, chip in enumerate(stars.groups.chip):

@@ -27,8 +27,9 @@ from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.solution import Solution, likelihood_of
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.shards import Shards, opened
-from bayesdist.infer.stars.stars import cell_of, prepare
+from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
+from bayesdist.model.grid import cell_index
 
 __all__ = ["estimate_discrepancy"]
 
@@ -212,7 +213,7 @@ def _along_axes(
         for cells in source.groups():
             if cells.chip != chip:
                 continue
-            at = row[cell_of(cells.X, cells.Y, side)]
+            at = row[cell_index(cells.X, cells.Y, (side, side))]
             here, M = values[at], cells.frame
             turned = np.einsum("cab,bd->cad", cells.curvature, M)
             for a in (0, 1):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.correlated.information import Information
 from bayesdist.infer.equations.scaled import scaled_inverse
-from bayesdist.infer.stars.stars import cell_of
+from bayesdist.model.grid import cell_index
 
 __all__ = ["block_ratios", "not_narrower", "score_excess", "shrunk_ratios"]
 
@@ -36,7 +36,9 @@ def score_excess(information: Information) -> Float:
         free = 1 - information.leverage(cells)
         squares, curvature = (np.einsum("caa->ca", one) for one in (cells.squares, cells.curvature))
         values = np.column_stack([squares / free, curvature, cells.count])
-        sums[cells.chip] += sums_over(cell_of(cells.X, cells.Y, side), values, side * side)
+        sums[cells.chip] += sums_over(
+            cell_index(cells.X, cells.Y, (side, side)), values, side * side
+        )
     out = np.ones((n_chips, side * side, 2))
     index = np.arange(side)
     for chip in range(n_chips):

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from bayesdist.infer import kernel
 from bayesdist.infer.stars.likelihood import Clip
-from bayesdist.infer.stars.stars import Stars, cell_of
+from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.sums import Sums
+from bayesdist.model.grid import cell_index
 
 __all__ = ["FoldStatistics", "bin_sums", "departures", "fold_sums", "held_out_gain", "truncated"]
 
@@ -55,7 +56,8 @@ def bin_sums(stars: Stars, theta: Float, clip: Clip, bins: int) -> FoldStatistic
     The stars are of one chip, without frames; residuals are taken about `theta`, and `clip` leaves
     stars out.
     """
-    return _sums(stars, cell_of(stars.X, stars.Y, bins), bins * bins, theta, clip)
+    code = cell_index(stars.X, stars.Y, (bins, bins))
+    return _sums(stars, code, bins * bins, theta, clip)
 
 
 def fold_sums(stars: Stars, theta: Float, clip: Clip, folds: int) -> FoldStatistics:

@@ -21,6 +21,7 @@ __all__ = ["Conditional", "Node", "conditional_mode", "expected_mode", "starting
 
 Float = NDArray[np.float64]
 
+MAX_STEPS = 60
 ON_A_RIDGE = 1e-2  # decrement at which a search stops where the curvature had to be made positive
 
 
@@ -63,13 +64,7 @@ def starting_point(target: Target, fit: LinearFit) -> Float:
 
 
 def conditional_mode(
-    target: Target,
-    split: Split,
-    y: Float,
-    at: Float,
-    *,
-    tolerance: float = 1e-9,
-    max_steps: int = 60,
+    target: Target, split: Split, y: Float, at: Float, *, tolerance: float = 1e-9
 ) -> Conditional:
     """Mode of the posterior at the grid's coordinates `at` (g,), starting from y (D',).
 
@@ -78,7 +73,7 @@ def conditional_mode(
     little.  DegenerateError when no maximum is found, or the curvature there is not positive.
     """
     here = _expand(target, split, y, at)
-    for _ in range(max_steps):
+    for _ in range(MAX_STEPS):
         factor, mended = _positive(target, split, here, at)
         step = factor.solve(here.gradient)
         decrement = 0.5 * float(here.gradient @ step)
@@ -104,7 +99,7 @@ def conditional_mode(
             )
     else:
         raise DegenerateError(
-            f"no posterior mode was found in {max_steps} Newton steps",
+            f"no posterior mode was found in {MAX_STEPS} Newton steps",
             where="posterior",
             do="check the match, the errors and the outlier model",
         )

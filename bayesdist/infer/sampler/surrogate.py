@@ -38,8 +38,7 @@ from numpy.polynomial import hermite_e
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError, NotConvergedError
-from bayesdist.infer.convergence import importance_efficiency
-from bayesdist.infer.convergence import pareto_k as tail_shape
+from bayesdist.infer.convergence import importance_efficiency, pareto_k
 from bayesdist.infer.density.proposal import Random
 from bayesdist.infer.posterior import Certificate
 from bayesdist.infer.sampler.move_schedule import EFFICIENT
@@ -94,40 +93,17 @@ class Surrogate:
 
 
 def certify(
-    white: Float,
-    log_weights: Float,
-    n_hyper: int,
-    *,
-    rng: np.random.Generator,
-    held_out: float = 0.5,
-    pareto_k: float | None = None,
+    white: Float, log_weights: Float, n_hyper: int, *, rng: np.random.Generator
 ) -> tuple[Surrogate, Certificate]:
-    """Surrogate fitted to some of the pilots, and its certificate by the others.
+    """Surrogate fitted to half of the pilots, and its certificate by the others.
 
     `white` (n, D) are independent draws of the proposal q inside its support, in coordinates about
     standard normal under q, the last `n_hyper` of them hyperparameters; `log_weights` (n,) are
-    exact log p - log q, up to a constant, minus infinity where p is zero.  `rng` splits the pilots,
-    of which a fraction `held_out` is for the certificate; `pareto_k` of the raw weights is found
-    from all pilots by default.
-
-    InputError for arrays that do not fit together, pilots that are not finite, or too few of them.
+    exact log p - log q, up to a constant, minus infinity where p is zero.  `rng` splits the pilots.
+    InputError for too few of them.
     """
-    white, log_weights = np.asarray(white, float), np.asarray(log_weights, float)
-    n = len(log_weights)
-    if white.shape[:1] != (n,) or white.ndim != 2 or not 0 <= n_hyper <= white.shape[1]:
-        raise InputError(
-            f"{n} log weights and {n_hyper} hyperparameters do not go with points of shape "
-            f"{white.shape}",
-            where="certificate",
-        )
-    if not np.isfinite(white).all() or np.isnan(log_weights).any() or (log_weights == np.inf).any():
-        raise InputError(
-            "pilots must be finite, and their log weights finite or minus infinity",
-            where="certificate",
-            do="leave out draws outside the support of the proposal",
-        )
-    order = rng.permutation(n)
-    n_test = round(held_out * n)
+    order = rng.permutation(len(log_weights))
+    n_test = round(len(order) / 2)
     test, train = order[:n_test], order[n_test:]
     train = train[np.isfinite(log_weights[train])]
     if len(train) < LEAST_TRAINING or not np.isfinite(log_weights[test]).any():
@@ -137,12 +113,11 @@ def certify(
             do="draw a few hundred pilots",
         )
     surrogate = _fit(white[train], log_weights[train], n_hyper)
-    if pareto_k is None:
-        # the tail of rounding errors means nothing
-        flat = np.ptp(log_weights[np.isfinite(log_weights)]) < ROUNDING
-        pareto_k = float("-inf") if flat else tail_shape(log_weights)
+    # the tail of rounding errors means nothing
+    flat = np.ptp(log_weights[np.isfinite(log_weights)]) < ROUNDING
+    k = float("-inf") if flat else pareto_k(log_weights)
     guess = surrogate.log_weight(white[test])
-    return surrogate, _judge(log_weights, log_weights[test], guess, len(train), pareto_k)
+    return surrogate, _judge(log_weights, log_weights[test], guess, len(train), k)
 
 
 def draw_surrogate(
@@ -251,9 +226,7 @@ def _ridge(core: Float, linear: Float, y: Float) -> Float:
 # -- the certificate ------------------------------------------------------------------------------
 
 
-def _judge(
-    log_weights: Float, exact: Float, guess: Float, n_train: int, pareto_k: float
-) -> Certificate:
+def _judge(log_weights: Float, exact: Float, guess: Float, n_train: int, k: float) -> Certificate:
     """Certificate from all log weights and, over pilots held out, exact and approximate ones."""
     finite = np.isfinite(exact)
     n_outside = int((~np.isfinite(log_weights)).sum())
@@ -278,8 +251,8 @@ def _judge(
         reasons.append(f"{n} pilots held out are fewer than {LEAST_HELD_OUT}")
     if n_outside:
         reasons.append(f"{n_outside} pilots lie where the posterior is zero")
-    if not pareto_k < PARETO_K.value:
-        reasons.append(f"Pareto k {pareto_k:.3f} of the proposal is not below {PARETO_K.value}")
+    if not k < PARETO_K.value:
+        reasons.append(f"Pareto k {k:.3f} of the proposal is not below {PARETO_K.value}")
     if not efficiency > EFFICIENT:
         reasons.append(f"efficiency {efficiency:.3f} of the proposal is not above {EFFICIENT}")
     if not sd <= MOST_REMAINDER:
@@ -295,7 +268,7 @@ def _judge(
         remainder_max=worst,
         raw_efficiency=efficiency,
         efficiency=1 / (1 + chi2),
-        pareto_k=pareto_k,
+        pareto_k=k,
         chi2=chi2,
         chi2_upper=upper,
         mean_shift_bound=bound,

@@ -282,7 +282,6 @@ def prepare(
     *,
     match_radius: float,
     motion: str = "none",
-    epoch0: float | None = None,
     parallax_factors: Float | None = None,
     dilation: Float | None = None,
     min_detections: int = MIN_DETECTIONS,
@@ -292,8 +291,8 @@ def prepare(
     Detections without star codes, and stars with fewer than `min_detections`, are left out; the
     model's exposures are those of the detections.  `theta` is good enough for the size and shape of
     pixels on the sky; `match_radius` is in pixels; `motion`, one of `MOTIONS`, gives the parameters
-    of a star; `epoch0` is the date of the stars' positions, the mean of the exposures' by default;
-    `parallax_factors` (E, 2), along u and v, are needed by 'parallax'; `dilation` (E,) is VAFACTOR.
+    of a star, whose position is that at the mean date of the exposures; `parallax_factors` (E, 2),
+    along u and v, are needed by 'parallax'; `dilation` (E,) is VAFACTOR.
 
     InputError when no star is left, for a motion without dates, or parallax without factors.
     """
@@ -315,7 +314,7 @@ def prepare(
     star = np.unique(detections.star[rows], return_inverse=True)[1]
     starts = np.concatenate([[0], np.cumsum(np.bincount(star))]).astype(np.int64)
     exposure, chip = detections.exposure[rows], detections.chip[rows]
-    time, factor, when = np.zeros(0), np.zeros((0, 2)), None
+    time, factor, when, epoch0 = np.zeros(0), np.zeros((0, 2)), None, 0.0
     if q > 2 or model.time is not None:
         if detections.epoch is None:
             raise InputError(
@@ -324,7 +323,7 @@ def prepare(
                 do="give an exposure log with epochs",
             )
         when = detections.epoch[exposure]
-        epoch0 = float(np.mean(detections.epoch)) if epoch0 is None else epoch0
+        epoch0 = float(np.mean(detections.epoch))
         time = when - epoch0 if q > 2 else time
     if q == MOTIONS["parallax"]:
         if parallax_factors is None:
@@ -353,7 +352,7 @@ def prepare(
         priors=StarPriors.none(len(starts) - 1, q),
         rows=rows,
         match_radius=match_radius,
-        epoch0=epoch0 or 0.0,
+        epoch0=epoch0,
         dilation=None if dilation is None else np.asarray(dilation, float),
     )
     return problem.at(theta, problem.mean_places(theta))

@@ -15,7 +15,7 @@ from bayesdist.infer import kernel
 from bayesdist.infer.kernel import Constants
 from bayesdist.model import DistortionModel, Groups
 
-__all__ = ["Stars", "cell_of", "errors_of", "groups_of", "in_table_order", "prepare"]
+__all__ = ["Stars", "errors_of", "groups_of", "in_table_order", "prepare"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -132,12 +132,6 @@ def prepare(model: DistortionModel, matches: Matches) -> tuple[Stars, Int]:
         off_v=None if matches.v_nominal is None else (matches.v_nominal - matches.v)[order],
     )
     return stars, np.arange(len(x))[order]
-
-
-def cell_of(X: Float, Y: Float, side: int) -> Int:
-    """Cell `iy * side + ix` (N,) of scaled positions, among `side` by `side` over a chip."""
-    ix, iy = (np.clip(((z + 1) * (0.5 * side)).astype(np.int64), 0, side - 1) for z in (X, Y))
-    return np.asarray(iy * side + ix)
 
 
 def errors_of(matches: Matches) -> tuple[Float, Float]:
