@@ -12,7 +12,7 @@ from bayesdist.calibration.chip_map import position_moments
 from bayesdist.infer.solution import Solution
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
 
-__all__ = ["RELATIVE", "UncertaintyMap", "uncertainty_map", "with_local"]
+__all__ = ["RELATIVE", "UncertaintyMap", "sigmas_of", "uncertainty_map", "with_local"]
 
 Float = NDArray[np.float64]
 
@@ -76,6 +76,14 @@ class UncertaintyMap:
         return float(self.sigma_v.max())
 
 
+def sigmas_of(uu: Float, vv: Float, uv: Float) -> tuple[Float, Float, Float]:
+    """Standard deviations (N,) of u and v, and their correlation; 0 where one is known exactly."""
+    sigma_u, sigma_v = np.sqrt(uu), np.sqrt(vv)
+    product = sigma_u * sigma_v
+    correlation = np.divide(uv, product, out=np.zeros_like(uv), where=product > 0)
+    return sigma_u, sigma_v, np.clip(correlation, -1.0, 1.0)
+
+
 def with_local(found: UncertaintyMap, sigma: Float | None) -> UncertaintyMap:
     """A map with what the model leaves out at each position; itself where that is not known.
 
@@ -127,16 +135,14 @@ def uncertainty_map(
     place = place_of(solution.model, epoch=epoch, exposure=exposure, chip=chip)
     x, y = grid_pixels(place.chip.size, grid)
     uu, vv, uv = position_moments(place.covariance(solution), place.basis, *mesh(x, y))
-    sigma_u, sigma_v = np.sqrt(uu), np.sqrt(vv)
-    product = sigma_u * sigma_v
-    correlation = np.divide(uv, product, out=np.zeros_like(uv), where=product > 0)
     shape = (y.size, x.size)
+    sigma_u, sigma_v, correlation = (one.reshape(shape) for one in sigmas_of(uu, vv, uv))
     return UncertaintyMap(
         x=x,
         y=y,
-        sigma_u=sigma_u.reshape(shape),
-        sigma_v=sigma_v.reshape(shape),
-        correlation=np.clip(correlation, -1.0, 1.0).reshape(shape),
+        sigma_u=sigma_u,
+        sigma_v=sigma_v,
+        correlation=correlation,
         unit=solution.model.unit,
         chip=place.chip.number,
         epoch=place.epoch,

@@ -322,9 +322,7 @@ def diagnose(
     shared = None
     if eliminated is not None:
         estimated = selfcal_discrepancy(eliminated, rng=restarted(rng), priors=discrepancy)
-        tests = selfcal_score_tests(
-            eliminated, mag=_column(stars, "mag"), epoch=_column(stars, "epoch")
-        )
+        tests = selfcal_score_tests(eliminated, mag=stars.mag, epoch=stars.epoch)
     else:
         estimated = estimate_discrepancy(
             shards,
@@ -355,12 +353,6 @@ def diagnose(
         if periods is None
         else time_variation(fit, stars, periods, rng=restarted(rng)),
     )
-
-
-def _column(stars: Matches, name: str) -> NDArray[np.float64] | None:
-    """A column of detections that are all in memory."""
-    values: NDArray[np.float64] | None = getattr(stars, name)
-    return values
 
 
 def catalogue_covariance(

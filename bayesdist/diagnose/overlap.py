@@ -195,14 +195,10 @@ def _epoch(pairs: Matches, rows: Int) -> float:
     return float(np.median(pairs.epoch[rows]))
 
 
-def _numbers(pairs: Matches, rows: Int) -> Int:
-    return np.asarray(pairs.chip_numbers)[pairs.chip[rows]]
-
-
 def _known_plane(known: Calibration, pairs: Matches, rows: Int, epoch: float) -> Float:
     """Positions (N, 2) through the known distortion, its drift included; arcseconds."""
     then = None if known.no_date else epoch
-    chips = _numbers(pairs, rows)
+    chips = pairs.chip_number[rows]
     out = np.empty((len(rows), 2))
     for number in np.unique(chips):
         here = chips == number
@@ -218,7 +214,7 @@ def _solved_plane(
 
     Without what is fitted for the single exposure: no file holds that.
     """
-    chips = _numbers(pairs, rows)
+    chips = pairs.chip_number[rows]
     filters = np.asarray(pairs.filter_names)[pairs.filter[rows]]
     x, y = corrected(tables, pairs.x[rows], pairs.y[rows], chip=chips, filter=filters)
     view = without_frames(solution)

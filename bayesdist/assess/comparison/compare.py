@@ -19,6 +19,7 @@ from bayesdist.assess.comparison.frame import (
     draws_of_sum,
     with_errors,
 )
+from bayesdist.assess.maps import sigmas_of
 from bayesdist.calibration.chip_map import ChipMap, position_moments
 from bayesdist.infer.equations.scaled import FieldTest, chi_square, known_terms
 from bayesdist.limits import DIFFERENCE
@@ -178,10 +179,7 @@ def compare(
         K = basis.n_terms
         uu, vv, uv = position_moments(frame.cov.reshape(2, K, 2, K), basis, X, Y)
         chi2 = _of_two(du, dv, uu, vv, uv)
-        sigma_u, sigma_v = np.sqrt(uu).reshape(shape), np.sqrt(vv).reshape(shape)
-        product = (sigma_u * sigma_v).ravel()
-        correlation = np.divide(uv, product, out=np.zeros_like(uv), where=product > 0)
-        correlation = np.clip(correlation, -1.0, 1.0).reshape(shape)
+        sigma_u, sigma_v, correlation = (one.reshape(shape) for one in sigmas_of(uu, vv, uv))
         draws = draws_of_sum(zip(frame.shares, (a, b), strict=True))
         field = chi_square(
             d.ravel(), frame.raw_cov, without=frame.taken, norm=frame.norm, draws=draws

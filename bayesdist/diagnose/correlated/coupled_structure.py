@@ -1,17 +1,9 @@
-"""Posterior of the structure outside polynomials, amplitudes marginalised.
+"""Posterior of the structure outside polynomials where axes and chips are coupled.
 
-With the part that the fit absorbs eliminated, the data determine the coefficients z of the
-structure's functions through a score s and an information S, so that for amplitudes eta
-
-    z | eta   ~ N((S + P)^-1 s, (S + P)^-1)             P = P(eta), the prior precision
-    log p(eta | data) = log p(eta) + (s^T (S + P)^-1 s - log|S + P| + log|P|) / 2
-
-The amplitude and the correlation length of the Matern field and the amplitude of the higher orders
-are integrated on a grid that is refined where the density is.  In the eigenvectors of the sines'
-information, in units of their prior at one length, every amplitude is a sum.
-
-Axes and chips with independent likelihoods have posteriors of their own.  Where they are coupled,
-as by the stars of a self-calibration, they have one, with amplitudes and a length in common.
+Axes and chips with independent likelihoods have posteriors of their own (`chip_structure`, whose
+density this is).  Where they are coupled, as by the stars of a self-calibration, they have one,
+with amplitudes and a length in common.  In the eigenvectors of the sines' information, in units of
+their prior at one length, every amplitude is a sum.
 """
 
 from __future__ import annotations

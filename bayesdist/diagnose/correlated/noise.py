@@ -10,7 +10,7 @@ from bayesdist.diagnose.correlated.information import Information
 from bayesdist.infer.equations.scaled import scaled_inverse
 from bayesdist.model.grid import cell_index
 
-__all__ = ["block_ratios", "not_narrower", "score_excess", "shrunk_ratios"]
+__all__ = ["block_ratios", "not_narrower", "score_excess"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -54,7 +54,18 @@ def block_ratios(block: Int, values: Float, n: int) -> Float:
 
     `block` (N,) is that of each of the values (N, 3): squares, curvatures, numbers.
     """
-    return shrunk_ratios(*sums_over(block, values, n).T)[block]
+    top, bottom, number = sums_over(block, values, n).T
+    mean = top.sum() / bottom.sum()
+    good = (number >= STARS_PER_BLOCK / 6) & (bottom > 0) & (top > 0)
+    out = np.full(n, mean)
+    if good.sum() > 1:
+        ratio = np.log(top[good] / bottom[good] / mean)
+        own = 2.5 / number[good]  # a normal star's square has variance 2; mixtures have some more
+        w = 1 / own
+        q = (w * (ratio - np.average(ratio, weights=w)) ** 2).sum()
+        scatter = max(0.0, (q - (len(w) - 1)) / (w.sum() - (w**2).sum() / w.sum()))
+        out[good] = mean * np.exp(ratio * scatter / (scatter + own))
+    return np.asarray(np.clip(out, MIN_RATIO, MAX_RATIO)[block])
 
 
 def not_narrower(noise: Float, formal: Float) -> tuple[Float, float]:
@@ -67,18 +78,3 @@ def not_narrower(noise: Float, formal: Float) -> tuple[Float, float]:
     noise = 0.99 * noise + 0.01 * formal
     ratio = float(np.sum(scaled_inverse(formal) * noise)) / len(formal)
     return noise * max(1.0, 1 / ratio), ratio
-
-
-def shrunk_ratios(top: Float, bottom: Float, n: Float) -> Float:
-    """Ratios of sums over blocks, shrunk to their mean."""
-    mean = top.sum() / bottom.sum()
-    good = (n >= STARS_PER_BLOCK / 6) & (bottom > 0) & (top > 0)
-    out = np.full(len(n), mean)
-    if good.sum() > 1:
-        ratio = np.log(top[good] / bottom[good] / mean)
-        own = 2.5 / n[good]  # a normal star's square has variance 2; mixtures have some more
-        w = 1 / own
-        q = (w * (ratio - np.average(ratio, weights=w)) ** 2).sum()
-        scatter = max(0.0, (q - (len(w) - 1)) / (w.sum() - (w**2).sum() / w.sum()))
-        out[good] = mean * np.exp(ratio * scatter / (scatter + own))
-    return np.asarray(np.clip(out, MIN_RATIO, MAX_RATIO))

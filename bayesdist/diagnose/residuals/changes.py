@@ -72,8 +72,7 @@ def _change(period: str, axis: str, one: BinValues, rest: BinValues) -> PatternC
         )
     a, b = one.mean[good], rest.mean[good]
     variance = one.sem[good] ** 2 + rest.sem[good] ** 2
-    difference = BinValues(one.mean, one.sem, one.dof).minus(rest)
-    p_value = _p_value((a - b) ** 2 / variance, difference.dof[good])
+    p_value = _p_value((a - b) ** 2 / variance, one.minus(rest).dof[good])
     excess = float(np.mean((a - b) ** 2 - variance))
     alike = float(np.corrcoef(a, b)[0, 1]) if a.std() > 0 and b.std() > 0 else float("nan")
     return PatternChange(period, axis, p_value, float(np.sqrt(max(excess, 0.0))), alike, n)

@@ -107,19 +107,26 @@ class Projection:
         out = out - self.information[G + which, :G] @ self.nuisance[:, which]
         return np.asarray((out + out.T) / 2)
 
+    def moved(self, block: Block, by: Float, own: Float | None) -> Float:
+        """Change (2, K, n) of a block's polynomial by global parameters, and by its exposure's own.
+
+        These change by `by` (G, n) and `own` (l, n), None for an exposure without parameters.
+        """
+        by_global, by_local = block.parts(self.n_global)
+        n_own = by_global.shape[2]
+        out = by_global @ by[block.columns[:n_own]]
+        if own is not None:
+            index = self.exposures[block.frame_exposure].index
+            out += by_local @ own[np.searchsorted(index, block.columns[n_own:])]
+        return np.asarray(out)
+
     def through(self, block: Block, by: Float) -> Float:
         """Change (2, K, n) of a block's polynomial that global parameters (G, n) bring about.
 
         The parameters of the exposure follow them.
         """
-        by_global, by_local = block.parts(self.n_global)
-        n_own = by_global.shape[2]
-        out = by_global @ by[block.columns[:n_own]]
-        if by_local.shape[2]:
-            one = self.exposures[block.frame_exposure]
-            at = np.searchsorted(one.index, block.columns[n_own:])
-            out -= by_local @ (one.gain[at, : self.n_global] @ by)
-        return np.asarray(out)
+        one = self.exposures.get(block.frame_exposure)
+        return self.moved(block, by, None if one is None else -one.gain[:, : self.n_global] @ by)
 
     def star_scores(self, F: Float, block: Block, coefficients: Float) -> Float:
         """Scores (n, q) of detections, by coefficients (2, L, q) of functions F (L, n)."""
@@ -166,15 +173,10 @@ class Projection:
 
         `which` (n,) are from 0 to q - 1.
         """
-        K, nuisance = self.sample.model.n_terms, self.nuisance[:, which]
-        by_global, by_local = block.parts(self.n_global)
-        n_own = by_global.shape[2]
+        K, one = self.sample.model.n_terms, self.exposures.get(block.frame_exposure)
+        own = None if one is None else self._following(one, which)
         out = _added(block, self.n_added, K, which)
-        out[:, :K] -= by_global @ nuisance[block.columns[:n_own]]
-        if by_local.shape[2]:
-            one = self.exposures[block.frame_exposure]
-            at = np.searchsorted(one.index, block.columns[n_own:])
-            out[:, :K] -= by_local @ self._following(one, which)[at]
+        out[:, :K] -= self.moved(block, self.nuisance[:, which], own)
         return out
 
     def _following(self, one: Eliminated, which: Int) -> Float:
