@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,9 +37,10 @@ if TYPE_CHECKING:
     from bayesdist.model import Chip
     from bayesdist.report.campaign import CampaignResults
 
-__all__ = ["ChipResults", "Product", "ReportInput", "SelfcalResults", "campaign_of"]
+__all__ = ["ChipResults", "Product", "ReportInput", "SelfcalResults", "needed"]
 
 Float = NDArray[np.float64]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -242,7 +243,7 @@ class ReportInput:
         return float(np.mean(self.posterior.hyper[key]))
 
 
-def campaign_of(r: ReportInput) -> CampaignResults:
-    """Results of the campaign, of a run that has one."""
-    assert r.campaign is not None
-    return r.campaign
+def needed(value: T | None) -> T:
+    """Value that the registry has found to be there."""
+    assert value is not None
+    return value

@@ -24,7 +24,6 @@ __all__ = [
     "COLORBAR",
     "CYCLE",
     "GUIDE",
-    "HYPER_LABELS",
     "INK",
     "LEVEL_COLORS",
     "OUTLINE",
@@ -65,7 +64,6 @@ INK = "#1F2A37"
 PALE = "#A9B4C0"  # vectors that may be noise alone, and stars in the background
 OUTLINE = "#9AA5B1"  # of chips, and lines at zero
 GUIDE = "#E3E8ED"  # lines of a grid behind data
-HYPER_LABELS = {"f": "f", "j": "j", "s_out": r"$s_\mathrm{out}$"}
 COLORBAR: dict[str, Any] = {"fraction": 0.05, "pad": 0.02}  # next to maps
 WIDTH = 7.2  # inches: the text width of an A4 or Letter page
 

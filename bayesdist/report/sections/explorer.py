@@ -15,7 +15,7 @@ from bayesdist.assess.terms.forms import MEASURED, Row
 from bayesdist.assess.terms.given import CENTROID
 from bayesdist.numbers import ladder
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput
+from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.style import CYCLE, SEQUENTIAL
 
 __all__ = ["budget_data", "map_data"]
@@ -31,8 +31,7 @@ _COLORS = 12
 @REPORT.data(needs=("surface",))
 def budget_data(r: ReportInput) -> dict[str, Any]:
     """Budget as a function of position, epoch and magnitude."""
-    s = r.surface
-    assert s is not None
+    s = needed(r.surface)
     nodes = s.spans[0].nodes
     return _common(r) | {
         "terms": list(s.model.basis(s.model.chips[0].number).terms),

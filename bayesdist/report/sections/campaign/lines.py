@@ -9,7 +9,7 @@ from typing import Any
 from bayesdist.numbers import MISSING, count, display_scale, interval, number, rounded
 from bayesdist.report.campaign import CampaignResults
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput, campaign_of
+from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.sections.campaign.published import Published, PublishedLine, published_terms
 from bayesdist.report.sections.campaign.terms import name_of_scatter, name_of_term
 from bayesdist.report.texttable import TextTable, listing
@@ -28,7 +28,7 @@ FIXED = 5e-3  # 10^-6, or 10^-3 of a length: a term with errors below it is held
 @REPORT.table("campaign-time", needs=("campaign",))
 def time_tables(r: ReportInput) -> Iterator[TextTable]:
     """Tables of the gauge, lines of each term, changes at the breaks, scatter and claims."""
-    c = campaign_of(r)
+    c = needed(r.campaign)
     found, joint = c.section("time_dependence"), c.summary.get("lines") or []
     names = {chip.number: chip.name for chip in c.chips}
     published = published_terms(c.config, c.filter, tuple(names.values()))

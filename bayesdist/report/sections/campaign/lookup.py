@@ -15,7 +15,7 @@ from bayesdist.numbers import count, display_scale, number, size_of
 from bayesdist.report.arrows import Arrows, magnification_of, spacing, vector_map
 from bayesdist.report.campaign import CampaignResults, ChipResiduals
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput, campaign_of
+from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.fields import Grid, scalar_map
 from bayesdist.report.panels import ChipPanels
 from bayesdist.report.registry import Plot
@@ -46,7 +46,7 @@ _REACH = 4.5  # times the robust width of the residuals without tables: where ax
 @REPORT.table("campaign-tables", needs=("campaign",))
 def lookup_table(r: ReportInput) -> TextTable:
     """Table of the look-up tables of each chip."""
-    c = campaign_of(r)
+    c = needed(r.campaign)
     t = c.section("tables")
     if not t.get("chips"):
         return listing("Look-up tables", {"Method": "none: no tables were fitted"})
@@ -90,7 +90,7 @@ def table_residuals(r: ReportInput) -> Plot:
 
     Figures 6 and 7 of ACS ISR 2015-06.
     """
-    found = campaign_of(r)
+    found = needed(r.campaign)
     order = sorted(range(len(found.residuals)), key=lambda k: r.mosaic.places[k])
     chips = [found.residuals[k] for k in order]  # from the top
     every = np.concatenate([c.without for c in chips])
@@ -156,7 +156,7 @@ def _base(c: CampaignResults) -> str:
 
 
 def _maps_of_residuals(r: ReportInput) -> Mapping[str, str]:
-    which = ("without", "with") if campaign_of(r).tables else ("without",)
+    which = ("without", "with") if needed(r.campaign).tables else ("without",)
     return {f"residuals_{one}_tables": one for one in which}
 
 
@@ -166,7 +166,7 @@ def residual_map(r: ReportInput, which: str) -> Plot:
 
     Figure 10 of ACS ISR 2015-06.
     """
-    c = campaign_of(r)
+    c = needed(r.campaign)
     binned = binned_of(c.residuals, which)
     M, key = _common_scale(c.residuals)
     panels = residual_panels(binned, r.mosaic, unit="pix", magnification=M, key=key)
@@ -235,7 +235,7 @@ def rms_of_cells(*binned: BinnedResiduals) -> tuple[float, float]:
 
 def _figures_by_filter(r: ReportInput, name: str, *, known: bool) -> Mapping[str, str]:
     """Names of figures by filter, '' the detector's own; only with known errors where asked."""
-    tables = [t for t in campaign_of(r).tables if t.sigma is not None or not known]
+    tables = [t for t in needed(r.campaign).tables if t.sigma is not None or not known]
     return {f"{name}_{t.filter}" if t.filter else name: t.filter for t in tables}
 
 
@@ -252,7 +252,7 @@ def _by_chip(c: CampaignResults, filter: str) -> list[LookupTable | None]:
 )
 def table_nodes(r: ReportInput, filter: str) -> Plot:
     """Shifts of the pixels by the tables of a filter, an arrow at each node."""
-    c = campaign_of(r)
+    c = needed(r.campaign)
     chips = _by_chip(c, filter)
     tables = [t for t in c.tables if t.filter == filter]
     length = np.concatenate([np.hypot(*t.values).ravel() for t in tables])
@@ -303,7 +303,7 @@ def _arrows(table: LookupTable) -> Arrows:
 )
 def table_errors(r: ReportInput, filter: str) -> Plot:
     """Standard errors of the nodes along x and y, in one scale of colours."""
-    c = campaign_of(r)
+    c = needed(r.campaign)
     chips = _by_chip(c, filter)
     tables = [t for t in c.tables if t.filter == filter]
     every = np.concatenate([t.sigma.ravel() for t in tables if t.sigma is not None])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bayesdist.numbers import count, number, percent, size_of
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput, campaign_of
+from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import (
     GUIDE,
@@ -43,7 +43,7 @@ _LEFT_OUT = PALETTE["vermilion"]
 @REPORT.table("campaign-matching", needs=("campaign",))
 def matching_table(r: ReportInput) -> TextTable:
     """Table of detections that were matched, and that were left out."""
-    c = campaign_of(r)
+    c = needed(r.campaign)
     m = c.section("matching")
     left_out = {
         name: int(c.matching[name].sum())
@@ -71,9 +71,8 @@ def catalogue_errors(r: ReportInput) -> Plot:
 
     Figure 3 of ACS ISR 2015-06.
     """
-    c = campaign_of(r)
-    catalog, centroids, found = c.catalog, c.centroids, c.section("matching")
-    assert catalog is not None
+    c = needed(r.campaign)
+    catalog, centroids, found = needed(c.catalog), c.centroids, c.section("matching")
     fig = new_figure(WIDTH, 3.3)
     left, right = fig.subplots(1, 2)
     if catalog.sigma is not None:
@@ -155,8 +154,7 @@ def _motions(ax: Axes, catalog: CatalogStars) -> None:
 @REPORT.figure("campaign-matching", needs=("campaign.detections",))
 def fit_quality(r: ReportInput) -> Plot:
     """Quality of the PSF fit against magnitude, with the cuts: Figure 5 of ACS ISR 2015-06."""
-    d = campaign_of(r).detections
-    assert d is not None
+    d = needed(needed(r.campaign).detections)
     faintest, brightest = np.quantile(d.mag, (0.9995, 0.001))
     low, high = np.quantile(d.q[d.q > 0], (0.0005, 0.9995))
     fig = new_figure(WIDTH, 3.5)
@@ -200,7 +198,7 @@ def fit_quality(r: ReportInput) -> Plot:
 @REPORT.figure("campaign-matching", needs=("campaign",))
 def matching(r: ReportInput) -> Plot:
     """Completeness and fraction of false pairs of each exposure, against its date."""
-    c = campaign_of(r)
+    c = needed(r.campaign)
     epoch = np.asarray(c.matching["epoch"], float)
     rows = (
         ("completeness [%]", 100 * np.asarray(c.matching["completeness"], float), "blue"),
@@ -236,9 +234,8 @@ def matching(r: ReportInput) -> Plot:
 @REPORT.figure("campaign-matching", needs=("campaign.footprints",))
 def footprints(r: ReportInput) -> Plot:
     """Outlines of the chips of every exposure over the catalogue: Figure 4 of ACS ISR 2015-06."""
-    c = campaign_of(r)
-    field = c.footprints
-    assert field is not None
+    c = needed(r.campaign)
+    field = needed(c.footprints)
     fig = new_figure(0.85 * WIDTH, 0.78 * WIDTH, layout="compressed")
     ax = fig.subplots()
     ax.plot(field.u, field.v, ".", ms=1.3, color="#9AA7B4", mec="none", zorder=1)

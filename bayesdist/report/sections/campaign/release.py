@@ -8,7 +8,7 @@ from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.numbers import MISSING, count, number, size_of
 from bayesdist.report.arrows import Arrows, magnification_of, vector_map
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput, campaign_of
+from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.panels import Panels
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import WIDTH, new_figure, nice_below
@@ -31,7 +31,7 @@ _KINDS = {
 @REPORT.table("campaign-release", needs=("campaign",))
 def released_files(r: ReportInput) -> TextTable | None:
     """Table of files for pipelines, with their dates; None where none were written."""
-    c = campaign_of(r)
+    c = needed(r.campaign)
     files = [p for p in c.summary.get("products") or () if p["kind"] in _KINDS]
     if not files:
         return None
@@ -59,8 +59,7 @@ def overlap(r: ReportInput) -> Plot:
 
     Figures 27 and 28 of ACS ISR 2015-06.
     """
-    t = campaign_of(r).overlap
-    assert t is not None
+    t = needed(needed(r.campaign).overlap)
     states = {"old": (t.binned_old, t.old), "new": (t.binned_new, t.new)}
     panels, arrows, titles, largest = _panels(t), [], [], {}
     for which, (binned, found) in states.items():

@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 
 from bayesdist.numbers import MISSING, count, display_scale, number, percent, with_mas
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput, SelfcalResults
+from bayesdist.report.context import ReportInput, SelfcalResults, needed
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import CYCLE, INK, PALE, WIDTH, new_figure
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing
@@ -29,8 +29,7 @@ MAX_STARS_DRAWN = 20_000  # more only hide each other
 @REPORT.table("selfcal", needs=("selfcal",))
 def selfcal_tables(r: ReportInput) -> tuple[TextTable, ...]:
     """Tables of gauge, detections, exposures and stars."""
-    found = r.selfcal
-    assert found is not None
+    found = needed(r.selfcal)
     return (_gauge(found), _detections(found), _exposures(found, r), _stars(found, r))
 
 
@@ -141,8 +140,7 @@ def _stars(found: SelfcalResults, r: ReportInput) -> TextTable:
 @REPORT.figure("selfcal", needs=("selfcal",))
 def selfcal(r: ReportInput) -> Plot:
     """The field with its exposures, and the errors of the stars."""
-    found = r.selfcal
-    assert found is not None
+    found = needed(r.selfcal)
     stars = found.stars[:: max(1, -(-len(found.stars) // MAX_STARS_DRAWN))]
     fig = new_figure(WIDTH, 0.5 * WIDTH)
     field, errors = fig.subplots(1, 2)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bayesdist.numbers import count, display_scale, number, size_of
 from bayesdist.report.campaign import CampaignResults
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput, campaign_of
+from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.campaign.terms import (
     TermCourse,
@@ -39,8 +39,7 @@ FALLS = 1.2  # scatter before VAFACTOR over that after it, above which the aberr
 
 def _figures(r: ReportInput) -> Mapping[str, tuple[str, int]]:
     """Names of figures, each with its term and chips."""
-    series = campaign_of(r).series
-    assert series is not None
+    series = needed(needed(r.campaign).series)
     return {
         f"series_{term}" + (f"_{n + 1}" if n else ""): (term, n)
         for term, labels in terms_of(series).items()
@@ -54,9 +53,9 @@ def series(r: ReportInput, which: tuple[str, int]) -> Plot:
 
     Against time, and against PA_V3 where it is known: Figures 14 to 24 of ACS ISR 2015-06.
     """
-    campaign, (term, n) = campaign_of(r), which
-    series, found, unit = campaign.series, campaign.section("time_dependence"), campaign.unit
-    assert series is not None
+    campaign, (term, n) = needed(r.campaign), which
+    series, unit = needed(campaign.series), campaign.unit
+    found = campaign.section("time_dependence")
     labels = terms_of(series)[term][ABREAST * n : ABREAST * (n + 1)]
     courses = [course_of(series, found.get("lines", []), label) for label in labels]
     first = which == next(iter(_figures(r).values()))

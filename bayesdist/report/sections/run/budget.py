@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.numbers import MISSING, display_scale, percent, with_mas
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput
+from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.fields import Grid, scalar_map
 from bayesdist.report.panels import ChipPanels
 from bayesdist.report.registry import Plot
@@ -63,10 +63,10 @@ def is_total(row: Mapping[str, str | float]) -> bool:
 @REPORT.table("budget", needs=("budget",))
 def budget_table(r: ReportInput) -> TextTable:
     """Table of the error budget, the total last."""
-    assert r.budget is not None
-    unit, mas = r.budget.unit, r.scale_mas
+    budget = needed(r.budget)
+    unit, mas = budget.unit, r.scale_mas
     names = {str(c.chip.number): c.chip.name for c in r.chips} | {"all": "all"}
-    rows = r.budget.rows_by_chip() if r.several else r.budget.rows()
+    rows = budget.rows_by_chip() if r.several else budget.rows()
     out = [
         (
             str(row["name"]),
@@ -80,14 +80,14 @@ def budget_table(r: ReportInput) -> TextTable:
     ]
     of_chip = ("Chip",) if r.several else ()
     heads = ("Term", *of_chip, "Kind", "Source", "u", "v", "Radial", "Known to")
-    epoch = r.budget.epoch
+    epoch = budget.epoch
     when = "" if epoch is None else f" at epoch {epoch:.2f}"
     return TextTable(
         f"Error budget{when}: rms over the detector, 1 σ",
         heads,
         tuple(out),
         words=tuple(range(len(heads) - 4)),
-        leading=len(r.budget.rows()),  # rows of all chips together
+        leading=len(budget.rows()),  # rows of all chips together
         stacked=(heads.index("Radial"),),
         note="The parts of the model are correlated and enter the total jointly, by draws;"
         " independent terms are added in quadrature. The total therefore need not be the root of"
@@ -118,8 +118,7 @@ def budget_terms(r: ReportInput) -> Plot:
 
     Each of up to three chips has a panel next to that of the whole detector.
     """
-    budget = r.budget
-    assert budget is not None
+    budget = needed(r.budget)
     rows = budget.rows()
     parts = {"all chips": rows}
     if 1 < len(budget.chips) <= _MOST_PANELS:
@@ -172,8 +171,7 @@ def _bars(ax: Axes, rows: Sequence[Mapping[str, str | float]], factor: float) ->
 @REPORT.figure("budget", needs=("budget",))
 def budget_dominating(r: ReportInput) -> Plot:
     """Map of the term that contributes most at each position."""
-    budget = r.budget
-    assert budget is not None
+    budget = needed(r.budget)
     share = budget.share
     present = np.flatnonzero(share)
     colors = [CYCLE[k % len(CYCLE)] for k in range(len(present))]

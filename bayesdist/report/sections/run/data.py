@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bayesdist.numbers import MISSING, count, display_scale, number
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput
+from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import INK, PALETTE, SEQUENTIAL, WIDTH, new_figure
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing, short_paths
@@ -70,8 +70,7 @@ def data_tables(r: ReportInput) -> tuple[TextTable, ...]:
 
 
 def _magnitude_table(r: ReportInput) -> TextTable:
-    e = r.magnitude_errors
-    assert e is not None
+    e = needed(r.magnitude_errors)
     scale = display_scale(r.unit, np.concatenate([e.sigma_u, e.sigma_v]))
     rows = tuple(
         (f"{mag:.2f}", count(n), number(su * scale.factor), number(sv * scale.factor))

@@ -14,7 +14,7 @@ from scipy.stats import binom
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
 from bayesdist.numbers import count, number
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput
+from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.panels import chip_axes
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import CYCLE, INK, WIDTH, new_figure
@@ -43,8 +43,7 @@ def _with_coverage(r: ReportInput) -> bool:
 @REPORT.table("holdout", needs=("held_out",), when=_with_coverage)
 def holdout_coverage(r: ReportInput) -> TextTable:
     """Table of the coverage of the held-out stars along each axis."""
-    found = r.held_out
-    assert found is not None
+    found = needed(r.held_out)
     rows = tuple(
         (
             c.axis,
@@ -64,8 +63,7 @@ def holdout_coverage(r: ReportInput) -> TextTable:
 @REPORT.table("holdout", needs=("held_out",))
 def holdout_table(r: ReportInput) -> TextTable:
     """Table of the most informative tests."""
-    found = r.held_out
-    assert found is not None
+    found = needed(r.held_out)
     shown = found.tests[:_MOST_TESTS]
     rows = tuple(
         (
@@ -100,8 +98,7 @@ def _question(test: HeldTest, unit: str) -> str:
 @REPORT.figure("holdout", needs=("held_out",), printed=lambda r: r.campaign is None)
 def holdout(r: ReportInput) -> Plot:
     """Predictive probabilities, and residuals by region in units of their prediction."""
-    found, mosaic = r.held_out, r.mosaic
-    assert found is not None
+    found, mosaic = needed(r.held_out), r.mosaic
     rows, columns = (max(place[k] for place in mosaic.places) + 1 for k in (0, 1))
     aspect = max(ny / nx for nx, ny in mosaic.sizes)
     panel = min(0.75 * WIDTH / columns, 4.4)

@@ -18,7 +18,7 @@ from bayesdist.numbers import (
 )
 from bayesdist.report.arrows import CHANCE, Arrows, magnification_of, spacing, vector_map
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput
+from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.panels import ChipPanels
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import nice_below
@@ -41,8 +41,7 @@ _CLEAR = 3.0  # sigmas beyond which a coefficient counts
 @REPORT.table("periods", needs=("periods",))
 def period_tables(r: ReportInput) -> tuple[TextTable, ...]:
     """Tables of verdict, periods, coefficients of first and last, and residuals."""
-    found = r.periods
-    assert found is not None
+    found = needed(r.periods)
     out = [_verdict(found), _periods(found, r), _coefficients(found)]
     for chip, table in zip(found.comparison.model.chips, found.residuals, strict=True):
         out.append(_residuals(table, r.on_chip(chip)))
@@ -179,8 +178,7 @@ def period_differences(r: ReportInput) -> Plot:
 
     Vectors that noise would make as long at their position in more than 5 % of cases are pale.
     """
-    found = r.periods
-    assert found is not None
+    found = needed(r.periods)
     comparison, unit = found.comparison, found.comparison.model.unit
     longest = r.mosaic.longest_side
     chips, lengths = [], []

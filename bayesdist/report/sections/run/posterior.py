@@ -23,10 +23,10 @@ from bayesdist.numbers import (
     rounded,
 )
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput
+from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.corners import Column, corner_figure
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import CYCLE, HYPER_LABELS, INK, WIDTH, legend_above, new_figure
+from bayesdist.report.style import CYCLE, INK, WIDTH, legend_above, new_figure
 from bayesdist.report.texttable import TextTable
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ __all__ = [
 
 Float = NDArray[np.float64]
 
+_MIXTURE_LABELS = {"f": "f", "j": "j", "s_out": r"$s_\mathrm{out}$"}
 _MAX_POINTS = 20_000  # draws that enter a corner plot
 _TRACE_POINTS = 2_000  # draws that stand as points in a trace
 
@@ -55,8 +56,7 @@ def _with_mixture(r: ReportInput) -> bool:
 @REPORT.table("outliers", needs=("posterior",))
 def outlier_table(r: ReportInput) -> TextTable:
     """Table of the mixture's own parameters, and of the number of stars or detections it flags."""
-    post, words = r.posterior, r.words
-    assert post is not None
+    post, words = needed(r.posterior), r.words
     named = {
         "f": (f"Fraction of {words.false_rows}, f", ""),
         "j": ("Jitter, j: error beyond the quoted one", r.unit),
@@ -107,8 +107,7 @@ def outlier_table(r: ReportInput) -> TextTable:
 @REPORT.table("outliers", needs=("added_errors",))
 def added_errors_table(r: ReportInput) -> TextTable:
     """Table of errors beyond the quoted ones, by the groups that the evidence asks for."""
-    found = r.added_errors
-    assert found is not None
+    found = needed(r.added_errors)
     scale = display_scale(r.unit, found.sigma)
     rows = []
     for g, label in enumerate(found.labels):
@@ -138,18 +137,13 @@ def added_errors_table(r: ReportInput) -> TextTable:
 @REPORT.figure("outliers", needs=("posterior",), when=_with_mixture)
 def outliers_corner(r: ReportInput) -> Plot:
     """Corner plot of the outlier fraction, jitter and outlier scale, of those that were sampled."""
-    posterior = r.posterior
-    assert posterior is not None
-    unit = posterior.model.unit
-    columns = []
-    for key in ("f", "j", "s_out"):
-        if key in posterior.hyper:
-            draws = _thinned(np.asarray(posterior.hyper[key], float).ravel())
-            fraction = key == "f"
-            values = 100.0 * draws if fraction else draws
-            columns.append(Column(HYPER_LABELS[key], "%" if fraction else unit, values))
+    posterior = needed(r.posterior)
+    columns = [
+        Column(label, unit, _thinned(draws.ravel()))
+        for label, unit, draws in _mixture_draws(posterior)
+    ]
     text = "Joint posterior of the mixture's parameters; dashed lines hold 68 %."
-    if r.posterior is not None and "f" in r.posterior.hyper:
+    if "f" in posterior.hyper:
         text += f" The fraction of {r.words.false_rows} is {percent(r.sampled_mean('f'))}."
     return Plot(
         corner_figure(columns),
@@ -162,8 +156,7 @@ def outliers_corner(r: ReportInput) -> Plot:
 @REPORT.figure("coefficients", needs=("posterior",))
 def coefficients_corner(r: ReportInput) -> Plot:
     """Corner plot of coefficients, as differences from least squares, with its Gaussian over it."""
-    posterior, fit = r.posterior, r.fit
-    assert posterior is not None
+    posterior, fit = needed(r.posterior), r.fit
     names = correlated_parameters(posterior)
     index = [posterior.model.names.index(name) for name in names]
     draws = _thinned(posterior.flat)[:, index] - fit.mean[index]
@@ -205,6 +198,17 @@ def correlated_parameters(posterior: Posterior, n: int = 5) -> tuple[str, ...]:
     return tuple(posterior.model.names[chosen[k]] for k in sorted(picked))
 
 
+def _mixture_draws(posterior: Posterior) -> list[tuple[str, str, Float]]:
+    """Label, unit and draws (ensembles, draws) of each of f, j, s_out that was sampled."""
+    unit = posterior.model.unit
+    hyper = {key: np.asarray(draws, float) for key, draws in posterior.hyper.items()}
+    return [
+        (label, "%", 100.0 * hyper[key]) if key == "f" else (label, unit, hyper[key])
+        for key, label in _MIXTURE_LABELS.items()
+        if key in hyper
+    ]
+
+
 def _thinned(draws: Float) -> Float:
     return draws[:: max(1, len(draws) // _MAX_POINTS)]
 
@@ -212,8 +216,7 @@ def _thinned(draws: Float) -> Float:
 @REPORT.figure("coefficients", needs=("posterior",))
 def traces(r: ReportInput) -> Plot:
     """Chains of the slowest parameters and of f, j, s_out, and their densities, by ensemble."""
-    posterior = r.posterior
-    assert posterior is not None
+    posterior = needed(r.posterior)
     names = slowest_parameters(posterior, without=r.held)
     rows: list[tuple[str, str, Float]] = []
     for name in names:
@@ -226,11 +229,7 @@ def traces(r: ReportInput) -> Plot:
                 posterior.theta[..., k] - mean,
             )
         )
-    for key in ("f", "j", "s_out"):
-        if key in posterior.hyper:
-            fraction = key == "f"
-            values = np.asarray(posterior.hyper[key], float) * (100.0 if fraction else 1.0)
-            rows.append((HYPER_LABELS[key], "%" if fraction else posterior.model.unit, values))
+    rows += _mixture_draws(posterior)
     fig = new_figure(WIDTH, 1.0 * len(rows) + 0.7)
     axes = fig.subplots(
         len(rows), 2, sharey="row", sharex="col", width_ratios=(4, 1), squeeze=False
