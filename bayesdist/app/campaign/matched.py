@@ -94,10 +94,6 @@ class CampaignMatched(Matched):
             rolls={one.name: one.pa_v3 for one in inputs.log},
         )
 
-    def reopened(self, folder: Path, config: Config) -> CampaignMatched:
-        """Matches as a run that is resumed reads them: rows name the files that they lie in."""
-        return load_matched_campaign(folder, self.inputs, {self.section: self.facts})
-
     def save(self, folder: Path) -> None:
         """Write the files of a run's folder that belong to it."""
         super().save(folder)

@@ -114,10 +114,6 @@ class Matched:
         """Two exposures far apart in time laid on each other; None where none are known so."""
         return None
 
-    def reopened(self, folder: Path, config: Config) -> Matched:
-        """Matches as a run that is resumed reads them from its folder."""
-        return self
-
     def save(self, folder: Path) -> None:
         """Write the files of a run's folder that belong to it."""
         if self.table is not None:

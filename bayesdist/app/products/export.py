@@ -59,7 +59,7 @@ def export_files(
                     entry["sky"] = sky.summary
                     log.log(sky.level, "export: %s: %s", path.name, sky.sentence)
                     findings += sky.findings
-            products.append(entry | built.summary | {"findings": findings})
+            products.append(entry | dict(built.summary) | {"findings": findings})
     for one in products:
         _compare(one, budget)
     return products

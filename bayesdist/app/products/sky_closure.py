@@ -120,7 +120,8 @@ def sky_closure(
     uv = model.predict(
         solution.mean, x, y, chip=chip, **({} if model.time is None else {"epoch": product.epoch})
     )
-    own = SkyCoord(*sky_of_plane(*(uv.T * arcsec), point), unit="deg")
+    u, v = uv.T * arcsec
+    own = SkyCoord(*sky_of_plane(u, v, point), unit="deg")
     east, north = true.spherical_offsets_to(at)
     return SkyClosure(
         n=int(mine.sum()),

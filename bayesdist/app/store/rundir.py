@@ -320,8 +320,7 @@ class RunDirectory(RunStore):
         """Remove what a run wrote, and nothing else."""
         pairs = part_files(self / PAIRS)
         names = [path.relative_to(self.path).as_posix() for path in pairs]
-        # the last one may be of a command that came before the assessment
-        super().clear(*others, "config.toml", "bayesdist.log", *names, "catalogue_errors.h5")
+        super().clear(*others, "config.toml", "bayesdist.log", *names)
 
 
 def _hashes(config: Config, base: Path) -> dict[str, str]:

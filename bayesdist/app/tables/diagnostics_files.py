@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from dataclasses import asdict, replace
 from typing import Any
@@ -9,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.tables.fingerprint import fingerprint_of
 from bayesdist.diagnose.correlated.storage import discrepancy_from_arrays, discrepancy_to_arrays
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.residuals.misfit import Misfit
@@ -20,13 +20,21 @@ from bayesdist.infer.catalogue.star_errors import StarCovariance
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.records import record_from_arrays, record_to_arrays
 
-__all__ = ["load_diagnostics", "write_diagnostics"]
+__all__ = ["fingerprint_of", "load_diagnostics", "write_diagnostics"]
 
 CORRELATED = "discrepancy.h5"
 CATALOGUE = "catalogue_errors.h5"
 OTHERS = "diagnostics.h5"
 
 log = logging.getLogger("bayesdist")
+
+
+def fingerprint_of(fit: LinearFit, posterior: Posterior) -> str:
+    """Hash of the numbers of a fit and of the posterior's draws, to which a file belongs."""
+    digest = hashlib.sha256()
+    for values in (fit.mean, fit.cov, posterior.theta):
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
 
 
 def write_diagnostics(
@@ -37,7 +45,8 @@ def write_diagnostics(
     assert found.correlated is not None
     arrays, facts = discrepancy_to_arrays(found.correlated)
     write_arrays(run / CORRELATED, fingerprint, arrays)
-    _save_catalogue(run, fingerprint, found.catalogue)
+    if found.catalogue is not None:
+        _save_catalogue(run, fingerprint, found.catalogue)
     others = replace(found, correlated=None, catalogue=None)
     write_arrays(run / OTHERS, fingerprint, record_to_arrays(others))
     run.summarise(
@@ -75,10 +84,7 @@ def load_diagnostics(run: RunDirectory, fit: LinearFit, posterior: Posterior) ->
     )
 
 
-def _save_catalogue(run: RunDirectory, fingerprint: str, stars: StarCovariance | None) -> None:
-    if stars is None:
-        (run / CATALOGUE).unlink(missing_ok=True)
-        return
+def _save_catalogue(run: RunDirectory, fingerprint: str, stars: StarCovariance) -> None:
     motions = np.empty((0, 0)) if stars.motions is None else stars.motions
     arrays = {"total": stars.total, "counted": stars.counted, "motions": motions}
     write_arrays(run / CATALOGUE, fingerprint, arrays)
