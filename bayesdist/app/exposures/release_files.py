@@ -98,5 +98,5 @@ def write_files(
 
 
 def _entry(path: str, kind: str, findings: Any) -> dict[str, Any]:
-    said = [f"{f.level}: {f.where}: {f.message}" for f in findings]
-    return {"path": path, "kind": kind, "findings": said}
+    texts = [f"{f.level}: {f.where}: {f.message}" for f in findings]
+    return {"path": path, "kind": kind, "findings": texts}
