@@ -69,7 +69,7 @@ def run(folder):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(series, "_verdict", first)
-        patch.setattr(series, "MOST_SWEEPS", 1000)
+        patch.setattr(series, "MAX_SWEEPS", 1000)
         good("run", folder / "campaign_f606w.toml", "-o", out, "-q")
     return out
 

@@ -24,7 +24,7 @@ ABERRATION = "velocity aberration"
 # Cox & Gilliland (2002, HST Calibration Workshop): the scale varies by up to 5e-5 over an orbit
 SWING = 5e-5
 PERIOD = 5760.0  # s, of 96 minutes
-LONGEST = 1000.0  # s, where the log has no exposure times
+LONG_EXPOSURE = 1000.0  # s, where the log has no exposure times
 PUBLISHED = "published: 5e-5 in an orbit (Cox & Gilliland 2002)"
 
 
@@ -65,7 +65,7 @@ def aberration_term(scatter: ExposureScatter, inputs: Inputs, solution: Solution
         source += ", not corrected"
     else:
         given = [one.exptime for one in inputs.log if one.exptime is not None]
-        seconds = math.sqrt(np.mean(np.square(given))) if given else LONGEST
+        seconds = math.sqrt(np.mean(np.square(given))) if given else LONG_EXPOSURE
         sigma = scale_error(seconds)
         source += f", over {seconds:.0f} s"
         if not given:

@@ -15,7 +15,7 @@ from bayesdist.model import DistortionModel, TimeDependence
 __all__ = ["gap_priors", "with_gap"]
 
 CONSTANTS = (("u", 0, 0), ("v", 0, 0))
-HELD = 1e-6  # pixels, and pixels per year
+SIGMA_HELD = 1e-6  # pixels, and pixels per year
 
 
 def with_gap(model: DistortionModel) -> DistortionModel:
@@ -43,7 +43,7 @@ def gap_priors(
     """
     reference, named = model.chips[0].number, () if asked is None else asked.terms
     held = {
-        p.name: (0.0, HELD * pixel)
+        p.name: (0.0, SIGMA_HELD * pixel)
         for p in model.parameters
         if p.kind == "tdd"
         and (p.axis, p.i, p.j) in CONSTANTS

@@ -32,12 +32,12 @@ __all__ = [
 
 Float = NDArray[np.float64]
 
-FEWEST = 3  # exposures: two of them differ, but do not scatter
-SAME_DAY = 1.0 / 365.25  # years: epochs within say nothing of a rate
+MIN_EXPOSURES = 3  # exposures: two of them differ, but do not scatter
+ONE_DAY = 1.0 / 365.25  # years: epochs within say nothing of a rate
 LINEAR_KINDS = 3  # drifting terms from which on scale and both shears drift
 ONE_ROLL = 2.0  # degrees: roll angles that scatter by less are one
-NAMED = 5  # exposures in a sentence
-STILL = 1.0  # years over which stars may stand still
+MAX_NAMED = 5  # exposures in a sentence
+YEARS_AT_REST = 1.0  # years over which stars may stand still
 
 
 def refuse_campaign(inputs: Inputs) -> None:
@@ -101,12 +101,12 @@ def input_warnings(inputs: Inputs) -> list[str]:
         out.append(_unlogged(inputs.unlogged, log.source))
     epochs = log.values("epoch")
     span = float(np.ptp(epochs))
-    if catalog.pm_u is None and span > STILL:
+    if catalog.pm_u is None and span > YEARS_AT_REST:
         out.append(
             f"the catalogue has no proper motions, and the exposures span {span:.1f} years: "
             "whatever the stars move is taken for an error"
         )
-    elif catalog.sigma_pm_u is None and catalog.pm_u is not None and span > STILL:
+    elif catalog.sigma_pm_u is None and catalog.pm_u is not None and span > YEARS_AT_REST:
         out.append(
             "the catalogue has no errors of the proper motions: its positions count as equally "
             "good at all epochs"
@@ -129,12 +129,12 @@ def input_warnings(inputs: Inputs) -> list[str]:
 
 
 def _unlogged(names: tuple[str, ...], log: str) -> str:
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
     several = len(names) > 1
     return (
         f"{len(names)} star list{'s are of exposures' if several else ' is of an exposure'} that "
         f"{log} does not have, and {'are' if several else 'is'} not used: "
-        f"{', '.join(names[:NAMED])}{more}"
+        f"{', '.join(names[:MAX_NAMED])}{more}"
     )
 
 
@@ -201,12 +201,12 @@ def refuse_few(epochs: Float, time: TimeDependence | None) -> None:
         Naming the segment and its dates.
     """
     n = len(epochs)
-    if n < FEWEST:
+    if n < MIN_EXPOSURES:
         few = "one exposure tells" if n == 1 else f"{n} exposures tell"
         raise DegenerateError(
             f"{few} neither how exposures scatter nor how they drift",
             where="campaign.exposures",
-            do=f"give at least {FEWEST}, or calibrate matched stars ([data] in place of "
+            do=f"give at least {MIN_EXPOSURES}, or calibrate matched stars ([data] in place of "
             "[campaign], model.frames = 'shift_rotation')",
         )
     if time is None:
@@ -217,7 +217,7 @@ def refuse_few(epochs: Float, time: TimeDependence | None) -> None:
         fault = ""
         if not len(inside):
             fault = f"holds no exposure: they are from {epochs.min():.2f} to {epochs.max():.2f}"
-        elif np.ptp(inside) < SAME_DAY:
+        elif np.ptp(inside) < ONE_DAY:
             which = "exposure" if len(inside) == 1 else "epoch"
             fault = f"holds one {which} only, at {inside[0]:.2f}: its rate is not determined"
         if fault:

@@ -14,10 +14,10 @@ __all__ = ["refuse_outrun_stars"]
 
 Float = NDArray[np.float64]
 
-TWICE = 2.0  # ratio of scatters beyond which centroids are not what most of it is
-EXPLAINED = 0.5  # fraction of the variance of the scatters that the dates must explain
-FEWEST = 5  # exposures: a parabola in time takes three
-NORMAL = 1.4826  # of the median of |z|
+MIN_SCATTER_RATIO = 2.0  # ratio of scatters beyond which centroids are not what most of it is
+MIN_EXPLAINED = 0.5  # fraction of the variance of the scatters that the dates must explain
+MIN_EXPOSURES = 5  # exposures: a parabola in time takes three
+SIGMA_OF_MEDIAN = 1.4826  # of the median of |z|
 
 
 def refuse_outrun_stars(inputs: Inputs, fit: LinearFit, pairs: Matches) -> None:
@@ -44,16 +44,16 @@ def refuse_outrun_stars(inputs: Inputs, fit: LinearFit, pairs: Matches) -> None:
     names = range(len(pairs.exposure_names))
     rows = [np.flatnonzero(pairs.exposure == k) for k in names]
     rows = [one for one in rows if len(one)]
-    if len(rows) < FEWEST:
+    if len(rows) < MIN_EXPOSURES:
         return
     date = np.array([pairs.epoch[one[0]] for one in rows])
-    scatter = np.array([NORMAL * np.median(size[one]) for one in rows])
-    if np.ptp(date) == 0 or scatter.max() < TWICE * scatter.min():
+    scatter = np.array([SIGMA_OF_MEDIAN * np.median(size[one]) for one in rows])
+    if np.ptp(date) == 0 or scatter.max() < MIN_SCATTER_RATIO * scatter.min():
         return
     at = (date - date.mean()) / np.ptp(date)
     curve = np.polynomial.Polynomial.fit(at, scatter**2, 2).convert()
     left = np.var(scatter**2 - curve(at)) / np.var(scatter**2)
-    if left > 1.0 - EXPLAINED or curve.coef[2] <= 0:
+    if left > 1.0 - MIN_EXPLAINED or curve.coef[2] <= 0:
         return
     low, high = int(np.argmin(scatter)), int(np.argmax(scatter))
     raise InputError(

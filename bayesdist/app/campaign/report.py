@@ -34,11 +34,11 @@ __all__ = ["campaign_results", "held_parameters"]
 
 Float = NDArray[np.float64]
 
-DRAWN = 20_000  # markers in a figure: more only hide each other
-CELL = 64.0  # pixels: the nodes of ACS ISR 2015-06
-IN_CELL = 20  # stars that a cell should have at the median
-HELD = 0.99  # of the prior's sigma: what narrows it by less is no measurement
-WIDEST = 8  # cells of this many times the size, however few stars there are
+MAX_MARKERS = 20_000  # markers in a figure: more only hide each other
+CELL_PIX = 64.0  # pixels: the nodes of ACS ISR 2015-06
+MIN_STARS_PER_CELL = 20  # stars that a cell should have at the median
+HELD_BY_PRIOR = 0.99  # of the prior's sigma: what narrows it by less is no measurement
+WIDEST_CELL = 8  # cells of this many times the size, however few stars there are
 
 
 def campaign_results(results: Results) -> CampaignResults:
@@ -86,11 +86,11 @@ def held_parameters(fit: LinearFit, priors: GaussianPriors) -> tuple[str, ...]:
     return tuple(
         p.name
         for p, known in zip(fit.model.parameters, share, strict=True)
-        if p.kind != "frame" and known > HELD
+        if p.kind != "frame" and known > HELD_BY_PRIOR
     )
 
 
-def _some(n: int, most: int) -> slice:
+def _spread_rows(n: int, most: int) -> slice:
     """Evenly spread rows, at most that many: lists come in the order of the field, or in none."""
     return slice(None, None, max(1, -(-n // most)))
 
@@ -101,7 +101,7 @@ def _catalog_stars(inputs: Inputs, matching: Table) -> CatalogStars | None:
     if catalog.mag is None or (catalog.sigma_u is None and catalog.sigma_pm_u is None):
         return None
     shift = float(np.nan_to_num(np.nanmedian(np.asarray(matching["zero_point"], float))))
-    rows = _some(len(catalog), DRAWN // 2)
+    rows = _spread_rows(len(catalog), MAX_MARKERS // 2)
     limit, sigma, motion = None, None, None
     if catalog.sigma_u is not None and catalog.sigma_v is not None:
         sigma = np.hypot(catalog.sigma_u, catalog.sigma_v)[rows]
@@ -126,7 +126,7 @@ def _detections(inputs: Inputs) -> Detections | None:
     lists, cuts, passed = star_lists.lists, star_lists.cuts, star_lists.passed
     if any(one.mag is None or one.q is None for one in lists):
         return None
-    every = max(1, -(-len(star_lists) // DRAWN))
+    every = max(1, -(-len(star_lists) // MAX_MARKERS))
     mag, q, kept = (
         np.concatenate([np.asarray(a)[::every] for a in columns])
         for columns in ([one.mag for one in lists], [one.q for one in lists], passed)
@@ -154,7 +154,7 @@ def _footprints(posterior: Posterior, matched: CampaignMatched) -> Footprints:
             when = exposure.epoch if model.time is not None else None
             outlines.append(model.predict(theta, x, y, epoch=when, **place))
             epochs.append(exposure.epoch)
-    rows = _some(len(catalog), DRAWN // 2)
+    rows = _spread_rows(len(catalog), MAX_MARKERS // 2)
     u = -catalog.u if matched.mirrored else catalog.u
     return Footprints(u[rows], catalog.v[rows], tuple(outlines), np.array(epochs), catalog.unit)
 
@@ -187,7 +187,7 @@ def _residuals(data: FitData, matched: CampaignMatched) -> tuple[ChipResiduals, 
         here = good & (numbers == chip.number)
         bins = _cells(chip.size, int(here.sum()))
         binned = [_binned(pairs, r, here, bins, chip.size) for r in left]
-        rows = _some(int(here.sum()), DRAWN // (2 * len(model.chips)))
+        rows = _spread_rows(int(here.sum()), MAX_MARKERS // (2 * len(model.chips)))
         points = [r[here][rows] for r in left]
         again = (points[-1], binned[-1]) if tables else (None, None)
         out.append(ChipResiduals(chip, points[0], again[0], binned[0], again[1]))
@@ -196,9 +196,9 @@ def _residuals(data: FitData, matched: CampaignMatched) -> tuple[ChipResiduals, 
 
 def _cells(size: tuple[float, float], n: int) -> tuple[int, int]:
     """Cells of a chip along x and y: of the tables' size, or wider where stars are few."""
-    for k in (1, 2, 4, WIDEST):
-        nx, ny = (max(1, round(s / (k * CELL))) for s in size)
-        if n >= IN_CELL * nx * ny:
+    for k in (1, 2, 4, WIDEST_CELL):
+        nx, ny = (max(1, round(s / (k * CELL_PIX))) for s in size)
+        if n >= MIN_STARS_PER_CELL * nx * ny:
             break
     return nx, ny
 

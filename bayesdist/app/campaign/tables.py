@@ -38,7 +38,7 @@ ErrorsAt = Callable[[Float, Float, int], Float]  # of positions (n, 2), at pixel
 
 log = logging.getLogger("bayesdist")
 
-ROUGH = 1  # iterations of the tables from whose residuals the errors of the stars are taken
+ROUGH_ITERATIONS = 1  # of the tables from whose residuals the errors of the stars are taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ def fit_tables(matched: CampaignMatched) -> FittedTables:
         method=block.method,
         step=block.step,
         max_iterations=block.max_iterations,
-        report=_say,
+        report=_log_iteration,
     )
 
     def by_covariance(x: Float, y: Float, chip: int) -> Float:
@@ -135,7 +135,7 @@ def _with_errors(matched: CampaignMatched, held: tuple[LookupTable, ...]) -> Mat
         beneath=held,
         method=block.method,
         step=block.step,
-        max_iterations=ROUGH,
+        max_iterations=ROUGH_ITERATIONS,
     )
     _, _, errors = scatter_by_magnitude(rough.corrected(pairs), model, inputs)
     return pairs.with_errors(errors)
@@ -152,7 +152,7 @@ def _stored(
     )
 
 
-def _say(one: Iteration) -> None:
+def _log_iteration(one: Iteration) -> None:
     log.info(
         "fit: tables, round %d: moved %.2g px, residuals %.4f px", one.number, one.moved, one.rms
     )

@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-from bayesdist.app.config.assess import CATALOGUE_WORDS, require_own_names
+from bayesdist.app.config.assess import CATALOGUE_WORDS
 from bayesdist.app.config.campaign import CampaignConfig
 from bayesdist.app.config.data import Data, MatchesConfig
-from bayesdist.app.config.detector import (
-    ChipBlock,
-    Detector,
-    chips_of,
-    one_chip,
-    reference_first,
-    require_detector,
-)
+from bayesdist.app.config.detector import ChipBlock
 from bayesdist.app.config.kinds import KINDS, Config
 from bayesdist.app.config.reading import (
     config_of_record,
@@ -20,7 +13,6 @@ from bayesdist.app.config.reading import (
     load_requirements,
     load_text,
     parse_config,
-    validated,
 )
 from bayesdist.app.config.selfcal import SelfcalConfig
 
@@ -31,18 +23,11 @@ __all__ = [
     "ChipBlock",
     "Config",
     "Data",
-    "Detector",
     "MatchesConfig",
     "SelfcalConfig",
-    "chips_of",
     "config_of_record",
     "load_config",
     "load_requirements",
     "load_text",
-    "one_chip",
     "parse_config",
-    "reference_first",
-    "require_detector",
-    "require_own_names",
-    "validated",
 ]

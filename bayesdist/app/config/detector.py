@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 from pydantic import PositiveFloat
 
@@ -20,6 +21,7 @@ __all__ = [
 ]
 
 Pair = tuple[PositiveFloat, PositiveFloat]
+Block = TypeVar("Block", bound="ChipBlock")
 
 
 class Detector(Section):
@@ -66,7 +68,7 @@ def require_detector(
         raise ValueError("detector.size is missing; give it, or [[chip]] blocks")
 
 
-def reference_first(chips: Sequence[ChipBlock]) -> list[ChipBlock]:
+def reference_first(chips: Sequence[Block]) -> list[Block]:
     """The blocks with the reference chip in front: it defines the frame."""
     return sorted(chips, key=lambda c: not c.reference)
 

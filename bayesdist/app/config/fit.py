@@ -5,7 +5,7 @@ What a kind does not have is a constant of its class, so that nobody has to ask 
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
@@ -64,9 +64,27 @@ class CampaignFit(_Fit):
 class _Outliers(Section):
     """Errors beyond the quoted ones, and the fraction of false matches."""
 
+    if TYPE_CHECKING:
+
+        @property
+        def model(self) -> str: ...
+        @property
+        def outlier_scale(self) -> float | None: ...
+
     jitter: Literal["fit"] | Annotated[float, Field(ge=0)] = "fit"
     fraction_prior: Pair = (1.0, 9.0)
     jitter_scale: PositiveFloat | None = None
+
+    def mixture(self, match_radius: float | None) -> OutlierMixture:
+        """The outlier mixture within a radius of the match."""
+        return OutlierMixture(
+            model=self.model,
+            match_radius=match_radius,
+            jitter=None if self.jitter == "fit" else self.jitter,
+            fraction_prior=self.fraction_prior,
+            jitter_scale=self.jitter_scale,
+            outlier_scale=self.outlier_scale,
+        )
 
 
 class SelfcalOutliers(_Outliers):
@@ -78,19 +96,11 @@ class SelfcalOutliers(_Outliers):
 
     model: Literal["uniform"] = "uniform"
 
-    def mixture(self, match_radius: float | None = None) -> OutlierMixture:
-        """The outlier mixture within a radius of the match."""
-        return _mixture_of(self, match_radius)
-
 
 class _Mixture(_Outliers):
     model: Literal["gaussian", "uniform", "none"] = "gaussian"
     match_radius: PositiveFloat | None = None
     outlier_scale: PositiveFloat | None = None
-
-    def mixture(self) -> OutlierMixture:
-        """The outlier mixture."""
-        return _mixture_of(self, self.match_radius)
 
 
 class CampaignOutliers(_Mixture):
@@ -112,18 +122,6 @@ class Outliers(_Mixture):
                 "jitter of all stars; leave one of the two out"
             )
         return self
-
-
-def _mixture_of(block: SelfcalOutliers | _Mixture, match_radius: float | None) -> OutlierMixture:
-    """The outlier mixture of a block."""
-    return OutlierMixture(
-        model=block.model,
-        match_radius=match_radius,
-        jitter=None if block.jitter == "fit" else block.jitter,
-        fraction_prior=block.fraction_prior,
-        jitter_scale=block.jitter_scale,
-        outlier_scale=block.outlier_scale,
-    )
 
 
 class _Sampler(Section):

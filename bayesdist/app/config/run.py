@@ -99,7 +99,7 @@ class RunConfig(Section):
 
     def mixture(self) -> OutlierMixture:
         """The outlier mixture."""
-        return self.outliers.mixture()
+        return self.outliers.mixture(self.outliers.match_radius)
 
     def resources(self) -> Compute:
         """Where the work is done."""

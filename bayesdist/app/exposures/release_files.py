@@ -13,15 +13,8 @@ from bayesdist.calibration.orientation import lay_on
 from bayesdist.infer.solution import Solution
 from bayesdist.infer.transforms import reference_gauge, without_frames
 from bayesdist.model import LookupTable
-from bayesdist.products import (
-    Period,
-    lint_idctab,
-    lint_lookup_file,
-    read_calibration,
-    read_idctab,
-    read_lookup_file,
-    write_release,
-)
+from bayesdist.products import Period, read_calibration, write_release
+from bayesdist.products.registry import lint
 
 __all__ = ["write_files"]
 
@@ -88,15 +81,13 @@ def write_files(
     )
     out: list[dict[str, Any]] = []
     for period, path in written.idctabs.items():
-        findings = lint_idctab(read_idctab(path))
         lost = [asdict(one) for one in written.lost.get(period, ())]
-        out.append(_entry(path.name, "IDCTAB", findings) | {"period": period, "lost": lost})
+        out.append(_entry(path, "IDCTAB") | {"period": period, "lost": lost})
     others = [] if written.d2im is None else [("D2IMFILE", written.d2im)]
-    for kind, path in [*others, *(("NPOLFILE", p) for p in written.npol.values())]:
-        out.append(_entry(path.name, kind, lint_lookup_file(read_lookup_file(path))))
-    return out
+    others += [("NPOLFILE", path) for path in written.npol.values()]
+    return out + [_entry(path, kind) for kind, path in others]
 
 
-def _entry(path: str, kind: str, findings: Any) -> dict[str, Any]:
-    said = [f"{f.level}: {f.where}: {f.message}" for f in findings]
-    return {"path": path, "kind": kind, "findings": said}
+def _entry(path: Path, kind: str) -> dict[str, Any]:
+    findings = [f"{f.level}: {f.where}: {f.message}" for f in lint(path)]
+    return {"path": path.name, "kind": kind, "findings": findings}

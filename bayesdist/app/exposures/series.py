@@ -20,9 +20,9 @@ __all__ = ["write_series_tables"]
 
 log = logging.getLogger("bayesdist")
 
-PREDICTIONS = 25  # epochs at which the drift is tabulated
-MOST_SWEEPS = 6000  # chips that scatter nearly alike make slow chains
-FEWEST = 8  # exposures below which nothing is said of time
+N_EPOCHS = 25  # epochs at which the drift is tabulated
+MAX_SWEEPS = 6000  # chips that scatter nearly alike make slow chains
+MIN_EXPOSURES = 8  # exposures below which nothing is said of time
 
 
 def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> None:
@@ -37,11 +37,11 @@ def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> No
     """
     series = required(fitted.alone, "fits of single exposures")
     time, seed = fitted.linear.model.time, config.sampler.seed
-    if time is None or len(series.names) < FEWEST:
+    if time is None or len(series.names) < MIN_EXPOSURES:
         return
     trend = TrendModel("lines" if time.breaks else "line", time.breaks, reference=time.epoch0)
     try:
-        posterior = fit_series(series, trend, seed=seed, max_sweeps=MOST_SWEEPS)
+        posterior = fit_series(series, trend, seed=seed, max_sweeps=MAX_SWEEPS)
     except DegenerateError as error:
         if free_rates(config):
             raise
@@ -65,7 +65,7 @@ def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> No
                 )
             ),
             "outlying_exposures": outlying,
-            "warnings": list(_doubts(fitted.facts["exposures_outlying"], outlying)),
+            "warnings": list(_disagreements(fitted.facts["exposures_outlying"], outlying)),
             "breaks": _changes(posterior),
             "verdicts": verdicts,
         }
@@ -74,7 +74,7 @@ def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> No
         log.info("diagnose: %s: %s", row["term"], row["claim"])
 
 
-def _doubts(known: Sequence[str], outlying: Sequence[str]) -> Iterator[str]:
+def _disagreements(known: Sequence[str], outlying: Sequence[str]) -> Iterator[str]:
     """Where the exposures alone and the joint fit, which knows of outlying ones, disagree."""
     missed = [name for name in outlying if name not in known]
     if missed:
@@ -137,7 +137,7 @@ def _exposures(series: Series, posterior: SeriesPosterior) -> Table:
 
 def _predictions(posterior: SeriesPosterior) -> Table:
     first, last = posterior.series.span
-    found = posterior.predict(np.linspace(first, last, PREDICTIONS))
+    found = posterior.predict(np.linspace(first, last, N_EPOCHS))
     columns: dict[str, object] = {"epoch": found.epoch}
     for k, name in enumerate(posterior.series.coefficients):
         columns[name] = found.mean[:, k]

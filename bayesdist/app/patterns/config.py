@@ -9,18 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
-from bayesdist.app.config import (
+from bayesdist.app.config.assess import require_own_names
+from bayesdist.app.config.detector import (
     ChipBlock,
     Detector,
     chips_of,
-    load_text,
     one_chip,
     reference_first,
     require_detector,
-    require_own_names,
-    validated,
 )
 from bayesdist.app.config.model import Polynomials
+from bayesdist.app.config.reading import load_text, validated
 from bayesdist.app.config.section import Section
 from bayesdist.app.config.selfcal import Frames, MinDetections, require_scales
 from bayesdist.assess.planning.dithers import Camera, PlannedStars, PriorInformation
@@ -174,7 +173,7 @@ class PlanConfig(Section):
     def camera(self) -> Camera:
         """The detector that is planned for."""
         chips = self.chips()
-        places = [c.place for c in reference_first(self.chip) if isinstance(c, PlannedChip)]
+        places = [c.place for c in reference_first(self.chip)]
         given = [p for p in places if p is not None]
         flat = flat_coefficients(self.model.order, chips, given or None)
         return Camera(chips, flat, self.selfcal.frames)

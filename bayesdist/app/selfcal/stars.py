@@ -28,8 +28,8 @@ FLAGS = {
     DOUBTFUL: "more than a third of the detections are expected to be false",
     REFERENCE: "a reference star: its catalogue position is in its place",
 }
-MEMBERS = 2 / 3  # of the detections, below which a star is doubtful
-MANY = 100_000  # stars, above which there is a Parquet file beside the table
+MIN_MEMBERS = 2 / 3  # of the detections, below which a star is doubtful
+PARQUET_FROM = 100_000  # stars, above which there is a Parquet file beside the table
 
 
 def write_stars(results: Results) -> dict[str, Any]:
@@ -50,7 +50,7 @@ def write_stars(results: Results) -> dict[str, Any]:
     write_table(table, results.run / "stars.ecsv")
     path = results.run / "stars.parquet"
     path.unlink(missing_ok=True)
-    if len(table) > MANY:
+    if len(table) > PARQUET_FROM:
         columns = {name: np.asarray(table[name]) for name in table.colnames}
         units = {name: str(table[name].unit) for name in columns if table[name].unit is not None}
         write_columns(path, columns, units)
@@ -112,7 +112,7 @@ def star_table(
     if mag is not None:
         table["mag"] = solution.problem.medians(mag)
     flags = np.where(found.n == 2, FEW, 0)
-    flags |= np.where(found.n_members < MEMBERS * found.n, DOUBTFUL, 0)
+    flags |= np.where(found.n_members < MIN_MEMBERS * found.n, DOUBTFUL, 0)
     flags |= np.where(solution.problem.priors.informed, REFERENCE, 0)
     table["flags"] = flags
     table.meta = {"flags": {str(bit): text for bit, text in FLAGS.items()}}

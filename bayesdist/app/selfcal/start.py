@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.config import SelfcalConfig, one_chip
+from bayesdist.app.config import SelfcalConfig
+from bayesdist.app.config.detector import one_chip
 from bayesdist.app.kinds.star_lists import positions_by_chip, start_of
 from bayesdist.app.selfcal.commanded import Commanded
 from bayesdist.data import ReferenceCatalog
