@@ -99,7 +99,9 @@ def match_exposure(
         raise failure
     middle = 0.5 * (plane.min(axis=0) + plane.max(axis=0))
     rho = np.hypot(*(points - middle).T)
-    pairs = _settled(linear(points), chip, rho, reference, tree, largest, fixed=radius is not None)
+    pairs = _iterated_pairs(
+        linear(points), chip, rho, reference, tree, largest, fixed=radius is not None
+    )
     if pairs is None:
         raise failure
     moved, allowed, index, partner = pairs.moved, pairs.allowed, pairs.index, pairs.partner
@@ -173,7 +175,7 @@ class _Pairs:
     distance: Float
 
 
-def _settled(
+def _iterated_pairs(
     start: Float,
     chip: Int,
     rho: Float,
