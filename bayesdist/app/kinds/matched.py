@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.config import Config
 from bayesdist.app.tables.output import write_table
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matches import Matches
