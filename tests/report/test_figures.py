@@ -21,7 +21,7 @@ from bayesdist.report.panels import ChipPanels
 from bayesdist.report.sections.run.data import _density
 from bayesdist.report.sections.run.posterior import correlated_parameters, slowest_parameters
 from bayesdist.report.sections.run.residuals import MixtureCurve, _histograms
-from bayesdist.report.style import nice_below
+from bayesdist.report.style import figure_style, nice_below
 
 from .plots import figures_of
 from .runs import SIZE, report_input
@@ -312,9 +312,10 @@ def test_a_million_stars_are_drawn_as_counts():
     sigma = rng.uniform(0.01, 0.1, n)
     residual = rng.normal(size=(n, 2)) * sigma[:, None]
     curve = MixtureCurve(sigma)
-    bars = _histograms(residual, (curve, curve), unit="pix", sampled=False, rows="stars")
     mag = rng.uniform(10, 20, n)
-    hexagons = _density(mag, residual, unit="pix", errors=None, shown="stars")
+    with figure_style():
+        bars = _histograms(residual, (curve, curve), unit="pix", sampled=False, rows="stars")
+        hexagons = _density(mag, residual, unit="pix", errors=None, shown="stars")
     for ax in bars.axes[2:]:  # all stars of u, and of v
         (counts,) = [patch.get_data().values for patch in ax.patches]
         assert counts.sum() == n and counts.size < 200
