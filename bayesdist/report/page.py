@@ -18,6 +18,8 @@ from bayesdist.report.texttable import Level, TextTable
 
 __all__ = ["Part", "Picture", "parts_of", "picture_of", "template"]
 
+REPORT = "bayesdist.report"  # whose templates all pages share
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -92,10 +94,14 @@ def picture_of(name: str, drawing: Drawing, *, printed: bool = True) -> Picture:
     return Picture(name, data, pixels / DPI, drawing, printed)
 
 
-def template(name: str) -> jinja2.Template:
-    """Template by its file name; a variable that it needs and is not given is an error."""
+def template(name: str, package: str = REPORT) -> jinja2.Template:
+    """Template of a package by its file name; it may include those of the report.
+
+    A variable that it needs and is not given is an error.
+    """
+    packages = dict.fromkeys((package, REPORT))
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("bayesdist.report"),
+        loader=jinja2.ChoiceLoader([jinja2.PackageLoader(one) for one in packages]),
         autoescape=".html" in name,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

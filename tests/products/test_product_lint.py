@@ -21,64 +21,12 @@ from bayesdist.products.formats.common.content import Hdu
 
 from .support import F606W, some_solution
 
-# WSDC D-T033, Appendix B, band W1, as it came through text extraction: B_0_2 shows the value
-# of B_1_1.  Order of terms: 00, 10, 01, 20, 11, 02, 30, ...
-# fmt: off
-W1 = {
-    "a": (7.228039e-01, -7.790246e-04, -1.243220e-04, -1.629945e-06, 1.344445e-06, -7.793528e-06,
-          2.756392e-09, -1.186318e-10, 1.228555e-09, -2.928111e-10,
-          1.794526e-12, -4.586393e-13, 1.503974e-12, -5.895443e-13, -6.270019e-13),
-    "b": (-7.946909e-02, -2.481941e-04, 3.218232e-04, -6.590985e-08, -3.541684e-06, -3.541684e-06,
-          -6.360093e-11, -2.600160e-10, -4.987962e-10, -3.174803e-09,
-          8.797685e-13, 7.028808e-13, -2.594371e-13, 1.458031e-12, -8.545365e-13),
-    "ap": (-7.233219e-01, 7.777227e-04, 1.261763e-04, 1.636841e-06, -1.342059e-06, 7.795772e-06,
-           -2.759976e-09, 1.107923e-10, -1.159637e-09, 2.696271e-10,
-           -1.804259e-12, 4.712913e-13, -1.580363e-12, 6.084245e-13, 6.665114e-13),
-    "bp": (7.930997e-02, 2.484437e-04, -3.239962e-04, 6.524476e-08, 3.542573e-06, -1.163635e-06,
-           6.293886e-11, 2.734704e-10, 4.895069e-10, 3.198763e-09,
-           -8.708176e-13, -7.164364e-13, 2.664114e-13, -1.423222e-12, 8.509823e-13),
-}
-# fmt: on
-TERMS = tuple((n - j, j) for n in range(5) for j in range(n + 1))
-
-
-def w1(**changes) -> SipHeader:
-    terms = {name: dict(zip(TERMS, values, strict=True)) for name, values in W1.items()}
-    sip = SipHeader(
-        crpix=(508.5, 508.5),
-        crval=(0.0, 0.0),
-        cd=np.diag([-2.75, 2.75]) / 3600,
-        ctype=("RA---TAN-SIP", "DEC--TAN-SIP"),
-        order=(4, 4),
-        inverse_order=(4, 4),
-        dmax=(2.046, 1.066),
-        size=(1016, 1016),
-        **terms,
-    )
-    return replace(sip, **changes)
-
 
 def said(findings, level: str = "") -> str:
     return "\n".join(str(f) for f in findings if f.level.startswith(level))
 
 
 # -- SIP -----------------------------------------------------------------------------------------
-
-
-def test_the_copied_coefficient_of_wise_w1_is_found_three_ways() -> None:
-    text = said(lint_sip(w1()))
-    assert "warning: B_1_1, B_0_2: the same value, 3.541684e-06" in text
-    assert "warning: B_DMAX: says 1.066 px" in text
-    assert "error: AP, BP: they miss the inverse" in text
-
-
-def test_the_right_coefficient_satisfies_all_three() -> None:
-    # the published inverse says what B_0_2 must be, but for terms of second order in the distortion
-    right = {**w1().b, (0, 2): -W1["bp"][5]}
-    findings = lint_sip(w1(b=right))
-    assert said(findings, "error") == ""
-    assert said(findings, "warning") == ""
-    assert "A_0_0, A_1_0, A_0_1, B_0_0, B_1_0, B_0_1: constant or linear terms" in said(findings)
 
 
 def good() -> SipHeader:

@@ -205,6 +205,19 @@ def test_only_w1_has_a_wrong_coefficient(bands) -> None:
     assert "what stands there is the value of B_1_1" in errors[0]
 
 
+def test_the_copied_coefficient_of_w1_is_found_three_ways(bands) -> None:
+    sip = bands[1].sip
+    text = "\n".join(said(lint_sip(sip)))
+    assert "warning: B_1_1, B_0_2: the same value, 3.541684e-06" in text
+    assert "warning: B_DMAX: says 1.066 px" in text
+    assert "error: AP, BP: they miss the inverse" in text
+    # the published inverse says what it must be, but for terms of second order in the distortion
+    right = lint_sip(with_b_0_2(sip, -sip.bp[0, 2]))
+    assert said(right, "error") == said(right, "warning") == []
+    low = "A_0_0, A_1_0, A_0_1, B_0_0, B_1_0, B_0_1: constant or linear terms"
+    assert any(low in text for text in said(right, "note"))
+
+
 def test_b_0_2_of_w1_is_positive_and_satisfies_all_that_was_printed(bands) -> None:
     sip = bands[1].sip
     first, second, *_ = implied_values(sip)

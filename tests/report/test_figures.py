@@ -21,7 +21,7 @@ from bayesdist.report.panels import ChipPanels
 from bayesdist.report.sections.run.data import _density
 from bayesdist.report.sections.run.posterior import correlated_parameters, slowest_parameters
 from bayesdist.report.sections.run.residuals import MixtureCurve, _histograms
-from bayesdist.report.style import nice_below
+from bayesdist.report.style import figure_style, nice_below
 
 from .plots import figures_of
 from .runs import SIZE, report_input
@@ -187,7 +187,10 @@ def test_each_chip_has_a_panel_where_it_lies(wfc):
             assert len({(length, unit, text) for length, unit, _, text in keys}) == 1
             np.testing.assert_allclose([paper for _, _, paper, _ in keys], keys[0][2], rtol=1e-6)
         fills = {
-            c.get_clim() for ax in panels for c in ax.collections if c.get_cmap().name == "cividis"
+            c.get_clim()
+            for ax in panels
+            for c in ax.collections
+            if c.get_cmap().name == "cividis" and c.get_array() is not None
         }
         assert len(fills) == (name in ("uncertainty_radius", "pixel_area"))
 
@@ -315,9 +318,10 @@ def test_a_million_stars_are_drawn_as_counts():
     sigma = rng.uniform(0.01, 0.1, n)
     residual = rng.normal(size=(n, 2)) * sigma[:, None]
     curve = MixtureCurve(sigma)
-    bars = _histograms(residual, (curve, curve), unit="pix", sampled=False, rows="stars")
     mag = rng.uniform(10, 20, n)
-    hexagons = _density(mag, residual, unit="pix", errors=None, shown="stars")
+    with figure_style():
+        bars = _histograms(residual, (curve, curve), unit="pix", sampled=False, rows="stars")
+        hexagons = _density(mag, residual, unit="pix", errors=None, shown="stars")
     for ax in bars.axes[2:]:  # all stars of u, and of v
         (counts,) = [patch.get_data().values for patch in ax.patches]
         assert counts.sum() == n and counts.size < 200

@@ -8,7 +8,7 @@ from bayesdist.missions.wise.assess.residual_correlation import DRAWS
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput
 from bayesdist.numbers import probability
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import INK, PALETTE, WIDTH, figure_style, new_figure
+from bayesdist.report.style import INK, PALETTE, WIDTH, legend_above, new_figure
 
 __all__ = [
     "CASES",
@@ -28,29 +28,25 @@ CASES = {
 @BANDS.figure("histograms", printed=True)
 def histograms(inputs: BandsInput) -> Plot:
     """Residuals along x and y of all pairs, on a logarithmic scale of counts."""
-    with figure_style():
-        fig = new_figure(WIDTH, 0.5 + 1.75 * len(inputs.bands))
-        axes = fig.subplots(len(inputs.bands), 2, sharey="row", sharex="row", squeeze=False)
-        for band, row in zip(inputs.bands, axes, strict=True):
-            name, cases = band.name, band.sums.histograms
-            for k, (ax, axis) in enumerate(zip(row, "XY", strict=True)):
-                for case, (color, width, dashes) in CASES.items():
-                    if case not in cases:
-                        continue
-                    one = cases[case]
-                    ax.stairs(
-                        one.counts[k], one.edges, color=color, lw=width, ls=dashes, label=case
-                    )
-                reach = next(iter(cases.values())).reach
-                ax.set_xlim(-reach, reach)
-                ax.set_yscale("log")
-                ax.set_ylim(bottom=0.7)
-                ax.set_title(f"{name} {axis}", pad=3)
-            row[0].set_ylabel("pairs per bin")
-        for ax in axes[-1]:
-            ax.set_xlabel("residual [pix]")
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper left", ncols=len(labels))
+    fig = new_figure(WIDTH, 0.5 + 1.75 * len(inputs.bands))
+    axes = fig.subplots(len(inputs.bands), 2, sharey="row", sharex="row", squeeze=False)
+    for band, row in zip(inputs.bands, axes, strict=True):
+        name, cases = band.name, band.sums.histograms
+        for k, (ax, axis) in enumerate(zip(row, "XY", strict=True)):
+            for case, (color, width, dashes) in CASES.items():
+                if case not in cases:
+                    continue
+                one = cases[case]
+                ax.stairs(one.counts[k], one.edges, color=color, lw=width, ls=dashes, label=case)
+            reach = next(iter(cases.values())).reach
+            ax.set_xlim(-reach, reach)
+            ax.set_yscale("log")
+            ax.set_ylim(bottom=0.7)
+            ax.set_title(f"{name} {axis}", pad=3)
+        row[0].set_ylabel("pairs per bin")
+    for ax in axes[-1]:
+        ax.set_xlabel("residual [pix]")
+    legend_above(fig, axes[0, 0])
     said = "Without correction (blue)"
     if inputs.optical:
         said += ", corrected by the optical model (green, dashed)"
@@ -69,41 +65,39 @@ def correlation(inputs: BandsInput) -> Plot:
     bands = inputs.bands
     columns = min(2, len(bands))
     rows = -(-len(bands) // columns)
-    with figure_style():
-        fig = new_figure(WIDTH, 0.5 + 2.1 * rows)
-        axes = fig.subplots(rows, columns, squeeze=False).ravel()
-        for ax in axes[len(bands) :]:
-            ax.remove()
-        for band, ax in zip(bands, axes, strict=False):
-            c = band.correlation
-            both = (("X", c.uu, c.sigma_uu, "blue", "-"), ("Y", c.vv, c.sigma_vv, "orange", "--"))
-            for label, values, sigma, color, dashes in both:
-                ax.fill_between(
-                    c.separation,
-                    -2e6 * sigma,
-                    2e6 * sigma,
-                    color=PALETTE[color],
-                    alpha=0.25,
-                    lw=0,
-                    label=f"±2 σ of noise in {label}",
-                )
-                ax.plot(
-                    c.separation,
-                    1e6 * values,
-                    color=PALETTE[color],
-                    ls=dashes,
-                    marker="o",
-                    ms=2.5,
-                    label=f"{label} with {label}",
-                )
-            ax.axhline(0.0, color=INK, lw=0.5)
-            ax.set_xlim(0.0, float(np.max(c.separation)) * 1.02)
-            ax.set_title(f"{band.name}: {chance_of(c.p_value)}", pad=3)
-            ax.set_xlabel("separation [pix]")
-        for ax in axes[: len(bands) : columns]:
-            ax.set_ylabel("mean product [10⁻⁶ pix²]")
-        handles, labels = axes[0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper left", ncols=len(labels))
+    fig = new_figure(WIDTH, 0.5 + 2.1 * rows)
+    axes = fig.subplots(rows, columns, squeeze=False).ravel()
+    for ax in axes[len(bands) :]:
+        ax.remove()
+    for band, ax in zip(bands, axes, strict=False):
+        c = band.correlation
+        both = (("X", c.uu, c.sigma_uu, "blue", "-"), ("Y", c.vv, c.sigma_vv, "orange", "--"))
+        for label, values, sigma, color, dashes in both:
+            ax.fill_between(
+                c.separation,
+                -2e6 * sigma,
+                2e6 * sigma,
+                color=PALETTE[color],
+                alpha=0.25,
+                lw=0,
+                label=f"±2 σ of noise in {label}",
+            )
+            ax.plot(
+                c.separation,
+                1e6 * values,
+                color=PALETTE[color],
+                ls=dashes,
+                marker="o",
+                ms=2.5,
+                label=f"{label} with {label}",
+            )
+        ax.axhline(0.0, color=INK, lw=0.5)
+        ax.set_xlim(0.0, float(np.max(c.separation)) * 1.02)
+        ax.set_title(f"{band.name}: {chance_of(c.p_value)}", pad=3)
+        ax.set_xlabel("separation [pix]")
+    for ax in axes[: len(bands) : columns]:
+        ax.set_ylabel("mean product [10⁻⁶ pix²]")
+    legend_above(fig, axes[0])
     return Plot(
         fig,
         "Correlation of mean residuals",

@@ -23,7 +23,8 @@ def write_bands(folder: Path, inputs: BandsInput) -> list[str]:
     drawings = draw_all(BANDS, inputs)
     save_drawings(drawings, folder / "figures")
     overview, *parts = parts_of(BANDS, inputs, drawings)
-    text = template("bands.html.jinja").render(run=inputs, overview=overview, parts=parts)
+    page = template("bands.html.jinja", __package__)
+    text = page.render(run=inputs, overview=overview, parts=parts)
     with atomic_path(folder / "bands.html") as temporary:
         temporary.write_text(text, encoding="utf-8")
     drawn = [f"figures/{name}.{kind}" for kind in ("png", "pdf") for name in drawings]

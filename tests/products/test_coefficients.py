@@ -1,4 +1,4 @@
-"""Evaluation and extrema of polynomials."""
+"""Polynomials by their coefficients: values, extrema, and names in the formats that own them."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,14 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from bayesdist.model import polynomial_terms
-from bayesdist.products.formats.common.coefficients import evaluate, largest_magnitude
+from bayesdist.products.formats.common.coefficients import (
+    evaluate,
+    idctab_column,
+    idctab_powers,
+    largest_magnitude,
+    sip_keyword,
+    sip_powers,
+)
 
 
 def test_value_is_the_sum_of_its_terms() -> None:
@@ -48,3 +55,23 @@ def test_largest_magnitude_finds_an_interior_maximum_between_samples() -> None:
 def test_nothing_has_no_magnitude() -> None:
     assert largest_magnitude({}, (0, 10), (0, 10)) == 0.0
     assert largest_magnitude({(2, 0): 0.0}, (0, 10), (0, 10)) == 0.0
+
+
+# -- names: the order of indices ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("i", "j"), polynomial_terms(9))
+def test_names_and_powers_are_inverse_to_one_another(i: int, j: int) -> None:
+    assert idctab_powers(idctab_column("CX", i, j)) == ("CX", i, j)
+    assert sip_powers(sip_keyword("BP", i, j)) == ("BP", i, j)
+
+
+def test_first_order_is_as_stwcs_has_it() -> None:
+    # stwcs makes its CD matrix of [[CX11, CX10], [CY11, CY10]]: x first
+    assert [idctab_column("CX", 1, 0), idctab_column("CX", 0, 1)] == ["CX11", "CX10"]
+
+
+@pytest.mark.parametrize("name", ["CX12", "CX1", "CZ11", "A_1", "XREF", "AP_ORDER", "A_10_0"])
+def test_other_names_are_no_coefficients(name: str) -> None:
+    assert idctab_powers(name) is None
+    assert sip_powers(name) is None
