@@ -10,7 +10,7 @@ import numpy as np
 from astropy.table import Column
 from numpy.typing import NDArray
 
-from bayesdist.data.labels import LABELS_OF_CODES, Labels, recoded
+from bayesdist.data.columns.labels import LABELS_OF_CODES, Labels, recoded
 from bayesdist.data.reading.columns import (
     columns_read,
     match_columns,
