@@ -30,11 +30,12 @@ _HOMES = {
     "bayesdist.data.matching.search_radius": ("SearchRadius", "search_radius"),
     "bayesdist.data.matching.similarity": ("find_similarity", "pattern_index"),
     "bayesdist.data.matching.table": ("Matching", "match_table", "match_to_catalog"),
-    "bayesdist.data.motions": ("motion_error_line", "select_motions"),
     "bayesdist.data.storage.on_disk": ("open_matches",),
     "bayesdist.data.preparing": (
         "centroid_errors",
+        "motion_error_line",
         "neutralise_aberration",
+        "select_motions",
     ),
     "bayesdist.data.reading.formats": ("FORMATS", "MatchFormat", "input_files"),
     "bayesdist.data.reading.options": ("ReadOptions",),

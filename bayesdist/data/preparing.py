@@ -1,24 +1,129 @@
-"""Preparation of matches for the fit: errors of the centroids, and a scale without aberration."""
+"""Preparation for the fit: well measured motions, errors of centroids, and no aberration."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.exposures import ExposureLog
-from bayesdist.data.magnitude_errors import MagnitudeErrors
+from bayesdist.data.magnitude_errors import MAD_TO_SIGMA, MagnitudeErrors
 from bayesdist.data.matches import Matches
 from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError
 
-__all__ = ["centroid_errors", "neutralise_aberration"]
+__all__ = [
+    "MotionErrorLine",
+    "centroid_errors",
+    "motion_error_line",
+    "neutralise_aberration",
+    "select_motions",
+]
 
 Float = NDArray[np.float64]
 
+_STARS_IN_BIN = 200  # stars of a bin in magnitude
+_MAX_BINS = 40
+# above the median, in the logarithm: 0.6 % of a log-normal distribution
+_MAX_SCATTERS_ABOVE = 2.5
+_MIN_SCATTER = 0.05  # of ln(sigma): among errors all alike a slightly larger one stays
 # of the total scatter that is the centroid's, whatever the catalogue quotes
 MIN_CENTROID_FRACTION = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class MotionErrorLine:
+    """Largest error of a proper motion that counts as well measured, by magnitude.
+
+    Parameters
+    ----------
+    mag, sigma : ndarray, shape (B,)
+        Knots in rising magnitude; linear in the logarithm between, constant beyond.
+    """
+
+    mag: Float
+    sigma: Float
+
+    def __call__(self, mag: ArrayLike) -> Float:
+        """The line at magnitudes, in the catalogue's unit per year."""
+        return np.exp(np.interp(np.asarray(mag, float), self.mag, np.log(self.sigma)))
+
+
+def motion_error_line(catalog: ReferenceCatalog) -> MotionErrorLine:
+    """Line in magnitude and proper-motion error above which stars are badly measured.
+
+    In bins of about 200 stars by magnitude (40 bins at most) the line is the median of the error
+    times exp(2.5 s), s being the robust scatter (1.4826 median absolute deviation) of its
+    logarithm. The median follows how errors grow towards faint stars; what lies above is far from
+    the stars of its own magnitude.  The error is the larger one of the two axes.
+
+    Parameters
+    ----------
+    catalog : ReferenceCatalog
+
+    Returns
+    -------
+    MotionErrorLine
+
+    Raises
+    ------
+    InputError
+        Without magnitudes or errors of the motions.
+    """
+    sigma = _motion_errors(catalog)
+    if catalog.mag is None:
+        raise InputError(
+            "has no magnitudes to tell badly measured motions by",
+            where=catalog.source,
+            do="give them, or keep all stars (campaign.pm_selection = 'all')",
+        )
+    count = int(np.clip(len(catalog) // _STARS_IN_BIN, 1, _MAX_BINS))
+    parts = np.array_split(np.argsort(catalog.mag, kind="stable"), count)
+    knots = []
+    for part in parts:
+        log = np.log(np.maximum(sigma[part], np.finfo(float).tiny))
+        middle = float(np.median(log))
+        scatter = max(MAD_TO_SIGMA * float(np.median(np.abs(log - middle))), _MIN_SCATTER)
+        knots.append(
+            (float(np.median(catalog.mag[part])), np.exp(middle + _MAX_SCATTERS_ABOVE * scatter))
+        )
+    mag, line = np.array(knots).T
+    return MotionErrorLine(mag, line)
+
+
+def select_motions(catalog: ReferenceCatalog) -> ReferenceCatalog:
+    """Stars with well measured proper motions (the red line of ACS ISR 2015-06, Figure 3).
+
+    Parameters
+    ----------
+    catalog : ReferenceCatalog
+
+    Returns
+    -------
+    ReferenceCatalog
+        The stars at or below the line of `motion_error_line`, by the worse axis; they keep their
+        codes.
+
+    Raises
+    ------
+    InputError
+        As `motion_error_line`.
+    """
+    line = motion_error_line(catalog)
+    assert catalog.mag is not None
+    return catalog.select(_motion_errors(catalog) <= line(catalog.mag))
+
+
+def _motion_errors(catalog: ReferenceCatalog) -> Float:
+    if catalog.sigma_pm_u is None or catalog.sigma_pm_v is None:
+        raise InputError(
+            "has no errors of the proper motions",
+            where=catalog.source,
+            do="give sigma_pm_u and sigma_pm_v",
+        )
+    return np.maximum(catalog.sigma_pm_u, catalog.sigma_pm_v)
 
 
 def centroid_errors(table: Matches, total: MagnitudeErrors) -> MagnitudeErrors:

@@ -7,7 +7,7 @@ import pytest
 from astropy.table import Table
 
 from bayesdist.data import ReferenceCatalog, catalog_from_table
-from bayesdist.data.motions import motion_error_line, select_motions
+from bayesdist.data.preparing import motion_error_line, select_motions
 from bayesdist.errors import InputError
 
 

@@ -13,7 +13,7 @@ from bayesdist.app.results import Results
 from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches
-from bayesdist.data.motions import motion_error_line
+from bayesdist.data.preparing import motion_error_line
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
 from bayesdist.infer import GaussianPriors, LinearFit, Posterior, fit_linear
 from bayesdist.infer.equations.scaled import one_thread

@@ -19,9 +19,9 @@ from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.catalog import ReferenceCatalog
+from bayesdist.data.columns.labels import merged_counts
 from bayesdist.data.detections import Detections
 from bayesdist.data.exposures import ExposureLog
-from bayesdist.data.labels import merged_counts
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.exposure import ExposureMatch, match_exposure
 from bayesdist.data.matching.reports import (

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data import batches
-from bayesdist.data.joining import joined_columns
-from bayesdist.data.labels import LABELS_OF_CODES, Labels
-from bayesdist.data.match_columns import COLUMNS, POSITIONS, SIGMAS
+from bayesdist.data.columns.checked import COLUMNS, POSITIONS, SIGMAS
+from bayesdist.data.columns.joining import joined_columns
+from bayesdist.data.columns.labels import LABELS_OF_CODES, Labels
 from bayesdist.data.matches import Matches
 from bayesdist.data.reading.formats import exposure_names, input_files
 from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors

@@ -10,7 +10,7 @@ import numpy as np
 from astropy.table import Column
 from numpy.typing import NDArray
 
-from bayesdist.data.labels import LABELS_OF_CODES, Labels, recoded
+from bayesdist.data.columns.labels import DEFAULT_LABELS, LABELS_OF_CODES, Labels, recoded
 from bayesdist.data.reading.columns import (
     columns_read,
     match_columns,
@@ -33,7 +33,6 @@ __all__ = ["StoredFile", "scan", "stored_file", "tangent_point_of"]
 Int = NDArray[np.int64]
 
 _BLOCK = 2**18  # rows scanned together
-_DEFAULTS: dict[str, Any] = {"exposure": "1", "chip": 1, "filter": ""}
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +79,7 @@ class StoredFile:
             for key, labels in LABELS_OF_CODES.items():
                 if key not in found:
                     own = self.exposure_name if key == "exposure" else None
-                    out[labels] = (_DEFAULTS[key] if own is None else own,)
+                    out[labels] = (DEFAULT_LABELS[key] if own is None else own,)
             yield out
 
     def direction(self) -> tuple[int, int, int]:

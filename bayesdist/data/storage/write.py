@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.batches import BATCH
+from bayesdist.data.columns.labels import DEFAULT_LABELS, LABELS_OF_CODES
 from bayesdist.data.matches import Matches
 from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError
@@ -29,11 +30,6 @@ _NUMBERS = (
     *("u_nominal", "v_nominal"),
 )
 _LENGTHS = ("u", "v", "sigma_u", "sigma_v", "u_nominal", "v_nominal")
-_LABELS = {
-    "exposure": ("exposure_names", ("1",)),
-    "chip": ("chip_numbers", (1,)),
-    "filter": ("filter_names", ("",)),
-}
 
 
 def write_partitioned(
@@ -125,9 +121,10 @@ def _make_empty(folder: Path) -> None:
 def _columns(table: Matches, names: Collection[str]) -> dict[str, NDArray[Any] | Labelled]:
     """Columns of a table; labels where there are other than the default, or `names` has them."""
     columns: dict[str, Any] = columns_of(table, (*_NUMBERS, "star"))
-    for name, (labels, default) in _LABELS.items():
-        if getattr(table, labels) != default or name in names:
-            columns[name] = (getattr(table, name), getattr(table, labels))
+    for name, key in LABELS_OF_CODES.items():
+        labels = getattr(table, key)
+        if labels != (DEFAULT_LABELS[name],) or name in names:
+            columns[name] = (getattr(table, name), labels)
     return columns
 
 

@@ -8,6 +8,7 @@ import io
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -92,19 +93,11 @@ def _read_ecsv(path: Path) -> Table:
     return Table.read(_bare_lines(path), format="ascii.ecsv")
 
 
-def _read_csv(path: Path) -> Table:
-    return _separated(path, ",", "ascii.csv")
-
-
 def _read_text(path: Path) -> Table:
     return parse_text_table(read_lines(path), where=str(path))
 
 
-def _read_tsv(path: Path) -> Table:
-    return _separated(path, "\t", "ascii.tab")
-
-
-def _separated(path: Path, mark: str, format: str) -> Table:
+def _read_separated(path: Path, *, mark: str, format: str) -> Table:
     lines = _bare_lines(path)
     _refuse_short_rows(lines, mark, path)
     return Table.read(lines, format=format, comment="#", guess=False)
@@ -197,8 +190,8 @@ def parquet_units(schema: pyarrow.Schema) -> dict[str, str]:
 
 TABLE_SUFFIXES: dict[str, Callable[[Path], Table]] = {
     ".ecsv": _read_ecsv,
-    ".csv": _read_csv,
-    ".tsv": _read_tsv,
+    ".csv": partial(_read_separated, mark=",", format="ascii.csv"),
+    ".tsv": partial(_read_separated, mark="\t", format="ascii.tab"),
     ".fits": _read_fits,
     ".fit": _read_fits,
     ".ldac": _read_fits,

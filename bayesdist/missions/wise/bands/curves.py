@@ -12,6 +12,7 @@ from bayesdist.report.style import INK, PALETTE, WIDTH, legend_above, new_figure
 
 __all__ = [
     "CASES",
+    "below_draws",
     "chance_of",
     "correlation",
     "histograms",
@@ -109,4 +110,9 @@ def correlation(inputs: BandsInput) -> Plot:
 
 def chance_of(p: float) -> str:
     """A probability counted in draws: the smallest that they tell is a bound."""
-    return f"p < {2 / DRAWS:g}" if p < 1.5 / DRAWS else probability(p)
+    return f"p < {2 / DRAWS:g}" if below_draws(p) else probability(p)
+
+
+def below_draws(p: float) -> bool:
+    """True if no noise field reached the data: the smallest probability that draws can tell."""
+    return p < 1.5 / DRAWS

@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesdist.missions.wise.assess.account import LONGEST_DIFFERENCES
 from bayesdist.missions.wise.bands.context import BANDS, BandResult, BandsInput
-from bayesdist.missions.wise.bands.curves import CASES, chance_of
+from bayesdist.missions.wise.bands.curves import CASES, below_draws, chance_of
 from bayesdist.numbers import MISSING, count, number, percent, probability, size_of
 from bayesdist.report.texttable import TextTable, listing
 
@@ -70,14 +70,9 @@ def _structure(b: BandResult) -> str:
     if p.significant:
         what = f"{p.k} × {p.k} blocks" if p.edges_seen else "smooth"
         return f"{what}, {probability(max(p.p_value, 0.0))}"
-    if _counted_out(b):
+    if below_draws(b.correlation.p_value):
         return f"correlated bins, {chance_of(b.correlation.p_value)}"
     return f"none found, {probability(p.p_value)}"
-
-
-def _counted_out(b: BandResult) -> bool:
-    """True if no noise field reached the correlation: as little as draws can tell."""
-    return chance_of(b.correlation.p_value).startswith("p <")
 
 
 @BANDS.table("structure")

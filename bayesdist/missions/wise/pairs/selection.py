@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.labels import merged_counts
+from bayesdist.data.columns.labels import merged_counts
 from bayesdist.data.matches import Matches
 from bayesdist.data.tables.checks import counted
 from bayesdist.errors import InputError

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.labels import LABELS_OF_CODES, Labels, merged_counts
+from bayesdist.data.columns.labels import LABELS_OF_CODES, Labels, merged_counts
 from bayesdist.data.tables.checks import (
     absent,
     check_values,

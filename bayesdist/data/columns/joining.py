@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.labels import LABELS_OF_CODES, merged_counts
-from bayesdist.data.match_columns import OPTIONAL, POSITIONS, SIGMAS, MatchColumns
+from bayesdist.data.columns.checked import OPTIONAL, POSITIONS, SIGMAS, MatchColumns
+from bayesdist.data.columns.labels import LABELS_OF_CODES, merged_counts
 from bayesdist.errors import InputError
 
 __all__ = ["joined_arguments", "joined_columns", "merged_codes"]

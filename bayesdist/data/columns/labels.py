@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 
-__all__ = ["LABELS_OF_CODES", "Labels", "merged_counts", "recoded"]
+__all__ = ["DEFAULT_LABELS", "LABELS_OF_CODES", "Labels", "merged_counts", "recoded"]
 
 Int = NDArray[np.int64]
 
@@ -21,6 +21,7 @@ LABELS_OF_CODES = {
     "chip": "chip_numbers",
     "filter": "filter_names",
 }
+DEFAULT_LABELS: dict[str, Any] = {"exposure": "1", "chip": 1, "filter": ""}
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,1 @@
+"""Columns and labels that matches are made of: completed, checked, and joined."""
