@@ -88,9 +88,7 @@ def test_functions_find_what_the_run_has_found(one_roll):
     np.testing.assert_array_equal(fitted.linear.mean, known.mean)
     np.testing.assert_array_equal(fitted.linear.cov, known.cov)
     results = results_of(RunDirectory.open(one_roll.path))
-    np.testing.assert_array_equal(
-        fitted.solved.mode.stars, results.fitted.solved.mode.stars
-    )
+    np.testing.assert_array_equal(fitted.solved.mode.stars, results.fitted.solved.mode.stars)
     np.testing.assert_array_equal(fitted.solved.gauge.held, results.fitted.solved.gauge.held)
     assert fitted.solved.fixed == results.fitted.solved.fixed
     made, read = FitData(matched, fitted).stars, results.data.stars
