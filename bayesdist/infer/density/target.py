@@ -93,8 +93,7 @@ class Target:
         by_hyper, curvature, chain = self.hyper.chained(h, by_hyper, curvature)
         prior_gradient, prior_curvature = self.hyper.prior_terms(h)
         curvature = curvature + prior_curvature
-        sums = sums.with_cross(which)
-        sums = replace(sums, cross=np.einsum("ghak,hi->giak", sums.cross, chain))
+        sums = replace(sums, cross=np.einsum("ghak,hi->giak", sums.cross[:, which], chain))
         matrix, right = sums.assemble(model, theta)
         gradient = np.concatenate([right + self.priors.pull(theta), by_hyper + prior_gradient])
         matrix = matrix + self.priors.matrix(model, len(h))

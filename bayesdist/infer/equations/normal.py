@@ -51,10 +51,6 @@ class NormalEquations(Sums):
         chi2 = self.chi2 - 2 * float((self.right * step).sum()) + float((pull * step).sum())
         return replace(self, right=self.right - pull, about=about, chi2=chi2)
 
-    def with_cross(self, which: list[int]) -> NormalEquations:
-        """Equations with only some of the further parameters."""
-        return replace(self, cross=self.cross[:, which])
-
     def _apply(self, E: Float) -> Float:
         uu, uv, vv = self.weight[:, 0], self.weight[:, 1], self.weight[:, 2]
         u = np.einsum("gkl,gl->gk", uu, E[:, 0]) + np.einsum("gkl,gl->gk", uv, E[:, 1])

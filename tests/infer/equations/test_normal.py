@@ -245,8 +245,7 @@ def test_some_of_the_mixed_derivatives(problem):
     model, stars, _, theta = problem
     hyper = OutlierMixture().bind(0.05)
     full = mixture(stars, theta, hyper.constants(np.array([[-3.5, -3.0, -0.2]])))
-    some = full.with_cross([0, 2])
-    np.testing.assert_array_equal(some.cross, full.cross[:, [0, 2]])
+    some = replace(full, cross=full.cross[:, [0, 2]])
     matrix, _ = some.assemble(model, theta)
     whole, _ = full.assemble(model, theta)
     keep = np.r_[: model.n_params, model.n_params + np.array([0, 2])]
