@@ -14,7 +14,7 @@ from bayesdist.diagnose.holdout.deviations import deviation_tests
 from bayesdist.diagnose.holdout.frames import frames_for
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.sums import held_sums
-from bayesdist.diagnose.holdout.tests import AxisCoverage, HeldTest, all_tests, coverage_of
+from bayesdist.diagnose.holdout.tests import AxisCoverage, HeldTest, all_tests, axis_coverage
 from bayesdist.diagnose.significance import holm, p_words
 from bayesdist.errors import InputError
 from bayesdist.limits import HELD_OUT, HELD_OUT_DOUBTFUL, HELD_OUT_UNUSUAL
@@ -168,5 +168,5 @@ def holdout_validation(
         region_offset=np.divide(
             found.offset_scores, error, out=np.full_like(error, np.nan), where=error > 0
         ),
-        coverage=coverage_of(sums),
+        coverage=axis_coverage(sums),
     )
