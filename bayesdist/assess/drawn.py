@@ -61,7 +61,7 @@ class DrawnErrors:
     image: Image
     n_draws: int
     seed: int  # of the errors that are independent from position to position, and of the terms
-    _kept: dict[EvaluationDomain, tuple[ErrorField, ...]] = field(default_factory=dict, repr=False)
+    _cache: dict[EvaluationDomain, tuple[ErrorField, ...]] = field(default_factory=dict, repr=False)
 
     @property
     def unit(self) -> str:
@@ -70,9 +70,9 @@ class DrawnErrors:
 
     def at(self, domain: EvaluationDomain) -> tuple[ErrorField, ...]:
         """The errors of each term at the positions of a domain."""
-        if domain not in self._kept:
-            self._kept[domain] = tuple(one.on(domain, self.image) for one in self.draws)
-        return self._kept[domain]
+        if domain not in self._cache:
+            self._cache[domain] = tuple(one.on(domain, self.image) for one in self.draws)
+        return self._cache[domain]
 
     def rows(self, domain: EvaluationDomain) -> tuple[Row, ...]:
         """Rows of everything that an error is made of there."""
@@ -99,7 +99,7 @@ class DrawnErrors:
                 old if new is term else new.draw(self.n_draws, rng)
                 for old, term, new, rng in zip(self.draws, self.terms, way, random, strict=True)
             )
-            out.append(replace(self, terms=way, draws=draws, _kept={}))
+            out.append(replace(self, terms=way, draws=draws, _cache={}))
         return tuple(out)
 
     def statistics(

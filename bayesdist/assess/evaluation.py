@@ -19,7 +19,6 @@ from bayesdist.assess.requirements.margins import Margin, judge
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.rests_on import rests_on
 from bayesdist.assess.requirements.validity import ValidityPeriod, validity_period
-from bayesdist.assess.requirements.verdict import effective_draws
 from bayesdist.assess.terms.centroid import centroids_of
 from bayesdist.assess.terms.correlated import StructureErrors
 from bayesdist.assess.terms.forms import Known
@@ -319,7 +318,6 @@ def validity_of(
             r,
             np.linspace(last, last + settings.years_ahead, VALIDITY_EPOCHS),
             grid=settings.grid,
-            n_effective=effective_draws(drawn.solution, n),
             pixel_scale=settings.pixel_scale(errors),
         )
         for r in requirements

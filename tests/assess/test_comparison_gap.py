@@ -15,7 +15,6 @@ from scipy.stats import chi2, kstest
 from bayesdist.assess.comparison.gap import gap_difference, pair_of_chips
 from bayesdist.assess.comparison.sentences import gap_lines, gap_verdict
 from bayesdist.calibration.calibration import calibration_of
-from bayesdist.errors import InputError
 from bayesdist.infer import Rejection, fit_linear, save_fit
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import idctab_from_solution, write_idctab
@@ -137,13 +136,6 @@ def test_errors_of_a_gap_hold_what_chips_share():
     lonely[constants[1]] = 0.05  # a pixel
     apart = replace(fit, cov=fit.cov + np.outer(lonely, lonely))
     assert gap_difference(pair(apart), pair(fit)).sigma[0] == pytest.approx(1.0, rel=0.02)
-
-
-def test_chips_of_other_sizes_are_refused():
-    model = DistortionModel(2, CHIPS, "arcsec")
-    other = DistortionModel(2, tuple(replace(c, size=(512.0, 200.0)) for c in CHIPS), "arcsec")
-    with pytest.raises(InputError, match="another size"):
-        gap_difference(pair(drawn(model, truth(model), 1)), pair(drawn(other, truth(other), 1)))
 
 
 # -- files ----------------------------------------------------------------------------------------

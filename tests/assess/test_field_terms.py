@@ -17,7 +17,6 @@ from bayesdist.assess.terms.parameters import (
     ScaleError,
 )
 from bayesdist.assess.terms.solution import SolutionErrors
-from bayesdist.errors import InputError
 from bayesdist.infer.transforms import reference_gauge, without_frames
 from tests.budgets import detector_budget
 from tests.infer.small_campaign import campaign_model, campaign_truth
@@ -211,14 +210,6 @@ def test_scatter_adds_to_the_total_in_quadrature(solution_of):
     parts = np.hypot(alone.sigma("model"), found.sigma(term.name))
     np.testing.assert_allclose(found.sigma("model"), parts, rtol=2 * TOLERANCE)
     assert found.parts == ("coefficients", "time dependence", "exposure scatter", "model")
-
-
-def test_kinds_that_no_exposure_has_are_refused(rich):
-    model, theta = scattering()
-    with pytest.raises(InputError, match="exposures have no deviation 'focus'"):
-        scatter_of(model, theta, focus=1e-6)
-    with pytest.raises(InputError, match=r"scatter has shape \(5, 2\) for 1 kinds"):
-        ExposureVariation(model, theta, ("scale",), np.ones((5, 2)))
 
 
 def test_in_gauge_held_a_star_may_lie_in_the_first_exposure(solution_of):

@@ -82,15 +82,16 @@ class ErrorBudget:
     @property
     def x(self) -> Float:
         """FITS 1-based columns (P,)."""
-        return self.domain.x[self._kept]
+        return self.domain.x[self._compared]
 
     @property
     def y(self) -> Float:
         """FITS 1-based rows (P,)."""
-        return self.domain.y[self._kept]
+        return self.domain.y[self._compared]
 
     @property
-    def _kept(self) -> slice:
+    def _compared(self) -> slice:
+        """Rows of the positions, without the one that the others are compared with."""
         return slice(1 if self.domain.relative else 0, None)
 
     @property

@@ -27,7 +27,6 @@ from bayesdist.assess.comparison.frame import (
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.similarity import as_real, similarity_fields, turn_between
-from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.model import PolynomialBasis
 
@@ -82,17 +81,12 @@ def pair_of_chips(
 def gap_difference(a: ChipPair, b: ChipPair) -> GapDifference:
     """Compare where two calibrations have a chip against another one.
 
-    `a`, `b`: of the same chips; of any order, reference pixel, orientation, parity and unit.  Their
-    errors are taken as independent. InputError for chips of different size, or without linear part.
+    `a`, `b`: of the same chips, which `compare` has compared; of any order, reference pixel,
+    orientation, parity and unit.  Their errors are taken as independent. InputError for chips
+    without linear part.
     """
     bases = []
     for of_a, of_b in ((a.reference, b.reference), (a.other, b.other)):
-        if of_a.basis.size != of_b.basis.size:
-            raise InputError(
-                f"chip {of_a.chip} has another size in each",
-                where=f"{a.other.name}, {b.other.name}",
-                do="compare calibrations of one detector",
-            )
         order = max(of_a.basis.order, of_b.basis.order)
         bases.append(PolynomialBasis(order, of_a.basis.size, of_a.basis.reference_pixel))
     K = bases[0].n_terms

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.requirements.margins import domains_of
 from bayesdist.assess.requirements.requirement import Requirement
+from bayesdist.assess.requirements.verdict import effective_draws
 from bayesdist.assess.units import convert
 from bayesdist.diagnose.significance import clopper_pearson
-from bayesdist.errors import InputError
 from bayesdist.model.grid import DEFAULT_GRID
 
 __all__ = ["ValidityPeriod", "validity_period"]
@@ -83,7 +83,6 @@ def validity_period(
     epochs: ArrayLike,
     *,
     grid: tuple[int, int] = DEFAULT_GRID,
-    n_effective: float | None = None,
     pixel_scale: float | None = None,
 ) -> ValidityPeriod:
     """Follow a requirement through time.
@@ -92,28 +91,17 @@ def validity_period(
     covariance, and with the curvature that the data and its prior leave open, where the errors hold
     it.
 
-    `errors`: one set of draws for all epochs: the curve has no noise of its own between them.
-    `requirement`: its own epoch is not used. `epochs`: (n,), decimal years, rising. `grid`: points
-    on x and y of a chip. `n_effective`: independent draws that the draws are worth; their number by
-    default. `pixel_scale`: as `check_requirements`. InputError for a model that does not depend on
-    time, and epochs that do not rise.
+    `errors`: of a model that depends on time; one set of draws for all epochs: the curve has no
+    noise of its own between them. `requirement`: its own epoch is not used. `epochs`: (n,), decimal
+    years, rising, two or more. `grid`: points on x and y of a chip. `pixel_scale`: as
+    `check_requirements`.
     """
-    model = errors.solution.model
-    at = np.atleast_1d(np.asarray(epochs, float))
-    if model.time is None:
-        raise InputError(
-            "the model does not depend on time, so that no date can be given",
-            where=requirement.where,
-            do="give the model time-dependent terms",
-        )
-    if at.size < 2 or not (np.diff(at) > 0).all():
-        raise InputError("the epochs do not rise", where="epochs", do="give two or more in order")
+    at = np.asarray(epochs, float)
     factor = convert(1.0, errors.unit, requirement.unit, pixel_scale, where=requirement.where)
-    n = n_effective or float(errors.n_draws)
+    n = effective_draws(errors.solution, errors.n_draws)
     here = replace(requirement, epoch=float(at[0]), epochs=None)
-    (domain,) = domains_of(here, model, grid)
-    epochs = [float(epoch) for epoch in at]
-    found = errors.over_epochs(domain, epochs, [requirement.statistic])
+    (domain,) = domains_of(here, errors.solution.model, grid)
+    found = errors.over_epochs(domain, [float(epoch) for epoch in at], [requirement.statistic])
     draws = factor * np.array([one[requirement.statistic] for one in found])
     met, value = np.mean(draws <= requirement.limit, axis=1), np.median(draws, axis=1)
     low, high = np.array([clopper_pearson(p, n, BAND) for p in met]).T

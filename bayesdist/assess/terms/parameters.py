@@ -171,10 +171,7 @@ def one_size_term(name: str, kind: str, sigma: float, solution: Solution, source
 
 @dataclass(frozen=True, eq=False)
 class ExposureVariation:
-    """Deviation of a new exposure from the polynomials that all exposures have in common.
-
-    InputError for a kind that is no parameter of an exposure, or another number of kinds in `tau`.
-    """
+    """Deviation of a new exposure from the polynomials that all exposures have in common."""
 
     # with frames in gauge 'held', in which exposures deviate from the polynomials
     model: DistortionModel
@@ -186,22 +183,6 @@ class ExposureVariation:
     aberration: ScaleError | None = None
     name: str = EXPOSURE_SCATTER
     source: str = MEASURED
-
-    def __post_init__(self) -> None:
-        known = self.model.free_frame_names(self._exposure)
-        unknown = [kind for kind in self.kinds if kind not in known]
-        if unknown:
-            raise InputError(
-                f"exposures have no deviation {unknown[0]!r}",
-                where=f"budget term {self.name!r}",
-                do=f"choose among {', '.join(known) or 'those of a model with frames'}",
-            )
-        if self.tau.shape[1:] != (len(self.kinds),):
-            raise InputError(
-                f"scatter has shape {self.tau.shape} for {len(self.kinds)} kinds of deviation",
-                where=f"budget term {self.name!r}",
-                do="give draws by kinds",
-            )
 
     @property
     def _exposure(self) -> int:

@@ -319,8 +319,8 @@ def _where_it_counts(grids: Sequence[Float], weight: Float) -> list[Float]:
     out = []
     for k, grid in enumerate(grids):
         best = weight.max(axis=tuple(a for a in range(weight.ndim) if a != k))
-        kept = np.flatnonzero(best > NEGLIGIBLE)
-        low, high = max(kept[0] - 1, 0), min(kept[-1] + 1, len(grid) - 1)
+        likely = np.flatnonzero(best > NEGLIGIBLE)
+        low, high = max(likely[0] - 1, 0), min(likely[-1] + 1, len(grid) - 1)
         out.append(np.geomspace(grid[low], grid[high], REFINED[len(grids) - 1]))
     return out
 

@@ -187,9 +187,9 @@ def chip_structure(
             points.append(point)
             log_weight.append(prior + density)
     every = np.array(log_weight)
-    kept = every.max(axis=1) > every.max() - NEGLIGIBLE
-    weight = np.exp(every[kept] - every.max())
-    points = [p for p, k in zip(points, kept, strict=True) if k]
+    likely = every.max(axis=1) > every.max() - NEGLIGIBLE
+    weight = np.exp(every[likely] - every.max())
+    points = [p for p, k in zip(points, likely, strict=True) if k]
     return Structure(functions, amplitudes.terms, tuple(points), weight / weight.sum())
 
 

@@ -22,7 +22,7 @@ from bayesdist.diagnose.holdout.sums import LEVELS, PIT_BINS, STEP, TAILS, BinSu
 from bayesdist.diagnose.significance import clopper_pearson, hotelling_p
 from bayesdist.limits import HELD_OUT_DISTRIBUTION, HELD_OUT_RATIO, HELD_OUT_TAILS
 
-__all__ = ["AXIS", "AxisCoverage", "HeldTest", "all_tests", "coverage_of"]
+__all__ = ["AXIS", "AxisCoverage", "HeldTest", "all_tests", "axis_coverage"]
 
 Float = NDArray[np.float64]
 
@@ -85,7 +85,7 @@ class AxisCoverage:
     interval: tuple[float, float]  # of the fraction, 95 %
 
 
-def coverage_of(sums: HeldSums) -> tuple[AxisCoverage, ...]:
+def axis_coverage(sums: HeldSums) -> tuple[AxisCoverage, ...]:
     """Coverage along u and v at each level."""
     return tuple(
         AxisCoverage(

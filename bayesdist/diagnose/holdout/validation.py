@@ -12,12 +12,11 @@ from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.bins import Bin, partitions_of
 from bayesdist.diagnose.holdout.deviations import deviation_tests
 from bayesdist.diagnose.holdout.frames import frames_for
-from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
+from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.sums import held_sums
-from bayesdist.diagnose.holdout.tests import AxisCoverage, HeldTest, all_tests, coverage_of
+from bayesdist.diagnose.holdout.tests import AxisCoverage, HeldTest, all_tests, axis_coverage
 from bayesdist.diagnose.significance import holm, p_words
 from bayesdist.errors import InputError
-from bayesdist.infer.posterior import Posterior
 from bayesdist.limits import HELD_OUT, HELD_OUT_DOUBTFUL, HELD_OUT_UNUSUAL
 
 __all__ = ["HoldoutValidation", "holdout_validation"]
@@ -124,14 +123,13 @@ def _rank(test: HeldTest) -> tuple[float, int, float, bool]:
 
 
 def holdout_validation(
-    solution: Posterior | Predictive, held: Matches, *, whole: Sequence[str] = ()
+    predictive: Predictive, held: Matches, *, whole: Sequence[str] = ()
 ) -> HoldoutValidation:
-    """Results of stars that a solution has not seen.
+    """Results of stars that a solution has not seen, against its prediction.
 
     Of the exposures `whole` all stars were held out. Raises InputError for too few stars, and for a
-    campaign's posterior of which only the draws are given.
+    campaign's prediction without deviations of its exposures.
     """
-    predictive = solution if isinstance(solution, Predictive) else predictive_of(solution)
     where = ", ".join(held.sources)
     if predictive.model.gauge != "first" and predictive.deviations is None:
         raise InputError(
@@ -170,5 +168,5 @@ def holdout_validation(
         region_offset=np.divide(
             found.offset_scores, error, out=np.full_like(error, np.nan), where=error > 0
         ),
-        coverage=coverage_of(sums),
+        coverage=axis_coverage(sums),
     )

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
 from bayesdist.diagnose.residuals.binned import BAND_AXES, BinnedSums, BinValues
-from bayesdist.errors import DegenerateError, InputError
+from bayesdist.errors import DegenerateError
 
 __all__ = ["PatternChange", "pattern_changes"]
 
@@ -42,18 +42,13 @@ def pattern_changes(periods: Mapping[str, BinnedSums]) -> tuple[PatternChange, .
     share of the rest.
 
     Periods are disjoint in their stars, two or more, all against one model in pixels; changes are
-    those in X and Y of each. Raises InputError for less than two periods, DegenerateError when
-    fewer than three bins hold five stars in a period and in the rest.
+    those in X and Y of each. Raises DegenerateError when fewer than three bins hold five stars in a
+    period and in the rest.
     """
-    names = list(periods)
-    if len(names) < 2:
-        raise InputError("one period has no other to be compared with", do="give two or more")
     out = []
-    for name in names:
-        others = [periods[n] for n in names if n != name]
-        rest = others[0]
-        for more in others[1:]:
-            rest = rest + more
+    for name in periods:
+        one, *others = (sums for other, sums in periods.items() if other != name)
+        rest = sum(others, start=one)
         out += [
             _change(name, axis, periods[name].values(axis), rest.values(axis))
             for axis in BAND_AXES[:2]

@@ -159,11 +159,11 @@ def _absorbed(sums: BinnedSums, order: int | None) -> float:
     """
     if order is None:
         return 0.0
-    kept_y, kept_x = (_kept(n, order) for n in sums.count.shape)
-    return 2.0 * sum(kept_x[i] * kept_y[j] for i, j in polynomial_terms(order))
+    passed_y, passed_x = (_passed(n, order) for n in sums.count.shape)
+    return 2.0 * sum(passed_x[i] * passed_y[j] for i, j in polynomial_terms(order))
 
 
-def _kept(n: int, order: int) -> Float:
+def _passed(n: int, order: int) -> Float:
     """Mean square of each Legendre polynomial, averaged over n equal bins, over its mean square."""
     means = bin_means(n, order)
     return (2 * np.arange(order + 1) + 1) * np.mean(means**2, axis=1)

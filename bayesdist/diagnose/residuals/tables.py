@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations, product
 
@@ -16,7 +16,6 @@ from bayesdist.diagnose.residuals.rows import (
     bin_row,
     pair_row,
 )
-from bayesdist.errors import InputError
 
 __all__ = [
     "WISE_ARCSEC",
@@ -112,22 +111,10 @@ def band_to_band_table(
     frames they are not: the catalogue's errors cancel in the difference, its noise is smaller than
     said here, and its noise-free part larger.
 
-    As `fitting_table`; the bins of all bands are as many and cover the same field, `arcsec` are
-    those per pixel of each band. Raises InputError for one band only, for bands whose bins differ
-    in number, or a band without scale.
+    As `fitting_table`, of two bands or more; the bins of all are as many and cover the same field,
+    `arcsec` are those per pixel of each band.
     """
     values = _in_arcsec(bands, arcsec)
-    names = list(bands)
-    if len(names) < 2:
-        raise InputError("one band has no other to be compared with", do="give two bands or more")
-    shapes = {name: band.count.shape for name, band in bands.items()}
-    for name in names[1:]:
-        if shapes[name] != shapes[names[0]]:
-            raise InputError(
-                f"bands {names[0]} and {name} have bins of shape {shapes[names[0]]} and "
-                f"{shapes[name]}",
-                do="take as many bins for every band",
-            )
     rows = tuple(
         bin_row(
             f"{later}-{earlier}/{axis}",
@@ -195,13 +182,6 @@ def _two_bands(bands: Iterable[str]) -> Iterator[tuple[str, str, str]]:
 def _in_arcsec(
     bands: Mapping[str, BinnedSums], arcsec: Mapping[str, float]
 ) -> dict[tuple[str, str], BinValues]:
-    missing: Sequence[str] = [name for name in bands if name not in arcsec]
-    if missing:
-        raise InputError(
-            f"the pixel scale of band {missing[0]!r} is not known",
-            where="arcsec",
-            do="give its arcsec per pixel",
-        )
     return {
         (name, axis): band.values(axis).scaled(arcsec[name])
         for name, band in bands.items()

@@ -14,7 +14,7 @@ def independent_directions(whole: Float, left: Float, least: float) -> Float:
     """Directions (n, q) of regressors that the parameters have left.
 
     `whole` and `left` (n, n) are the information of the regressors before and after the parameters
-    are projected out, `least` the fraction of it that a direction must have kept. Directions are in
+    are projected out, `least` the fraction of it that a direction must keep. Directions are in
     units in which `whole` is the unit matrix.
     """
     diagonal = np.diag(whole)
@@ -23,8 +23,8 @@ def independent_directions(whole: Float, left: Float, least: float) -> Float:
     values, vectors = np.linalg.eigh(whole * np.outer(scale, scale))
     good = values > 1e-8 * values.max(initial=1e-300)
     basis = scale[:, None] * vectors[:, good] / np.sqrt(values[good])
-    kept, turn = np.linalg.eigh(basis.T @ left @ basis)
-    return np.asarray(basis @ turn[:, kept > least])
+    fraction, turn = np.linalg.eigh(basis.T @ left @ basis)
+    return np.asarray(basis @ turn[:, fraction > least])
 
 
 def squares_of(

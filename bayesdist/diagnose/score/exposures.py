@@ -42,8 +42,8 @@ class _Deviations:
     """One exposure's deviations, all parameters projected out."""
 
     score: Float  # (n,)
-    information: Float  # (n, n) beside all parameters
-    own: Float  # (n, n) beside those of the exposure alone
+    information: Float  # (n, n) with all parameters projected out
+    own: Float  # (n, n) with those of the exposure alone
     cross: Float  # (n, G) with the global parameters
     covariance: Float  # (n, n) of the score, from those of single detections
     square: Float  # (n, n) mean square of the deviations over the detector

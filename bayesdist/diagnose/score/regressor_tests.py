@@ -124,7 +124,7 @@ class _Directions:
 
     regressors: Regressors
     columns: Int  # (n,)
-    basis: Float  # (n, q) with unit information beside all parameters
+    basis: Float  # (n, q) with unit information, all parameters projected out
     score: Float  # (q,) also the step by which the fit would move
 
     @property

@@ -16,19 +16,19 @@ from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.model.timedep import TimeDependence
 
-__all__ = ["EDGES", "EDGES_BESIDE_ORDERS", "Factor", "Functions", "Regressors", "functions_for"]
+__all__ = ["EDGES", "EDGES_ADJUSTED", "Factor", "Functions", "Regressors", "functions_for"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-EDGES, EDGES_BESIDE_ORDERS = "edges", "edges beside orders"
+EDGES, EDGES_ADJUSTED = "edges", "edges adjusted for orders"
 LINEAR = 1  # order of the terms that go with magnitude, colour and time
 HIGHER = 2  # orders above the model's that are tested
 OUTSIDE = 0.5  # per cent of the values at either end that are moved to the others
 MIN_AT_EDGES = 200  # detections: some in each margin
 NEAR_EDGE = 0.05  # of half a side, over which what is at an edge falls off
 SHORTEST = 0.1  # years over which a drift is looked for
-# information that a direction has kept beside the parameters, over what it had: below, it is theirs
+# of the information of a direction, left by the parameters: below, it is theirs
 INDEPENDENT = 1e-6
 CONSTANT = 1e-9  # scatter of a factor, in magnitudes or of the time from -1 to 1
 OWN_OF_TIME = 0.02  # frames take up drifts but for what the curvature of the polynomial leaves
@@ -53,20 +53,20 @@ class Regressors:
 
     family: Family
     functions: Int  # which `Functions`
-    # fraction of the information that a direction must have kept beside the model's parameters
+    # fraction of its information that a direction must keep when parameters are projected out
     least: float = INDEPENDENT
     # functions that the fit is given as well, so that they do not pass for these
-    beside: Int = field(default_factory=lambda: np.zeros(0, np.int64))
+    adjusted_for: Int = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def every(self) -> Int:
         """Indices of all of these functions, the tested ones first."""
-        return np.concatenate([self.functions, self.beside])
+        return np.concatenate([self.functions, self.adjusted_for])
 
     @property
     def own(self) -> NDArray[np.bool_]:
         """Boolean mask of those that are tested."""
-        return np.arange(len(self.functions) + len(self.beside)) < len(self.functions)
+        return np.arange(len(self.functions) + len(self.adjusted_for)) < len(self.functions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +141,8 @@ def functions_for(sample: ScoredSample) -> Functions:
         start += len(functions)
         regressors.append(Regressors(FAMILIES[name], functions, least))
         if name == EDGES:
-            beside = replace(FAMILIES[EDGES], name=EDGES_BESIDE_ORDERS)
-            regressors.append(Regressors(beside, functions, least, orders))
+            adjusted = replace(FAMILIES[EDGES], name=EDGES_ADJUSTED)
+            regressors.append(Regressors(adjusted, functions, least, orders))
     return Functions(sample, n + HIGHER, tuple(factors), tuple(regressors))
 
 

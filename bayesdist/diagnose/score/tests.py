@@ -15,7 +15,7 @@ from bayesdist.diagnose.score.noise import noise_tests
 from bayesdist.diagnose.score.pattern import pattern_test
 from bayesdist.diagnose.score.projection import projection_of
 from bayesdist.diagnose.score.regressor_tests import regressor_tests
-from bayesdist.diagnose.score.regressors import EDGES, EDGES_BESIDE_ORDERS, functions_for
+from bayesdist.diagnose.score.regressors import EDGES, EDGES_ADJUSTED, functions_for
 from bayesdist.diagnose.score.result import Outcome, ScoreTest, corrected
 from bayesdist.diagnose.score.sample import scored_sample
 from bayesdist.diagnose.score.truncation import truncation_test
@@ -86,13 +86,13 @@ def score_tests(
 
 
 def _edges_or_orders(outcomes: list[Outcome]) -> list[Outcome]:
-    """Outcomes with one test of the edges: the weaker one beside the orders, if it says nothing.
+    """Outcomes with one test of the edges: the one adjusted for orders, where that says nothing.
 
-    A missing order rises towards the edges as well.  Beside the orders there is less to be seen of
-    what does so by itself, but something.
+    A missing order rises towards the edges as well.  Adjusted for the orders there is less to be
+    seen of what does so by itself, but something.
     """
     by_name = {one.name: one for one in outcomes}
-    beside = by_name.pop(EDGES_BESIDE_ORDERS, None)
-    if EDGES in by_name and beside is not None and beside.p_value > SAYS_NOTHING:
-        by_name[EDGES] = replace(beside, family=FAMILIES[EDGES])
+    adjusted = by_name.pop(EDGES_ADJUSTED, None)
+    if EDGES in by_name and adjusted is not None and adjusted.p_value > SAYS_NOTHING:
+        by_name[EDGES] = replace(adjusted, family=FAMILIES[EDGES])
     return list(by_name.values())

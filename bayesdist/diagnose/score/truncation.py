@@ -124,10 +124,10 @@ def _alike(variance: Float, inlier: Float) -> Int:
     part = np.searchsorted(edges, variance, side="right")
     count = np.bincount(part, inlier, minlength=len(edges) + 1)
     # what equal errors leave with few stars goes to its neighbour
-    kept = np.flatnonzero(count >= STARS_PER_PART / 2)
-    if not len(kept):
+    large = np.flatnonzero(count >= STARS_PER_PART / 2)
+    if not len(large):
         return np.zeros(len(variance), np.int64)
-    return np.clip(np.searchsorted(kept, np.arange(len(count))), 0, len(kept) - 1)[part]
+    return np.clip(np.searchsorted(large, np.arange(len(count))), 0, len(large) - 1)[part]
 
 
 def truncation_test(sample: ScoredSample, match_radius: float | None = None) -> Outcome | None:

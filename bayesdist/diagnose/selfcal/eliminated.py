@@ -31,15 +31,15 @@ from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 
 __all__ = [
+    "Absorbed",
     "Columns",
     "Piece",
     "Remainder",
-    "StarSums",
+    "absorbed_by_stars",
     "add_products",
     "eliminated",
     "even_stars",
     "pieces",
-    "star_sums",
     "without_parameters",
 ]
 
@@ -218,7 +218,7 @@ def pieces(columns: Columns) -> Iterator[Piece]:
 
 
 @dataclass(frozen=True, eq=False)
-class StarSums:
+class Absorbed:
     """Parts of the information and score of a piece that its stars absorb."""
 
     rows: Float  # A^-1/2 T (S q, columns), by internal columns
@@ -253,7 +253,9 @@ def without_parameters(solution: SelfCalibrationMode, N: Float, score: Float) ->
     return Remainder((S + S.T) / 2, score[D:] - through.T @ (root.T @ pull), gain)
 
 
-def star_sums(columns: Columns, piece: Piece, scores: DetectionScores, stars: Float) -> StarSums:
+def absorbed_by_stars(
+    columns: Columns, piece: Piece, scores: DetectionScores, stars: Float
+) -> Absorbed:
     """Sums over the detections of each star of a piece, the stars (S, q) where the scores are."""
     priors = columns.problem.priors
     precision = priors.precision[piece.stars]
@@ -272,7 +274,7 @@ def star_sums(columns: Columns, piece: Piece, scores: DetectionScores, stars: Fl
     T[:, columns.sparse] = (piece.of_stars(S_H) @ piece.sparse).toarray()
     roots = _inverse_roots(own)
     rows = np.reshape(roots @ T.reshape(S, q, -1), (S * q, -1))
-    return StarSums(rows, np.ravel(np.einsum("skq,sq->sk", roots, b)))
+    return Absorbed(rows, np.ravel(np.einsum("skq,sq->sk", roots, b)))
 
 
 def eliminated(
@@ -303,13 +305,13 @@ def eliminated(
     other = np.zeros((len(inside), n))
     for piece in pieces(columns):
         here = scores.at(piece.rows)
-        sums = star_sums(columns, piece, here, stars)
+        sums = absorbed_by_stars(columns, piece, here, stars)
         add_products(total, columns, columns, piece, here.curvature)
         total -= sums.rows.T @ sums.rows
         score += _pulled(columns, piece, here.gradient) - sums.rows.T @ sums.right
         if working is not None:
             here = working.at(piece.rows)
-            sums = star_sums(columns, piece, here, stars)
+            sums = absorbed_by_stars(columns, piece, here, stars)
             add_products(other, narrow, columns, piece, here.curvature)
             other -= sums.rows[:, inside].T @ sums.rows
     if working is None:

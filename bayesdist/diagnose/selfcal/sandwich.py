@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.diagnose.selfcal.eliminated import Columns, Piece, pieces, star_sums
+from bayesdist.diagnose.selfcal.eliminated import Columns, Piece, absorbed_by_stars, pieces
 from bayesdist.diagnose.selfcal.scores import DetectionScores
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 
@@ -34,7 +34,7 @@ def sandwich(solution: SelfCalibrationMode, scores: DetectionScores) -> Float:
     meat = np.array(solution.prior.precision)
     for piece in pieces(columns):
         here = scores.at(piece.rows)
-        sums = star_sums(columns, piece, here, solution.stars)
+        sums = absorbed_by_stars(columns, piece, here, solution.stars)
         S, q = piece.stars.stop - piece.stars.start, p.n_star
         moved = _displacements(columns, piece, inside)
         whole = np.einsum("nab,naf,nbf->n", here.curvature, moved, moved, optimize=True)

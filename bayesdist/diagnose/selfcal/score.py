@@ -22,10 +22,10 @@ from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.selfcal.columns import AddedColumns, pointing_terms
 from bayesdist.diagnose.selfcal.correlated import MAX_EXPOSURES
 from bayesdist.diagnose.selfcal.eliminated import (
+    absorbed_by_stars,
     add_products,
     even_stars,
     pieces,
-    star_sums,
     without_parameters,
 )
 from bayesdist.diagnose.selfcal.leverage import taken_by_stars
@@ -106,7 +106,7 @@ def _summed(
     unit = np.broadcast_to(np.eye(2), (len(p), 2, 2))
     for piece in pieces(columns):
         here = scores.at(piece.rows)
-        sums = star_sums(columns, piece, here, stars)
+        sums = absorbed_by_stars(columns, piece, here, stars)
         taken += sums.rows.T @ sums.rows
         score -= sums.rows.T @ sums.right
         add_products(known, columns, columns, piece, here.curvature)

@@ -54,15 +54,15 @@ class Functions:
     n_draws: int
     uniform: bool = False
     covariance: Mapping[int | None, Float] | None = None
-    _kept: dict[EvaluationDomain, FunctionField] = field(default_factory=dict, repr=False)
+    _cache: dict[EvaluationDomain, FunctionField] = field(default_factory=dict, repr=False)
 
     def on(self, domain: EvaluationDomain, image: Image) -> FunctionField:
         """The errors at the positions of a domain; of those asked for last they are kept."""
         key = domain.at(None)
-        if key not in self._kept:
-            self._kept.clear()
-            self._kept[key] = FunctionField(self, key)
-        return self._kept[key]
+        if key not in self._cache:
+            self._cache.clear()
+            self._cache[key] = FunctionField(self, key)
+        return self._cache[key]
 
     def of(self, chip: int) -> NDArray[np.floating] | None:
         """Coefficients (n', 2, m) on a chip; None where there is no error."""
