@@ -327,13 +327,13 @@ def test_worker_of_two_threads_and_then_none(problem, by_threads, monkeypatch):
 
 
 @dataclass(frozen=True)
-class DeadlyPiece:
+class DeadlyReader:
     """Kills who reads it."""
 
     def __len__(self) -> int:
         return 1
 
-    def read(self):
+    def load(self):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -341,8 +341,8 @@ class DeadlyMatches:
     def __len__(self) -> int:
         return 1
 
-    def pieces(self):
-        return (DeadlyPiece(),)
+    def readers(self):
+        return (DeadlyReader(),)
 
 
 def test_all_workers_lost_while_they_read(problem):
