@@ -15,9 +15,9 @@ from .limits import limits_from, pilot, said_and_true
 from .places import covered
 from .ranks import ranks
 
-CAMPAIGNS = {True: 24, False: 3}  # of each kind, in full and reduced
-CALIBRATIONS = {True: 200, False: 12}
-TRUTHS = {True: 200, False: 12}  # from the priors
+CAMPAIGNS = {True: 24, False: 2}  # of each kind, in full and reduced
+CALIBRATIONS = {True: 200, False: 8}
+TRUTHS = {True: 200, False: 8}  # from the priors
 JUDGED = ("drift", "pattern")
 PILOTS = {True: 8, False: 2}
 

@@ -63,11 +63,13 @@ def test_the_rate_of_false_matches_is_what_happens(rng):
     assert hits > 100
 
 
-def test_a_million_detections_in_seconds(rng):
-    catalog, found, mag, truth, _ = field(rng, 1_000_000, turn=1e-5)
+def test_a_million_detections_in_seconds(rng, full):
+    """Or a fifth of them in a fifth of the time."""
+    n = 1_000_000 if full else 200_000
+    catalog, found, mag, truth, _ = field(rng, n, turn=1e-5)
     start = time.process_time()
     m = match_to_catalog(*found.T, catalog, mag=mag)
-    assert time.process_time() - start < 30.0
+    assert time.process_time() - start < 30.0 * n / 1_000_000
     assert (truth[m.index] == m.catalog_index).sum() > 0.99 * (truth >= 0).sum()
 
 

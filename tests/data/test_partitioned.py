@@ -656,8 +656,10 @@ def measured(small, path):
 
 
 @pytest.mark.parametrize("group", [10_000, 10_000_000])
-def test_memory_does_not_grow_with_the_table(rng, tmp_path, group):
+def test_memory_does_not_grow_with_the_table(rng, tmp_path, group, full):
     """A table of 8 times as many rows, in small row groups or one that holds them all."""
+    if not full and group < 1_000_000:
+        pytest.skip("one large row group is read: set BAYESDIST_FULL=1")
     small = write(tmp_path / "small.parquet", stars(rng, 1000))
     found = []
     for k, n in enumerate((400_000, 3_200_000)):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 from scipy import optimize, stats
@@ -354,14 +356,24 @@ def independent():
     return nearly_gaussian(6)
 
 
-@pytest.mark.parametrize("kind", [independent, misleading])
+LONG = {"limits": Limits(ess=1e9), "max_steps": 160, "checkpoint_every": 30, **MISLED}
+
+
+@pytest.fixture(scope="module", params=[independent, misleading])
+def whole(request, tmp_path_factory):
+    """A kind of problem, its chains, and the folder of their checkpoints."""
+    kind, folder = request.param, tmp_path_factory.mktemp("chains")
+    alone = run_chains(*kind(), settings(**LONG))
+    saved = run_chains(*kind(), settings(folder=folder, fingerprint="x", **LONG))
+    np.testing.assert_array_equal(saved.psi, alone.psi)
+    assert (alone.plan.method == "independence") == (kind is independent)
+    return kind, alone, folder
+
+
 @pytest.mark.parametrize("keep", ["all", "none of the pilot", "first", "every third", "odd"])
-def test_killed_runs_end_as_if_nothing_had_happened(kind, keep, tmp_path):
-    options = {"limits": Limits(ess=1e9), "max_steps": 160, "checkpoint_every": 30}
-    whole = run_chains(*kind(), settings(**options, **MISLED))
-    kept = run_chains(*kind(), settings(folder=tmp_path, fingerprint="x", **options, **MISLED))
-    np.testing.assert_array_equal(kept.psi, whole.psi)
-    assert (whole.plan.method == "independence") == (kind is independent)
+def test_killed_runs_end_as_if_nothing_had_happened(whole, keep, tmp_path):
+    kind, whole, folder = whole
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     files = sorted(tmp_path.glob("*.h5"))
     assert len(files) > 12 and (tmp_path / "chain-0-pilot.h5") in files
     for k, path in enumerate(files):
@@ -375,9 +387,7 @@ def test_killed_runs_end_as_if_nothing_had_happened(kind, keep, tmp_path):
         if lost:
             path.unlink()
     target, proposal = kind()
-    again = run_chains(
-        target, proposal, settings(folder=tmp_path, fingerprint="x", **options, **MISLED)
-    )
+    again = run_chains(target, proposal, settings(folder=tmp_path, fingerprint="x", **LONG))
     np.testing.assert_array_equal(again.psi, whole.psi)
     np.testing.assert_array_equal(again.log_prob, whole.log_prob)
     for name in ("steps", "warmup", "passes", "acceptance"):
