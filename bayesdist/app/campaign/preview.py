@@ -23,7 +23,7 @@ def campaign_lines(inputs: Inputs) -> Iterator[str]:
     yield f"exposures    {len(log.names)} in {', '.join(log.filters)}"
     passed, left = sum(int(good.sum()) for good in lists.passed), lists.cut_words
     yield f"detections   {len(lists)}: {passed} pass the cuts" + (f", {left}" if left else "")
-    yield f"catalogue    {len(catalog)} of {inputs.n_catalog} stars, in {catalog.unit}"
+    yield f"catalogue    {len(catalog)} of {len(inputs.whole_catalog)} stars, in {catalog.unit}"
     for text in (*([inputs.plane] if inputs.plane else []), *catalog.notes):
         yield f"             {text}"
     yield f"epochs       {epochs.min():.2f} to {epochs.max():.2f}"
