@@ -83,8 +83,8 @@ def read_campaign(config: CampaignConfig, base: Path) -> Inputs:
     whole, plane = read_campaign_catalog(block, base, whole_log)
     log = _exposures_of(block, whole_log)
     found = lists_of(block, base)
-    wanted = tuple(one for one in found.lists if one.exposure in log)
-    missing = sorted(set(log.names) - {one.exposure for one in wanted})
+    lists = found.of(log.names)
+    missing = sorted(set(log.names) - set(lists.names))
     if missing:
         raise InputError(
             f"there is no star list of exposure {missing[0]!r}"
@@ -92,7 +92,7 @@ def read_campaign(config: CampaignConfig, base: Path) -> Inputs:
             where=log.source,
             do="add the list, or take the exposure out of the log",
         )
-    unlogged = dict.fromkeys(one.exposure for one in found.lists if one.exposure not in whole_log)
+    unlogged = dict.fromkeys(name for name in found.names if name not in whole_log)
     reliable = block.pm_selection == "reliable" and whole.sigma_pm_u is not None
     return Inputs(
         config,
@@ -100,7 +100,7 @@ def read_campaign(config: CampaignConfig, base: Path) -> Inputs:
         whole,
         select_motions(whole) if reliable else whole,
         log,
-        replace(found, lists=wanted),
+        lists,
         tuple(unlogged),
         plane,
     )

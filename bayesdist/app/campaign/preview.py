@@ -55,8 +55,8 @@ def _rolls(rolls: np.ndarray) -> str:
 def _without(inputs: Inputs) -> dict[int, list[str]]:
     """Exposures that have nothing on a chip, by its number."""
     lists, out = inputs.star_lists, dict[int, list[str]]()
-    for one, good in zip(lists.lists, lists.passed, strict=True):
+    for name, one, good in zip(lists.names, lists.lists, lists.passed, strict=True):
         for chip in inputs.config.chips():
             if chip.number not in one.chip[good]:
-                out.setdefault(chip.number, []).append(one.exposure)
+                out.setdefault(chip.number, []).append(name)
     return out
