@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.app.campaign.aberration import PERIOD, SWING, scale_error
-from bayesdist.app.campaign.inputs import errors_by_star
+from bayesdist.app.campaign.catalogue import errors_by_star
 from bayesdist.assess.adjusted import with_shared_stars
 from bayesdist.assess.terms.parameters import CATALOGUE as POSITIONS
 from bayesdist.assess.terms.parameters import MOTIONS, catalogue_terms

@@ -8,7 +8,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
-from bayesdist.app.campaign.inputs import Inputs, errors_by_star
+from bayesdist.app.campaign.catalogue import errors_by_star
+from bayesdist.app.campaign.inputs import Inputs
+from bayesdist.app.config import Config
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.split import set_aside
 from bayesdist.app.kinds.star_lists import known_calibration

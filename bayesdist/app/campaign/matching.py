@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.campaign.catalogue import parities_of
 from bayesdist.app.campaign.input_validation import input_warnings, refuse_few, shear_warnings
-from bayesdist.app.campaign.inputs import Inputs, parities_of
+from bayesdist.app.campaign.inputs import Inputs
 from bayesdist.app.campaign.matched import CampaignMatched, matched_campaign
 from bayesdist.app.campaign.reference import free_rates
 from bayesdist.app.kinds.star_lists import StarLists, positions_by_chip, start_of
@@ -97,7 +98,7 @@ def _facts(
         "n_exposures": len(found.reports),
         "n_detections": len(inputs.star_lists),
         "n_pairs": len(found.table),
-        "n_catalog": inputs.n_catalog,
+        "n_catalog": len(inputs.whole_catalog),
         "n_catalog_used": len(inputs.catalog),
         "left_out": dict(found.left_out),
         "completeness": {

@@ -23,7 +23,7 @@ def campaign_lines(inputs: Inputs) -> Iterator[str]:
     yield f"exposures    {len(log.names)} in {', '.join(log.filters)}"
     passed, left = sum(int(good.sum()) for good in lists.passed), lists.cut_words
     yield f"detections   {len(lists)}: {passed} pass the cuts" + (f", {left}" if left else "")
-    yield f"catalogue    {len(catalog)} of {inputs.n_catalog} stars, in {catalog.unit}"
+    yield f"catalogue    {len(catalog)} of {len(inputs.whole_catalog)} stars, in {catalog.unit}"
     for text in (*([inputs.plane] if inputs.plane else []), *catalog.notes):
         yield f"             {text}"
     yield f"epochs       {epochs.min():.2f} to {epochs.max():.2f}"
@@ -55,8 +55,8 @@ def _rolls(rolls: np.ndarray) -> str:
 def _without(inputs: Inputs) -> dict[int, list[str]]:
     """Exposures that have nothing on a chip, by its number."""
     lists, out = inputs.star_lists, dict[int, list[str]]()
-    for one, good in zip(lists.lists, lists.passed, strict=True):
+    for name, one, good in zip(lists.names, lists.lists, lists.passed, strict=True):
         for chip in inputs.config.chips():
             if chip.number not in one.chip[good]:
-                out.setdefault(chip.number, []).append(one.name)
+                out.setdefault(chip.number, []).append(name)
     return out

@@ -102,7 +102,7 @@ def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianP
         units, drifting terms, or reference dates.
     """
     tdd, chip = config.model.tdd, config.chips()[0].number
-    if tdd is None or tdd.rates == FREE:
+    if tdd is None or free_rates(config):
         return None
     path = _file_of_run(base / tdd.rates, POSTERIOR, "model.tdd.rates")
     posterior: Posterior = load_posterior(path)

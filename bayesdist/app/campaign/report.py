@@ -6,7 +6,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.inputs import Inputs, read_campaign_catalog
+from bayesdist.app.campaign.inputs import Inputs
 from bayesdist.app.campaign.matched import CampaignMatched, campaign_matches
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.results import Results
@@ -96,8 +96,7 @@ def _spread_rows(n: int, most: int) -> slice:
 
 
 def _catalog_stars(inputs: Inputs, matching: Table) -> CatalogStars | None:
-    block = inputs.config.campaign
-    catalog, _ = read_campaign_catalog(block, inputs.base, inputs.log)
+    catalog = inputs.whole_catalog
     if catalog.mag is None or (catalog.sigma_u is None and catalog.sigma_pm_u is None):
         return None
     shift = float(np.nan_to_num(np.nanmedian(np.asarray(matching["zero_point"], float))))
@@ -107,7 +106,7 @@ def _catalog_stars(inputs: Inputs, matching: Table) -> CatalogStars | None:
         sigma = np.hypot(catalog.sigma_u, catalog.sigma_v)[rows]
     if catalog.sigma_pm_u is not None and catalog.sigma_pm_v is not None:
         motion = np.maximum(catalog.sigma_pm_u, catalog.sigma_pm_v)[rows]
-        if block.pm_selection == "reliable":
+        if inputs.config.campaign.pm_selection == "reliable":
             line = motion_error_line(catalog)
             limit = (line.mag - shift, line.sigma)
     return CatalogStars(

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from astropy.table import Table
+from numpy.typing import NDArray
 
 from bayesdist.app.tables.output import write_table
 from bayesdist.data import ReferenceCatalog
@@ -18,7 +19,7 @@ from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_influence import StarErrors
 from bayesdist.model import LookupTable
 
-__all__ = ["Matched"]
+__all__ = ["Matched", "columns_by_code"]
 
 MATCHING = "matching.ecsv"
 
@@ -97,17 +98,13 @@ class Matched:
 
     def with_motions(self, table: Matches) -> Matches:
         """Matches with what the catalogue states of the motions of their stars."""
-        catalog = self.catalogue
-        if catalog is None or catalog.pm_u is None or catalog.sigma_pm_u is None:
+        if self.catalogue is None or table.star is None:
             return table
-        if table.star is None:
+        names = ("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v")
+        motions = columns_by_code(self.catalogue, *names)
+        if motions is None:
             return table
-        columns = {}
-        for name in ("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"):
-            by_code = np.zeros(int(catalog.star.max()) + 1)
-            by_code[catalog.star] = getattr(catalog, name)
-            columns[name] = by_code[table.star]
-        return table.with_columns(**columns)
+        return table.with_columns(**dict(zip(names, motions[table.star].T, strict=True)))
 
     def overlap(self, posterior: Posterior, tables: tuple[LookupTable, ...]) -> OverlapTest | None:
         """Two exposures far apart in time laid on each other; None where none are known so."""
@@ -117,3 +114,14 @@ class Matched:
         """Write the files of a run's folder that belong to it."""
         if self.table is not None:
             write_table(self.table, folder / MATCHING)
+
+
+def columns_by_code(catalog: ReferenceCatalog, *names: str) -> NDArray[np.float64] | None:
+    """Columns of a catalogue by code of the star (codes, n); None where it lacks one of them."""
+    out = np.zeros((int(catalog.star.max()) + 1, len(names)))
+    for k, name in enumerate(names):
+        values = getattr(catalog, name)
+        if values is None:
+            return None
+        out[catalog.star, k] = values
+    return out

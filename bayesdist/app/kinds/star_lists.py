@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -50,6 +50,15 @@ class StarLists:
     def __len__(self) -> int:
         """Detections of all lists."""
         return sum(len(one) for one in self.lists)
+
+    @property
+    def names(self) -> list[str]:
+        """Exposures of the lists."""
+        return [one.name for one in self.lists]
+
+    def of(self, names: Collection[str]) -> StarLists:
+        """Lists of some exposures."""
+        return replace(self, lists=tuple(one for one in self.lists if one.name in names))
 
     @cached_property
     def _tested(self) -> list[tuple[NDArray[np.bool_], dict[str, int]]]:

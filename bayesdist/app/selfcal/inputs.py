@@ -184,15 +184,15 @@ def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
     """
     block, gauge = config.selfcal, config.gauge
     found = lists_of(block, base)
-    for one, good in zip(found.lists, found.passed, strict=True):
+    names = found.names
+    for name, one, good in zip(names, found.lists, found.passed, strict=True):
         if not good.any():
             raise InputError(
-                f"no detection of exposure {one.name} passes the cuts",
+                f"no detection of exposure {name} passes the cuts",
                 where=one.source,
                 do="widen them, or leave the exposure out",
             )
     used = [one.select(good) for one, good in zip(found.lists, found.passed, strict=True)]
-    names = [one.name for one in used]
     if len(used) < 2:
         raise InputError(
             f"there is one exposure, {names[0]}, and distortion shows between exposures",

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from itertools import combinations_with_replacement
+from itertools import combinations
 from typing import Any
 
 import numpy as np
-from astropy.table import Table
+from astropy.table import Column, Table
 from astropy.units import Unit
 from numpy.typing import NDArray
 
@@ -90,23 +90,18 @@ def star_table(
         Magnitudes of the detections.
     references : ReferenceCatalog, optional
     """
-    q = found.values.shape[1]
-    names = NAMES[:q]
-    table = Table({"star": np.arange(len(found))})
+    names = NAMES[: found.values.shape[1]]
     units = [f"{found.unit} / yr" if name.startswith("pm") else found.unit for name in names]
-    for k, name in enumerate(names):
-        table[name] = found.values[:, k]
-        table[name].unit = units[k]
-    for k, name in enumerate(names):
-        table[f"sigma_{name}"] = np.sqrt(found.cov[:, k, k])
-        table[f"sigma_{name}"].unit = units[k]
-    for a, b in combinations_with_replacement(range(q), 2):
-        if a != b:
-            table[f"cov_{names[a]}_{names[b]}"] = found.cov[:, a, b]
-            table[f"cov_{names[a]}_{names[b]}"].unit = Unit(units[a]) * Unit(units[b])
+    table = Table({"star": np.arange(len(found))})
+    for k, (name, unit) in enumerate(zip(names, units, strict=True)):
+        table[name] = Column(found.values[:, k], unit=unit)
+    for k, (name, unit) in enumerate(zip(names, units, strict=True)):
+        table[f"sigma_{name}"] = Column(np.sqrt(found.cov[:, k, k]), unit=unit)
+    for a, b in combinations(range(len(names)), 2):
+        unit = Unit(units[a]) * Unit(units[b])
+        table[f"cov_{names[a]}_{names[b]}"] = Column(found.cov[:, a, b], unit=unit)
     for k, name in enumerate(names[:2]):
-        table[f"sigma_own_{name}"] = np.sqrt(found.own[:, k, k])
-        table[f"sigma_own_{name}"].unit = found.unit
+        table[f"sigma_own_{name}"] = Column(np.sqrt(found.own[:, k, k]), unit=found.unit)
     table["n"] = found.n
     table["n_members"] = found.n_members
     if mag is not None:
