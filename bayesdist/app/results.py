@@ -20,11 +20,11 @@ from bayesdist.app.kinds.kind import Kind, kind_of
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.matches.sources import RunInput, input_of_run
-from bayesdist.app.products.made_files import ProductInput, product_input
+from bayesdist.app.products.made_files import ProductInput, product_of, solution_of
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.diagnostics_files import load_diagnostics
 from bayesdist.app.tables.evaluation_files import load_evaluation
-from bayesdist.assess.error_model import ErrorModel, solution_with_errors
+from bayesdist.assess.error_model import ErrorModel
 from bayesdist.assess.evaluation import Evaluation, EvaluationSettings
 from bayesdist.checks import Check, in_order
 from bayesdist.diagnose.diagnostics import Diagnostics
@@ -178,12 +178,8 @@ class Results:
 
     @cached_property
     def solution(self) -> Posterior:
-        """What is exported and shown: with all errors of the parameters that were found.
-
-        Neither catalogue nor matches are needed for it.
-        """
-        hierarchy = None if self.fitted.scatter is None else self.fit
-        return solution_with_errors(self.posterior, self.stored, hierarchy)
+        """What is exported and shown: with all errors of the parameters that were found."""
+        return solution_of(self.posterior, self.stored, self.fitted)
 
     @cached_property
     def errors(self) -> ErrorModel:
@@ -205,7 +201,8 @@ class Results:
     @property
     def product(self) -> ProductInput:
         """What files of the solution are made from."""
-        return product_input(self.solution, self.data, self.config, str(self.run.path))
+        source = str(self.run.path)
+        return product_of(self.posterior, self.stored, self.data, self.config, source)
 
     @property
     def gauge_words(self) -> str:

@@ -48,7 +48,7 @@ def monitor(
     which stage 'match' is done, or pairs as a run keeps them.
     """
     directory = RunDirectory(run)
-    if not (directory / "run.json").exists():
+    if not directory.is_initialized:
         raise directory.not_a_run_error()
     config = directory.config
     posterior, matches, fitted, left_out = _fitted(directory, config, Path(new))
