@@ -1,4 +1,4 @@
-"""What stages write into the folder of a run: files, sections of summary.json, lines of the log."""
+"""Files, sections of summary.json and lines of the log that the stages of a run write."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ __all__ = ["ProductInput", "made_files", "product_input", "product_of", "solutio
 
 @dataclass(frozen=True, eq=False)
 class ProductInput:
-    """What the files of a run are made from.
+    """Ingredients of the files of a run.
 
     Parameters
     ----------

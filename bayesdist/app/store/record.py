@@ -74,7 +74,7 @@ class FileMark:
 
 @dataclass(frozen=True)
 class Artefact:
-    """What a stage was made from, and what it wrote.
+    """Ingredients of a stage, and the files that it wrote.
 
     Parameters
     ----------

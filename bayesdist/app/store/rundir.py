@@ -214,7 +214,7 @@ class RunDirectory(RunStore):
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What the run is made from: configuration, inputs, seed, versions."""
+        """Facts that the run is made from: configuration, inputs, seed, versions."""
         return self.record.facts
 
     def note(self, **facts: Any) -> None:
@@ -270,7 +270,7 @@ class RunDirectory(RunStore):
     def _made_from(
         self, stage: str, requirements: Sequence[Requirement] | None = None
     ) -> tuple[object, ...] | None:
-        """What a stage is made from now; None where a stage is missing that it needs."""
+        """Ingredients of a stage now; None where a stage is missing that it needs."""
         facts = self.facts
         if requirements is not None:
             facts = facts | {"requirements": [as_json(vars(one)) for one in requirements]}

@@ -1,4 +1,4 @@
-"""What a run says of each star: a folder of Parquet files, one for each piece of the data."""
+"""Residuals and memberships of each star: a folder of Parquet files, one for each batch."""
 
 from __future__ import annotations
 

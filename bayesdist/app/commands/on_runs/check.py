@@ -46,7 +46,7 @@ def check(path: str | Path) -> str:
 
 
 def _lines(results: Results) -> Iterator[str]:
-    """What the fit of matched stars says."""
+    """Lines on the fit of matched stars."""
     data, config = results.data, results.config
     matches, model, fit, fitted = data.placed, data.model, data.fit, data.fitted
     sigma = data.shards.survey.reference_sigma
