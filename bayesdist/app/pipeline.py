@@ -32,12 +32,12 @@ from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.products.export import export_files
-from bayesdist.app.products.made_files import ProductInput, product_input
+from bayesdist.app.products.made_files import product_of
 from bayesdist.app.products.product_terms import file_errors
 from bayesdist.app.report import report
 from bayesdist.assess import evaluation as assessed
 from bayesdist.assess import star_sample
-from bayesdist.assess.error_model import ErrorModel, solution_with_errors
+from bayesdist.assess.error_model import ErrorModel
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
 
@@ -146,7 +146,7 @@ def evaluate(
     series : mapping, optional
         How linear terms went with time, as summary.json has it.
     """
-    product = _product(posterior, found, data, config, source)
+    product = product_of(posterior, found, data, config, source)
     assert isinstance(product.solution, Posterior)
     return assessed.evaluate(
         errors,
@@ -190,7 +190,7 @@ def export(
     source : str
         As of `evaluate`.
     """
-    product = _product(posterior, found, data, config, source)
+    product = product_of(posterior, found, data, config, source)
     stars = None
     if product.tangent_point is not None and config.products.asked():
         if found is not None:
@@ -206,12 +206,3 @@ def export(
         stars=stars,
         budget=() if evaluation is None else evaluation.budget.rows(),
     )
-
-
-def _product(
-    posterior: Posterior, found: Diagnostics | None, data: FitData, config: Config, source: str
-) -> ProductInput:
-    """What files are made from: the solution with all errors of the parameters."""
-    hierarchy = None if data.fitted.scatter is None else data.fit
-    solution = solution_with_errors(posterior, found, hierarchy)
-    return product_input(solution, data, config, source or config.detector.name or "solution")

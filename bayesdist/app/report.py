@@ -50,7 +50,7 @@ def report(results: Results) -> list[str]:
 
 
 def _is_command_line() -> bool:
-    """Whether other processes may import the main module: a user's own may not be guarded."""
+    """Boolean: other processes may import the main module; a user's own may not be guarded."""
     path = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
     name = path.parent.stem if path.name == "__main__.py" else path.stem
     return name == "bayesdist" and (os.cpu_count() or 1) > 1
@@ -100,7 +100,7 @@ def report_input(results: Results) -> ReportInput:
 
 
 def title_of(config: Config) -> str:
-    """What was calibrated: detector, or chips, and the filter of a campaign; may be empty."""
+    """Name of the detector, or of the chips, and the filter of a campaign; may be empty."""
     detector = config.detector.name or " and ".join(chip.name for chip in config.chip)
     band = None if config.campaign is None else config.campaign.filter
     return ", ".join(part for part in (detector, band) if part)
@@ -140,7 +140,7 @@ def _vectors(solution: Posterior, part: str, chip: Chip, epoch: float | None) ->
 
 
 def _product_checks(product: dict[str, Any]) -> tuple[Check, ...]:
-    """What was verified on a file as written."""
+    """Checks of a file as written."""
     out = []
     if product.get("closure_pix") is not None:
         out.append(Check("Products", "worst closure of the inverse (pix)", product["closure_pix"]))

@@ -20,11 +20,11 @@ from bayesdist.app.kinds.kind import Kind, kind_of
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.matches.sources import RunInput, input_of_run
-from bayesdist.app.products.made_files import ProductInput, product_input
+from bayesdist.app.products.made_files import ProductInput, product_of, solution_of
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.diagnostics_files import load_diagnostics
 from bayesdist.app.tables.evaluation_files import load_evaluation
-from bayesdist.assess.error_model import ErrorModel, solution_with_errors
+from bayesdist.assess.error_model import ErrorModel
 from bayesdist.assess.evaluation import Evaluation, EvaluationSettings
 from bayesdist.checks import Check, in_order
 from bayesdist.diagnose.diagnostics import Diagnostics
@@ -101,7 +101,7 @@ class Results:
 
     @cached_property
     def kind(self) -> Kind:
-        """What the run does in its own way."""
+        """Kind of the run, with all that it does in its own way."""
         return kind_of(self.config)
 
     @cached_property
@@ -148,12 +148,12 @@ class Results:
 
     @cached_property
     def stored(self) -> Diagnostics | None:
-        """What residuals say, as the assessment has found it; None before."""
+        """Diagnostics as the run has them; None before."""
         return self.made.get("stored") or load_diagnostics(self.run, self.fit, self.posterior)
 
     @cached_property
     def diagnostics(self) -> Diagnostics:
-        """What residuals say, as found before or found now; less of a fit alone."""
+        """Diagnostics as the run has them, or made now; fewer of a fit alone."""
         if not self.is_sampled:
             return diagnose_fit_of_run(self.data, self.config)
         return self.stored or diagnose_run(self.posterior, self.data, self.config, self.base)
@@ -178,12 +178,8 @@ class Results:
 
     @cached_property
     def solution(self) -> Posterior:
-        """What is exported and shown: with all errors of the parameters that were found.
-
-        Neither catalogue nor matches are needed for it.
-        """
-        hierarchy = None if self.fitted.scatter is None else self.fit
-        return solution_with_errors(self.posterior, self.stored, hierarchy)
+        """Posterior that is exported and shown: with all errors that were found."""
+        return solution_of(self.posterior, self.stored, self.fitted)
 
     @cached_property
     def errors(self) -> ErrorModel:
@@ -204,8 +200,9 @@ class Results:
 
     @property
     def product(self) -> ProductInput:
-        """What files of the solution are made from."""
-        return product_input(self.solution, self.data, self.config, str(self.run.path))
+        """Ingredients of the files of the solution."""
+        source = str(self.run.path)
+        return product_of(self.posterior, self.stored, self.data, self.config, source)
 
     @property
     def gauge_words(self) -> str:
@@ -214,7 +211,7 @@ class Results:
 
     @property
     def series(self) -> Mapping[str, Any]:
-        """How linear terms go with time: a section of summary.json, empty where it has none."""
+        """Linear terms against time: a section of summary.json, empty where it has none."""
         found: Mapping[str, Any] = self.run.summary.get("time_dependence", {})
         return found
 

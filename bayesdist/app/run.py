@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.assessment.rehearsal import rehearse
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.kind import kind_of
@@ -21,6 +20,7 @@ from bayesdist.app.pipeline import (
     report,
     sample,
 )
+from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results, open_results
 from bayesdist.app.saving import (
     save_diagnosed,

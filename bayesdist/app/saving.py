@@ -1,4 +1,4 @@
-"""What stages write into the folder of a run: files, sections of summary.json, lines of the log."""
+"""Files, sections of summary.json and lines of the log that the stages of a run write."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import logging
 from bayesdist.app.assessment.checks import frames_doubt, in_circle
 from bayesdist.app.assessment.holdout import holdout_summary, holdout_table
 from bayesdist.app.assessment.periods import periods_summary, periods_table
-from bayesdist.app.assessment.rehearsal import rehearse_solution
 from bayesdist.app.assessment.settings import idle_dates
 from bayesdist.app.config import Config
 from bayesdist.app.exposures.linear_terms import line_sections
@@ -15,6 +14,7 @@ from bayesdist.app.exposures.series import write_series_tables
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.summary import fit_sections, log_fit, sample_sections
 from bayesdist.app.matches.added_errors import grouping_sentence
+from bayesdist.app.rehearsal import rehearse_solution
 from bayesdist.app.results import Results
 from bayesdist.app.selfcal.stars import write_stars
 from bayesdist.app.tables.diagnostics_files import write_diagnostics

@@ -1,4 +1,4 @@
-"""What a person sees in the terminal: logs, progress, tables."""
+"""Logs, progress and tables in the terminal."""
 
 from __future__ import annotations
 

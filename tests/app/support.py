@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.assessment.rehearsal import rehearse
 from bayesdist.app.cli import main
+from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results, results_of
 from bayesdist.app.run import make_stages
 from bayesdist.app.store.rundir import RunDirectory

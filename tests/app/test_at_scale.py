@@ -113,7 +113,7 @@ def test_no_stage_takes_all_rows_into_memory(job, tmp_path, on_disk, monkeypatch
     monkeypatch.setattr(
         Matches, "_complete", lambda self: (sizes.append(np.size(self.x)), complete(self))[1]
     )
-    for name in ("kinds.fit_data", "kinds.reader", "kinds.stars", "stages.report"):
+    for name in ("kinds.fit_data", "kinds.reader", "kinds.stars", "report"):
         monkeypatch.setattr(f"bayesdist.app.{name}.SAMPLE", 900, raising=False)
     monkeypatch.setattr("bayesdist.infer.linear.MEDIAN_STARS", 900)
     good("init", tmp_path / "c.toml", "--matches", job.parent / "stars")

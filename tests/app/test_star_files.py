@@ -11,7 +11,7 @@ import xarray as xr
 from scipy.special import logsumexp
 from scipy.stats import norm
 
-from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.store.rundir import RunDirectory, part_files
 from bayesdist.app.tables import star_files
 from bayesdist.data import batches, read_matches
 from bayesdist.data.tables.files import parquet_units
@@ -86,7 +86,7 @@ def test_one_part_for_each_piece(finished, matches, part, tmp_path, monkeypatch)
     assert batches.BATCH > 400
     monkeypatch.setattr("bayesdist.data.batches.BATCH", 90)
     star_files.write_star_files(matches, fit, posterior, folder)
-    parts = star_files.part_files(folder)
+    parts = part_files(folder)
     assert [p.name for p in parts] == [f"part-{k:05d}.parquet" for k in range(5)]
     both = [pq.read_table(p).to_pydict() for p in parts]
     for name, values in part.to_pydict().items():

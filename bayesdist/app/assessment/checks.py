@@ -103,7 +103,7 @@ def frames_doubt(data: FitData, majority: str, config: Config) -> str:
 
 
 def provenance_notes(posterior: Posterior, gauge: str) -> dict[str, bool | str]:
-    """What must be said of the draws, and of the gauge, in the head of a file."""
+    """Notes on the draws and the gauge for the head of a file."""
     label = posterior.approximation
     return {
         "converged": posterior.convergence.converged,

@@ -1,4 +1,4 @@
-"""What residuals say of the solution of a run, whatever it was made from."""
+"""Diagnostics of the solution of a run, whatever it was made from."""
 
 from __future__ import annotations
 

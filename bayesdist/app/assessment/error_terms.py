@@ -62,7 +62,7 @@ def errors_of_run(
 
 
 def _variation(solution: Posterior, data: FitData) -> ExposureVariation:
-    """How a new exposure deviates: as those at hand scatter, velocity aberration among it."""
+    """Deviation of a new exposure: as those at hand scatter, velocity aberration among it."""
     scatter = required(data.fitted.scatter, "joint fit of exposures")
     return ExposureVariation(
         solution.model,
@@ -74,7 +74,7 @@ def _variation(solution: Posterior, data: FitData) -> ExposureVariation:
 
 
 def _table_terms(solution: Solution, data: FitData, config: Config) -> tuple[LocalErrors, ...]:
-    """What the errors of the tables leave of the position, and what lies between their nodes."""
+    """Terms of the errors of the tables, and of the distortion between their nodes."""
     stored, block = data.fitted.tables, config.tables
     epoch = assessment_epoch(data, config)
     between = interpolation_term(stored.between, solution, grid=config.assess.grid, epoch=epoch)

@@ -58,7 +58,7 @@ def predictive_of_run(
 
 
 def _known_stars(data: FitData) -> StarInfluence | None:
-    """What errors of the catalogue did in the fit, of stars of exposures that are held out whole.
+    """Influence of the catalogue's errors on the fit, of stars of exposures held out whole.
 
     These stars were in the fit, in other exposures: that is no part of their residuals.
     """

@@ -10,11 +10,10 @@ from typing import Any, ClassVar
 
 from bayesdist.app.campaign.catalogue import errors_by_star
 from bayesdist.app.campaign.inputs import Inputs
-from bayesdist.app.config import Config
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.split import set_aside
 from bayesdist.app.kinds.star_lists import known_calibration
-from bayesdist.app.tables.star_files import PAIRS, part_files
+from bayesdist.app.store.rundir import PAIRS, part_files
 from bayesdist.data import read_matches, write_partitioned
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.overlap import OverlapTest, overlap_test

@@ -1,4 +1,4 @@
-"""What commands have in common: quiet ones, lists with commas, files that may be replaced."""
+"""Options that commands have in common: quiet ones, lists, files that may be replaced."""
 
 from __future__ import annotations
 

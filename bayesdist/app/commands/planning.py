@@ -1,4 +1,4 @@
-"""What to observe, and which order to fit."""
+"""Exposures and dither patterns to observe, and the order to fit."""
 
 from __future__ import annotations
 

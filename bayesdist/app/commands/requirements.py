@@ -1,4 +1,4 @@
-"""What a run is worth: its margins against requirements, and the budget of a position."""
+"""Margins of a run against requirements, and the error budget of a position."""
 
 from __future__ import annotations
 

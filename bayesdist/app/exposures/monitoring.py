@@ -12,8 +12,7 @@ from bayesdist.app.config import Config
 from bayesdist.app.kinds.errors import read_magnitude_errors
 from bayesdist.app.kinds.fitted import required
 from bayesdist.app.results import Results
-from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.tables.star_files import PAIRS, part_files
+from bayesdist.app.store.rundir import PAIRS, RunDirectory, part_files
 from bayesdist.data import Matches, read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior

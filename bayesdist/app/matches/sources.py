@@ -40,7 +40,7 @@ class RunInput(Protocol):
 
 @dataclass(frozen=True)
 class MatchSource:
-    """How the matches of one format are read.
+    """Reader of the matches of one format.
 
     Parameters
     ----------

@@ -7,19 +7,23 @@ from dataclasses import dataclass, replace
 from bayesdist.app.assessment.settings import assessment_epoch
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.assess.error_model import solution_with_errors
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.plane import Plane
+from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.infer import Posterior
 from bayesdist.infer.solution import Solution
 from bayesdist.model import LookupTable
 from bayesdist.products.formats.common.document import BuildOptions, Built
 from bayesdist.products.registry import build
 
-__all__ = ["ProductInput", "made_files", "product_input"]
+__all__ = ["ProductInput", "made_files", "product_input", "product_of", "solution_of"]
 
 
 @dataclass(frozen=True, eq=False)
 class ProductInput:
-    """What the files of a run are made from.
+    """Ingredients of the files of a run.
 
     Parameters
     ----------
@@ -74,6 +78,22 @@ def product_input(solution: Solution, data: FitData, config: Config, source: str
         data.matched.filter,
         fitted.scatter is not None,
     )
+
+
+def solution_of(posterior: Posterior, found: Diagnostics | None, fitted: Fitted) -> Posterior:
+    """Posterior with all errors of the parameters that were found, as it is exported and shown.
+
+    Neither catalogue nor matches are needed for it.
+    """
+    return solution_with_errors(posterior, found, None if fitted.scatter is None else fitted.linear)
+
+
+def product_of(
+    posterior: Posterior, found: Diagnostics | None, data: FitData, config: Config, source: str
+) -> ProductInput:
+    """Ingredients of the files of a posterior with all errors of the parameters."""
+    source = source or config.detector.name or "solution"
+    return product_input(solution_of(posterior, found, data.fitted), data, config, source)
 
 
 def made_files(product: ProductInput, config: Config) -> dict[str, tuple[Built, ...]]:

@@ -1,4 +1,4 @@
-"""What the files of a run differ by from its solution, read back from the files as written.
+"""Differences of the files of a run from its solution, read back from the files as written.
 
 A SIP header holds one chip at one date: drift is left out at any other, look-up tables always.  An
 IDCTAB lies along axes of its own and counts in its own pixels: the best shift, rotation and, once

@@ -65,7 +65,7 @@ class SkyClosure:
 
     @property
     def sentence(self) -> str:
-        """What the log says."""
+        """Line for the log."""
         return (
             f"on the sky by astropy.wcs {self.rms:.4g} arcsec rms from RA, Dec of {self.n} stars, "
             f"on average {self.east:+.2g} east and {self.north:+.2g} north; "
@@ -74,7 +74,7 @@ class SkyClosure:
 
     @property
     def faithful(self) -> bool:
-        """Whether the header is where the solution is."""
+        """Boolean: the header is where the solution is."""
         return SKY_CLOSURE.met_by(self.solution / self.pixel)
 
     @property
@@ -84,7 +84,7 @@ class SkyClosure:
 
     @property
     def findings(self) -> list[str]:
-        """What is wrong, as the product's findings say it."""
+        """Faults, as the product's findings have them."""
         if self.faithful:
             return []
         return [

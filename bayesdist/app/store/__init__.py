@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bayesdist.app.store.keys import Adjustable, differences
-from bayesdist.app.store.record import Artefact, Record, as_json, write_json
+from bayesdist.app.store.record import Artefact, Record, as_json, versions, write_json
 from bayesdist.app.store.store import Made, RunStore, Stage
 
 __all__ = [
@@ -15,5 +15,6 @@ __all__ = [
     "Stage",
     "as_json",
     "differences",
+    "versions",
     "write_json",
 ]

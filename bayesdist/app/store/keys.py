@@ -17,7 +17,7 @@ __all__ = ["Adjustable", "canonical", "difference", "differences", "digest_of", 
 
 @dataclass(frozen=True)
 class Adjustable:
-    """What may change while a stage goes on from its checkpoints: in its key, not in theirs."""
+    """Settings that may change while a stage is resumed: in its key, not in its checkpoints."""
 
     value: Any
 

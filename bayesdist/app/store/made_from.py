@@ -1,4 +1,4 @@
-"""What the stages of a run are made from: settings, inputs, and the stages before them."""
+"""Ingredients of the stages of a run: settings, inputs, and the stages before them."""
 
 from __future__ import annotations
 

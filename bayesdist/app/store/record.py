@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import platform
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +17,12 @@ import numpy as np
 from bayesdist.app.store.keys import digest_of
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path, sha256_of
+from bayesdist.version import __version__
 
-__all__ = ["SCHEMA", "Artefact", "FileMark", "Record", "as_json", "write_json"]
+__all__ = ["SCHEMA", "Artefact", "FileMark", "Record", "as_json", "versions", "write_json"]
 
 SCHEMA = 2
+PACKAGES = ("arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
 
 
 def as_json(value: Any) -> Any:
@@ -46,6 +51,14 @@ def json_text(value: Any) -> str:
     return json.dumps(as_json(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
+def versions() -> dict[str, str]:
+    """Versions of Python, the platform, and the packages that matter."""
+    out = {"python": sys.version.split()[0], "platform": platform.platform()}
+    out["bayesdist"] = __version__  # also where it runs from a source tree
+    out |= {name: metadata.version(name) for name in PACKAGES}
+    return out
+
+
 @dataclass(frozen=True)
 class FileMark:
     """Size and SHA-256 of a file as it was written."""
@@ -61,7 +74,7 @@ class FileMark:
 
 @dataclass(frozen=True)
 class Artefact:
-    """What a stage was made from, and what it wrote.
+    """Ingredients of a stage, and the files that it wrote.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ from bayesdist.app.config import (
     config_of_record,
     load_config,
 )
-from bayesdist.app.store import Made, Record, RunStore, as_json
+from bayesdist.app.store import Made, Record, RunStore, as_json, versions
 from bayesdist.app.store.made_from import STAGES, changes, made_from_of, with_seed
 from bayesdist.app.store.named_files import files_of_products, named_files
 from bayesdist.app.store.refusals import (
@@ -24,16 +24,21 @@ from bayesdist.app.store.refusals import (
     refuse_other_inputs,
 )
 from bayesdist.app.summary import head_of
-from bayesdist.app.tables.output import versions
-from bayesdist.app.tables.star_files import PAIRS, part_files
 from bayesdist.assess import Requirement
 from bayesdist.data import input_files
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.files import atomic_path, made_folder, remove_leftovers, sha256_of
 
-__all__ = ["RunDirectory"]
+__all__ = ["PAIRS", "RunDirectory", "part_files"]
 
 T = TypeVar("T")
+
+PAIRS = "pairs"  # folder of matches, of a campaign and of formats that are selected from
+
+
+def part_files(folder: Path) -> list[Path]:
+    """Parts that are there, in order."""
+    return sorted(folder.glob("part-" + 5 * "[0-9]" + ".parquet"))
 
 
 class RunDirectory(RunStore):
@@ -209,7 +214,7 @@ class RunDirectory(RunStore):
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What the run is made from: configuration, inputs, seed, versions."""
+        """Facts that the run is made from: configuration, inputs, seed, versions."""
         return self.record.facts
 
     def note(self, **facts: Any) -> None:
@@ -265,7 +270,7 @@ class RunDirectory(RunStore):
     def _made_from(
         self, stage: str, requirements: Sequence[Requirement] | None = None
     ) -> tuple[object, ...] | None:
-        """What a stage is made from now; None where a stage is missing that it needs."""
+        """Ingredients of a stage now; None where a stage is missing that it needs."""
         facts = self.facts
         if requirements is not None:
             facts = facts | {"requirements": [as_json(vars(one)) for one in requirements]}

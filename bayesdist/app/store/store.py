@@ -42,7 +42,7 @@ log = logging.getLogger("bayesdist")
 
 @dataclass(frozen=True)
 class Stage:
-    """What a store has to know of a stage.
+    """Revision and checkpoints of a stage.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ class RunStore:
         return Made(name, artefact.digest)
 
     def _parts(self, name: str, made_from: tuple[object, ...]) -> dict[str, Any]:
-        """What an artefact is made from, as run.json has it."""
+        """Ingredients of an artefact, as run.json has them."""
         made = {one.name: one.digest for one in made_from if isinstance(one, Made)}
         parts: dict[str, Any] = {"revision": self.stages[name].revision, "from": made}
         for one in made_from:
@@ -290,7 +290,7 @@ class RunStore:
                 record.artefacts[later] = replace(known, sections=kept)
 
     def _in_order(self, found: dict[str, Any]) -> dict[str, Any]:
-        """What there is of stages, in the order of these."""
+        """Entries of stages that are there, in the order of these."""
         return {one: found[one] for one in self.stages if one in found}
 
     def _is_there(self, name: str) -> bool:

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import os
-import platform
 import shutil
-import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from astropy.table import Table
 
-from bayesdist.app.store import write_json
+from bayesdist.app.store import versions, write_json
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
-from bayesdist.version import __version__
 
-__all__ = ["atomic_directory", "record_folder", "refuse_existing", "versions", "write_table"]
+__all__ = ["atomic_directory", "record_folder", "refuse_existing", "write_table"]
 
 
 def refuse_existing(path: Path, force: bool) -> None:
@@ -41,16 +37,6 @@ def write_table(table: Table, path: Path) -> None:
 
 
 SCHEMA = 1  # of records of commands
-
-PACKAGES = ("arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python, the platform, and the packages that matter."""
-    out = {"python": sys.version.split()[0], "platform": platform.platform()}
-    out["bayesdist"] = __version__  # also where it runs from a source tree
-    out |= {name: metadata.version(name) for name in PACKAGES}
-    return out
 
 
 @contextmanager

@@ -1,9 +1,10 @@
-"""What a run says of each star: a folder of Parquet files, one for each piece of the data."""
+"""Residuals and memberships of each star: a folder of Parquet files, one for each batch."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from bayesdist.app.store.rundir import part_files
 from bayesdist.data import Matches
 from bayesdist.data.storage.write import write_columns
 from bayesdist.files import made_folder, remove_leftovers
@@ -11,15 +12,9 @@ from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.posterior.memberships import memberships_of
 from bayesdist.infer.stars.stars import in_table_order, prepare
 
-__all__ = ["FOLDER", "PAIRS", "part_files", "write_star_files"]
+__all__ = ["FOLDER", "write_star_files"]
 
 FOLDER = "stars"
-PAIRS = "pairs"  # of a campaign, as they were matched
-
-
-def part_files(folder: Path) -> list[Path]:
-    """Parts that are there, in order."""
-    return sorted(folder.glob("part-" + 5 * "[0-9]" + ".parquet"))
 
 
 def write_star_files(matches: Matches, fit: LinearFit, posterior: Posterior, folder: Path) -> None:

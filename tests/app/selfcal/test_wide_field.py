@@ -53,5 +53,5 @@ def test_tangent_planes_are_taken_to_one_by_the_size_of_a_pixel(tmp_path, scale_
         assert most / 4 < moved < most
         assert not test.significant
         # what the stages after the match read
-        raw, kept = results.inputs.inputs.detections, results.matched.detections
+        raw, kept = results.inputs.detections, results.matched.detections
         assert np.hypot(kept.x - raw.x, kept.y - raw.y).max() == pytest.approx(moved)

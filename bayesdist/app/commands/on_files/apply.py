@@ -174,7 +174,7 @@ def _frame_lines(a: Application, source: str) -> list[str]:
 
 
 def _losses(a: Application, at: Positions, x: Float, y: Float, inverse: bool) -> list[str]:
-    """What happened to positions without a pixel, or beyond the detector."""
+    """Lines on positions without a pixel, or beyond the detector."""
     out = []
     if inverse:
         none = int((~np.isfinite(at.x)).sum())

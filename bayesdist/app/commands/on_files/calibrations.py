@@ -102,7 +102,7 @@ def _scale_of_run(path: Path, solution: Solution) -> tuple[float, str] | None:
 
 
 def notes_of(found: Calibration, epoch: float | None) -> tuple[str, ...]:
-    """What a reader of results by a calibration has to know."""
+    """Notes for a reader of results by a calibration."""
     first = found.chip(epoch=epoch)
     errors = {
         "none": ("it holds no errors",),

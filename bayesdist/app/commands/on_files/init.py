@@ -143,7 +143,7 @@ def init(
 def _of_matches(
     matches: str | Path, columns: Mapping[str, str] | None, size: tuple[int, int] | None
 ) -> tuple[int, dict[str, object]]:
-    """How many there are, and what a table of matches puts into the template."""
+    """Number of matches of a table, and what it puts into the template."""
     table, unit_line, sigma, read_sigma = _read(matches, columns)
     layout = table_layout(matches, columns, read_sigma=read_sigma)
     chips = {n: _size(*reach, size) for n, reach in _reach(table).items()}
@@ -234,7 +234,7 @@ def _reach(matches: Matches) -> dict[int, tuple[float, float]]:
 
 
 def _size(x: float, y: float, given: tuple[int, int] | None) -> dict[str, Any]:
-    """What a chip's size is: as given, or as far as its stars say."""
+    """Size of a chip: as given, or as far as its stars say."""
     if given is not None:
         (nx, ny), how = given, "as given"
     else:

@@ -1,4 +1,4 @@
-"""What `bayesdist init` finds in a table: its columns, and the scatter of its matches."""
+"""Columns of a table, and the scatter of its matches, as `bayesdist init` finds them."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def column_lines(layout: TableLayout | None, columns: Mapping[str, str] | None) 
 
 
 def _remarks(layout: TableLayout) -> list[str]:
-    """What a user has to look at."""
+    """Remarks on columns that a user has to look at."""
     out = []
     ra = layout.taken.get("ra", "")
     if ra.lower() in _BY_THE_IMAGE:

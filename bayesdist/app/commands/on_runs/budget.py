@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.assessment.judging import errors_of
+from bayesdist.app.commands.on_runs.judging import errors_of
 from bayesdist.app.results import open_results
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory

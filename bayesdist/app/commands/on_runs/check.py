@@ -7,11 +7,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from bayesdist.app.assessment.checks import in_circle
-from bayesdist.app.assessment.rehearsal import rehearse
 from bayesdist.app.assessment.settings import idle_dates
 from bayesdist.app.config import Config, load_config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.matches.added_errors import grouping_sentence
+from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results, open_results
 from bayesdist.app.screen import number
 from bayesdist.app.store.rundir import RunDirectory
@@ -46,7 +46,7 @@ def check(path: str | Path) -> str:
 
 
 def _lines(results: Results) -> Iterator[str]:
-    """What the fit of matched stars says."""
+    """Lines on the fit of matched stars."""
     data, config = results.data, results.config
     matches, model, fit, fitted = data.placed, data.model, data.fit, data.fitted
     sigma = data.shards.survey.reference_sigma

@@ -93,7 +93,7 @@ def _scale_of(path: str | Path) -> float | None:
 
 
 def _common(both: tuple[Calibration, Calibration], chip: int | None) -> list[tuple[int, int]]:
-    """What is compared with what: chips by their numbers, or the single ones of both."""
+    """Pairs of chips that are compared: by their numbers, or the single ones of both."""
     a, b = both
     if chip is not None:
         return [(_number(a, chip), _number(b, chip))]
@@ -128,7 +128,7 @@ def _number(one: Calibration, number: int) -> int:
 def _gaps(
     both: tuple[Calibration, Calibration], epoch: float | None, numbers: list[int]
 ) -> list[GapDifference]:
-    """How every further chip lies against the reference chip of A."""
+    """Differences of every further chip's place against the reference chip of A."""
     if len(numbers) < 2:
         return []
     reference = next(n for n in both[0].numbers if n in numbers)

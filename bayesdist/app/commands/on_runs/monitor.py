@@ -48,7 +48,7 @@ def monitor(
     which stage 'match' is done, or pairs as a run keeps them.
     """
     directory = RunDirectory(run)
-    if not (directory / "run.json").exists():
+    if not directory.is_initialized:
         raise directory.not_a_run_error()
     config = directory.config
     posterior, matches, fitted, left_out = _fitted(directory, config, Path(new))
@@ -160,7 +160,7 @@ def _refuse_the_same(run: RunDirectory, path: Any) -> None:
 
 
 def _facts(new: NewFit, posterior: Posterior) -> dict[str, Any]:
-    """What is told of the new matches beside the change."""
+    """Facts on the new matches beside the change."""
     n = new.target.n_theta
     shards = new.target.shards
     flagged, _ = count_outliers(shards, new.target.hyper, new.theta[None], new.psi[None, n:])
@@ -179,7 +179,7 @@ def _facts(new: NewFit, posterior: Posterior) -> dict[str, Any]:
 
 
 def _lines(found: Monitored, facts: dict[str, Any], scores: Sequence[PeriodScore]) -> list[str]:
-    """What stands below the verdict."""
+    """Lines below the verdict."""
     frames = "nothing" if facts["frames"] == "none" else facts["frames"].replace("_", ", ")
     lines = [
         f"new matches: {facts['n_matches']}, of which {facts['n_flagged']} are more likely false "

@@ -123,7 +123,7 @@ def _require_alike(by_filter: Mapping[str, Results]) -> None:
 
 
 def _structure(results: Results) -> dict[str, Any]:
-    """What files of several filters must have in common, in words that take a plural."""
+    """Properties that files of several filters must have in common, in words that take a plural."""
     model, time = results.posterior.model, results.posterior.model.time
     return {
         "chips": model.chips,
@@ -137,7 +137,7 @@ def _structure(results: Results) -> dict[str, Any]:
 
 
 def _same_detector(a: Fitted, b: Fitted) -> bool:
-    """Whether two runs corrected the pixels alike, as far as a D2IMFILE holds it."""
+    """Boolean: two runs corrected the pixels alike, as far as a D2IMFILE holds it."""
     mine, theirs = (
         {
             t.chip: (t.first, t.step, t.values.astype(np.float32))
@@ -152,7 +152,7 @@ def _same_detector(a: Fitted, b: Fitted) -> bool:
 
 
 def _doubts(by_filter: Mapping[str, Results], *, allowed: bool) -> list[str]:
-    """What has not converged, as sentences."""
+    """Sentences on runs that have not converged."""
     out = []
     for name, results in by_filter.items():
         convergence = results.posterior.convergence

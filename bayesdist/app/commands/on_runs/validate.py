@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from bayesdist.app.assessment.judging import margins_of, validity_periods_of
 from bayesdist.app.assessment.settings import idle_dates
+from bayesdist.app.commands.on_runs.judging import margins_of, validity_periods_of
 from bayesdist.app.config import load_requirements
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory

@@ -13,8 +13,7 @@ from bayesdist.app.config import Data
 from bayesdist.app.matches.reading import is_large
 from bayesdist.app.matches.sources import MatchSource
 from bayesdist.app.store.named_files import named_files
-from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.tables.star_files import PAIRS, part_files
+from bayesdist.app.store.rundir import PAIRS, RunDirectory, part_files
 from bayesdist.data import Matches, open_matches, write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
