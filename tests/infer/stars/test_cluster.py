@@ -291,7 +291,8 @@ def test_worker_dies_of_a_task_that_then_succeeds(there, problem, tmp_path):
 
 def test_task_that_kills_every_worker_ends_with_an_error(there, cluster):
     before = cluster.scheduler.allowed_failures
-    cluster.scheduler.allowed_failures = 0
+    # with 0, a shard that is read again where such a task runs would be given up as well
+    cluster.scheduler.allowed_failures = 2
     try:
         with pytest.raises(errors.InputError, match="workers die again and again"):
             there.sum(die)
