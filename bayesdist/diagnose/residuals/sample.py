@@ -57,6 +57,12 @@ class StarSample:
         return len(self.table)
 
     @property
+    def probably_true(self) -> NDArray[np.bool_]:
+        """Boolean mask (N,) of the stars that are no likely false match, else that were used."""
+        p = self.outlier_probability
+        return self.used if p is None else p < CERTAIN
+
+    @property
     def partial(self) -> bool:
         """True where there are more stars than these."""
         return len(self.table) < self.n_total
@@ -111,9 +117,7 @@ def centroid_scatter(stars: StarSample, *, n_params: int = 0) -> MagnitudeErrors
     mag = stars.table.mag
     if mag is None:
         return None
-    good = np.isfinite(mag) & (
-        stars.used if stars.outlier_probability is None else stars.outlier_probability < CERTAIN
-    )
+    good = np.isfinite(mag) & stars.probably_true
     if good.sum() < MIN_STARS:
         return None
     share = round(n_params * len(stars) / max(stars.n_total, 1))
