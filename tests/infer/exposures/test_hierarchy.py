@@ -266,21 +266,34 @@ def test_jointly_is_alone_and_then_the_line():
     assert (small < 0.4 * found.select("WFC2.A_2.alpha", "WFC2.A_2.beta").sigma).all()
 
 
+def named_by_chance(n, campaigns=20_000):
+    """Sound exposures of n that chance makes more likely ten times as wide than not, at odds of 49.
+
+    Of three perfectly measured deviations each, against the scatter of the other exposures; what is
+    not known so well is named less often.
+    """
+    z = np.random.default_rng(1).normal(size=(campaigns, n, 3))
+    others = np.sqrt(((z**2).sum(axis=1, keepdims=True) - z**2) / (n - 1))
+    wide, narrow = (stats.norm.logpdf(z, scale=k * others).sum(axis=-1) for k in (10.0, 1.0))
+    return (wide - narrow > np.log(49)).sum() / campaigns
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("own", [None, OWN], ids=["together", "apart"])
 def test_scatter_and_lines_over_many_truths(full, own):
     """Pulls of alpha and beta, and where the true tau lies in its posterior."""
     n = 100 if full else 6
     truth = TAU if own is None else np.concatenate([TAU, own])
-    pulls, ranks = [], []
+    pulls, ranks, outlying = [], [], 0
     for seed in range(n):
         model, matches, theta = campaign(1000 + seed, 40, 150, own=own)
         found = fit_hierarchical(matches, model, n_tau=128)
-        assert not found.outlying
+        outlying += len(found.outlying)
         a = lines(reference_gauge(found)).select(*FREE)
         d = a.values - true_lines(model, theta).select(*FREE).values
         pulls.append(d @ np.linalg.solve(a.cov, d))
         ranks.append((found.tau_draws < truth).mean(axis=0))
+    assert outlying <= stats.poisson(n * named_by_chance(40)).isf(1e-3)
     # the covariance of the lines describes their errors
     assert stats.kstest(pulls, stats.chi2(len(FREE)).cdf).pvalue > 1e-3
     rms = np.sqrt(np.mean(pulls) / len(FREE))
