@@ -29,7 +29,6 @@ from bayesdist.names import require_known
 __all__ = [
     "CATALOGUE",
     "EXPOSURE_SCATTER",
-    "LINEAR_KINDS",
     "MOTIONS",
     "CatalogueErrors",
     "ExposureVariation",
@@ -44,8 +43,6 @@ Float = NDArray[np.float64]
 CATALOGUE = "reference catalogue (shared stars)"
 MOTIONS = "proper motions (shared stars)"
 EXPOSURE_SCATTER = "exposure scatter"
-
-LINEAR_KINDS = ("scale", "rotation")
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +121,7 @@ class ScaleError:
 
     def __post_init__(self) -> None:
         where = f"budget term {self.name!r}"
-        require_known(self.kind, LINEAR_KINDS, "kind", where=where)
+        require_known(self.kind, ("scale", "rotation"), "kind", where=where)
         if not (math.isfinite(self.sigma) and self.sigma >= 0):
             raise InputError(
                 f"sigma is {self.sigma}", where=where, do="give a number that is not negative"
@@ -155,17 +152,19 @@ class ScaleError:
         return Polynomials(self.rows[0], model, mean, mean + sizes * moved)
 
 
+# terms that a row of the configuration with one sigma makes, by its kind
+ONE_SIZE: dict[str, Callable[..., ErrorTerm]] = {"scale": ScaleError, "rotation": ScaleError}
+
+
 def one_size_kinds() -> tuple[str, ...]:
     """Kinds of error terms that have one size, those that missions add among them."""
-    return (*LINEAR_KINDS, *(kind for one in missions().values() for kind in one.error_terms))
+    return (*ONE_SIZE, *(kind for one in missions().values() for kind in one.error_terms))
 
 
 def one_size_term(name: str, kind: str, sigma: float, solution: Solution, source: str) -> ErrorTerm:
     """Error term of a kind; parameters as of `ScaleError`."""
-    make: Callable[..., ErrorTerm] = ScaleError
-    for mission in missions().values():
-        if kind in mission.error_terms:
-            make = load_object(mission.error_terms[kind])
+    added = {kind: path for one in missions().values() for kind, path in one.error_terms.items()}
+    make = ONE_SIZE[kind] if kind in ONE_SIZE else load_object(added[kind])
     return make(name, kind, sigma, solution, source)
 
 
