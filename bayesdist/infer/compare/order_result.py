@@ -63,11 +63,16 @@ class HeldOutOrders:
     def difference(self, low: int, high: int) -> tuple[float, float]:
         """Log predictive density of a higher order minus that of a lower one, with its error.
 
-        Both axes together; the standard error is from the scatter between the groups.
+        Both axes together; the standard error is from the scatter between the groups.  Where the
+        p further coefficients of both axes stand out by d of their errors, that scatter sums to a
+        variance of d^2 + p, since each group is held against an estimate that the groups share;
+        the sum itself, half a non-central chi-square, has d^2 + p/2.
         """
         a, b = self.orders.index(low), self.orders.index(high)
         each = (self.log_density[:, b] - self.log_density[:, a]).sum(axis=-1)
-        return float(each.sum()), float(np.sqrt(len(each)) * each.std(ddof=1))
+        shared = ((high + 1) * (high + 2) - (low + 1) * (low + 2)) / 2  # p/2
+        variance = max(len(each) * each.var(ddof=1) - shared, shared)
+        return float(each.sum()), float(np.sqrt(variance))
 
 
 @dataclass(frozen=True, eq=False)
