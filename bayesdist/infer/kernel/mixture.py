@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 from bayesdist.infer.kernel.blocks import BLOCK
 from bayesdist.infer.kernel.numeric import bits_of, from_bits
 
-__all__ = ["GAUSSIAN", "NO_OUTLIERS", "UNIFORM", "Constants", "log_of_product", "packed"]
+__all__ = [
+    "GAUSSIAN",
+    "NO_OUTLIERS",
+    "UNIFORM",
+    "Constants",
+    "log_of_product",
+    "packed",
+    "total_of",
+]
 
 Float = NDArray[np.float64]
 
@@ -91,4 +99,18 @@ def log_of_product(density, n, work):
     else:  # extreme errors or fractions: each star alone
         for s in range(n):
             total += math.log(density[s])
+    return total
+
+
+@nb.njit(cache=True, forceinline=True)
+def total_of(values, work):
+    """Sum of the values of a whole block, those of one lane first."""
+    for s in range(LANES):
+        work[s] = values[s]
+    for m in range(1, 8):
+        for s in range(LANES):
+            work[s] += values[s + LANES * m]
+    total = 0.0
+    for s in range(LANES):
+        total += work[s]
     return total

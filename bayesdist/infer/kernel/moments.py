@@ -30,6 +30,7 @@ PIECE = 4096  # stars whose sums are separate, to be shared among threads
 EVALUATIONS = 10  # cost of the sums of one star, in likelihood evaluations
 
 N_LEAST, N_MIXTURE = 9, 10  # scalar sums of the two passes
+COLUMNS = 12  # of the mixture: 11, and one of zeros, since they are taken by three
 N_HYPER = 3  # log j, logit f, log s_out
 
 
@@ -79,40 +80,72 @@ def _dot(a, b):
     return total
 
 
+@nb.njit(cache=True, forceinline=True, fastmath=FAST | {"reassoc"})
+def _nine_dots(a, b, c, p, q, r):
+    """Sums of the products of three blocks with three others, each loaded once for three sums."""
+    ap = aq = ar = bp = bq = br = cp = cq = cr = 0.0
+    for s in range(BLOCK):
+        ap += a[s] * p[s]
+        aq += a[s] * q[s]
+        ar += a[s] * r[s]
+        bp += b[s] * p[s]
+        bq += b[s] * q[s]
+        br += b[s] * r[s]
+        cp += c[s] * p[s]
+        cq += c[s] * q[s]
+        cr += c[s] * r[s]
+    return (ap, bp, cp), (aq, bq, cq), (ar, br, cr)
+
+
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _add(columns, first, last, P, Q, top, work, out):
-    """Add the moments of some columns (n, BLOCK) with P_i Q_j, i + j <= top, to out (n, M)."""
-    for c in range(first, last):
+    """Add the moments of columns (n, BLOCK) with P_i Q_j, i + j <= top, to out (n, M).
+
+    Columns are taken by three, and so are the j.
+    """
+    a, b, c = work[0], work[1], work[2]
+    for k in range(first, last, 3):
         for i in range(top + 1):
             for s in range(BLOCK):
-                work[s] = columns[c, s] * P[i, s]
-            for j in range(top + 1 - i):
+                a[s] = columns[k, s] * P[i, s]
+                b[s] = columns[k + 1, s] * P[i, s]
+                c[s] = columns[k + 2, s] * P[i, s]
+            n = top + 1 - i
+            for j in range(0, n - 2, 3):
+                three = _nine_dots(a, b, c, Q[j], Q[j + 1], Q[j + 2])
+                for m in range(3):
+                    t = i + j + m
+                    for column in range(3):
+                        out[k + column, t * (t + 1) // 2 + j + m] += three[m][column]
+            for j in range(n // 3 * 3, n):
                 t = i + j
-                out[c, t * (t + 1) // 2 + j] += _dot(work, Q[j])
+                for column in range(3):
+                    out[k + column, t * (t + 1) // 2 + j] += _dot(work[column], Q[j])
 
 
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
 def _least_squares(pieces, X, Y, u, v, var_u, var_v, about, test, order, rules):
     n_pieces, top = len(pieces), 2 * order
-    sums = np.zeros((n_pieces, 4, (top + 1) * (top + 2) // 2))
+    sums = np.zeros((n_pieces, 6, (top + 1) * (top + 2) // 2))
     scalars = np.zeros((n_pieces, N_LEAST))
     chi2_limit, r2_limit, corner, power = rules[0], rules[1], rules[2], int(rules[3])
     for b in nb.prange(n_pieces):
         g, first, end = pieces[b]
         P, Q = np.empty((top + 1, BLOCK)), np.empty((top + 1, BLOCK))
         pu, pv, tu, tv = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
-        work = np.empty(BLOCK)
-        columns, parts = np.empty((4, BLOCK)), np.empty((N_LEAST, BLOCK))
+        work = np.empty((3, BLOCK))
+        # the third and sixth are zeros, since they are taken by three
+        columns, parts = np.zeros((6, BLOCK)), np.empty((N_LEAST, BLOCK))
         for a in range(first, end, BLOCK):
             e = min(a + BLOCK, end)
             n = e - a
             Xb, Yb, ub, vb, su, sv = X[a:e], Y[a:e], u[a:e], v[a:e], var_u[a:e], var_v[a:e]
             legendre(Xb, n, top, P)
             legendre(Yb, n, top, Q)
-            horner(about[g, 0], order, Xb, Yb, n, pu, work)
-            horner(about[g, 1], order, Xb, Yb, n, pv, work)
-            horner(test[g, 0], order, Xb, Yb, n, tu, work)
-            horner(test[g, 1], order, Xb, Yb, n, tv, work)
+            horner(about[g, 0], order, Xb, Yb, n, pu, work[0])
+            horner(about[g, 1], order, Xb, Yb, n, pv, work[0])
+            horner(test[g, 0], order, Xb, Yb, n, tu, work[0])
+            horner(test[g, 1], order, Xb, Yb, n, tv, work[0])
             columns[:] = 0.0
             parts[:] = 0.0
             for s in range(n):
@@ -126,7 +159,7 @@ def _least_squares(pieces, X, Y, u, v, var_u, var_v, about, test, order, rules):
                 ru, rv = ub[s] - pu[s], vb[s] - pv[s]
                 wu, wv = factor * iu, factor * iv
                 columns[0, s], columns[1, s] = wu, wv
-                columns[2, s], columns[3, s] = wu * ru, wv * rv
+                columns[3, s], columns[4, s] = wu * ru, wv * rv
                 parts[0, s], parts[1, s] = used, 1.0 if far else 0.0
                 parts[2, s] = used * (ru * ru * iu + rv * rv * iv)
                 parts[3, s], parts[4, s] = used * ru * ru, used * rv * rv
@@ -135,15 +168,15 @@ def _least_squares(pieces, X, Y, u, v, var_u, var_v, about, test, order, rules):
                 parts[7, s], parts[8, s] = used * ru, used * rv
             for k in range(N_LEAST):
                 scalars[b, k] += _dot(parts[k], P[0])
-            _add(columns, 0, 2, P, Q, top, work, sums[b])
-            _add(columns, 2, 4, P, Q, order, work, sums[b])
+            _add(columns, 0, 3, P, Q, top, work, sums[b])
+            _add(columns, 3, 6, P, Q, order, work, sums[b])
     return sums, scalars
 
 
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
 def _mixture(pieces, X, Y, u, v, var_u, var_v, coef, order, row, unit2, em):
     n_pieces, top = len(pieces), 2 * order
-    sums = np.zeros((n_pieces, 11, (top + 1) * (top + 2) // 2))
+    sums = np.zeros((n_pieces, COLUMNS, (top + 1) * (top + 2) // 2))
     scalars = np.zeros((n_pieces, N_MIXTURE))
     wavering, log_unit = 0.0 if em else 1.0, math.log(2 * math.pi * unit2)
     j2, core, outlier, half, never, f, w = (
@@ -158,15 +191,15 @@ def _mixture(pieces, X, Y, u, v, var_u, var_v, coef, order, row, unit2, em):
     for b in nb.prange(n_pieces):
         g, first, end = pieces[b]
         P, Q = np.empty((top + 1, BLOCK)), np.empty((top + 1, BLOCK))
-        pu, pv, work = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+        pu, pv, work = np.empty(BLOCK), np.empty(BLOCK), np.empty((3, BLOCK))
         density = np.empty(BLOCK)
-        columns, parts = np.empty((11, BLOCK)), np.empty((N_MIXTURE, BLOCK))
+        columns, parts = np.empty((COLUMNS, BLOCK)), np.empty((N_MIXTURE, BLOCK))
         for a in range(first, end, BLOCK):
             e = min(a + BLOCK, end)
             n = e - a
             Xb, Yb, ub, vb, su, sv = X[a:e], Y[a:e], u[a:e], v[a:e], var_u[a:e], var_v[a:e]
-            horner(coef[g, 0], order, Xb, Yb, n, pu, work)
-            horner(coef[g, 1], order, Xb, Yb, n, pv, work)
+            horner(coef[g, 0], order, Xb, Yb, n, pu, work[0])
+            horner(coef[g, 1], order, Xb, Yb, n, pv, work[0])
             legendre(Xb, n, top, P)
             legendre(Yb, n, top, Q)
             columns[:] = 0.0
@@ -214,11 +247,9 @@ def _mixture(pieces, X, Y, u, v, var_u, var_v, coef, order, row, unit2, em):
                 parts[9, s] = 2.0 * p * r2 * w - pq * D_s * D_s
             for k in range(N_MIXTURE):
                 scalars[b, k] += _dot(parts[k], P[0])
-            scalars[b, 0] += log_of_product(density, n, work) - n * log_unit
+            scalars[b, 0] += log_of_product(density, n, work[0]) - n * log_unit
             _add(columns, 0, 3, P, Q, top, work, sums[b])
-            _add(columns, 3, 5, P, Q, order, work, sums[b])
-            if not em:
-                _add(columns, 5, 11, P, Q, order, work, sums[b])
+            _add(columns, 3, 6 if em else COLUMNS, P, Q, order, work, sums[b])
     return sums, scalars
 
 
@@ -261,7 +292,7 @@ def least_squares_moments(
     total = _by_group(sums, pieces)
     weight = np.zeros((len(about), 3, K, K))
     weight[:, 0::2] = np.einsum("gcm,klm->gckl", total[:, :2], product_table(order), optimize=True)
-    right = total[:, 2:, :K].copy()
+    right = total[:, 3:5, :K].copy()
     return Moments(weight, right, np.zeros((len(about), N_HYPER, 2, K)), scalars.sum(axis=0))
 
 
@@ -285,7 +316,6 @@ def mixture_moments(
     outliers, then by log s_out; minus the Hessian by log j, logit f, log s_out: jj, jf, js, ff, fs,
     ss.
     """
-    K = (order + 1) * (order + 2) // 2
     with threads_for(EVALUATIONS * len(columns[0])):
         sums, scalars = _mixture(
             pieces,
@@ -296,11 +326,14 @@ def mixture_moments(
             constants.unit2,
             em,
         )
-    total = _by_group(sums, pieces)
+    return mixture_sums(_by_group(sums, pieces), scalars.sum(axis=0), order, em)
+
+
+def mixture_sums(total: Float, scalars: Float, order: int, em: bool) -> Moments:
+    """Moments of a mixture from sums (G, COLUMNS, M) over the stars of each group."""
+    K = (order + 1) * (order + 2) // 2
     weight = np.einsum("gcm,klm->gckl", total[:, :3], product_table(order), optimize=True)
-    return Moments(
-        weight,
-        total[:, 3:5, :K].copy(),
-        total[:, 5:, :K].reshape(len(coef), N_HYPER, 2, K).copy(),
-        scalars.sum(axis=0),
-    )
+    cross = total[:, 5:11, :K].reshape(len(total), N_HYPER, 2, K).copy()
+    if em:
+        cross[:] = 0.0
+    return Moments(weight, total[:, 3:5, :K].copy(), cross, scalars)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numba as nb
 
-__all__ = ["horner", "legendre"]
+__all__ = ["horner", "legendre", "polynomial"]
 
 # sums of products may be fused; nothing that would change NaN or infinity
 FAST = {"contract", "nsz", "arcp"}
@@ -26,6 +26,24 @@ def horner(coef, order, X, Y, n, out, inner):
                 inner[s] = inner[s] * Y[s] + c
         for s in range(n):
             out[s] = out[s] * X[s] + inner[s]
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def polynomial(coef, order, x, y):
+    """Sum of c_ij x^i y^j of one star, as `horner`, for an order that the compiler knows.
+
+    Its loops are then unrolled and nothing is stored between terms: a loop over stars becomes
+    vector instructions at the rate of multiply-adds.  One such loop takes one polynomial: two of
+    high order exceed what the compiler unrolls.
+    """
+    value = 0.0
+    for i in range(order, -1, -1):
+        inner = 0.0
+        for j in range(order - i, -1, -1):
+            total = i + j
+            inner = inner * y + coef[total * (total + 1) // 2 + j]
+        value = value * x + inner
+    return value
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)

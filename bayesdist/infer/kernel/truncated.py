@@ -23,13 +23,13 @@ from bayesdist.infer.kernel.blocks import BLOCK, threads_for
 from bayesdist.infer.kernel.circle import MOST, NODES, log_circle, slopes
 from bayesdist.infer.kernel.mixture import GAUSSIAN, Constants, packed
 from bayesdist.infer.kernel.moments import (
-    N_HYPER,
+    COLUMNS,
     N_MIXTURE,
     Moments,
     _add,
     _by_group,
     _dot,
-    product_table,
+    mixture_sums,
 )
 from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.polynomial import FAST, horner, legendre
@@ -46,7 +46,7 @@ Int = NDArray[np.int64]
 
 SCRATCH = 16_000_000  # bytes of partial sums in memory at a time
 INTEGRAL = 30  # cost of a star, in likelihood evaluations without a circle
-N_TERMS = 21  # columns and scalars of one star
+N_TERMS = COLUMNS + N_MIXTURE  # columns and scalars of one star
 
 
 # In the loops `stars` are the columns X, Y, u, v, var_u, var_v, off_u, off_v; `circle` is True for
@@ -119,7 +119,7 @@ def _evaluated(blocks, stars, coef, order, rows, unit2, circle, out):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _terms(star, row, circle, wavering, q, work, zc, zo, out):
-    """Write the terms of one star to out (21,): 11 columns and 10 scalars of `mixture_moments`.
+    """Write the terms of one star to out (N_TERMS,): columns and scalars of `mixture_moments`.
 
     `wavering` is 1, or 0 at fixed memberships.
     """
@@ -171,30 +171,31 @@ def _terms(star, row, circle, wavering, q, work, zc, zo, out):
     out[9] = p * out_su - pq * out_s * D_u
     out[10] = p * out_sv - pq * out_s * D_v
     pq = p * m
-    out[11] = math.log(d_in + d_out) - (q_in if is_core else q_out)
-    out[12], out[13], out[14] = m * in_j, p, p * out_s
-    out[15] = -m * in_jj - pq * in_j * in_j
-    out[16], out[17] = pq * in_j, pq * in_j * out_s
-    out[18], out[19] = f * (1.0 - f) - pq, -pq * out_s
-    out[20] = -p * out_ss - pq * out_s * out_s
+    out[11] = 0.0
+    out[12] = math.log(d_in + d_out) - (q_in if is_core else q_out)
+    out[13], out[14], out[15] = m * in_j, p, p * out_s
+    out[16] = -m * in_jj - pq * in_j * in_j
+    out[17], out[18] = pq * in_j, pq * in_j * out_s
+    out[19], out[20] = f * (1.0 - f) - pq, -pq * out_s
+    out[21] = -p * out_ss - pq * out_s * out_s
 
 
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
 def _moments(pieces, stars, coef, order, row, unit2, circle, em):
     n_pieces, top = len(pieces), 2 * order
-    sums = np.zeros((n_pieces, 11, (top + 1) * (top + 2) // 2))
+    sums = np.zeros((n_pieces, COLUMNS, (top + 1) * (top + 2) // 2))
     scalars = np.zeros((n_pieces, N_MIXTURE))
     wavering, log_unit = 0.0 if em else 1.0, math.log(2 * math.pi * unit2)
     for b in nb.prange(n_pieces):
         g, first, end = pieces[b]
         P, Q = np.empty((top + 1, BLOCK)), np.empty((top + 1, BLOCK))
-        pu, pv, inner = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+        pu, pv, inner = np.empty(BLOCK), np.empty(BLOCK), np.empty((3, BLOCK))
         q, work, zc, zo = np.empty(MOST), np.empty(MOST), np.empty(10), np.empty(10)
         one, columns = np.empty(N_TERMS), np.empty((N_TERMS, BLOCK))
         for a in range(first, end, BLOCK):
             e = min(a + BLOCK, end)
             n = e - a
-            _placed(stars, coef[g], order, a, e, pu, pv, inner)
+            _placed(stars, coef[g], order, a, e, pu, pv, inner[0])
             legendre(stars[0][a:e], n, top, P)
             legendre(stars[1][a:e], n, top, Q)
             columns[:] = 0.0
@@ -203,12 +204,10 @@ def _moments(pieces, stars, coef, order, row, unit2, circle, em):
                 _terms(star, row, circle, wavering, q, work, zc, zo, one)
                 columns[:, s] = one
             for k in range(N_MIXTURE):
-                scalars[b, k] += _dot(columns[11 + k], P[0])
+                scalars[b, k] += _dot(columns[COLUMNS + k], P[0])
             scalars[b, 0] -= n * log_unit
             _add(columns, 0, 3, P, Q, top, inner, sums[b])
-            _add(columns, 3, 5, P, Q, order, inner, sums[b])
-            if not em:
-                _add(columns, 5, 11, P, Q, order, inner, sums[b])
+            _add(columns, 3, 6 if em else COLUMNS, P, Q, order, inner, sums[b])
     return sums, scalars
 
 
@@ -304,7 +303,6 @@ def truncated_moments(
     Hessian, and `cross` is zero.  It is the covariance of a truncated Gaussian times two inverse
     variances, and never negative.
     """
-    K = (order + 1) * (order + 2) // 2
     with threads_for(INTEGRAL * len(columns[0])):
         sums, scalars = _moments(
             pieces,
@@ -316,14 +314,7 @@ def truncated_moments(
             _circle(constants),
             em,
         )
-    total = _by_group(sums, pieces)
-    weight = np.einsum("gcm,klm->gckl", total[:, :3], product_table(order), optimize=True)
-    return Moments(
-        weight,
-        total[:, 3:5, :K].copy(),
-        total[:, 5:, :K].reshape(len(coef), N_HYPER, 2, K).copy(),
-        scalars.sum(axis=0),
-    )
+    return mixture_sums(_by_group(sums, pieces), scalars.sum(axis=0), order, em)
 
 
 def truncated_scores(
