@@ -134,7 +134,7 @@ class DistortionModel(EffectiveCoefficients):
     def _exposure_codes(self, exposure: NDArray[np.generic]) -> Int:
         if np.issubdtype(exposure.dtype, np.integer):
             codes = exposure.astype(np.int64)
-            if codes.size and not (0 <= codes.min() and codes.max() < len(self.exposures)):
+            if codes.size and not (codes.min() >= 0 and codes.max() < len(self.exposures)):
                 raise InputError(f"exposure codes must lie in 0..{len(self.exposures) - 1}")
             return codes
         known = {name: code for code, name in enumerate(self.exposures)}

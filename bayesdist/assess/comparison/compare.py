@@ -217,7 +217,8 @@ def compare(
 
 def term_sigmas(frame: CommonFrame) -> Float:
     """Standard deviations (2 K,) of the difference; 0 for terms that were taken out."""
-    assert frame.cov is not None and frame.raw_cov is not None
+    assert frame.cov is not None
+    assert frame.raw_cov is not None
     variance = np.diag(frame.cov)
     return np.sqrt(np.where(variance > 1e-16 * np.diag(frame.raw_cov), variance, 0.0))
 

@@ -138,7 +138,6 @@ def common_frame(a: ChipMap, b: ChipMap, *, keep: bool = False) -> CommonFrame:
     fields = similarity_fields(moved)
     estimate = least_squares(fields, basis)
     raw = as_real(za - moved)
-    found = estimate @ raw
     errors = None
     if cov is not None and a.correlated and b.correlated:
         errors = estimate @ cov @ estimate.T
@@ -152,9 +151,7 @@ def common_frame(a: ChipMap, b: ChipMap, *, keep: bool = False) -> CommonFrame:
         raw_cov=None if cov is None else _symmetric(to_pixels @ cov @ to_pixels.T),
         taken=to_pixels @ taken,
         shares=shares,
-        similarity=_similarity(
-            turn, mirrored, same_unit, lies_alike, linear, za, zb, found, errors
-        ),
+        similarity=_similarity(turn, mirrored, same_unit, lies_alike, linear, za, zb, errors),
         pixel_mas=_pixel_mas(a, b, linear, turn),
     )
 
@@ -207,7 +204,6 @@ def _similarity(
     linear: Float,
     za: Complex,
     zb: Complex,
-    found: Float,
     errors: Float | None,
 ) -> Similarity:
     inverse = np.linalg.inv(linear)

@@ -116,7 +116,8 @@ def gap_difference(a: ChipPair, b: ChipPair) -> GapDifference:
         for pair, by in ((a, estimate), (b, estimate @ change))
         if pair.cov is not None
     ]
-    assert a.other.chip is not None and a.reference.chip is not None
+    assert a.other.chip is not None
+    assert a.reference.chip is not None
     cov = sum(errors[1:], errors[0]) if errors else None
     return GapDifference(
         a.other.chip,

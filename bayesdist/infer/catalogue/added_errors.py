@@ -181,7 +181,8 @@ def grouped_errors(
 
 def _quoted(table: Matches) -> Float:
     """Quoted variances (2, N)."""
-    assert table.sigma_u is not None and table.sigma_v is not None
+    assert table.sigma_u is not None
+    assert table.sigma_v is not None
     return np.stack([table.sigma_u, table.sigma_v]) ** 2
 
 
