@@ -34,6 +34,12 @@ class BayesdistError(Exception):
     ----------
     exit_code : int
         Exit status of the command line for this kind of error.
+
+    Examples
+    --------
+    >>> error = bd.BayesdistError("is empty", where="stars.csv", do="give a table with stars")
+    >>> str(error)
+    'stars.csv: is empty; give a table with stars.'
     """
 
     exit_code = 1
@@ -52,7 +58,21 @@ class BayesdistError(Exception):
 
 
 class InputError(BayesdistError):
-    """Input data, files or arguments that cannot be used."""
+    """Input data, files or arguments that cannot be used.
+
+    Parameters
+    ----------
+    cause, where, do : str
+        As of `BayesdistError`.
+
+    Examples
+    --------
+    >>> try:
+    ...     bd.PolynomialBasis(0, (1016, 1016), (508.5, 508.5))
+    ... except bd.InputError as error:
+    ...     print(error.exit_code)
+    1
+    """
 
 
 class ConfigError(InputError):

@@ -100,6 +100,13 @@ class Matches(MatchColumns):
     InputError
         For no rows, unequal lengths, values that are not finite, errors that are not positive, an
         unknown unit, or the same star twice.
+
+    Examples
+    --------
+    >>> x, y = np.array([10.0, 200.0, 900.0]), np.array([20.0, 800.0, 500.0])
+    >>> matches = bd.Matches(x, y, x - 508.5, y - 508.5, unit="pix")
+    >>> len(matches.with_errors((0.05, 0.05)))
+    3
     """
 
     _readers: tuple[BatchReader, ...] | None = field(default=None, init=False)

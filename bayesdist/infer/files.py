@@ -60,6 +60,22 @@ def save_posterior(
         Replaced atomically.
     provenance : mapping, optional
         JSON-able facts about the run, stored as an attribute.
+
+    Raises
+    ------
+    InputError
+        When the system refuses to write.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)
+    >>> bd.save_posterior(posterior, matches, "posterior.nc")
+    >>> np.array_equal(bd.load_posterior("posterior.nc").theta, posterior.theta)
+    True
     """
     import xarray as xr
 
@@ -151,6 +167,17 @@ def load_posterior(path: str | Path) -> Posterior:
     ------
     FormatError
         When the file is missing or is not such a file.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)
+    >>> bd.save_posterior(posterior, None, "posterior.nc")
+    >>> bd.load_posterior("posterior.nc").model == posterior.model
+    True
     """
     import xarray as xr
 

@@ -83,6 +83,16 @@ class DistortionModel(EffectiveCoefficients):
     InputError
         For an unknown kind of frame, no chip, a time-dependent term above the order, or a gauge
         that does not go with the frames.
+
+    Examples
+    --------
+    >>> chip = bd.Chip(1, "W2", (1016, 1016), (508.5, 508.5))
+    >>> model = bd.DistortionModel(3, (chip,))
+    >>> model.n_params  # ten coefficients along each axis
+    20
+    >>> model.predict(np.zeros(20), [1.0, 508.5], [1.0, 508.5])
+    array([[0., 0.],
+           [0., 0.]])
     """
 
     def groups(

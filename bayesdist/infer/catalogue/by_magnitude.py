@@ -75,6 +75,15 @@ def fit_by_magnitude(
     ------
     InputError
         When the table has no magnitudes, too few stars, or stars without scatter.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=4, size=(1016, 1016))
+    >>> fit, matches, errors = bd.fit_by_magnitude(matches, model)
+    >>> bool((matches.sigma_u > 0).all())
+    True
     """
     if not matches.has_mag:
         raise InputError(

@@ -102,6 +102,16 @@ def sample(
         When no posterior mode is found.
     InputError
         For checkpoints of other data or settings, or a disk that is full.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)
+    >>> posterior.convergence.converged
+    True
     """
     seeds = ensemble_seeds(seed, ensembles)
     if method not in METHODS:

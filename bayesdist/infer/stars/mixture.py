@@ -76,6 +76,12 @@ class OutlierMixture:
     InputError
         For an unknown model, a missing radius, a negative jitter, an improper prior, or the prior
         of a parameter that is not sampled.
+
+    Examples
+    --------
+    >>> mixture = bd.OutlierMixture(jitter=0.0)  # quoted errors are right
+    >>> mixture.model
+    'gaussian'
     """
 
     model: str = "gaussian"

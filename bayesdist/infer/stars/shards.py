@@ -40,6 +40,12 @@ class Compute:
         Address of a Dask scheduler; without one a cluster of this machine's processes is started.
     workers : int, optional
         Processes of that cluster; as many as there are cores by default.
+
+    Examples
+    --------
+    >>> compute = bd.Compute(memory_mb=200)
+    >>> compute.engine
+    'threads'
     """
 
     engine: str = "threads"
