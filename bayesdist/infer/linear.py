@@ -26,7 +26,8 @@ from bayesdist.infer.equations.rank import check_coverage, require_full_rank
 from bayesdist.infer.equations.scaled import scaled_cholesky
 from bayesdist.infer.solution import Solution
 from bayesdist.infer.stars.likelihood import Clip, ClippedGaussian
-from bayesdist.infer.stars.shards import Compute, Shards, opened
+from bayesdist.infer.stars.loading import opened
+from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 

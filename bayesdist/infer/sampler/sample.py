@@ -24,8 +24,9 @@ from bayesdist.infer.posterior.memberships import count_outliers
 from bayesdist.infer.sampler.certified import run_certified
 from bayesdist.infer.sampler.chains import Settings, ensemble_seeds, run_chains
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
+from bayesdist.infer.stars.loading import opened
 from bayesdist.infer.stars.mixture import OutlierMixture
-from bayesdist.infer.stars.shards import Compute, Shards, opened
+from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars
 
 __all__ = ["sample"]
