@@ -6,6 +6,8 @@ one sentence and exits with its code.  Any other exception is a defect of the pr
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 __all__ = [
     "BayesdistError",
     "ConfigError",
@@ -15,7 +17,10 @@ __all__ = [
     "NotConvergedError",
     "NotSettledError",
     "RenamedError",
+    "required",
 ]
+
+T = TypeVar("T")
 
 
 class BayesdistError(Exception):
@@ -101,3 +106,10 @@ class RenamedError(BayesdistError):
     """A command under a name that it no longer has."""
 
     exit_code = 2
+
+
+def required(value: T | None, cause: str, *, do: str = "") -> T:
+    """The value, if there is one; InputError, with this cause, if there is none."""
+    if value is None:
+        raise InputError(cause, do=do)
+    return value

@@ -208,11 +208,11 @@ class ReferenceCatalog:
         # factors of the middle of the field serve all of it
         east, north = parallax_factors(epoch, *self.tangent_point)[0]
         sigmas = {}
-        if self.sigma_parallax is not None and then.sigma_u is not None:
-            assert then.sigma_v is not None
+        u, v = then.sigma_u, then.sigma_v
+        if self.sigma_parallax is not None and u is not None and v is not None:
             sigmas = {
-                "sigma_u": np.hypot(then.sigma_u, east * self.sigma_parallax),
-                "sigma_v": np.hypot(then.sigma_v, north * self.sigma_parallax),
+                "sigma_u": np.hypot(u, east * self.sigma_parallax),
+                "sigma_v": np.hypot(v, north * self.sigma_parallax),
             }
         return replace(
             then,

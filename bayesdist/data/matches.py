@@ -17,7 +17,7 @@ from bayesdist.data.columns.checked import SIGMAS, MatchColumns, refuse_repeated
 from bayesdist.data.columns.joining import joined_arguments, joined_columns
 from bayesdist.data.columns.labels import Labels, merged_counts
 from bayesdist.data.magnitude_errors import MagnitudeErrors, no_magnitudes
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 
 __all__ = ["BatchReader", "Matches"]
 
@@ -489,8 +489,7 @@ class Matches(MatchColumns):
     def _errors(self, errors: Errors) -> tuple[Float, Float]:
         """Errors (N,) of u and of v."""
         if isinstance(errors, MagnitudeErrors):
-            assert self.mag is not None
-            return errors.at(self.mag)
+            return errors.at(required(self.mag, "errors by magnitude need magnitudes"))
         if isinstance(errors, AddedErrors):
             return errors.at(*self.grouped(errors.by))
         pair = errors if isinstance(errors, tuple) else (errors, errors)
