@@ -565,6 +565,7 @@ def _by_bits(batch: Matches, bits: NDArray[np.uint8]) -> Matches:
 def _checked_numbers(errors: float | tuple[ArrayLike, ArrayLike]) -> tuple[float, float]:
     """Errors of u and v that are one number each, finite and positive."""
     pair = errors if isinstance(errors, tuple) else (errors, errors)
+    numbers = []
     for name, sigma in zip(SIGMAS, pair, strict=True):
         if not isinstance(sigma, float | int):
             raise InputError(
@@ -575,4 +576,5 @@ def _checked_numbers(errors: float | tuple[ArrayLike, ArrayLike]) -> tuple[float
             raise InputError(
                 f"{name} is {sigma:g}, and must be finite and positive", do="give another"
             )
-    return float(pair[0]), float(pair[1])  # type: ignore[arg-type]
+        numbers.append(float(sigma))
+    return numbers[0], numbers[1]

@@ -110,7 +110,7 @@ def save_posterior(
     }
     if matches is not None and len(matches) <= MOST_STARS:
         groups["observed_data"] = xr.Dataset({"u": ("star", matches.u), "v": ("star", matches.v)})
-        groups["constant_data"] = _constants(posterior, matches, xr)
+        groups["constant_data"] = _constants(posterior, matches)
         # of one draw only where the stars' positions are unknowns too
         few = posterior.log_prob.size * len(matches) * 8 <= LARGEST
         if few and not posterior.own_places:
@@ -131,7 +131,10 @@ def save_posterior(
     _write(tree, path)
 
 
-def _constants(posterior: Posterior, matches: Matches, xr):  # type: ignore[no-untyped-def]
+def _constants(posterior: Posterior, matches: Matches) -> xr.Dataset:
+    """Columns of the matches that the posterior was made from."""
+    import xarray as xr
+
     columns = {
         "x": matches.x,
         "y": matches.y,

@@ -24,6 +24,7 @@ from bayesdist.infer.compare.frame_fields import mean_squares, without
 from bayesdist.infer.compare.monitoring import Change, NewFit
 from bayesdist.infer.equations.normal import NormalEquations, mixture
 from bayesdist.infer.equations.scaled import FieldTest, determined
+from bayesdist.infer.kernel import Constants
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import nearest_frame
@@ -105,7 +106,9 @@ def _edges(matches: Matches, most: int) -> Float:
     return dates[np.flatnonzero(np.diff(period)) + 1]
 
 
-def _sums(new: NewFit, table: Matches, constants) -> tuple[NormalEquations, float, float, int]:  # type: ignore[no-untyped-def]
+def _sums(
+    new: NewFit, table: Matches, constants: Constants
+) -> tuple[NormalEquations, float, float, int]:
     stars, _ = prepare(new.model, table)
     epoch = required(table.epoch, "matches need epochs", do="map column 'epoch'")
     equations = mixture(stars, new.theta, constants, True)
