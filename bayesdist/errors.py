@@ -6,6 +6,8 @@ one sentence and exits with its code.  Any other exception is a defect of the pr
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 __all__ = [
     "BayesdistError",
     "ConfigError",
@@ -15,7 +17,10 @@ __all__ = [
     "NotConvergedError",
     "NotSettledError",
     "RenamedError",
+    "required",
 ]
+
+T = TypeVar("T")
 
 
 class BayesdistError(Exception):
@@ -34,6 +39,12 @@ class BayesdistError(Exception):
     ----------
     exit_code : int
         Exit status of the command line for this kind of error.
+
+    Examples
+    --------
+    >>> error = bd.BayesdistError("is empty", where="stars.csv", do="give a table with stars")
+    >>> str(error)
+    'stars.csv: is empty; give a table with stars.'
     """
 
     exit_code = 1
@@ -52,7 +63,21 @@ class BayesdistError(Exception):
 
 
 class InputError(BayesdistError):
-    """Input data, files or arguments that cannot be used."""
+    """Input data, files or arguments that cannot be used.
+
+    Parameters
+    ----------
+    cause, where, do : str
+        As of `BayesdistError`.
+
+    Examples
+    --------
+    >>> try:
+    ...     bd.PolynomialBasis(0, (1016, 1016), (508.5, 508.5))
+    ... except bd.InputError as error:
+    ...     print(error.exit_code)
+    1
+    """
 
 
 class ConfigError(InputError):
@@ -81,3 +106,10 @@ class RenamedError(BayesdistError):
     """A command under a name that it no longer has."""
 
     exit_code = 2
+
+
+def required(value: T | None, cause: str, *, do: str = "") -> T:
+    """The value, if there is one; InputError, with this cause, if there is none."""
+    if value is None:
+        raise InputError(cause, do=do)
+    return value

@@ -71,7 +71,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             os.fsync(written.fileno())  # a rename may reach the disk before the content does
         for note in _watchers:
             note(target)
-        os.replace(temporary, target)
+        temporary.replace(target)
     except OSError as error:
         if not _concerns(error, temporary, target):
             raise
@@ -155,7 +155,7 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
         When the file cannot be read.
     """
     try:
-        with open(path, "rb") as stream:
+        with Path(path).open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise InputError(

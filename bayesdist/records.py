@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,16 @@ def record_from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Any:
     return _Reader(arrays).of(tree)
 
 
+@runtime_checkable
+class _Described(Protocol):
+    """An object that describes itself in JSON."""
+
+    def to_dict(self) -> dict[str, Any]: ...
+
+    @classmethod
+    def from_dict(cls, state: dict[str, Any]) -> Self: ...
+
+
 class _Writer:
     """The tree of a record, and its arrays; what stands twice in it is written once."""
 
@@ -81,7 +91,7 @@ class _Writer:
             return {type(value).__name__: [self.of(one) for one in value]}
         if isinstance(value, Mapping):
             return {"mapping": [[self.of(k), self.of(v)] for k, v in value.items()]}
-        if hasattr(value, "to_dict") and hasattr(value, "from_dict"):
+        if isinstance(value, _Described):
             return self._once(value, self._plain)
         if is_dataclass(value) and not isinstance(value, type):
             return {"class": _name(value), "fields": self._fields(value)}

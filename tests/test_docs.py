@@ -130,7 +130,7 @@ def _configured(kind: type[BaseModel], section: str = "") -> set[tuple[str, str]
     """Section and key of all that a configuration may hold."""
     found = set()
     for key, field in kind.model_fields.items():
-        inner = [m for m in _models(field.annotation)]
+        inner = list(_models(field.annotation))
         path = f"{section}.{key}".strip(".")
         if inner:
             found |= {pair for m in inner for pair in _configured(m, path)}

@@ -81,6 +81,11 @@ def run(
     Raises
     ------
     BayesdistError
+
+    Examples
+    --------
+    >>> directory = bd.run("config.toml", "run")  # doctest: +SKIP
+    >>> posterior = bd.load_posterior(directory / "posterior.nc")  # doctest: +SKIP
     """
     settings, text = load_config(config)
     directory = RunDirectory.plan(

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.errors import required
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.catalogue.star_errors import StarCovariance
 from bayesdist.infer.equations.scaled import recolouring, scaled_cholesky
@@ -44,8 +45,8 @@ def with_diagnosed_errors(
     """
     solution, stars, found = posterior, diagnostics.catalogue, diagnostics.correlated
     if stars is not None:
-        assert hierarchy is not None
-        solution = with_shared_stars(posterior, hierarchy, stars)
+        needed = required(hierarchy, "errors of the catalogue need a joint fit")
+        solution = with_shared_stars(posterior, needed, stars)
     if found is None:
         return solution
     cov = found.noise if noise_alone else found.covariance

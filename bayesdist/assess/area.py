@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bayesdist.calibration.area import determinant
 from bayesdist.calibration.calibration import calibration_of
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 from bayesdist.infer.solution import Solution
 from bayesdist.model.basis import point_blocks
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
@@ -83,8 +83,7 @@ def area_map(
         or a bad grid.
     """
     one = calibration_of(solution).chip(chip, epoch, origin="stated")
-    basis, covariance = one.basis, one.cov
-    assert covariance is not None
+    basis, covariance = one.basis, required(one.cov, "the solution has no covariance")
     det_ref, d_ref = determinant(basis, one.coefficients, *np.array(basis.reference_pixel)[:, None])
     if det_ref[0] == 0.0:
         raise InputError(

@@ -251,6 +251,17 @@ def error_budget(
     InputError
         For an unknown chip, a missing epoch, a bad grid, fewer than two draws, or a term whose unit
         needs a pixel scale that is not known.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> catalogue = bd.UserTerm("catalogue", "systematic", 0.005, 0.005)
+    >>> budget = bd.error_budget(fit, terms=[catalogue], grid=(5, 3), n_draws=100, rng=rng)
+    >>> [row["name"] for row in budget.rows()]
+    ['coefficients', 'catalogue', 'total']
     """
     chip = place_of(solution.model, epoch=epoch, chip=chip).chip.number
     if pixel_scale is None:

@@ -26,7 +26,7 @@ from bayesdist.assess.terms.given import Centroids
 from bayesdist.assess.units import pixel_scale_of
 from bayesdist.checks import Check, in_order, worst
 from bayesdist.diagnose.diagnostics import Diagnostics
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.selfcal import gauge_free
 from bayesdist.infer.selfcal.relative import gauge_free_matrix
@@ -308,8 +308,7 @@ def validity_of(
     epoch = diagnostics.sample.table.epoch
     if errors.solution.solution.model.time is None or not requirements or not settings.years_ahead:
         return ()
-    assert epoch is not None  # the model depends on time
-    last = float(np.max(epoch))
+    last = float(np.max(required(epoch, "a model with drift needs the epochs of its matches")))
     n = min(VALIDITY_DRAWS, settings.draws)
     drawn = drawn_errors(errors, diagnostics, settings, rng, n=n)
     return tuple(

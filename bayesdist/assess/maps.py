@@ -38,6 +38,16 @@ class UncertaintyMap:
         Decimal years.
     kind : str
         'least squares', 'posterior', or `RELATIVE`: the posterior without what the gauge decides.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> found = bd.uncertainty_map(fit, grid=(5, 3))
+    >>> bool(found.radius_max >= found.sigma_u.max())
+    True
     """
 
     x: Float
@@ -131,6 +141,16 @@ def uncertainty_map(
     ------
     InputError
         For an unknown chip or exposure, a missing epoch, or a bad grid.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> found = bd.uncertainty_map(fit, grid=(5, 3))
+    >>> found.sigma_u.shape
+    (3, 5)
     """
     place = place_of(solution.model, epoch=epoch, exposure=exposure, chip=chip)
     x, y = grid_pixels(place.chip.size, grid)

@@ -85,17 +85,15 @@ def chip_places(solution: Solution, *, epoch: float | None = None) -> tuple[tupl
     chips have the same place: where they overlap, all stand in one column.
     """
     chips = solution.model.chips
-    centres, gradient = [], None
+    centres, gradients = [], []
     for chip in chips:
         place = place_of(solution.model, epoch=epoch, chip=chip.number)
         polynomial = place.polynomial(solution.mean)
         middle = (np.array(chip.size) + 1) / 2
         centres.append(polynomial @ place.basis.evaluate(*middle[:, None])[0])
-        if gradient is None:
-            px, py = place.gradient(*middle[:, None])
-            gradient = np.column_stack([polynomial @ px[0], polynomial @ py[0]])
-    assert gradient is not None
-    x, y = np.linalg.lstsq(gradient, np.transpose(centres), rcond=None)[0]
+        px, py = place.gradient(*middle[:, None])
+        gradients.append(np.column_stack([polynomial @ px[0], polynomial @ py[0]]))
+    x, y = np.linalg.lstsq(gradients[0], np.transpose(centres), rcond=None)[0]
     half = np.array([c.size for c in chips]).min(axis=0) / 2
     places = tuple(zip(_ranks(-y, half[1]), _ranks(x, half[0]), strict=True))
     if len(set(places)) < len(places):

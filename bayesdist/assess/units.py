@@ -50,10 +50,11 @@ def convert(
             where=where,
             do="give detector.scale_mas",
         )
+    mas = dict(_MAS)
     if pixel_scale is not None:
         require_scale(pixel_scale)
-    mas = {**_MAS, "pix": pixel_scale}
-    return value * (mas[from_unit] / mas[to_unit])  # type: ignore[operator]
+        mas["pix"] = pixel_scale
+    return value * (mas[from_unit] / mas[to_unit])
 
 
 def require_scale(scale_mas: float) -> None:

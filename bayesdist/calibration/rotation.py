@@ -83,7 +83,7 @@ def coefficient_map(terms: Sequence[tuple[int, int]], matrix: ArrayLike) -> Floa
 
 def is_exact(M: Float) -> bool:
     """True where the rotated axes lie along axes again."""
-    return bool(np.all(M == np.round(M)))
+    return bool(np.all(np.round(M) == M))
 
 
 def rotated(

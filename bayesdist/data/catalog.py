@@ -70,6 +70,12 @@ class ReferenceCatalog:
     InputError
         For no stars, unequal lengths, values that are not finite, negative errors or codes, or half
         a pair.
+
+    Examples
+    --------
+    >>> catalog = bd.ReferenceCatalog(u=[0.0, 30.0], v=[5.0, -10.0], unit="arcsec")
+    >>> len(catalog)
+    2
     """
 
     u: Float
@@ -202,11 +208,11 @@ class ReferenceCatalog:
         # factors of the middle of the field serve all of it
         east, north = parallax_factors(epoch, *self.tangent_point)[0]
         sigmas = {}
-        if self.sigma_parallax is not None and then.sigma_u is not None:
-            assert then.sigma_v is not None
+        u, v = then.sigma_u, then.sigma_v
+        if self.sigma_parallax is not None and u is not None and v is not None:
             sigmas = {
-                "sigma_u": np.hypot(then.sigma_u, east * self.sigma_parallax),
-                "sigma_v": np.hypot(then.sigma_v, north * self.sigma_parallax),
+                "sigma_u": np.hypot(u, east * self.sigma_parallax),
+                "sigma_v": np.hypot(v, north * self.sigma_parallax),
             }
         return replace(
             then,
@@ -262,7 +268,7 @@ def read_catalog(
     epoch: float | None = None,
     tangent_point: tuple[float, float] | None = None,
 ) -> ReferenceCatalog:
-    """Read a reference catalogue from a table file.
+    r"""Read a reference catalogue from a table file.
 
     Parameters
     ----------
@@ -279,6 +285,13 @@ def read_catalog(
     ------
     InputError
         As `catalog_from_table`, and for files that cannot be read.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> n = Path("catalog.csv").write_text("u,v,mag\n0,5,18.1\n30,-10,19.4\n")
+    >>> bd.read_catalog("catalog.csv", unit="arcsec").mag.tolist()
+    [18.1, 19.4]
     """
     path = Path(path)
     return catalog_from_table(

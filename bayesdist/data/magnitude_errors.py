@@ -64,10 +64,11 @@ class MagnitudeErrors:
         inside = np.clip(np.asarray(mag, float), self.mag[0], self.mag[-1])
         if len(self.mag) == 1:
             return np.full(inside.shape, self.sigma_u[0]), np.full(inside.shape, self.sigma_v[0])
-        return tuple(  # type: ignore[return-value]
+        u, v = (
             np.exp(PchipInterpolator(self.mag, np.log(sigma))(inside))
             for sigma in (self.sigma_u, self.sigma_v)
         )
+        return u, v
 
 
 def no_magnitudes(where: str) -> InputError:

@@ -17,7 +17,7 @@ from bayesdist.data.columns.checked import SIGMAS, MatchColumns, refuse_repeated
 from bayesdist.data.columns.joining import joined_arguments, joined_columns
 from bayesdist.data.columns.labels import Labels, merged_counts
 from bayesdist.data.magnitude_errors import MagnitudeErrors, no_magnitudes
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 
 __all__ = ["BatchReader", "Matches"]
 
@@ -100,6 +100,13 @@ class Matches(MatchColumns):
     InputError
         For no rows, unequal lengths, values that are not finite, errors that are not positive, an
         unknown unit, or the same star twice.
+
+    Examples
+    --------
+    >>> x, y = np.array([10.0, 200.0, 900.0]), np.array([20.0, 800.0, 500.0])
+    >>> matches = bd.Matches(x, y, x - 508.5, y - 508.5, unit="pix")
+    >>> len(matches.with_errors((0.05, 0.05)))
+    3
     """
 
     _readers: tuple[BatchReader, ...] | None = field(default=None, init=False)
@@ -482,8 +489,7 @@ class Matches(MatchColumns):
     def _errors(self, errors: Errors) -> tuple[Float, Float]:
         """Errors (N,) of u and of v."""
         if isinstance(errors, MagnitudeErrors):
-            assert self.mag is not None
-            return errors.at(self.mag)
+            return errors.at(required(self.mag, "errors by magnitude need magnitudes"))
         if isinstance(errors, AddedErrors):
             return errors.at(*self.grouped(errors.by))
         pair = errors if isinstance(errors, tuple) else (errors, errors)
@@ -559,6 +565,7 @@ def _by_bits(batch: Matches, bits: NDArray[np.uint8]) -> Matches:
 def _checked_numbers(errors: float | tuple[ArrayLike, ArrayLike]) -> tuple[float, float]:
     """Errors of u and v that are one number each, finite and positive."""
     pair = errors if isinstance(errors, tuple) else (errors, errors)
+    numbers = []
     for name, sigma in zip(SIGMAS, pair, strict=True):
         if not isinstance(sigma, float | int):
             raise InputError(
@@ -569,4 +576,5 @@ def _checked_numbers(errors: float | tuple[ArrayLike, ArrayLike]) -> tuple[float
             raise InputError(
                 f"{name} is {sigma:g}, and must be finite and positive", do="give another"
             )
-    return float(pair[0]), float(pair[1])  # type: ignore[arg-type]
+        numbers.append(float(sigma))
+    return numbers[0], numbers[1]

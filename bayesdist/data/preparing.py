@@ -12,7 +12,7 @@ from bayesdist.data.exposures import ExposureLog
 from bayesdist.data.magnitude_errors import MAD_TO_SIGMA, MagnitudeErrors
 from bayesdist.data.matches import Matches
 from bayesdist.data.tables.checks import columns_of
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 
 __all__ = [
     "MotionErrorLine",
@@ -112,8 +112,8 @@ def select_motions(catalog: ReferenceCatalog) -> ReferenceCatalog:
         As `motion_error_line`.
     """
     line = motion_error_line(catalog)
-    assert catalog.mag is not None
-    return catalog.select(_motion_errors(catalog) <= line(catalog.mag))
+    mag = required(catalog.mag, "proper motions are selected by magnitude")
+    return catalog.select(_motion_errors(catalog) <= line(mag))
 
 
 def _motion_errors(catalog: ReferenceCatalog) -> Float:

@@ -31,7 +31,8 @@ _HOMES = {
     "bayesdist.infer.sampler.sample": ("sample",),
     "bayesdist.infer.solution": ("ReferenceGauge", "Solution", "TransformedSolution"),
     "bayesdist.infer.stars.mixture": ("OutlierMixture",),
-    "bayesdist.infer.stars.shards": ("Compute", "Shards", "load"),
+    "bayesdist.infer.stars.loading": ("load",),
+    "bayesdist.infer.stars.shards": ("Compute", "Shards"),
     "bayesdist.infer.transforms": (
         "LinearTerms",
         "linear_terms",

@@ -60,6 +60,22 @@ def save_posterior(
         Replaced atomically.
     provenance : mapping, optional
         JSON-able facts about the run, stored as an attribute.
+
+    Raises
+    ------
+    InputError
+        When the system refuses to write.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)
+    >>> bd.save_posterior(posterior, matches, "posterior.nc")
+    >>> np.array_equal(bd.load_posterior("posterior.nc").theta, posterior.theta)
+    True
     """
     import xarray as xr
 
@@ -94,7 +110,7 @@ def save_posterior(
     }
     if matches is not None and len(matches) <= MOST_STARS:
         groups["observed_data"] = xr.Dataset({"u": ("star", matches.u), "v": ("star", matches.v)})
-        groups["constant_data"] = _constants(posterior, matches, xr)
+        groups["constant_data"] = _constants(posterior, matches)
         # of one draw only where the stars' positions are unknowns too
         few = posterior.log_prob.size * len(matches) * 8 <= LARGEST
         if few and not posterior.own_places:
@@ -115,7 +131,10 @@ def save_posterior(
     _write(tree, path)
 
 
-def _constants(posterior: Posterior, matches: Matches, xr):  # type: ignore[no-untyped-def]
+def _constants(posterior: Posterior, matches: Matches) -> xr.Dataset:
+    """Columns of the matches that the posterior was made from."""
+    import xarray as xr
+
     columns = {
         "x": matches.x,
         "y": matches.y,
@@ -151,6 +170,17 @@ def load_posterior(path: str | Path) -> Posterior:
     ------
     FormatError
         When the file is missing or is not such a file.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)
+    >>> bd.save_posterior(posterior, None, "posterior.nc")
+    >>> bd.load_posterior("posterior.nc").model == posterior.model
+    True
     """
     import xarray as xr
 

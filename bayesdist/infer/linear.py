@@ -26,7 +26,8 @@ from bayesdist.infer.equations.rank import check_coverage, require_full_rank
 from bayesdist.infer.equations.scaled import scaled_cholesky
 from bayesdist.infer.solution import Solution
 from bayesdist.infer.stars.likelihood import Clip, ClippedGaussian
-from bayesdist.infer.stars.shards import Compute, Shards, opened
+from bayesdist.infer.stars.loading import opened
+from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
@@ -51,6 +52,12 @@ class Rejection:
         Stars with a first-pass residual above this many pixels are left out too.
     radial_weight : float
         Factor on the inverse variance in the corners, rising as the square of the radius.
+
+    Examples
+    --------
+    >>> strict = bd.Rejection(clip_chi2=16.0, clip_abs=None)
+    >>> strict.radial_weight
+    1.0
     """
 
     clip_chi2: float = 25.0
@@ -88,6 +95,17 @@ class LinearFit(Solution):
     dof : int
     condition : float
         Condition number of the normal matrix scaled to unit diagonal.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> np.allclose(fit.sigma, np.sqrt(np.diag(fit.cov)))
+    True
+    >>> fit.draws(7, rng).shape
+    (7, 12)
     """
 
     model: DistortionModel
@@ -175,6 +193,13 @@ def build_model(
     ------
     InputError
         When neither a size nor chips are given, or an epoch is needed and missing.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> bd.build_model(matches, order=2, size=(1016, 1016)).n_params
+    12
     """
     if not chips:
         if size is None:
@@ -239,6 +264,15 @@ def fit_linear(
     ------
     DegenerateError
         When the data do not determine the model: see `check_coverage` and `require_full_rank`.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> fit.mean.shape, fit.cov.shape
+    ((12,), (12, 12))
     """
     with opened(model, matches, compute) as shards:
         return _fitted(shards, model, rejection, priors or GaussianPriors.none(model))
@@ -322,6 +356,20 @@ def residuals(solution: Solution, matches: Matches) -> Float:
     -------
     ndarray, shape (N, 2)
         In the unit of u and v.
+
+    Raises
+    ------
+    InputError
+        For matches without errors, in another unit than the model's, or on other chips.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> bd.residuals(fit, matches).shape
+    (500, 2)
     """
     stars, order = prepare(solution.model, matches)
     return in_table_order(stars.residuals(solution.mean), order)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 from bayesdist.infer.solution import ReferenceGauge, Solution, TransformedSolution, root_of_diagonal
 from bayesdist.model import DistortionModel, TimeDependence
 from bayesdist.model.similarity import turned, turned_model
@@ -273,8 +273,7 @@ def lines(solution: Solution, s: int = 0, *, chip: int | None = None) -> LinearT
         For an unknown chip or segment.
     """
     view = segment(solution, s)
-    assert view.model.time is not None
-    t0 = view.model.time.epoch0[0]
+    t0 = required(view.model.time, "the model has no drift").epoch0[0]
     labels, alpha = _linear_jacobian(view.model, chip, t0)
     _, later = _linear_jacobian(view.model, chip, t0 + 1.0)
     both = tuple(f"{label}.{part}" for part in ("alpha", "beta") for label in labels)

@@ -119,6 +119,15 @@ class PolynomialBasis:
     ------
     InputError
         For an order outside 1..9 or a size that is not positive.
+
+    Examples
+    --------
+    >>> basis = bd.PolynomialBasis(2, (1016, 1016), (508.5, 508.5))
+    >>> basis.n_terms
+    6
+    >>> X, Y = basis.scaled([0.5, 508.5], [508.5, 1016.5])  # from edge to edge
+    >>> X.tolist(), Y.tolist()
+    ([-1.0, 0.0], [0.0, 1.0])
     """
 
     order: int

@@ -83,6 +83,16 @@ class DistortionModel(EffectiveCoefficients):
     InputError
         For an unknown kind of frame, no chip, a time-dependent term above the order, or a gauge
         that does not go with the frames.
+
+    Examples
+    --------
+    >>> chip = bd.Chip(1, "W2", (1016, 1016), (508.5, 508.5))
+    >>> model = bd.DistortionModel(3, (chip,))
+    >>> model.n_params  # ten coefficients along each axis
+    20
+    >>> model.predict(np.zeros(20), [1.0, 508.5], [1.0, 508.5])
+    array([[0., 0.],
+           [0., 0.]])
     """
 
     def groups(
@@ -134,7 +144,7 @@ class DistortionModel(EffectiveCoefficients):
     def _exposure_codes(self, exposure: NDArray[np.generic]) -> Int:
         if np.issubdtype(exposure.dtype, np.integer):
             codes = exposure.astype(np.int64)
-            if codes.size and not (0 <= codes.min() and codes.max() < len(self.exposures)):
+            if codes.size and not (codes.min() >= 0 and codes.max() < len(self.exposures)):
                 raise InputError(f"exposure codes must lie in 0..{len(self.exposures) - 1}")
             return codes
         known = {name: code for code, name in enumerate(self.exposures)}

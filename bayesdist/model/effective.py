@@ -22,6 +22,7 @@ from bayesdist.model.frames import (
 )
 from bayesdist.model.grouping import Groups
 from bayesdist.model.layout import ParameterLayout
+from bayesdist.model.timedep import TimeDependence
 
 __all__ = ["EffectiveCoefficients"]
 
@@ -52,21 +53,20 @@ class EffectiveCoefficients(ParameterLayout):
         poly = theta[..., : self.n_polynomial].reshape(*theta.shape[:-1], len(self.chips), 2, K)
         out = poly[..., chip, :, :]
         if self.time is not None:
-            for g, d in enumerate(self._drift(chip, epoch)):
+            for g, d in enumerate(self._drift(self.time, chip, epoch)):
                 own = theta[..., self.drift_slice(int(chip[g]))]
                 out[..., g, :, :] += np.einsum("akm,...m->...ak", d, own)
         return out
 
-    def _drift(self, chip: Int, epoch: Float) -> list[Float]:
+    def _drift(self, time: TimeDependence, chip: Int, epoch: Float) -> list[Float]:
         """Derivative of a group's polynomial by the chip's tdd parameters, (2, K, n_tdd) each."""
-        assert self.time is not None
         columns, axes = self.drift_columns
-        weights = self.time.weights(epoch)
+        weights = time.weights(epoch)
         out = []
         for c, w in zip(chip, weights, strict=True):
             d = np.zeros((2, self.n_terms, self.n_tdd))
             for t, axis in enumerate(axes):
-                cols = slice(t * self.time.n_values, (t + 1) * self.time.n_values)
+                cols = slice(t * time.n_values, (t + 1) * time.n_values)
                 d[axis, :, cols] = np.outer(columns[c][t], w)
             out.append(d)
         return out
@@ -158,7 +158,8 @@ class EffectiveCoefficients(ParameterLayout):
         theta = np.asarray(theta, float)
         K, o = self.n_terms, np.asarray(self.origin)
         poly = self.polynomials(theta, groups.chip, groups.epoch)
-        drift = self._drift(groups.chip, groups.epoch) if self.time is not None else None
+        time = self.time
+        drift = None if time is None else self._drift(time, groups.chip, groups.epoch)
         out = []
         for g in range(len(groups)):
             chip, e = int(groups.chip[g]), int(groups.exposure[g])

@@ -36,6 +36,12 @@ class Chip:
         Columns, rows.
     reference_pixel : tuple of float
         Zero point of the polynomial, FITS 1-based pixels.
+
+    Examples
+    --------
+    >>> chip = bd.Chip(1, "W2", (1016, 1016), (508.5, 508.5))
+    >>> chip.size
+    (1016, 1016)
     """
 
     number: int

@@ -51,6 +51,14 @@ class LookupTable:
     InputError
         For arrays of another shape, values that are not finite, a sigma below zero, or a step that
         is not above zero.
+
+    Examples
+    --------
+    >>> table = bd.LookupTable(1, np.full((2, 32, 64), 0.1))
+    >>> table.shape
+    (32, 64)
+    >>> np.allclose(table.evaluate([1000.0], [500.0]), 0.1)
+    True
     """
 
     chip: int

@@ -38,6 +38,12 @@ class TimeDependence:
     InputError
         For an unknown axis, a repeated term, breaks that do not rise, or a number of reference
         dates that is neither one nor one for each segment.
+
+    Examples
+    --------
+    >>> drift = bd.TimeDependence((("u", 0, 1), ("v", 1, 0)), (2004.5, 2010.0), breaks=(2007.0,))
+    >>> drift.n_segments
+    2
     """
 
     terms: tuple[tuple[str, int, int], ...]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
@@ -58,7 +59,7 @@ def write_pam(
     primary.header["FILETYPE"] = "PIXEL AREA MAP"
     primary.header["CREATOR"] = "bayesdist"
     if source:
-        primary.header["BDSOURCE"] = (os.path.basename(source)[:60], "the calibration")
+        primary.header["BDSOURCE"] = (Path(source).name[:60], "the calibration")
     with atomic_path(path) as temporary:
         fits.HDUList(hdus).writeto(temporary, checksum=True)
 

@@ -245,5 +245,6 @@ class ReportInput:
 
 def needed(value: T | None) -> T:
     """Value that the registry has found to be there."""
-    assert value is not None
+    if value is None:
+        raise LookupError("a figure is drawn without what it needs")
     return value

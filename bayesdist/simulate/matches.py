@@ -92,6 +92,13 @@ def simulate_matches(
     ------
     InputError
         For an unknown kind of outliers.
+
+    Examples
+    --------
+    >>> model, theta = bd.wise_solution("W2")
+    >>> matches, truth = bd.simulate_matches(model, theta, 400, rng=np.random.default_rng(1))
+    >>> len(matches), truth.false.shape
+    (400, (400,))
     """
     if outliers not in ("gaussian", "uniform"):
         raise InputError(f"unknown kind of outliers {outliers!r}", do="choose gaussian or uniform")
@@ -159,6 +166,16 @@ def simulate_partitioned(
     ------
     InputError
         As `simulate` and `write_partitioned`.
+
+    Examples
+    --------
+    >>> model, theta = bd.wise_solution("W2")
+    >>> rng = np.random.default_rng(1)
+    >>> truth = bd.simulate_partitioned(
+    ...     "many", 400, lambda n: bd.simulate_matches(model, theta, n, rng=rng)
+    ... )
+    >>> bd.open_matches("many").n_rows
+    400
     """
     truths: list[Truth] = []
     edges = even_edges(n, CHUNK)

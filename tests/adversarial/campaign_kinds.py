@@ -118,7 +118,6 @@ def order_4(rng: np.random.Generator, n: int) -> CampaignTruth:
 def trails(rng: np.random.Generator, n: int) -> CampaignTruth:
     """Trails draw stars along y in the last years, 0.008 px per magnitude fainter than the
     brightest, at full distance from the amplifier and at the end; the true map is without them."""
-
     return usual(rng, stars=n, displaced=trailing)
 
 
@@ -194,7 +193,7 @@ def curved(rng: np.random.Generator, n: int) -> CampaignTruth:
 @kind("campaign_catalogue", *CATALOGUE_WORDS, *STRUCTURE, n=300)
 def catalogue(rng: np.random.Generator, n: int) -> CampaignTruth:
     """The catalogue has a distortion of its own, 0.01 px rms on each axis."""
-    low = fields.random_polynomial(rng, {k: 1.0 for k in range(1, 4)})
+    low = fields.random_polynomial(rng, dict.fromkeys(range(1, 4), 1.0))
     own = fields.of_rms(fields.total(low, fields.smooth(rng, 300, 0.3)), 0.01)
 
     def astray(sky: np.ndarray) -> np.ndarray:

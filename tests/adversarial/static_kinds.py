@@ -118,7 +118,7 @@ def catalogue(rng: np.random.Generator, n: int, listed: bool) -> Truth:
     """The catalogue has a distortion of its own, 0.02 px rms on each axis, nearly all of it of
     orders that the fit takes for the detector's."""
     true_map = mapped(fields.distortion(rng))
-    low = fields.random_polynomial(rng, {k: 1.0 for k in range(4)})
+    low = fields.random_polynomial(rng, dict.fromkeys(range(4), 1.0))
     own = fields.total(fields.of_rms(low, 0.02), fields.smooth(rng, 270, 0.002))
     x, y = pixels(rng, n)
     config = order_config(3)

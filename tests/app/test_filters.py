@@ -176,7 +176,7 @@ def test_a_filter_without_exposures_before_a_break(folder, runs, tmp_path):
     )
     fit = load_fit(calibrated(tmp_path / "late", text, "match", "fit") / "fit.nc")
     known = drift_priors(load_posterior(runs["F606W"]), fit.model)
-    names = [name for name in known if name.endswith("_1_0.rate") or name.endswith("_0_1.rate")]
+    names = [name for name in known if name.endswith(("_1_0.rate", "_0_1.rate"))]
     assert len(names) == 6
     for name in names:
         k = fit.model.names.index(name)

@@ -141,7 +141,7 @@ def test_whole_exposures_are_drawn_and_predicted(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "holdout, words",
+    ("holdout", "words"),
     [
         ({}, ("sets nothing aside",)),
         ({"fraction": 0.01}, ("say too little", "holdout.fraction")),

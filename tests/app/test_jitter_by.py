@@ -163,7 +163,7 @@ def test_errors_far_too_small_are_scaled_first(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "sections, words",
+    ("sections", "words"),
     [
         ({"outliers": {"jitter_by": "axes"}}, ("outliers.jitter_by", "'axes'", "'exposure'")),
         ({"outliers": {"jitter_by": True}}, ("outliers.jitter_by",)),

@@ -9,7 +9,7 @@ import numpy as np
 
 from tests.benchmarks import roofline
 from tests.benchmarks.plain import PlainDensity
-from tests.benchmarks.problem import kernel_call, simulated, threads
+from tests.benchmarks.problem import Threads, kernel_call, simulated
 from tests.benchmarks.timing import best, say
 
 __all__ = ["FULL", "QUICK", "Sizes", "run"]
@@ -62,7 +62,7 @@ def run(sizes: Sizes) -> dict[str, Any]:
             call = kernel_call(problem, psi)
             row: dict[str, Any] = {"order": order, "n_stars": n, "batch": sizes.batch}
             for wanted in sizes.threads:
-                with threads(wanted) as count:
+                with Threads(wanted) as count:
                     if count != wanted:
                         continue  # a machine with fewer cores
                     call()

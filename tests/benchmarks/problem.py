@@ -26,12 +26,12 @@ from bayesdist.infer.stars.stars import prepare
 __all__ = [
     "HYPER",
     "Problem",
+    "Threads",
     "draws_of",
     "kernel_call",
     "open_stored",
     "simulated",
     "store",
-    "threads",
 ]
 
 Float = NDArray[np.float64]
@@ -148,7 +148,7 @@ def kernel_call(problem: Problem, psi: Float) -> Callable[[], Float]:
     return lambda: kernel.log_likelihood(stars.blocks, stars.columns, coef, model.order, constants)
 
 
-class threads:
+class Threads:
     """Context in which the kernel has so many threads."""
 
     def __init__(self, n: int) -> None:

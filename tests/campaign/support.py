@@ -158,7 +158,7 @@ def _simulate(setting: Setting, seed: int, folder: Path) -> None:
         if setting.pattern == "matern":
             making = f"{simulate}.making."
             stack.enter_context(mock.patch(making + "detector_tables", _random_field))
-            stack.enter_context(mock.patch(making + "filter_tables", lambda *_: ()))
+            stack.enter_context(mock.patch(making + "filter_tables", return_value=()))
         stack.enter_context(mock.patch(f"{simulate}.pointings.OWN", setting.own))
         options = ["--exposures", setting.exposures, "--stars", setting.stars, "--seed", seed]
         options += ["--no-tables"] if setting.pattern == "none" else []

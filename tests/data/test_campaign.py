@@ -317,8 +317,8 @@ def test_without_aberration_a_detector_has_one_scale(rng):
     for part, factor in ((slice(100), factors["a"]), (slice(100, None), factors["b"])):
         np.testing.assert_allclose(t.u[part] - origin[0] / factor, t.x[part] - 2048.0, atol=1e-9)
     np.testing.assert_allclose(t.sigma_u[:100], 1 / 1.00009)
+    bare = ExposureLog((log["a"], Exposure("b", 2005.0)))
     with pytest.raises(InputError, match="exposure b has no vafactor"):
-        bare = ExposureLog((log["a"], Exposure("b", 2005.0)))
         neutralise_aberration(Matches.concatenate(tables), bare)
     with pytest.raises(InputError, match="has no exposure 'b'"):
         neutralise_aberration(tables[1], log.select(names=["a"]))

@@ -97,7 +97,7 @@ def test_exposures_are_drawn_whatever_their_order():
 
 
 @pytest.mark.parametrize(
-    "aside, words",
+    ("aside", "words"),
     [
         (HoldoutSpec(0.1, ("z",)), "no exposure 'z'"),
         (HoldoutSpec(0.0), "no star is set aside"),

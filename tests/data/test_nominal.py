@@ -80,8 +80,8 @@ def test_kept_by_all_that_makes_tables(stars):
     held = HoldoutSpec(0.3).which(table)
     assert np.array_equal(split.held.u_nominal, table.u_nominal[held])
     assert np.array_equal(split.kept.u_nominal, table.u_nominal[~held])
+    bare = Matches(*(np.asarray(stars[name]) + 1 for name in ("x", "y", "u", "v")))
     with pytest.raises(InputError, match="has no 'u_nominal'"):
-        bare = Matches(*(np.asarray(stars[name]) + 1 for name in ("x", "y", "u", "v")))
         Matches.concatenate([table, bare])
 
 

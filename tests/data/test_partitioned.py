@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import pickle
 import subprocess
 import sys
@@ -394,8 +393,7 @@ def test_a_file_that_turned_bad_is_named_when_it_is_read(good, tmp_path, name, v
     write(path, planted(good, name, value), group=GROUP)
     where = rf"a\.parquet, row group 8 of 10, row {BAD_ROW}, column '{name}': {message}"
     with pytest.raises(InputError, match=where) as raised:
-        for piece in opened.readers():
-            piece.load()
+        [piece.load() for piece in opened.readers()]
     assert_one_sentence(raised)
 
 
@@ -424,8 +422,7 @@ def test_a_damaged_row_group_is_named(good, tmp_path, column, use_dictionary):
         open_matches(path)
     assert_one_sentence(raised)
     with pytest.raises(FormatError, match=where):
-        for piece in opened.readers():
-            piece.load()
+        [piece.load() for piece in opened.readers()]
 
 
 def test_files_cut_short_gone_or_replaced(good, tmp_path):
@@ -579,7 +576,7 @@ def test_what_is_written_is_read_back_to_the_last_bit(rng, tmp_path, monkeypatch
     paths = write_partitioned(iter(tables), tmp_path / "a" / "b", rows_per_group=150)
     assert [p.name for p in paths] == [f"part-0000{k}.parquet" for k in range(3)]
     assert [pq.ParquetFile(p).num_row_groups for p in paths] == [5, 1, 2]
-    assert sorted(os.listdir(tmp_path / "a" / "b")) == [p.name for p in paths]
+    assert sorted(p.name for p in (tmp_path / "a" / "b").iterdir()) == [p.name for p in paths]
     assert_same(tmp_path / "a" / "b", monkeypatch=monkeypatch)
     back = read_matches(tmp_path / "a" / "b")
     whole = Matches.concatenate(tables)
@@ -613,7 +610,7 @@ def test_nothing_half_written_stays(rng, tmp_path):
         write_partitioned([first, bare], tmp_path / "a")
     with pytest.raises(InputError, match="no tables to write"):
         write_partitioned([], tmp_path / "a")
-    assert os.listdir(tmp_path / "a") == []
+    assert not list((tmp_path / "a").iterdir())
     write_partitioned([bare], tmp_path / "a")
     assert pq.ParquetFile(tmp_path / "a" / "part-00000.parquet").schema_arrow.names == list("xyuv")
     with pytest.raises(InputError, match="holds Parquet files already"):

@@ -59,7 +59,7 @@ def data():
     positions = as_gndstr(p, x, y).T
     K, design = model.n_terms, model.basis().evaluate(x, y)
     theta = np.linalg.lstsq(design, positions)[0].T.ravel()
-    assert K * 2 == len(theta)
+    assert len(theta) == K * 2
     sigma = (rng.uniform(0.05, 0.3, 500), rng.uniform(0.05, 0.3, 500))
     model, matches, _ = simulated(7, 500, order=ORDER, theta=theta, sigma=sigma)
     return theta, matches, fit_linear(matches, model, **UNCLIPPED)

@@ -327,9 +327,10 @@ def test_wrong_references_are_refused(truth) -> None:
     ):
         with pytest.raises(InputError, match=message):
             call()
+    o = laid_on(truth, reference, **names)
+    turned = turned_by(truth, o)
     with pytest.raises(InputError, match="orientation is for pix"):
-        o = laid_on(truth, reference, **names)
-        oriented(turned_by(truth, o), o)
+        oriented(turned, o)
 
 
 # -- what a file can hold -------------------------------------------------------------------------

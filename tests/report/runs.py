@@ -32,8 +32,8 @@ from bayesdist.infer.checks import fit_checks, sampling_checks
 from bayesdist.infer.convergence import Convergence, Limits
 from bayesdist.infer.linear import LinearFit, fit_linear, residuals
 from bayesdist.infer.posterior import Posterior, SamplerInfo
+from bayesdist.infer.stars.loading import load
 from bayesdist.infer.stars.mixture import OutlierMixture
-from bayesdist.infer.stars.shards import load
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.report.context import ChipResults, Product, ReportInput
 from tests.budgets import detector_budget

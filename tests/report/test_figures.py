@@ -119,7 +119,9 @@ def _drawn_lengths(quiver):
     return np.array(out)
 
 
-@pytest.mark.parametrize("unit, size", [("pix", (1016.0, 1016.0)), ("arcsec", (4096.0, 2048.0))])
+@pytest.mark.parametrize(
+    ("unit", "size"), [("pix", (1016.0, 1016.0)), ("arcsec", (4096.0, 2048.0))]
+)
 def test_key_has_the_length_that_arrows_of_that_value_are_drawn_with(unit, size):
     run = report_input(size=size, unit=unit, scale=1.0 if unit == "pix" else 0.05)
     mas = {"mas": 1e-3, "arcsec": 1.0, "pix": 1.0}
@@ -396,8 +398,9 @@ def test_formal_ellipse_holds_what_one_sigma_holds_in_two_dimensions(converged, 
     )
 
 
-@pytest.mark.parametrize("value, expected", [(1.0, 1.0), (0.0499, 0.02), (5.0, 5.0), (999.0, 500.0),
-                                             (2e-7, 2e-7), (0.0, 1.0), (np.inf, 1.0)])  # fmt: skip
+@pytest.mark.parametrize(("value", "expected"), [
+    (1.0, 1.0), (0.0499, 0.02), (5.0, 5.0), (999.0, 500.0), (2e-7, 2e-7), (0.0, 1.0), (np.inf, 1.0),
+])  # fmt: skip
 def test_round_numbers_below(value, expected):
     assert nice_below(value) == expected
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -29,7 +27,7 @@ def test_reading_back_gives_the_same_numbers(tmp_path):
 def test_chunks_follow_one_generator(tmp_path, monkeypatch):
     monkeypatch.setattr(simulated_matches, "CHUNK", 1000)
     truth = simulate_wise_partitioned(tmp_path, 2500, rng=np.random.default_rng(3))
-    assert len(os.listdir(tmp_path)) == 3
+    assert len(list(tmp_path.iterdir())) == 3
     rng = np.random.default_rng(3)
     chunks, truths = zip(*(simulate_wise(n, rng=rng) for n in (833, 833, 834)), strict=True)
     expected = Matches.concatenate(chunks)
@@ -69,7 +67,7 @@ def test_errors(tmp_path):
     rng = np.random.default_rng(1)
     with pytest.raises(InputError, match="no band 'W9'"):
         simulate_wise_partitioned(tmp_path, 100, band="W9", rng=rng)
-    assert os.listdir(tmp_path) == []
+    assert not list(tmp_path.iterdir())
     simulate_wise_partitioned(tmp_path, 100, rng=rng)
     with pytest.raises(InputError, match="holds Parquet files already"):
         simulate_wise_partitioned(tmp_path, 100, rng=rng)

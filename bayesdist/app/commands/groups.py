@@ -27,9 +27,11 @@ class LazyGroup(click.Group):
         self._lazy = lazy
 
     def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names of the commands."""
         return list(self._lazy)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Command of a name, loaded; None for an unknown one."""
         return self.load(self._lazy[cmd_name]) if cmd_name in self._lazy else None
 
     @staticmethod

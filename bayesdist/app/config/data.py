@@ -95,7 +95,7 @@ def _of_its_format(raw: Any, handler: Any, info: ValidationInfo) -> Data:
     if isinstance(raw, Data):
         return raw
     if not isinstance(raw, Mapping) or not isinstance(raw.get("format", ""), str):
-        return handler(raw)  # type: ignore[no-any-return]
+        return handler(raw)
     format = raw.get("format", "auto")
     kind = Data
     if format not in FORMATS or raw.keys() - Data.model_fields.keys():

@@ -92,7 +92,7 @@ def load_requirements(path: str | Path) -> tuple[Requirement, ...]:
 def load_text(path: str | Path) -> str:
     """Text of a file as it stands, with its line ends."""
     try:
-        with open(path, encoding="utf-8", newline="") as stream:
+        with Path(path).open(encoding="utf-8", newline="") as stream:
             return stream.read()
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"

@@ -213,7 +213,8 @@ def _pattern(block: PatternBlock, side: float, seed: int) -> DitherPattern:
         pair = step if isinstance(step, tuple) else (step, step)
         round_ = unit * grid_offsets(block.grid.n, pair)
     else:
-        assert block.scales is not None and block.exposures is not None
+        assert block.scales is not None
+        assert block.exposures is not None
         # the same offsets for patterns that differ in their rolls alone
         rng = np.random.default_rng([seed, 2])
         low, high = block.scales.least, block.scales.largest

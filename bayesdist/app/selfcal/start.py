@@ -84,7 +84,7 @@ def started(
         exposure, chip, rows = _lists(d, apart=False)
         names, mags = list(d.exposure_names), None if d.mag is None else [d.mag[r] for r in rows]
     on = planes(start)
-    onto = _onto_references(on[0], None if mags is None else mags[0], references, block.frames)
+    onto = _onto_references(on[0], None if mags is None else mags[0], references)
     if onto is not None:
         on = [onto(plane) for plane in on]
     frames = mutual_frames(on, mags, names, source="selfcal.lists")
@@ -156,7 +156,7 @@ def _first(
 
 
 def _onto_references(
-    plane: Float, mag: Float | None, references: ReferenceCatalog | None, frames: str
+    plane: Float, mag: Float | None, references: ReferenceCatalog | None
 ) -> LinearMap | None:
     """Similarity from the first exposure onto the reference stars; a mirrored one is allowed."""
     if references is None:

@@ -70,6 +70,16 @@ class ErrorBudget:
         Draws behind the model's parts: their relative error is about 1 / sqrt(2 n_draws).
     products : tuple of BudgetTerm
         What files differ by from the solution: in no total.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> budget = bd.error_budget(fit, grid=(5, 3), n_draws=100, rng=rng)
+    >>> budget.total.name, budget.unit
+    ('total', 'pix')
     """
 
     domain: EvaluationDomain

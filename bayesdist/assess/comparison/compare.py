@@ -21,6 +21,7 @@ from bayesdist.assess.comparison.frame import (
 )
 from bayesdist.assess.maps import sigmas_of
 from bayesdist.calibration.chip_map import ChipMap, position_moments
+from bayesdist.errors import required
 from bayesdist.infer.equations.scaled import FieldTest, chi_square, known_terms
 from bayesdist.limits import DIFFERENCE
 from bayesdist.model.basis import point_blocks
@@ -217,9 +218,11 @@ def compare(
 
 def term_sigmas(frame: CommonFrame) -> Float:
     """Standard deviations (2 K,) of the difference; 0 for terms that were taken out."""
-    assert frame.cov is not None and frame.raw_cov is not None
-    variance = np.diag(frame.cov)
-    return np.sqrt(np.where(variance > 1e-16 * np.diag(frame.raw_cov), variance, 0.0))
+    variance, raw = (
+        np.diag(required(cov, "neither calibration has errors"))
+        for cov in (frame.cov, frame.raw_cov)
+    )
+    return np.sqrt(np.where(variance > 1e-16 * raw, variance, 0.0))
 
 
 def _of_two(du: Float, dv: Float, uu: Float, vv: Float, uv: Float) -> Float:

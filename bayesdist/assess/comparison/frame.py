@@ -138,7 +138,6 @@ def common_frame(a: ChipMap, b: ChipMap, *, keep: bool = False) -> CommonFrame:
     fields = similarity_fields(moved)
     estimate = least_squares(fields, basis)
     raw = as_real(za - moved)
-    found = estimate @ raw
     errors = None
     if cov is not None and a.correlated and b.correlated:
         errors = estimate @ cov @ estimate.T
@@ -152,9 +151,7 @@ def common_frame(a: ChipMap, b: ChipMap, *, keep: bool = False) -> CommonFrame:
         raw_cov=None if cov is None else _symmetric(to_pixels @ cov @ to_pixels.T),
         taken=to_pixels @ taken,
         shares=shares,
-        similarity=_similarity(
-            turn, mirrored, same_unit, lies_alike, linear, za, zb, found, errors
-        ),
+        similarity=_similarity(turn, mirrored, same_unit, lies_alike, linear, za, zb, errors),
         pixel_mas=_pixel_mas(a, b, linear, turn),
     )
 
@@ -207,23 +204,24 @@ def _similarity(
     linear: Float,
     za: Complex,
     zb: Complex,
-    found: Float,
     errors: Float | None,
 ) -> Similarity:
     inverse = np.linalg.inv(linear)
     shift = inverse @ as_real((za - zb)[:1])
-    sigma = sigma_shift = None
+    sigma = None
+    sigma_shift: tuple[float, float] | None = None
     if errors is not None:
         sigma = np.sqrt(np.maximum(np.diag(errors), 0.0))
         own = inverse @ errors[:2, :2] @ inverse.T
-        sigma_shift = tuple(np.sqrt(np.maximum(np.diag(own), 0.0)).tolist())
+        along_u, along_v = np.sqrt(np.maximum(np.diag(own), 0.0)).tolist()
+        sigma_shift = along_u, along_v
     return Similarity(
         shift=(float(shift[0]), float(shift[1])) if lies_alike else None,
         rotation=float(np.angle(turn)),
         scale=abs(turn),
         mirrored=mirrored,
         same_unit=same_unit,
-        sigma_shift=sigma_shift if lies_alike else None,  # type: ignore[arg-type]
+        sigma_shift=sigma_shift if lies_alike else None,
         sigma_rotation=None if sigma is None else float(sigma[3]),
         sigma_scale=None if sigma is None else float(sigma[2] * abs(turn)),
     )

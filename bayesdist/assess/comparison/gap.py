@@ -112,11 +112,12 @@ def gap_difference(a: ChipPair, b: ChipPair) -> GapDifference:
     turned = np.kron(turn_matrix(turn, mirrored=mirrored), np.eye(K))
     change = np.kron(np.eye(2), turned)
     errors = [
-        by @ _padded_pair(pair, K) @ by.T
+        by @ _padded(pair.cov, pair.reference.basis.n_terms, K) @ by.T
         for pair, by in ((a, estimate), (b, estimate @ change))
         if pair.cov is not None
     ]
-    assert a.other.chip is not None and a.reference.chip is not None
+    assert a.other.chip is not None
+    assert a.reference.chip is not None
     cov = sum(errors[1:], errors[0]) if errors else None
     return GapDifference(
         a.other.chip,
@@ -144,10 +145,8 @@ def _test(
     return chi_square(values, cov, norm=norm, draws=draws)
 
 
-def _padded_pair(pair: ChipPair, n_terms: int) -> Float:
-    """Joint covariance with zeros for terms that are not there."""
-    assert pair.cov is not None
-    K = pair.reference.basis.n_terms
+def _padded(cov: Float, K: int, n_terms: int) -> Float:
+    """Joint covariance of K terms of two chips, with zeros for terms that are not there."""
     out = np.zeros((4, n_terms, 4, n_terms))
-    out[:, :K, :, :K] = pair.cov.reshape(4, K, 4, K)
+    out[:, :K, :, :K] = cov.reshape(4, K, 4, K)
     return out.reshape(4 * n_terms, -1)

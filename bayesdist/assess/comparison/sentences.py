@@ -64,12 +64,12 @@ def comparison_lines(found: Comparison) -> list[str]:
         lines.append(f"only {found.errors_of} has errors: the significance takes {other} for exact")
     if found.noise_rms is not None:
         lines.append(f"the errors alone would make {found.noise_rms:.2g} pix rms")
-    if found.chi2 is not None and found.p_largest_z is not None:
-        assert found.p_largest_chi2 is not None
+    p_z, p_chi2 = found.p_largest_z, found.p_largest_chi2
+    if found.chi2 is not None and p_z is not None and p_chi2 is not None:
         lines.append(
             f"largest |z| of the coefficients {found.largest_z:.3g}: as large somewhere by chance "
-            f"with {_share(found.p_largest_z)}; largest chi-square on the grid "
-            f"{np.nanmax(found.chi2, initial=0.0):.3g}: {_share(found.p_largest_chi2)}"
+            f"with {_share(p_z)}; largest chi-square on the grid "
+            f"{np.nanmax(found.chi2, initial=0.0):.3g}: {_share(p_chi2)}"
         )
     if found.field is None and found.errors_of != "none":
         lines.append(_singly(found))

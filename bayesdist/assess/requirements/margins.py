@@ -68,6 +68,17 @@ class Margin:
     remedy : RequiredReduction or None
         The term that would have to shrink, and how far, for the requirement to be met; None where
         it is met, and where there is doubt about all numbers.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> need = bd.Requirement("field-wide", "p95", 1.0)
+    >>> (margin,) = bd.check_requirements(fit, [need], grid=(5, 3), n_draws=400, rng=rng)
+    >>> margin.value < need.limit
+    True
     """
 
     requirement: Requirement
@@ -156,6 +167,17 @@ def check_requirements(
         For a requirement without an epoch where the model depends on time, units that need a pixel
         scale that is not known, an unknown chip, a bad grid, a region without points of the grid, a
         magnitude without errors by magnitude, or fewer than two draws.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> need = bd.Requirement("field-wide", "p95", 1.0)
+    >>> (margin,) = bd.check_requirements(fit, [need], grid=(5, 3), n_draws=400, rng=rng)
+    >>> margin.verdict
+    'met'
     """
     if pixel_scale is None:
         pixel_scale = pixel_scale_of(solution, chip)

@@ -49,7 +49,7 @@ def check_region(region: Region | Sequence[Sequence[float]], where: str) -> Regi
             where=where,
             do="give three or more corners, [[x, y], ...] in pixels",
         )
-    return corners  # type: ignore[return-value]
+    return tuple((x, y) for x, y in corners)
 
 
 def in_region(region: Region, size: tuple[float, float], x: Float, y: Float) -> NDArray[np.bool_]:

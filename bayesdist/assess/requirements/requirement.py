@@ -58,6 +58,12 @@ class Requirement:
     ------
     InputError
         For an unknown statistic, unit or region, and for numbers out of range or at odds.
+
+    Examples
+    --------
+    >>> need = bd.Requirement("field-wide", "p95", 0.03, probability=0.95)
+    >>> need.unit
+    'pix'
     """
 
     name: str

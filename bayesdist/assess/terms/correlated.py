@@ -21,6 +21,7 @@ from bayesdist.assess.terms.forms import (
 )
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.correlated.deviations import LinearDeviations
+from bayesdist.errors import required
 
 __all__ = ["DEVIATIONS", "STRUCTURE", "STRUCTURE_IN_FIT", "Deviations", "StructureErrors"]
 
@@ -95,8 +96,8 @@ class Deviations:
 
     def draw(self, n: int, rng: np.random.Generator) -> Polynomials:
         """Draws in random order, as they have nothing to do with other terms."""
-        found, linear = self.discrepancy, self.discrepancy.linear
-        assert linear is not None
+        found = self.discrepancy
+        linear = required(found.linear, "no deviations of exposures were estimated")
         rows = rng.integers(len(linear.theta), size=n)
         theta = _moved(found, linear.theta[rows], self.frames)
         seed = int(rng.integers(2**63)) if self.single else None

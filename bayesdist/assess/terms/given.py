@@ -73,6 +73,12 @@ class UserTerm:
     ------
     InputError
         For an unknown kind or unit, or a sigma that is negative or not finite.
+
+    Examples
+    --------
+    >>> term = bd.UserTerm("reference catalogue", "systematic", 0.005, 0.005)
+    >>> [row.name for row in term.rows]
+    ['reference catalogue']
     """
 
     name: str

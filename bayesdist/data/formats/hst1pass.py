@@ -143,7 +143,7 @@ def is_matchup(lines: list[str]) -> bool:
 
 
 def read_hst1pass(path: str | Path) -> Hst1passList:
-    """Read one list.
+    r"""Read one list.
 
     Parameters
     ----------
@@ -158,6 +158,15 @@ def read_hst1pass(path: str | Path) -> Hst1passList:
     InputError
         For a missing file, a header without its FILEOUT block, no rows, or rows that do not have
         its columns (a truncated file).
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> head = "# FILEOUT:\n# (1) X -- raw\n# (2) Y -- raw\n# (3) M -- magnitude\n"
+    >>> n = Path("j8c0.uvwXYMpq").write_text(head + "100.5 200.25 -9.5\n")
+    >>> one = bd.read_hst1pass("j8c0.uvwXYMpq")
+    >>> one.name, one.detections().x.tolist()
+    ('j8c0', [100.5])
     """
     path = Path(path)
     lines = read_lines(path)
@@ -214,7 +223,7 @@ def _numbers(path: Path, lines: list[str], n_columns: int) -> Float:
 def read_matchup(
     path: str | Path, *, epoch: float | None = None, unit: str = "pix"
 ) -> ReferenceCatalog:
-    """Read a MATCHUP master as a reference catalogue.
+    r"""Read a MATCHUP master as a reference catalogue.
 
     Two forms are known: the original (xbar ybar mbar xsig ysig msig qbar Nf ...) and the calibrated
     one with a header line (x y m xe ye me std N_fnd ... name t).  In known files of the second
@@ -238,6 +247,15 @@ def read_matchup(
     ------
     InputError
         For a missing file, one that is no MATCHUP master, or rows cut off.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> head = "# xbar ybar mbar xsig ysig msig\n"
+    >>> n = Path("MATCHUP").write_text(head + "1 2 -9.5 0.01 0.02 0.05\n")
+    >>> master = bd.read_matchup("MATCHUP", epoch=2011.8)
+    >>> master.sigma_v.tolist()
+    [0.02]
     """
     path = Path(path)
     lines = read_lines(path)

@@ -36,7 +36,7 @@ from bayesdist.data.matching.reports import (
 from bayesdist.data.matching.similarity import PatternIndex, mismatch_reason, pattern_index
 from bayesdist.data.starlists import StarCuts
 from bayesdist.data.tables.column import encoded
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 
 __all__ = [
     "CampaignMatches",
@@ -280,8 +280,9 @@ def _table(
     star = np.concatenate([match.catalog_index for match in found])
     sigmas: dict[str, Any] = {}
     if catalog.sigma_u is not None:
-        sigmas["sigma_u"] = np.concatenate([m.sigma[0] for m in found])  # type: ignore[index]
-        sigmas["sigma_v"] = np.concatenate([m.sigma[1] for m in found])  # type: ignore[index]
+        pairs = [required(m.sigma, "a match has no errors") for m in found]
+        sigmas["sigma_u"] = np.concatenate([pair[0] for pair in pairs])
+        sigmas["sigma_v"] = np.concatenate([pair[1] for pair in pairs])
     return Matches(
         x=joined([one.x for one in lists]),
         y=joined([one.y for one in lists]),

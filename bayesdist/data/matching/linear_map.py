@@ -131,7 +131,8 @@ def _robust_linear(p: Float, q: Float) -> tuple[Float, Float] | None:
 
     def fit(use: NDArray[np.bool_]) -> tuple[Float, Float] | None:
         solution, _, rank, _ = np.linalg.lstsq(design[use], q[use], rcond=None)
-        return (solution, np.hypot(*(q - design @ solution).T)) if rank == 3 else None
+        away = np.asarray(np.hypot(*(q - design @ solution).T), float)
+        return (np.asarray(solution, float), away) if rank == 3 else None
 
     slack = 1e-12 * float(np.abs(q).max(initial=0.0))
     found = robust_fit(fit, len(p), least=MIN_PAIRS, slack=slack)

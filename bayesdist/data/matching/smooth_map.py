@@ -54,8 +54,8 @@ def smooth_map(points: Float, chip: Int, residual: Float, index: Int) -> SmoothM
         here = here[:: -(-len(here) // _MAX_PAIRS_FITTED)]
         fit = partial(_cubic, _terms(points[index[here]], low, high), residual[here])
         found = robust_fit(fit, len(here), least=_MIN_PAIRS_ON_CHIP, rounds=6)
-        assert found is not None
-        coefficients[number] = found.solution
+        if found is not None:
+            coefficients[number] = found.solution
     return SmoothMap(low, high, coefficients)
 
 

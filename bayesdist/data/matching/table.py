@@ -183,6 +183,16 @@ def match_table(
     InputError
         When the units differ, an exposure does not match, or proper motions meet a table without
         epoch.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> u, v = rng.uniform(0.0, 1000.0, (2, 60))
+    >>> catalog = bd.ReferenceCatalog(u=u, v=v)
+    >>> seen = bd.Matches(u + 1.0, v - 2.0, u + 1.0, v - 2.0)  # by a known distortion, shifted
+    >>> found = bd.match_table(seen, catalog)
+    >>> len(found)
+    60
     """
     where = ", ".join(table.sources)
     if table.unit != catalog.unit:

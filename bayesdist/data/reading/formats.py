@@ -97,7 +97,7 @@ def _expanded(path: Path) -> list[Path]:
         return found
     if path.exists() or not glob.has_magic(str(path)):
         return [path]
-    found = sorted(Path(file) for file in glob.glob(str(path), recursive=True))
+    found = sorted(Path(file) for file in glob.glob(str(path), recursive=True))  # noqa: PTH207  from any root
     if not found:
         raise InputError("no file fits the pattern", where=str(path), do="check the pattern")
     return found

@@ -57,8 +57,8 @@ def table_layout(
         table: Columns = next(part.blocks(part.colnames, size=MAX_ROWS_READ))
         header: Mapping[str, Any] = {}
     else:
-        table = with_sky_columns(read_table(file))
-        header = table.meta
+        whole = with_sky_columns(read_table(file))
+        table, header = whole, whole.meta
     names = tuple(table.colnames)
     taken = needed_columns(names, columns, source=str(file), read_sigma=read_sigma)
     origin, why = origin_of(taken["x"], names, header)

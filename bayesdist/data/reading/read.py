@@ -54,7 +54,7 @@ def read_matches(
     chips: Mapping[str, int] | None = None,
     not_finite: str = "refuse",
 ) -> Matches:
-    """Read matched star positions.
+    r"""Read matched star positions.
 
     Parameters
     ----------
@@ -78,6 +78,14 @@ def read_matches(
     ------
     InputError
         For all that is wrong with a file or an option, in one sentence.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> n = Path("stars.csv").write_text("x,y,u,v\n10.5,20,0.1,0.2\n900,500,8.9,4.8\n")
+    >>> matches = bd.read_matches("stars.csv", unit="arcsec", sigma=0.01, pixel_origin=1)
+    >>> matches.x.tolist()
+    [10.5, 900.0]
     """
     known = (*FORMATS, *mission_formats())
     if format not in known:

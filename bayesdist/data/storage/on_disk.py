@@ -85,6 +85,15 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Any) -> Matches
     InputError
         For all that is wrong with a file or an option, in one sentence.  All files must have the
         same quantities; one of them may be empty.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> paths = bd.write_partitioned([matches], "stars")
+    >>> stars = bd.open_matches("stars")  # stays on disk
+    >>> sum(len(batch) for batch in stars.batches())
+    500
     """
     given = ReadOptions(**options)
     if given.not_finite == "reject":

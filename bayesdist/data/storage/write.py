@@ -65,6 +65,13 @@ def write_partitioned(
     InputError
         For no tables, tables that differ in their columns or unit, and a folder that cannot be
         written to or is in use.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> [path.name for path in bd.write_partitioned([matches, matches], "stars")]
+    ['part-00000.parquet', 'part-00001.parquet']
     """
     folder = Path(folder)
     if rows_per_group < 1:

@@ -142,8 +142,9 @@ def _ldac(hdus: fits.HDUList, objects: list[fits.BinTableHDU]) -> Table:
     """Objects of a FITS_LDAC catalogue, with the date of the image; several are chips."""
     tables = [Table.read(hdu, format="fits", mask_invalid=False) for hdu in objects]
     heads = [hdu for hdu in hdus if hdu.name == "LDAC_IMHEAD"]
-    cards = np.ravel(heads[0].data.field(0)) if heads and heads[0].data is not None else []
-    text = "".join(str(card) for card in cards)
+    text = ""
+    if heads and heads[0].data is not None:
+        text = "".join(str(card) for card in np.ravel(heads[0].data.field(0)))
     image = fits.Header.fromstring(text if len(text) % 80 == 0 else "")
     for number, table in enumerate(tables, 1):
         if len(tables) > 1 and "EXT_NUMBER" not in table.colnames:

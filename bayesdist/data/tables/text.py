@@ -27,7 +27,7 @@ def _kind(lines: Sequence[str]) -> str | None:
         return "ascii.ipac"
     if first.startswith("# %ECSV"):
         return "ascii.ecsv"
-    if first.startswith("#K ") or first.startswith("#N "):
+    if first.startswith(("#K ", "#N ")):
         return "ascii.daophot"
     if _SEXTRACTOR.match(first):
         return "ascii.sextractor"

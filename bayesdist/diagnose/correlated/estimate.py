@@ -26,7 +26,8 @@ from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.solution import Solution, likelihood_of
 from bayesdist.infer.stars.likelihood import Likelihood
-from bayesdist.infer.stars.shards import Shards, opened
+from bayesdist.infer.stars.loading import opened
+from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import cell_index

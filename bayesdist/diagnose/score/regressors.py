@@ -1,5 +1,7 @@
-"""Functions of the stars that a model may lack: terms of higher order, and terms that go with
-magnitude, colour and time."""
+"""Functions of the stars that a model may lack.
+
+They are terms of higher order, and terms that go with magnitude, colour and time.
+"""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
 from bayesdist.data.matches import Matches
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 from bayesdist.infer.catalogue.magnitude_law import MagnitudeLaw
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.linear import DEFAULT_REJECTION, NO_REJECTION, LinearFit, Rejection, fit_linear
@@ -75,6 +75,15 @@ def fit_by_magnitude(
     ------
     InputError
         When the table has no magnitudes, too few stars, or stars without scatter.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=4, size=(1016, 1016))
+    >>> fit, matches, errors = bd.fit_by_magnitude(matches, model)
+    >>> bool((matches.sigma_u > 0).all())
+    True
     """
     if not matches.has_mag:
         raise InputError(
@@ -96,11 +105,11 @@ def _law(
     priors: GaussianPriors | None,
 ) -> MagnitudeErrors:
     """Law of the errors with magnitude of some stars."""
-    assert stars.mag is not None
+    mag = required(stars.mag, "errors by magnitude need magnitudes")
     fit = fit_linear(stars.with_errors(1.0), model, rejection=rejection, priors=priors)
     residual = residuals_of(fit, stars)
-    bins = estimate(stars.mag, *residual, n_params=model.n_params)
-    law = MagnitudeLaw.of(stars.mag, bins)
+    bins = estimate(mag, *residual, n_params=model.n_params)
+    law = MagnitudeLaw.of(mag, bins)
     nodes, square = law.start, residual**2
     narrowest = (WIDER * np.exp(nodes.max())) ** 2
     f, wide = FALSE[0], max(narrowest, float((square.sum(axis=0)).max()) / 8.0)
@@ -119,7 +128,7 @@ def _law(
         if np.abs(nodes - before).max() < SETTLED:
             break
     sigma_u, sigma_v = np.exp(nodes)
-    scatter_u, scatter_v = _scatter(bins, stars.mag, good, square)
+    scatter_u, scatter_v = _scatter(bins, mag, good, square)
     return MagnitudeErrors(bins.mag, sigma_u, sigma_v, bins.n, scatter_u, scatter_v)
 
 

@@ -19,10 +19,12 @@ from scipy.linalg import null_space
 from scipy.stats import chi2 as chi_square
 
 from bayesdist.data.matches import Matches
+from bayesdist.errors import required
 from bayesdist.infer.compare.frame_fields import mean_squares, without
 from bayesdist.infer.compare.monitoring import Change, NewFit
 from bayesdist.infer.equations.normal import NormalEquations, mixture
 from bayesdist.infer.equations.scaled import FieldTest, determined
+from bayesdist.infer.kernel import Constants
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import nearest_frame
@@ -81,8 +83,8 @@ def period_scores(
     held: dict[int, tuple[NormalEquations, float, float, int]] = {}
     constants = new.target.hyper.constants(new.psi[None, new.target.n_theta :])
     for table in matches.batches():
-        assert table.epoch is not None
-        of_period = np.searchsorted(edges, table.epoch, side="right")
+        epoch = required(table.epoch, "matches need epochs", do="map column 'epoch'")
+        of_period = np.searchsorted(edges, epoch, side="right")
         for b in np.unique(of_period):
             part = table.select(of_period == b)
             found = _sums(new, part, constants)
@@ -95,8 +97,8 @@ def period_scores(
 
 def _edges(matches: Matches, most: int) -> Float:
     """Dates at which a new period begins."""
-    epoch = matches.sample(1_000_000).epoch
-    assert epoch is not None
+    some = matches.sample(1_000_000)
+    epoch = required(some.epoch, "matches need epochs", do="map column 'epoch'")
     dates, counts = np.unique(epoch, return_counts=True)
     if len(dates) <= most:
         return dates[1:]
@@ -104,11 +106,13 @@ def _edges(matches: Matches, most: int) -> Float:
     return dates[np.flatnonzero(np.diff(period)) + 1]
 
 
-def _sums(new: NewFit, table: Matches, constants) -> tuple[NormalEquations, float, float, int]:  # type: ignore[no-untyped-def]
+def _sums(
+    new: NewFit, table: Matches, constants: Constants
+) -> tuple[NormalEquations, float, float, int]:
     stars, _ = prepare(new.model, table)
-    assert table.epoch is not None
+    epoch = required(table.epoch, "matches need epochs", do="map column 'epoch'")
     equations = mixture(stars, new.theta, constants, True)
-    return equations, float(table.epoch.min()), float(table.epoch.max()), len(table)
+    return equations, float(epoch.min()), float(epoch.max()), len(table)
 
 
 def _joined(

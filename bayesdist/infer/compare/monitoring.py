@@ -28,8 +28,9 @@ from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.infer.exposures.hierarchy import held_in_reference
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.infer.solution import Solution, TransformedSolution
+from bayesdist.infer.stars.loading import load
 from bayesdist.infer.stars.mixture import OutlierMixture
-from bayesdist.infer.stars.shards import Compute, load
+from bayesdist.infer.stars.shards import Compute
 from bayesdist.infer.transforms import without_frames
 from bayesdist.model import DistortionModel
 

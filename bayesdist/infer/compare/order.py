@@ -26,7 +26,8 @@ from bayesdist.infer.compare.order_sums import (
     truncated,
 )
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
-from bayesdist.infer.stars.shards import Shards, opened
+from bayesdist.infer.stars.loading import opened
+from bayesdist.infer.stars.shards import Shards
 from bayesdist.model import DistortionModel
 from bayesdist.model.basis import MAX_ORDER
 

@@ -10,7 +10,7 @@ import numpy as np
 from astropy.time import Time
 
 from bayesdist.data import Matches
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 
 __all__ = ["Periods", "check_periods", "mjd_periods", "sum_by_period"]
 
@@ -84,9 +84,9 @@ def sum_by_period(matches: Matches, periods: Periods, task: Callable[[Matches], 
     check_periods(periods)
     sums: dict[str, Any] = {}
     for table in matches.batches():
-        assert table.epoch is not None
+        epoch = required(table.epoch, "matches need epochs", do="map column 'epoch'")
         for name, (start, stop) in periods.items():
-            inside = (table.epoch >= start) & (table.epoch < stop)
+            inside = (epoch >= start) & (epoch < stop)
             if inside.any():
                 part = task(table.select(inside))
                 sums[name] = sums[name] + part if name in sums else part

@@ -151,7 +151,7 @@ class Settling:
             of = f"settling.{len(places)}."
             places.append(
                 _Place(
-                    int(arrays[of + "kind"]),  # type: ignore[call-overload]
+                    int(arrays[of + "kind"].item()),
                     arrays[of + "constants"].astype(np.int64),
                     arrays[of + "shifts"].astype(np.int64),
                     arrays[of + "design"].astype(float),

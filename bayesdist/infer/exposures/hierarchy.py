@@ -35,7 +35,8 @@ from bayesdist.infer.exposures.scatter import Scatter
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.infer.solution import Solution
 from bayesdist.infer.stars.likelihood import ClippedGaussian
-from bayesdist.infer.stars.shards import Shards, opened
+from bayesdist.infer.stars.loading import opened
+from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.transforms import bare_model, reference_gauge
 from bayesdist.model import DistortionModel
 

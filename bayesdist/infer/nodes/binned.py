@@ -185,8 +185,8 @@ def _kernel(dx: tuple[int, ...], dy: tuple[int, ...]) -> Float:
     quadratic = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     for n in (6, 3, 1):
         design = quadratic[:, :n]
-        if len(x) >= ENOUGH * n or n == 1:
-            if np.linalg.matrix_rank(design) == n:
-                break
+        enough = len(x) >= ENOUGH * n or n == 1
+        if enough and np.linalg.matrix_rank(design) == n:
+            break
     weights: Float = np.linalg.pinv(design)[0]
     return weights

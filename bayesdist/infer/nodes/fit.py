@@ -244,7 +244,8 @@ def _with_memberships(matches: Matches, mixture: ResidualMixture, jitter: Float)
 
     A star of probability p counts p times: its variance is divided by p.
     """
-    assert matches.sigma_u is not None and matches.sigma_v is not None
+    assert matches.sigma_u is not None
+    assert matches.sigma_v is not None
     likely = mixture.probability >= LIKELY
     p = np.maximum(mixture.probability, LIKELY)
     wide = matches.with_errors(

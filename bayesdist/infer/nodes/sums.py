@@ -81,12 +81,11 @@ def node_sums(
     variances, zero for a star that does not count.  DegenerateError when the stars do not determine
     the polynomial.
     """
-    total: tuple[NodeSums, NodeSums] | None = None
-    for start in range(0, len(x), BLOCK):
+    total = _block(grid, x[:BLOCK], y[:BLOCK], shift[:BLOCK], precision[:BLOCK])
+    for start in range(BLOCK, len(x), BLOCK):
         rows = slice(start, start + BLOCK)
         part = _block(grid, x[rows], y[rows], shift[rows], precision[rows])
-        total = part if total is None else (total[0] + part[0], total[1] + part[1])
-    assert total is not None
+        total = total[0] + part[0], total[1] + part[1]
     for sums in total:
         scale = np.sqrt(np.diag(sums.polynomial))
         values = (

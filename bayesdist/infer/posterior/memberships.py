@@ -82,6 +82,22 @@ def memberships(posterior: Posterior, matches: Matches) -> Memberships:
     -------
     Memberships
         In the order of the table.
+
+    Raises
+    ------
+    InputError
+        For matches without errors, in another unit than the model's, or on other chips.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)
+    >>> doubted = bd.memberships(posterior, matches).outlier_probability > 0.5
+    >>> doubted.shape
+    (500,)
     """
     stars, order = prepare(posterior.model, matches)
     return memberships_of(posterior, stars).in_table_order(order)

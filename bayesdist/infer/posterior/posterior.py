@@ -127,6 +127,19 @@ class Posterior(Solution):
     own_places : bool
         True if the stars' positions are unknowns of the solution, as in a self-calibration: the
         matches then have the positions of the mean, which are those of no other draw.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)
+    >>> posterior.draws(100, rng).shape
+    (100, 12)
+    >>> low, high = posterior.interval(0.683).T
+    >>> bool((low < high).all())
+    True
     """
 
     model: DistortionModel

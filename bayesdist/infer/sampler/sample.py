@@ -24,8 +24,9 @@ from bayesdist.infer.posterior.memberships import count_outliers
 from bayesdist.infer.sampler.certified import run_certified
 from bayesdist.infer.sampler.chains import Settings, ensemble_seeds, run_chains
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
+from bayesdist.infer.stars.loading import opened
 from bayesdist.infer.stars.mixture import OutlierMixture
-from bayesdist.infer.stars.shards import Compute, Shards, opened
+from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars
 
 __all__ = ["sample"]
@@ -102,6 +103,16 @@ def sample(
         When no posterior mode is found.
     InputError
         For checkpoints of other data or settings, or a disk that is full.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)
+    >>> posterior.convergence.converged
+    True
     """
     seeds = ensemble_seeds(seed, ensembles)
     if method not in METHODS:

@@ -323,7 +323,7 @@ def _pivots(model: DistortionModel, null: Float) -> Int:
     first = model.chips[0].number
     degree = np.array(
         [
-            p.i + p.j  # type: ignore[operator]
+            (p.i or 0) + (p.j or 0)
             if p.kind == "polynomial" and p.chip == first
             else 100 + (p.kind != "polynomial")
             for p in model.parameters

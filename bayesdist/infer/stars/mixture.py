@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, gammaln, log_expit, logit
 
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel import Constants
 
@@ -76,6 +76,12 @@ class OutlierMixture:
     InputError
         For an unknown model, a missing radius, a negative jitter, an improper prior, or the prior
         of a parameter that is not sampled.
+
+    Examples
+    --------
+    >>> mixture = bd.OutlierMixture(jitter=0.0)  # quoted errors are right
+    >>> mixture.model
+    'gaussian'
     """
 
     model: str = "gaussian"
@@ -229,8 +235,8 @@ class Hyper:
         j2 = np.full(n, 0.0 if fixed is None else fixed**2)
         log_f, log_1_f, out = np.full(n, -np.inf), np.zeros(n), np.ones(n)
         if self.mixture.model == "uniform":
-            assert self.mixture.match_radius is not None
-            out = np.full(n, np.pi * self.mixture.match_radius**2)
+            radius = required(self.mixture.match_radius, "a uniform mixture needs a match radius")
+            out = np.full(n, np.pi * radius**2)
         for k, name in enumerate(self.mixture.hyper):
             if name == "j":
                 j2 = np.exp(2 * h[:, k])

@@ -40,7 +40,7 @@ class Store:
         try:
             if self._file is None:
                 # without a name: it disappears with the process, however that ends
-                self._file = tempfile.TemporaryFile(prefix="bayesdist-", buffering=0)
+                self._file = tempfile.TemporaryFile(buffering=0, prefix="bayesdist-")  # noqa: SIM115
                 self._closed = weakref.finalize(self, self._file.close)
             place = self._file.seek(0, 2)
             for column in (*stars.columns, *stars.offsets):
@@ -51,7 +51,7 @@ class Store:
                 where=_folder(),
                 do="set TMPDIR to a folder with more room, or raise compute.memory_mb",
             ) from error
-        none: dict[str, Any] = {name: EMPTY for name in COLUMNS + OFFSETS[: len(stars.offsets)]}
+        none: dict[str, Any] = dict.fromkeys(COLUMNS + OFFSETS[: len(stars.offsets)], EMPTY)
         frame = replace(stars, **none)
         frame.__dict__.update(blocks=stars.blocks, pieces=stars.pieces)
         self._kept.append((frame, place))

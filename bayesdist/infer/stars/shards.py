@@ -7,8 +7,7 @@ of the data, so that they depend neither on the threads nor on the engine.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +18,7 @@ from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.infer.stars.survey import Survey, survey
 from bayesdist.model import DistortionModel, Groups
 
-__all__ = ["Compute", "LocalShards", "Shards", "load", "opened", "shard_of"]
+__all__ = ["Compute", "LocalShards", "Shards", "shard_of", "total"]
 
 Task = Callable[..., Any]
 
@@ -40,6 +39,12 @@ class Compute:
         Address of a Dask scheduler; without one a cluster of this machine's processes is started.
     workers : int, optional
         Processes of that cluster; as many as there are cores by default.
+
+    Examples
+    --------
+    >>> compute = bd.Compute(memory_mb=200)
+    >>> compute.engine
+    'threads'
     """
 
     engine: str = "threads"
@@ -133,56 +138,3 @@ def total(parts: Any) -> Any:
     for part in parts:
         out = part if out is None else out + part
     return out
-
-
-@contextmanager
-def opened(
-    model: DistortionModel, matches: Matches | Shards, compute: Compute | None = None
-) -> Iterator[Shards]:
-    """Context with the data as shards, as of `load`; shards loaded here are closed at the end."""
-    shards = load(model, matches, compute)
-    try:
-        yield shards
-    finally:
-        if shards is not matches:
-            shards.close()
-
-
-def load(
-    model: DistortionModel, matches: Matches | Shards, compute: Compute | None = None
-) -> Shards:
-    """Load the data as shards of a model.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    matches : Matches or Shards
-        Shards are returned unchanged.
-    compute : Compute, optional
-
-    Returns
-    -------
-    Shards
-
-    Raises
-    ------
-    InputError
-        As `prepare`; for a full scratch folder; when there is no cluster.
-    """
-    if isinstance(matches, Shards):
-        if matches.model != model:
-            raise InputError(
-                "the shards were made for another model", do="load the matches for this one"
-            )
-        return matches
-    if not isinstance(matches, Matches):
-        raise InputError(
-            f"{type(matches).__name__} holds no matches",
-            do="give what read_matches, open_matches or load returned",
-        )
-    compute = compute or Compute()
-    if compute.engine == "threads":
-        return LocalShards(model, matches, compute.memory_mb)
-    from bayesdist.infer.stars.cluster import ClusterShards  # only where it is requested
-
-    return ClusterShards(model, matches, compute)

@@ -117,7 +117,7 @@ def test_stated_errors_are_those_by_which_estimates_scatter():
     assert (pulls**2).mean() == pytest.approx(1.0, abs=4 * np.sqrt(2 / 60))
 
 
-@pytest.mark.parametrize("dof, n", [(None, 300), (None, 2000), (4, 300), (4, 2000)])
+@pytest.mark.parametrize(("dof", "n"), [(None, 300), (None, 2000), (4, 300), (4, 2000)])
 def test_equal_axes_are_not_split(dof, n):
     """At odds of 20 to 1; long tails, of a t distribution, are none either."""
     seeds = range(20)
@@ -146,7 +146,7 @@ def test_a_wild_match_makes_no_axis_where_there_are_no_false_ones():
 
 
 @pytest.mark.parametrize(
-    "sigma, grouping",
+    ("sigma", "grouping"),
     [
         ([(0.05, 0.05), (0.05, 0.05)], "one"),
         ([(0.05, 0.08), (0.05, 0.08)], "axis"),

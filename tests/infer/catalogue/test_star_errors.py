@@ -270,8 +270,8 @@ def test_what_is_wrong_is_said():
         star_covariance(fit, matches, alike(0.01, 0.01, 3))
     with pytest.raises(InputError, match=r"position is -0\.01"):
         star_covariance(fit, matches, alike(-0.01, 0.01, n))
+    moving = replace(alike(0.01, 0.01, n), motion=np.full((n, 2), 0.1))
     with pytest.raises(InputError, match="need the catalogue's epoch"):
-        moving = replace(alike(0.01, 0.01, n), motion=np.full((n, 2), 0.1))
         star_covariance(fit, matches, moving)
     dated = replace(moving, epoch=np.full(n, 2004.0))
     with pytest.raises(InputError, match="need the epochs of the matches"):

@@ -153,7 +153,7 @@ def assert_error_is_the_scatter(gain):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", (1.0, 6.0))
+@pytest.mark.parametrize("size", [1.0, 6.0])
 def test_error_of_a_gain_where_the_higher_order_is_true(full, size):
     """Third-order terms that stand out by 1 and by 6 of their errors, all alike."""
     gain, third = [], slice(terms(2), terms(3))

@@ -493,7 +493,7 @@ def test_clean_tables_have_a_good_proposal(n, seed):
 
 
 @pytest.mark.parametrize(
-    "n, jitter, seed",
+    ("n", "jitter", "seed"),
     [(1000, 2.0, 1), (1000, 2.0, 2), (3000, 0.5, 2), (10_000, 0.5, 2), (10_000, 0.1, 3)],
 )
 def test_clean_tables_with_errors_far_too_small(n, jitter, seed):

@@ -446,7 +446,7 @@ def _within(found) -> tuple[float, bool]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "cut, kind", [(2.4, "uniform"), (3, "uniform"), (3, "gaussian"), (4, "uniform")]
+    ("cut", "kind"), [(2.4, "uniform"), (3, "uniform"), (3, "gaussian"), (4, "uniform")]
 )
 def test_coefficients_are_covered(cut, kind, full, capsys):
     """Of 1500 stars each, cut about a nominal solution that is off by four times their errors."""

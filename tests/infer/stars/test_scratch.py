@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import os
 import subprocess
 import tempfile
 from pathlib import Path
@@ -101,7 +100,7 @@ def test_nothing_is_left_behind(shards, tmp_path, monkeypatch):
     """The scratch file has no name, and is closed with its shards: by hand or by itself."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     for by_hand in (True, False):
-        before = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").is_dir() else 0
+        before = len(list(Path("/proc/self/fd").iterdir())) if Path("/proc/self/fd").is_dir() else 0
         box = Store(0)
         box.add(shards[0])
         assert list(tmp_path.iterdir()) == []
@@ -111,7 +110,7 @@ def test_nothing_is_left_behind(shards, tmp_path, monkeypatch):
             assert len(box) == 0 and list(box) == []
         del box
         gc.collect()  # an open file that is dropped would warn, and warnings are errors here
-        after = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").is_dir() else 0
+        after = len(list(Path("/proc/self/fd").iterdir())) if Path("/proc/self/fd").is_dir() else 0
         assert after == before
 
 

@@ -78,7 +78,7 @@ def test_crosses_have_the_magnification_they_state(sigma, factor):
     [stated] = [t.get_text() for t in ax.texts if "drawn" in t.get_text()]
     M = float(stated.split("×")[-1].replace("\u202f", "").strip())
     if factor is not None:
-        assert M == factor  # as section 6 of WSDC D-T033
+        assert factor == M  # as section 6 of WSDC D-T033
     [crosses] = [c for c in ax.collections if hasattr(c, "get_segments")]
     ends = np.array([np.diff(s, axis=0)[0] for s in crosses.get_segments()])
     np.testing.assert_allclose(np.abs(ends), M * np.array([[sigma, 2 * sigma]] * len(ends)))

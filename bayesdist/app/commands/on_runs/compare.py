@@ -20,7 +20,7 @@ from bayesdist.assess.comparison.gap import (
 from bayesdist.assess.comparison.sentences import comparison_lines, gap_lines, gap_verdict, verdict
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
-from bayesdist.products.formats.sip.calibration import MissingSize
+from bayesdist.products.formats.sip.calibration import MissingSizeError
 
 __all__ = ["compare_files"]
 
@@ -69,7 +69,7 @@ def _read(
     for k, other in ((0, 1), (1, 0)):
         try:
             calibration_at(paths[k], filter=filters[k])
-        except MissingSize:
+        except MissingSizeError:
             sizes[k] = calibration_at(paths[other], filter=filters[other]).model.chips[0].size
     a, b = (
         calibration_at(path, filter=one, size=size)

@@ -81,7 +81,8 @@ def _lines(
         schedules.append(Schedule("at any date", exposure_information(solution, content, None)))
     else:
         epoch, seen = results.epoch, results.diagnostics.sample.table.epoch
-        assert epoch is not None and seen is not None  # as the model drifts
+        assert epoch is not None
+        assert seen is not None
         wanted = requirement.epoch or (requirement.epochs or [epoch])[-1]
         last = float(np.max(seen))
         for date in dict.fromkeys([*epochs, wanted]):

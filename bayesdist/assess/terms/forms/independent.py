@@ -62,7 +62,7 @@ class NoiseField(ErrorField):
 
     def errors(self, draws: slice, scale: Scale) -> None:
         """None: the noise of all terms is drawn together."""
-        return None
+        return
 
     def squares(self) -> dict[str, Float]:
         """Mean squares of the row, if there is one."""
@@ -123,7 +123,7 @@ class KnownField(ErrorField):
 
     def errors(self, draws: slice, scale: Scale) -> None:
         """None: no error."""
-        return None
+        return
 
     def squares(self) -> dict[str, Float]:
         """Squares of the displacements, or of their differences."""

@@ -46,10 +46,11 @@ class DistortionField:
 
     def at_scaled(self, X: ArrayLike, Y: ArrayLike) -> Float:
         """Vectors (2, ...) at places of the array, which goes from -1 to 1 on both axes."""
+        X, Y = np.asarray(X, float), np.asarray(Y, float)
         order = self.basis.order
         square = np.zeros((2, order + 1, order + 1))
         square[:, *np.array(self.basis.terms).T] = self.polynomial
-        return np.stack([legendre.legval2d(X, Y, one) for one in square])
+        return np.stack([np.asarray(legendre.legval2d(X, Y, one), float) for one in square])
 
     def minus(self, other: DistortionField, ratio: float = 1.0) -> DistortionField:
         """This field less another one that covers the same part of the sky.
@@ -85,7 +86,7 @@ def field_of_solution(solution: Solution, *, epoch: float | None = None) -> Dist
     """
     place = place_of(solution.model, epoch=epoch)
     similarity = distortion_vectors(solution, grid=(2, 2), epoch=epoch).similarity
-    to_pixels = np.linalg.inv(similarity)
+    to_pixels = np.asarray(np.linalg.inv(similarity), float)
     basis = place.basis
     polynomial = to_pixels @ place.polynomial(solution.mean)
     # the array position itself: P_1 along each axis, half the size times it

@@ -73,8 +73,18 @@ def residual_correlation(
     chi2 = float((((found - mean) / sigma) ** 2).sum())
     others = (((by_chance[DRAWS:] - mean) / sigma) ** 2).sum(axis=(1, 2))
     p_value = (1 + int((others >= chi2).sum())) / (len(others) + 1)
+    (uu, vv, uv), (sigma_uu, sigma_vv, sigma_uv) = found - mean, sigma
     return ResidualCorrelation(
-        rings.separation, *(found - mean), *sigma, rings.n_pairs, chi2, p_value
+        rings.separation,
+        uu,
+        vv,
+        uv,
+        sigma_uu,
+        sigma_vv,
+        sigma_uv,
+        rings.n_pairs,
+        chi2,
+        p_value,
     )
 
 
@@ -106,7 +116,7 @@ class _Rings:
         ring[ring >= n_rings] = -1
         pairs = np.rint(_lagged(field.used[None].astype(float), None, shape)[0])
         inside = ring >= 0
-        counts = np.bincount(ring[inside], pairs[inside], n_rings)
+        counts = np.bincount(ring[inside], pairs[inside], n_rings).astype(float)
         total = np.bincount(ring[inside], (pairs * distance)[inside], n_rings)
         held = counts > 0
         # rings without pairs are dropped

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -160,10 +160,12 @@ def _tables(bands: tuple[BandResult, ...]) -> dict[str, StatisticsTable]:
     arcsec = {b.name: b.arcsec for b in bands}
     terms = {b.name: len(polynomial_terms(b.order)) for b in bands}
 
-    def rows(function: object, *several: BandResult, **options: object) -> StatisticsTable:
+    def rows(
+        function: Callable[..., StatisticsTable], *several: BandResult, **options: object
+    ) -> StatisticsTable:
         sums: dict[str, BinnedSums] = {b.name: b.sums.bins for b in several}
         absorbed = max(terms[b.name] for b in several)
-        return function(sums, rng=rng, absorbed=absorbed, **options)  # type: ignore[operator]
+        return function(sums, rng=rng, absorbed=absorbed, **options)
 
     pairs = [(a, b) for i, a in enumerate(bands) for b in bands[i + 1 :]]
     made = {

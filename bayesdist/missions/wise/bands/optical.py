@@ -34,7 +34,7 @@ class OpticalModel:
         """
         size = self.sip.size or chip.size
         times = [own / n for own, n in zip(size, chip.size, strict=True)]
-        if not np.isclose(*times, rtol=1e-3):
+        if not np.isclose(times[0], times[1], rtol=1e-3):
             raise InputError(
                 f"is for {size[0]:g} x {size[1]:g} pixels, and the array of {chip.name} has "
                 f"{chip.size[0]:g} x {chip.size[1]:g}",

@@ -153,10 +153,15 @@ def write_tables(inputs: BandsInput, folder: Path) -> tuple[str, ...]:
         _add(out, "Sigma rest", [one.rest for one in accounts], table.unit)
         if any(one.printed is not None for one in accounts):
             for statistic, head in HEADS.items():
-                values = [one.printed and one.printed.value[statistic] for one in accounts]
+                values = [
+                    None if one.printed is None else one.printed.value[statistic]
+                    for one in accounts
+                ]
                 _add(out, f"{head} printed", values, table.unit)
             for k, which in enumerate(("least", "most")):
-                values = [one.printed_noise and one.printed_noise[k] for one in accounts]
+                values = [
+                    None if one.printed_noise is None else one.printed_noise[k] for one in accounts
+                ]
                 _add(out, f"Sigma printed noise, {which}", values, table.unit)
             _add(out, "Sigma printed more", [one.remains for one in accounts], table.unit)
             out["Account"] = [one.sentence for one in accounts]

@@ -105,15 +105,13 @@ class RvbFile:
 def open_rvb_files(
     path: PathLike | Sequence[PathLike], columns: Mapping[str, str] | None
 ) -> list[RvbFile]:
+    """RvB files of a path, a pattern or several, each with the columns that were found."""
     columns = {{"color": "colour"}.get(key, key): name for key, name in (columns or {}).items()}
     out = []
     for file in input_files(path):
         name = file.name.lower()
-        contents: Table | ParquetPart
-        if name.endswith(".parquet"):
-            contents = describe_part(file)
-        else:
-            contents = read_table(file)
+        parquet = name.endswith(".parquet")
+        contents: Table | ParquetPart = describe_part(file) if parquet else read_table(file)
         names = list(contents.colnames)
         found = find_columns(names, columns, RVB_ALIASES, source=str(file), needed="xyuv")
         out.append(RvbFile(str(file), contents, found))

@@ -145,7 +145,7 @@ def read_rvb(
     path: PathLike | Sequence[PathLike],
     **options: Any,
 ) -> RvbPairs:
-    """RvB pairs of one band in memory.
+    r"""RvB pairs of one band in memory.
 
     Parameters
     ----------
@@ -160,6 +160,14 @@ def read_rvb(
     ------
     InputError
         As `stream_rvb`.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> n = Path("pairs.csv").write_text("x,y,u,v\n10,20,10.1,20.2\n900,800,899,799\n")
+    >>> pairs = bd.read_rvb("pairs.csv", band="W2", sigma=0.05)
+    >>> len(pairs.matches)
+    2
     """
     return RvbPairs.concatenate(list(stream_rvb(path, **options)))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,7 +67,8 @@ class RvbInput:
     def _settings(self) -> tuple[RvbData, tuple[float, float]]:
         """Section [data], and columns and rows of the detector."""
         config = self.run.config
-        assert isinstance(config.data, RvbData) and config.detector.size is not None
+        assert isinstance(config.data, RvbData)
+        assert config.detector.size is not None
         return config.data, config.detector.size
 
     def _written(self, selected: SelectedPairs) -> Matches:
@@ -122,7 +122,7 @@ class RvbInput:
         for stale in part_files(target):
             stale.unlink()
         try:
-            os.replace(Path(self._scratch.name) / PAIRS, target)
+            (Path(self._scratch.name) / PAIRS).replace(target)
         except OSError as error:
             raise InputError(
                 f"the selected pairs cannot be moved there ({error.strerror})",

@@ -19,7 +19,7 @@ from bayesdist.missions.wise.simulate.sets import PairChunk, WiseSet
 
 __all__ = ["write_wise_set"]
 
-UNITS = {name: "pix" for name in ("x", "y", "u", "v", "sigma")} | {"epoch": "yr", "mag": "mag"}
+UNITS = dict.fromkeys(("x", "y", "u", "v", "sigma"), "pix") | {"epoch": "yr", "mag": "mag"}
 UNITS["colour"] = "mag"
 
 

@@ -64,8 +64,10 @@ def partition_pattern(
     x, y, weight = _nodes(basis, blocks)
     phi = basis.evaluate(x, y)
     weighted = phi * weight[:, None]
-    smooth = np.linalg.solve(weighted.T @ phi, weighted.T @ raw.offsets(x, y)).T
-    rms = np.sqrt(weight @ PartitionPattern(basis, local, smooth).offsets(x, y) ** 2)
+    normal, right = weighted.T @ phi, weighted.T @ raw.offsets(x, y)
+    smooth = np.asarray(np.linalg.solve(normal, right).T, np.float64)
+    square: Float = np.square(PartitionPattern(basis, local, smooth).offsets(x, y))
+    rms = np.sqrt(weight @ square)
     factor = np.asarray(sigma) / rms
     return PartitionPattern(basis, local * factor[:, None, None, None], smooth * factor[:, None])
 

@@ -39,6 +39,12 @@ def wise_solution(band: str = "W2") -> tuple[DistortionModel, Float]:
     ------
     InputError
         For another band.
+
+    Examples
+    --------
+    >>> model, theta = bd.wise_solution("W4")
+    >>> model.order, theta.shape
+    (4, (30,))
     """
     if band not in WISE_COEFFICIENTS:
         raise InputError(
@@ -94,6 +100,17 @@ def simulate_wise(
     -------
     matches : Matches
     truth : Truth
+
+    Raises
+    ------
+    InputError
+        For another band, and as `simulate_matches`.
+
+    Examples
+    --------
+    >>> matches, truth = bd.simulate_wise(400, band="W2", rng=np.random.default_rng(1))
+    >>> len(matches), matches.unit
+    (400, 'pix')
     """
     model, theta = wise_solution(band)
     # star counts rise as 10^(0.3 m)
@@ -144,6 +161,12 @@ def simulate_wise_partitioned(
     ------
     InputError
         As `simulate_wise` and `write_partitioned`.
+
+    Examples
+    --------
+    >>> truth = bd.simulate_wise_partitioned("pairs", 400, rng=np.random.default_rng(1))
+    >>> bd.open_matches("pairs").n_rows
+    400
     """
     simulate = partial(
         simulate_wise,

@@ -62,7 +62,8 @@ def survey(n_frames: int = FRAMES) -> Survey:
         f"{FIRST_SCAN + s:05d}a{f + 1:03d}"
         for s, f in zip(scan.tolist(), frame.tolist(), strict=True)
     )
-    return Survey(names, START + number * CADENCE_S / YEAR_S, POLE / sine / ARCSEC2)
+    epoch = np.asarray(START + number * CADENCE_S / YEAR_S, np.float64)
+    return Survey(names, epoch, POLE / sine / ARCSEC2)
 
 
 def match_radius(r2: Float) -> Float:

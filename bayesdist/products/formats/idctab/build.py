@@ -121,6 +121,21 @@ def idctab_from_solution(
     -----
     TDD_DATE is the reference date of the fit.  stwcs dates an exposure by year + day of year /
     365.25, which is within about a day of the decimal year.
+
+    Examples
+    --------
+    >>> chip = bd.Chip(1, "WFC2", (4096, 2048), (2048.0, 1024.0))
+    >>> model = bd.DistortionModel(1, (chip,))
+    >>> theta = np.zeros(model.n_params)
+    >>> theta[model.coefficient_slice(None, 0)] = model.basis().from_monomials([0.0, 1.0, 0.0])
+    >>> theta[model.coefficient_slice(None, 1)] = model.basis().from_monomials([0.0, 0.0, 1.0])
+    >>> matches, _ = bd.simulate_matches(model, theta, 500, rng=np.random.default_rng(1))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> tab = bd.idctab_from_solution(
+    ...     fit, instrument="ACS", detector="WFC", scale_arcsec=0.05, filters=[("F606W", "CLEAR2L")]
+    ... )
+    >>> [int(row["DETCHIP"]) for row in tab.rows]
+    [1]
     """
     entries = _entries(solution, filters, instrument)
     first = entries[0][0]

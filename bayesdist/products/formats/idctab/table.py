@@ -60,6 +60,21 @@ class IdcTab:
     ------
     FormatError
         When a keyword or column is missing that stwcs cannot do without.
+
+    Examples
+    --------
+    >>> chip = bd.Chip(1, "WFC2", (4096, 2048), (2048.0, 1024.0))
+    >>> model = bd.DistortionModel(1, (chip,))
+    >>> theta = np.zeros(model.n_params)
+    >>> theta[model.coefficient_slice(None, 0)] = model.basis().from_monomials([0.0, 1.0, 0.0])
+    >>> theta[model.coefficient_slice(None, 1)] = model.basis().from_monomials([0.0, 0.0, 1.0])
+    >>> matches, _ = bd.simulate_matches(model, theta, 500, rng=np.random.default_rng(1))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> tab = bd.idctab_from_solution(
+    ...     fit, instrument="ACS", detector="WFC", scale_arcsec=0.05, filters=[("F606W", "CLEAR2L")]
+    ... )
+    >>> len(tab.rows)  # without an inverse
+    1
     """
 
     hdus: tuple[Hdu, ...]
@@ -412,6 +427,22 @@ def read_idctab(path: str | os.PathLike[str]) -> IdcTab:
         When the file cannot be read.
     FormatError
         When it is no FITS file, is truncated, or lacks a part that an IDCTAB must have.
+
+    Examples
+    --------
+    >>> chip = bd.Chip(1, "WFC2", (4096, 2048), (2048.0, 1024.0))
+    >>> model = bd.DistortionModel(1, (chip,))
+    >>> theta = np.zeros(model.n_params)
+    >>> theta[model.coefficient_slice(None, 0)] = model.basis().from_monomials([0.0, 1.0, 0.0])
+    >>> theta[model.coefficient_slice(None, 1)] = model.basis().from_monomials([0.0, 0.0, 1.0])
+    >>> matches, _ = bd.simulate_matches(model, theta, 500, rng=np.random.default_rng(1))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> tab = bd.idctab_from_solution(
+    ...     fit, instrument="ACS", detector="WFC", scale_arcsec=0.05, filters=[("F606W", "CLEAR2L")]
+    ... )
+    >>> bd.write_idctab(tab, "test_idc.fits")
+    >>> bool((bd.read_idctab("test_idc.fits").rows == tab.rows).all())
+    True
     """
     return IdcTab(read_hdus(path), str(path))
 
@@ -429,5 +460,21 @@ def write_idctab(tab: IdcTab, path: str | os.PathLike[str]) -> None:
     ------
     InputError
         When the file cannot be written.
+
+    Examples
+    --------
+    >>> chip = bd.Chip(1, "WFC2", (4096, 2048), (2048.0, 1024.0))
+    >>> model = bd.DistortionModel(1, (chip,))
+    >>> theta = np.zeros(model.n_params)
+    >>> theta[model.coefficient_slice(None, 0)] = model.basis().from_monomials([0.0, 1.0, 0.0])
+    >>> theta[model.coefficient_slice(None, 1)] = model.basis().from_monomials([0.0, 0.0, 1.0])
+    >>> matches, _ = bd.simulate_matches(model, theta, 500, rng=np.random.default_rng(1))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> tab = bd.idctab_from_solution(
+    ...     fit, instrument="ACS", detector="WFC", scale_arcsec=0.05, filters=[("F606W", "CLEAR2L")]
+    ... )
+    >>> bd.write_idctab(tab, "test_idc.fits")
+    >>> bool((bd.read_idctab("test_idc.fits").rows == tab.rows).all())
+    True
     """
     write_hdus(tab.hdus, path)

@@ -66,6 +66,13 @@ def write_d2im(
     ------
     InputError
         For no table, two tables of a chip, a table of a filter, or a file that cannot be written.
+
+    Examples
+    --------
+    >>> tables = [bd.LookupTable(chip, np.full((2, 32, 64), 0.1)) for chip in (1, 2)]
+    >>> file = bd.write_d2im(tables, "test_d2i.fits")
+    >>> sorted(table.chip for table in bd.read_d2im("test_d2i.fits"))
+    [1, 2]
     """
     where = "D2IMFILE"
     for table in tables:
@@ -112,6 +119,13 @@ def read_d2im(
         When the file cannot be read.
     FormatError
         When it is no D2IMFILE, or its tables are incomplete or not finite.
+
+    Examples
+    --------
+    >>> tables = [bd.LookupTable(chip, np.full((2, 32, 64), 0.1)) for chip in (1, 2)]
+    >>> file = bd.write_d2im(tables, "test_d2i.fits")
+    >>> sorted(table.chip for table in bd.read_d2im("test_d2i.fits"))
+    [1, 2]
     """
     file = read_lookup_file(path)
     check_kind(file, "d2im")

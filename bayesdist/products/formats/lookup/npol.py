@@ -92,6 +92,24 @@ def write_npol(
     -----
     The IDCTAB is taken at its own epoch: ten years of drift change an ACS/WFC shift of 0.05 px by
     2e-5 px.
+
+    Examples
+    --------
+    >>> chip = bd.Chip(1, "WFC2", (4096, 2048), (2048.0, 1024.0))
+    >>> model = bd.DistortionModel(1, (chip,))
+    >>> theta = np.zeros(model.n_params)
+    >>> theta[model.coefficient_slice(None, 0)] = model.basis().from_monomials([0.0, 1.0, 0.0])
+    >>> theta[model.coefficient_slice(None, 1)] = model.basis().from_monomials([0.0, 0.0, 1.0])
+    >>> matches, _ = bd.simulate_matches(model, theta, 500, rng=np.random.default_rng(1))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> tab = bd.idctab_from_solution(
+    ...     fit, instrument="ACS", detector="WFC", scale_arcsec=0.05, filters=[("F606W", "CLEAR2L")]
+    ... )
+    >>> table = bd.LookupTable(1, np.full((2, 32, 64), 0.1), filter="F606W")
+    >>> file = bd.write_npol([table], "test_npl.fits", idctab=tab, filters=("F606W", "CLEAR2L"))
+    >>> (back,) = bd.read_npol("test_npl.fits", tab)
+    >>> np.allclose(back.values, 0.1)
+    True
     """
     where = "NPOLFILE"
     if len(filters) not in (1, 2):
@@ -168,6 +186,24 @@ def read_npol(
         When it is no NPOLFILE, or its tables are incomplete or not finite.
     DegenerateError
         When the linear part of the IDCTAB is singular.
+
+    Examples
+    --------
+    >>> chip = bd.Chip(1, "WFC2", (4096, 2048), (2048.0, 1024.0))
+    >>> model = bd.DistortionModel(1, (chip,))
+    >>> theta = np.zeros(model.n_params)
+    >>> theta[model.coefficient_slice(None, 0)] = model.basis().from_monomials([0.0, 1.0, 0.0])
+    >>> theta[model.coefficient_slice(None, 1)] = model.basis().from_monomials([0.0, 0.0, 1.0])
+    >>> matches, _ = bd.simulate_matches(model, theta, 500, rng=np.random.default_rng(1))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> tab = bd.idctab_from_solution(
+    ...     fit, instrument="ACS", detector="WFC", scale_arcsec=0.05, filters=[("F606W", "CLEAR2L")]
+    ... )
+    >>> table = bd.LookupTable(1, np.full((2, 32, 64), 0.1), filter="F606W")
+    >>> file = bd.write_npol([table], "test_npl.fits", idctab=tab, filters=("F606W", "CLEAR2L"))
+    >>> (back,) = bd.read_npol("test_npl.fits", tab)
+    >>> np.allclose(back.values, 0.1)
+    True
     """
     file = read_lookup_file(path)
     check_kind(file, "npol")

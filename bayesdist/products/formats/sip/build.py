@@ -102,6 +102,16 @@ def sip_from_solution(
         For an unknown chip or `linear`, a missing epoch, an order that cannot be written, a linear
         part that is singular ('cd') or far from the identity ('sip'), a distortion without inverse,
         a tangent point of u, v in pixels, or a `crval` that is no position of the field.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> sip = bd.sip_from_solution(fit, scale_arcsec=2.757)
+    >>> sip.order
+    (2, 2)
     """
     calibration = as_calibration(solution)
     if tangent_point is None:

@@ -12,12 +12,12 @@ from bayesdist.errors import InputError
 from bayesdist.model import polynomial_terms
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
 
-__all__ = ["MissingSize", "sip_calibration"]
+__all__ = ["MissingSizeError", "sip_calibration"]
 
 Float = NDArray[np.float64]
 
 
-class MissingSize(InputError):
+class MissingSizeError(InputError):
     """Error of a header that does not state the size of its image."""
 
 
@@ -31,12 +31,12 @@ def sip_calibration(
 ) -> Calibration:
     """Calibration of a SIP header: one chip without number, with the header's sigmas if any.
 
-    `size` is columns and rows, for a header without them (else MissingSize); with `pixels`, for a
-    file without CD, (u, v) are corrected pixels, else arcseconds; `notes` go to the reader.
+    `size` is columns and rows, for a header without them (else MissingSizeError); with `pixels`,
+    for a file without CD, (u, v) are corrected pixels, else arcseconds; `notes` go to the reader.
     """
     found = size if sip.size is None else (float(sip.size[0]), float(sip.size[1]))
     if found is None:
-        raise MissingSize(
+        raise MissingSizeError(
             "does not say how large the image is",
             where=name,
             do="add NAXIS1 and NAXIS2 (or IMAGEW and IMAGEH), or compare it with a file that says",

@@ -66,6 +66,16 @@ class SipHeader:
         Columns and rows of the image (NAXIS1/2, or IMAGEW/H in a header without data).
     cards : tuple of str
         All cards as they were read, or those that the fields above do not stand for.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> sip = bd.sip_from_solution(fit, scale_arcsec=2.757)
+    >>> sorted(sip.a)
+    [(0, 2), (1, 1), (2, 0)]
     """
 
     crpix: tuple[float, float]

@@ -46,6 +46,16 @@ def write_sip(sip: SipHeader, path: str | os.PathLike[str]) -> None:
     ------
     InputError
         When the file cannot be written.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> bd.write_sip(bd.sip_from_solution(fit, scale_arcsec=2.757), "sip.hdr")
+    >>> bd.read_sip("sip.hdr").ctype
+    ('RA---TAN-SIP', 'DEC--TAN-SIP')
     """
     with atomic_path(path) as temporary:
         if str(path).lower().endswith(_FITS_SUFFIXES):

@@ -1,0 +1,47 @@
+"""The public face is documented: parameters, what is returned and refused, examples."""
+
+from __future__ import annotations
+
+import doctest
+import inspect
+
+import numpy as np
+import pytest
+from numpydoc.docscrape import NumpyDocString
+
+import bayesdist as bd
+
+PUBLIC = [name for name in bd.__all__ if name != "__version__"]
+BY_HAND = {"run"}  # needs a configuration with its data: docs/tutorial_wise.md is run by test_docs
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_examples_run(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    thing = getattr(bd, name)
+    found = doctest.DocTestFinder(recurse=False).find(thing, name, globs={"bd": bd, "np": np})
+    assert found and found[0].examples, f"bd.{name} has no example"
+    written = []
+    runner = doctest.DocTestRunner(verbose=False)
+    failed = runner.run(found[0], out=written.append).failed
+    assert not failed, "".join(written)
+    skipped = [doctest.SKIP in example.options for example in found[0].examples]
+    assert any(skipped) == (name in BY_HAND)
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_parameters_are_those_of_the_signature(name):
+    thing = getattr(bd, name)
+    text = NumpyDocString(inspect.getdoc(thing))
+    asked = {
+        ("**" if one.kind is one.VAR_KEYWORD else "") + one.name
+        for one in inspect.signature(thing).parameters.values()
+    }
+    told = {
+        part.strip().replace("\\", "") for one in text["Parameters"] for part in one.name.split(",")
+    }
+    assert told == asked
+    if inspect.isfunction(thing):
+        assert text["Raises"]
+        returns = inspect.signature(thing).return_annotation
+        assert bool(text["Returns"]) == (returns != "None")
