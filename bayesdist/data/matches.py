@@ -190,6 +190,28 @@ class Matches(MatchColumns):
         """
         return getattr(self, column) is not None if self.in_memory else column in self._stored
 
+    def column(self, name: str) -> NDArray[Any]:
+        """A column that may be missing.
+
+        Parameters
+        ----------
+        name : str
+
+        Returns
+        -------
+        ndarray, shape (N,)
+
+        Raises
+        ------
+        InputError
+            Where the stars do not have it.
+        """
+        found = getattr(self, name)
+        if found is None:
+            where = ", ".join(self.sources)
+            raise InputError(f"there is no column {name!r}", where=where, do="add or map it")
+        return np.asarray(found)
+
     @property
     def has_sigma(self) -> bool:
         """True where the stars have errors."""
@@ -482,8 +504,7 @@ class Matches(MatchColumns):
     def _errors(self, errors: Errors) -> tuple[Float, Float]:
         """Errors (N,) of u and of v."""
         if isinstance(errors, MagnitudeErrors):
-            assert self.mag is not None
-            return errors.at(self.mag)
+            return errors.at(self.column("mag"))
         if isinstance(errors, AddedErrors):
             return errors.at(*self.grouped(errors.by))
         pair = errors if isinstance(errors, tuple) else (errors, errors)

@@ -181,8 +181,7 @@ def grouped_errors(
 
 def _quoted(table: Matches) -> Float:
     """Quoted variances (2, N)."""
-    assert table.sigma_u is not None and table.sigma_v is not None
-    return np.stack([table.sigma_u, table.sigma_v]) ** 2
+    return np.stack([table.column("sigma_u"), table.column("sigma_v")]) ** 2
 
 
 def _starting_state(table: Matches, fit: LinearFit, quoted: Float, outliers: bool) -> _State:

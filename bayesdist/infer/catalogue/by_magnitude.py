@@ -96,11 +96,11 @@ def _law(
     priors: GaussianPriors | None,
 ) -> MagnitudeErrors:
     """Law of the errors with magnitude of some stars."""
-    assert stars.mag is not None
+    mag = stars.column("mag")
     fit = fit_linear(stars.with_errors(1.0), model, rejection=rejection, priors=priors)
     residual = residuals_of(fit, stars)
-    bins = estimate(stars.mag, *residual, n_params=model.n_params)
-    law = MagnitudeLaw.of(stars.mag, bins)
+    bins = estimate(mag, *residual, n_params=model.n_params)
+    law = MagnitudeLaw.of(mag, bins)
     nodes, square = law.start, residual**2
     narrowest = (WIDER * np.exp(nodes.max())) ** 2
     f, wide = FALSE[0], max(narrowest, float((square.sum(axis=0)).max()) / 8.0)
@@ -119,7 +119,7 @@ def _law(
         if np.abs(nodes - before).max() < SETTLED:
             break
     sigma_u, sigma_v = np.exp(nodes)
-    scatter_u, scatter_v = _scatter(bins, stars.mag, good, square)
+    scatter_u, scatter_v = _scatter(bins, mag, good, square)
     return MagnitudeErrors(bins.mag, sigma_u, sigma_v, bins.n, scatter_u, scatter_v)
 
 

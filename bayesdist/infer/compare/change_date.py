@@ -81,8 +81,7 @@ def period_scores(
     held: dict[int, tuple[NormalEquations, float, float, int]] = {}
     constants = new.target.hyper.constants(new.psi[None, new.target.n_theta :])
     for table in matches.batches():
-        assert table.epoch is not None
-        of_period = np.searchsorted(edges, table.epoch, side="right")
+        of_period = np.searchsorted(edges, table.column("epoch"), side="right")
         for b in np.unique(of_period):
             part = table.select(of_period == b)
             found = _sums(new, part, constants)
@@ -95,8 +94,7 @@ def period_scores(
 
 def _edges(matches: Matches, most: int) -> Float:
     """Dates at which a new period begins."""
-    epoch = matches.sample(1_000_000).epoch
-    assert epoch is not None
+    epoch = matches.sample(1_000_000).column("epoch")
     dates, counts = np.unique(epoch, return_counts=True)
     if len(dates) <= most:
         return dates[1:]
@@ -106,9 +104,9 @@ def _edges(matches: Matches, most: int) -> Float:
 
 def _sums(new: NewFit, table: Matches, constants) -> tuple[NormalEquations, float, float, int]:  # type: ignore[no-untyped-def]
     stars, _ = prepare(new.model, table)
-    assert table.epoch is not None
+    epoch = table.column("epoch")
     equations = mixture(stars, new.theta, constants, True)
-    return equations, float(table.epoch.min()), float(table.epoch.max()), len(table)
+    return equations, float(epoch.min()), float(epoch.max()), len(table)
 
 
 def _joined(

@@ -84,9 +84,9 @@ def sum_by_period(matches: Matches, periods: Periods, task: Callable[[Matches], 
     check_periods(periods)
     sums: dict[str, Any] = {}
     for table in matches.batches():
-        assert table.epoch is not None
+        epoch = table.column("epoch")
         for name, (start, stop) in periods.items():
-            inside = (table.epoch >= start) & (table.epoch < stop)
+            inside = (epoch >= start) & (epoch < stop)
             if inside.any():
                 part = task(table.select(inside))
                 sums[name] = sums[name] + part if name in sums else part
