@@ -121,7 +121,7 @@ class RunConfig(Section):
                 b.kind,
                 b.sigma_u,
                 b.sigma_v,
-                b.unit,
+                b.unit or "pix",
                 said_by_user(b.source),
                 varies=b.of_catalogue,
             )
