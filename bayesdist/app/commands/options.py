@@ -100,15 +100,15 @@ def chip_of(numbers: Sequence[int], chip: int | None, where: str) -> int:
     InputError
         For none, or one that is not there, among several.
     """
+    listed = ", ".join(map(str, numbers))
     if chip is None and len(numbers) == 1:
         return numbers[0]
-    if chip in numbers:
-        return chip
-    listed = ", ".join(map(str, numbers))
     if chip is None:
         raise InputError(
             f"has {len(numbers)} chips, and none is named",
             where=where,
             do=f"add --chip, one of {listed}",
         )
-    raise InputError(f"has no chip {chip}", where=where, do=f"choose one of {listed}")
+    if chip not in numbers:
+        raise InputError(f"has no chip {chip}", where=where, do=f"choose one of {listed}")
+    return chip
