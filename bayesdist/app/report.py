@@ -82,7 +82,7 @@ def report_input(results: Results) -> ReportInput:
         budget=evaluation.budget,
         surface=evaluation.surface,
         margins=evaluation.margins,
-        horizons=evaluation.validity,
+        validity=evaluation.validity,
         products=products,
         checks=evaluation.checks,
         score_tests=found.score_tests,

@@ -136,12 +136,17 @@ def make_stages(results: Results, stages: Collection[str], *, force: bool = Fals
             r = run.make(name, made, force=force).value or r
 
     def evaluated() -> Evaluation:
-        known = r.posterior, r.diagnostics, r.data, config
-        return evaluate(error_model(*known), *known, base, source=source, series=r.series)
+        posterior, found, data = r.posterior, r.diagnostics, r.data
+        errors = error_model(posterior, found, data, config)
+        return evaluate(
+            errors, posterior, found, data, config, base, source=source, series=r.series
+        )
 
     def exported() -> list[dict[str, Any]]:
-        known = r.stored_evaluation, r.posterior, r.stored, r.data, config, base
-        return export(*known, run.path, source=source)
+        evaluation, posterior = r.stored_evaluation, r.posterior
+        return export(
+            evaluation, posterior, r.stored, r.data, config, base, run.path, source=source
+        )
 
     stage("match", "matched", lambda: match(r.inputs, config, base), save_matches)
     stage("fit", "fitted", lambda: _fitted(r), save_fit)

@@ -146,7 +146,7 @@ class ReportInput:
     budget: ErrorBudget | None = None
     surface: BudgetSurface | None = None  # budget at every position and epoch, for the page
     margins: tuple[Margin, ...] = ()
-    horizons: tuple[ValidityPeriod, ...] = ()  # empty where nothing depends on time
+    validity: tuple[ValidityPeriod, ...] = ()  # empty where nothing depends on time
     products: tuple[Product, ...] = ()
     checks: tuple[Check, ...] = ()  # criteria and remarks but those of requirements and products
     score_tests: tuple[ScoreTest, ...] = ()  # of the residuals

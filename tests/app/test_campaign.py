@@ -78,7 +78,7 @@ def test_nearly_all_stars_are_matched_and_hardly_any_wrongly(run, folder):
     found = summary_of(run)["matching"]
     assert found["n_exposures"] == 20
     assert found["completeness"]["median"] > 0.95
-    assert found["false_share"] < 0.01
+    assert found["false_fraction"] < 0.01
     truth = read_acs(folder).truth
     pairs = read_matches(run / "pairs", unit="pix")
     assert len(pairs) == found["n_pairs"]

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from unittest import mock
 
 import numpy as np
 
 from bayesdist.app.campaign import fit as stage
-from bayesdist.app.campaign.matched import CampaignMatched, campaign_matches
+from bayesdist.app.campaign.matched import CampaignMatched
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.results import Results, open_results
@@ -121,7 +121,7 @@ class Calibrated:
     @property
     def matched(self) -> CampaignMatched:
         """Pairs as they were matched."""
-        return campaign_matches(self.results.matched)
+        return cast(CampaignMatched, self.results.matched)
 
 
 @contextmanager
@@ -209,7 +209,7 @@ def _results_of(*names: str) -> Iterator[dict[str, Any]]:
 
 def _with_catalogue(bare: HierarchicalFit, data: FitData) -> TransformedSolution:
     """The joint fit with the errors that a star of the catalogue has in all exposures."""
-    catalog, matches = campaign_matches(data.matched).inputs.catalog, data.stars
+    catalog, matches = data.matched.catalogue, data.stars
 
     def by_code(values: Any) -> np.ndarray:
         out = np.zeros(int(catalog.star.max()) + 1)

@@ -336,7 +336,7 @@ def test_a_good_campaign_passes(run):
     ("section", "changes", "name"),
     [
         ("matching", {"completeness": {"median": 0.9, "least": 0.3}}, "completeness"),
-        ("matching", {"false_share": 0.1}, "false pairs"),
+        ("matching", {"false_fraction": 0.1}, "false pairs"),
         ("matching", {"left_out": {"e001": "no match"}}, "left out"),
         ("tables", {"converged": False}, "tables converged"),
         ("time_dependence", {"converged": False}, "Series"),

@@ -97,7 +97,7 @@ def test_pictures_are_whole_and_described(page, figures):
     # periods, held-out stars and no catalogue were not asked for, and nothing depends on time
     others = ("periods", "holdout", "selfcal", "campaign")
     named = {one.name for one in every if not one.section.startswith(others)}
-    assert set(figures) == named - {"horizon"}
+    assert set(figures) == named - {"validity_period"}
     assert len(images) == len(figures)
     for image in images:
         png = base64.b64decode(image.get("src").split(",", 1)[1], validate=True)

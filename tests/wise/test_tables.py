@@ -37,7 +37,9 @@ TERMS = 15
 
 def calibrated(band: str, partition: bool, bins: int = 31, pairs: int | None = None):
     """Set, pairs, fit and bins; without false matches, whose share of the noise no theory gives."""
-    one = wise_set(band, pairs=pairs or PAIRS[band], seed=8, false_share=0.0, partition=partition)
+    one = wise_set(
+        band, pairs=pairs or PAIRS[band], seed=8, false_fraction=0.0, partition=partition
+    )
     drawn = pairs_of(one)
     matches = matches_of(drawn)
     fit = fit_linear(matches, one.model, rejection=Rejection(1e9, None))

@@ -47,7 +47,7 @@ def rehearsal_settings(data: FitData, config: Config) -> EvaluationSettings:
         grid=config.assess.grid,
         epoch=assessment_epoch(data, config),
         draws=config.assess.draws,
-        years_ahead=config.assess.horizon or 0.0,
+        years_ahead=config.assess.years_ahead,
         scale_mas=config.detector.scale_mas,
         single=config.assess.exposure == "single",
         # errors of centroids that the fit has found hold nothing else

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, PositiveFloat, create_model
 
@@ -37,6 +37,12 @@ class ReleaseBlock(Section):
 
 class Products(Section):
     """Files for pipelines."""
+
+    if TYPE_CHECKING:
+
+        @property
+        def release(self) -> ReleaseBlock | None:
+            """What a release is made of, where the kind of run has one."""
 
     def asked(self) -> dict[str, FormatSettings]:
         """Settings of the files that are asked for, by format."""

@@ -91,8 +91,7 @@ class FitData:
     def median_epoch(self) -> float:
         """Median date of the stars, decimal years; they have dates where the model drifts."""
         table = self.placed if self.placed.in_memory else self.placed.sample(SAMPLE)
-        assert table.epoch is not None
-        return float(np.median(table.epoch))
+        return float(np.median(table.column("epoch")))
 
     @cached_property
     def better_frames(self) -> FrameChoice | None:

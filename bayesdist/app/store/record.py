@@ -153,6 +153,13 @@ class Record:
             do="use that version, or choose another folder",
         )
 
+    def begins_file(self, name: str) -> bool:
+        """Note that the stage under way writes a file; False where that is known."""
+        if self.under_way is None or name in self.under_way["files"]:
+            return False
+        self.under_way["files"] = sorted([*self.under_way["files"], name])
+        return True
+
     def write(self, path: Path) -> None:
         """Replace run.json."""
         found = {name: asdict(one) for name, one in self.artefacts.items()}

@@ -12,7 +12,6 @@ from bayesdist.app.summary.rows import (
     BudgetRow,
     CoverageRow,
     HoldoutTest,
-    HorizonRow,
     MapRow,
     MarginRow,
     MeanAndSd,
@@ -22,6 +21,7 @@ from bayesdist.app.summary.rows import (
     ProductRow,
     ScoreTestRow,
     StructureRow,
+    ValidityRow,
 )
 
 __all__ = ["Summary", "head_of", "schema_text"]
@@ -156,7 +156,7 @@ class Summary(Part):
     budget: list[BudgetRow] | None = None
     misfit: Misfit | None = None
     margins: list[MarginRow] | None = None
-    horizons: list[HorizonRow] | None = None
+    validity_periods: list[ValidityRow] | None = None
     warnings: list[str] | None = None
     products: list[ProductRow] | None = None
     figures: list[str] | None = None

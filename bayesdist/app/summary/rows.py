@@ -10,7 +10,6 @@ __all__ = [
     "BudgetRow",
     "CoverageRow",
     "HoldoutTest",
-    "HorizonRow",
     "MapRow",
     "MarginRow",
     "MeanAndSd",
@@ -19,6 +18,7 @@ __all__ = [
     "ProductRow",
     "ScoreTestRow",
     "StructureRow",
+    "ValidityRow",
 ]
 
 Number = float | None  # null where it is not finite, or not known
@@ -162,7 +162,7 @@ class MarginRow(Part):
     remedy: str | None
 
 
-class HorizonRow(Part):
+class ValidityRow(Part):
     """Until when a requirement is met."""
 
     name: str

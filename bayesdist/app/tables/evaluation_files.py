@@ -86,8 +86,8 @@ def save_margins(
 def load_evaluation(run: RunDirectory, fit: LinearFit, posterior: Posterior) -> Evaluation:
     """The evaluation of a fit and a posterior; InputError where there is none of just these."""
     again = f"run 'bayesdist stage evaluate {run.path}' again"
-    found = record_from_arrays(read_arrays(run / FILE, fingerprint_of(fit, posterior), do=again))
-    assert isinstance(found, Evaluation)
+    arrays = read_arrays(run / FILE, fingerprint_of(fit, posterior), do=again)
+    found: Evaluation = record_from_arrays(arrays)
     return found
 
 
@@ -118,8 +118,8 @@ def _write_margins(
     table = margin_table(margins, several=len(posterior.model.chips) > 1)
     table.meta = dict(head)
     write_table(table, run / "margins.ecsv")
-    _write_validity(run / "horizon.ecsv", validity)
-    run.summarise(margins=margin_rows(margins), horizons=validity_rows(validity))
+    _write_validity(run / "validity_periods.ecsv", validity)
+    run.summarise(margins=margin_rows(margins), validity_periods=validity_rows(validity))
 
 
 def _write_validity(path: Path, validity: Sequence[ValidityPeriod]) -> None:

@@ -85,14 +85,15 @@ def bands(
 @click.option("--corner-radius", type=float, default=3.0, metavar="A", help="... in its corners.")
 @click.option("--optical", metavar="FILE", help="SIP header or WISE meta-data to begin with.")
 @click.option("--rotation", type=float, default=0.0, metavar="DEG", help="Of the optical model.")
-def bring_up(detections: str, reference: str, output: str, **options: Any) -> None:
+@click.pass_obj
+def bring_up(line: str, detections: str, reference: str, output: str, **options: Any) -> None:
     """Pairs and distortion from lists of stars that nobody has paired.
 
     DETECTIONS and REFERENCE have columns x, y, sigma and frame, in pixels of the band.
     """
     from bayesdist.missions.wise.bring_up.command import bring_up_files
 
-    click.echo(bring_up_files(detections, reference, output, **options))
+    click.echo(bring_up_files(detections, reference, output, command=line, **options))
 
 
 @command()
@@ -184,7 +185,7 @@ rvb.add_command(rereference)
     "--bands", type=CommaList(), default="W1,W2,W3,W4", metavar="W1,...", help="Of full sets."
 )
 @click.option("--pairs", type=int, metavar="N", show_default="as published", help="Of each band.")
-@click.option("--false-share", type=float, default=0.03, metavar="F", help="Of false matches.")
+@click.option("--false-fraction", type=float, default=0.03, metavar="F", help="Of false matches.")
 @click.option("--partition-pattern", is_flag=True, help="Blocks in the residuals.")
 @click.option("--stars", type=int, metavar="N", help="One small table of one band instead.")
 @click.option("--band", metavar="W2", help="Of the small table.")
