@@ -322,7 +322,9 @@ def diagnose(
     shared = None
     if eliminated is not None:
         estimated = selfcal_discrepancy(eliminated, rng=restarted(rng), priors=discrepancy)
-        tests = selfcal_score_tests(eliminated, mag=stars.mag, epoch=stars.epoch)
+        tests = selfcal_score_tests(
+            eliminated, mag=stars.mag, colour=stars.colour, epoch=stars.epoch
+        )
     else:
         estimated = estimate_discrepancy(
             shards,
