@@ -40,9 +40,8 @@ from bayesdist.diagnose.selfcal.eliminated import (
     pieces,
     without_parameters,
 )
-from bayesdist.diagnose.selfcal.leverage import taken_by_stars
 from bayesdist.diagnose.selfcal.sandwich import star_scores
-from bayesdist.diagnose.selfcal.scores import scores_of_detections
+from bayesdist.diagnose.selfcal.scores import scores_of_detections, taken_by_stars
 from bayesdist.diagnose.significance import hotelling_p
 from bayesdist.infer.selfcal.elimination import memberships
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
