@@ -9,7 +9,7 @@ out.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,30 +56,28 @@ MAX_DETECTIONS = 60_000  # that are looked at
 STARS_PER_DIRECTION = 2  # below, a covariance of the scores says nothing
 MIN_INFORMATION = 0.02  # of a direction, relative to that with known stars
 UNDITHERED = 1e-3  # of half a side: offsets that say nothing
-OF_EXPOSURES = replace(
+EXPOSURES_OF_SELFCAL = replace(
     EXPOSURES, remedy="give selfcal.frames a scale where it has none, or leave out exposures"
 )
-OF_STARS = replace(
+MOTIONS_OF_SELFCAL = replace(
     MOTIONS,
     remedy="set selfcal.motion to 'proper_motion'",
     present="stars move between the dates of the exposures, and are taken to stand still",
 )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _AddedColumns(Columns):
     """Functions of the questions on both axes of every chip, and deviations of exposures."""
 
-    added: Functions | None = field(default=None)
+    added: Functions
 
     def n_functions(self, chip: int) -> int:
         """Number of functions along one axis."""
-        assert self.added is not None
         return self.added.n_added
 
     def values(self, chip: int, rows: Int) -> Float:
         """Values (n, n_functions) of these."""
-        assert self.added is not None
         return self.added.at(rows)[self.problem.model.n_terms :].T
 
     def along_axes(self, functions: Int) -> Int:
@@ -131,11 +129,12 @@ def selfcal_score_tests(
     )
     sample = _sample(solution, some, rows, mag=mag, colour=colour, epoch=epoch)
     functions = functions_for(sample)
-    columns = _AddedColumns(problem, solution.theta, {}, deviations, functions)
+    columns = _AddedColumns(problem, solution.theta, deviations=deviations, added=functions)
     sums = _summed(solution, columns, rows, solution.stars[some])
     found = one_of_each(_regressor_tests(sums, columns, functions))
     chosen = columns.of_exposures
-    deviating = _tested(sums, OF_EXPOSURES, chosen, np.eye(len(chosen)), np.eye(len(chosen)))
+    each = np.eye(len(chosen))
+    deviating = _tested(sums, EXPOSURES_OF_SELFCAL, chosen, each, each)
     moving = None
     if epoch is not None and whole.n_star == 2 and np.ptp(epoch) > SHORTEST:
         moving = _motions(solution, epoch)
@@ -235,7 +234,7 @@ def _motions(solution: SelfCalibrationMode, epoch: Float) -> Outcome | None:
     """Test for stars that move."""
     p, scores = solution.problem, scores_of_detections(solution)
     residuals = StarResiduals(p.star, epoch, scores.gradient, scores.curvature, p.priors.precision)
-    return motion_outcome(residuals, p.model.unit, OF_STARS)
+    return motion_outcome(residuals, p.model.unit, MOTIONS_OF_SELFCAL)
 
 
 def _sample(
@@ -259,7 +258,7 @@ def _sample(
     residual = np.linalg.solve(J, r)[:, :, 0] * pixel
     variance = (p.var + solution.mixture.jitter**2) * pixel**2
     taken = taken_by_stars(solution)[rows]
-    varied = {name: None if one is None else one[rows] for name, one in known.items()}
+    at_rows = {name: None if one is None else one[rows] for name, one in known.items()}
     frames = [model.frame(theta, e) for e in range(len(model.exposures))]
     position, offset = _pointings(p, theta, frames)
     return ScoredSample(
@@ -271,9 +270,9 @@ def _sample(
         residual=np.asarray(residual.T, float),
         variance=np.stack([variance, variance]),
         inlier=memberships(whole, theta, solution.mixture, solution.stars)[rows],
-        mag=varied["mag"],
-        colour=varied["colour"],
-        epoch=varied["epoch"],
+        mag=at_rows["mag"],
+        colour=at_rows["colour"],
+        epoch=at_rows["epoch"],
         star=p.star,
         chip=p.groups.chip[group],
         exposure=p.groups.exposure[group],
