@@ -210,6 +210,7 @@ class _NodeCells:
 
     @classmethod
     def of(cls, chip: Chip, step: tuple[float, float], parts: int) -> _NodeCells:
+        """Cells of a chip, `parts` along each side of a square."""
         squares = [int(np.ceil(n / s - 1e-9)) + 1 for n, s in zip(chip.size, step, strict=True)]
         return cls(
             ((1 - step[0]) / 2, (1 - step[1]) / 2),
@@ -220,9 +221,11 @@ class _NodeCells:
 
     @property
     def number(self) -> int:
+        """Number of cells."""
         return self.shape[0] * self.shape[1]
 
     def of_pixels(self, x: Float, y: Float) -> Int:
+        """Cell of each pixel, shape (N,)."""
         i, j = (
             np.clip(((p - o) // s).astype(np.int64), 0, n - 1)
             for p, o, s, n in zip((x, y), self.origin, self.side, self.shape, strict=True)
@@ -230,6 +233,7 @@ class _NodeCells:
         return j * self.shape[0] + i
 
     def centres(self, cells: Int) -> tuple[Float, Float]:
+        """Pixels x and y of the centres of cells."""
         j, i = np.divmod(cells, self.shape[0])
         x, y = (o + (k + 0.5) * s for o, k, s in zip(self.origin, (i, j), self.side, strict=True))
         return x, y
