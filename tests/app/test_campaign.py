@@ -143,14 +143,6 @@ def test_each_period_has_its_table_and_both_are_the_model(run):
     assert {t.chip for t in read_d2im(run / "acs_wfc_d2i.fits")} == {1, 2}
 
 
-def test_a_stage_can_be_run_again(run):
-    of_these_stages = ("matching", "tables", "scatter", "fit")
-    before = {key: summary_of(run)[key] for key in of_these_stages}
-    good("stage", "match", run, "-q")
-    good("stage", "fit", run, "-q")
-    assert {key: summary_of(run)[key] for key in of_these_stages} == before
-
-
 def test_the_error_of_the_tables_is_in_the_budget(run):
     rows = {row["name"]: row for row in summary_of(run)["budget"]}
     tables, total = rows["look-up tables"], rows["total"]

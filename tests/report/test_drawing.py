@@ -1,8 +1,8 @@
 """Figures as files: nothing cut, numbers as matplotlib sets them, the same whoever draws."""
 
 import io
-import os
 import re
+from concurrent.futures.process import BrokenProcessPool
 
 import numpy as np
 import pytest
@@ -121,14 +121,14 @@ def test_several_processes_draw_what_one_draws(converged, alone, monkeypatch):
 
 def test_processes_that_fail_are_made_up_for(converged, alone, monkeypatch, caplog):
     monkeypatch.setattr(drawing, "MIN_FIGURES_SHARED", 1)
-    monkeypatch.setattr(drawing, "_receive", _end)
+    monkeypatch.setattr(drawing, "ProcessPoolExecutor", _ended)
     assert drawing.draw_all(Few, converged, processes=2) == alone
     assert "drawn by one process" in caplog.text
 
 
-def _end(results):
-    """End the process that begins with this."""
-    os._exit(3)
+def _ended(*_, **__):
+    """What a pool says whose processes have ended as they began."""
+    raise BrokenProcessPool("they have ended")
 
 
 def test_words_come_with_the_files(plots, alone):

@@ -29,21 +29,22 @@ from .runs import SIZE, report_input
 WITHOUT_UNIT = {"stars per bin", "stars per hexagon"}  # counts
 CATEGORIES = {"budget_terms", "margins"}  # names, not numbers, along y
 
+WFC = {"size": (4096.0, 2048.0), "names": ("WFC2", "WFC1")}
+ARCSEC = {"unit": "arcsec", "scale": 0.05}
+# each shape, unit and model of outliers once
 RUNS = {
     "square": {},
-    "wide in arcsec": {"size": (4096.0, 2048.0), "unit": "arcsec", "scale": 0.05},
     "least squares": {"sampler": False},
-    "uniform": {"outliers": "uniform"},
-    "no outliers": {"outliers": "none"},
-    "two wide chips": {"size": (4096.0, 2048.0), "names": ("WFC2", "WFC1")},
-    "two square chips": {"names": ("A", "B"), "unit": "arcsec", "scale": 0.05},
+    "wide in arcsec, no outliers": {"size": (4096.0, 2048.0), "outliers": "none"} | ARCSEC,
+    "two wide chips": WFC,
+    "two square chips in arcsec, uniform": {"names": ("A", "B"), "outliers": "uniform"} | ARCSEC,
 }
-WFC = {"size": (4096.0, 2048.0), "names": ("WFC2", "WFC1")}
 
 
 @pytest.fixture(scope="module", params=RUNS, ids=str)
 def every_figure(request):
-    figures = figures_of(report_input(**RUNS[request.param]))
+    options = RUNS[request.param]
+    figures = figures_of(report_input(**options)) if options else request.getfixturevalue("figures")
     for figure in figures.values():
         figure.canvas.draw()
     return figures
@@ -262,13 +263,11 @@ def test_the_largest_radius_is_printed(converged, figures):
 
 def test_maps_of_one_figure_share_their_colours(figures):
     fig = figures["uncertainty_radius"]
-    limits = {
-        c.get_clim()
+    limits = [
+        {c.get_clim() for c in ax.collections if c.get_cmap().name == "cividis"}
         for ax in fig.axes[:2]
-        for c in ax.collections
-        if c.get_cmap().name == "cividis"
-    }
-    assert len(limits) == 1
+    ]
+    assert len(limits[0]) == 1 and limits[0] == limits[1]
 
 
 def test_detector_is_shown_x_right_y_up_with_square_pixels(figures):

@@ -25,7 +25,7 @@ from bayesdist.missions.wise.assess.histograms import band_sums
 from bayesdist.missions.wise.published import RESIDUAL_SIGMAS, WISE_BANDS
 from bayesdist.missions.wise.simulate import wise_set
 
-from .support import matches_of, pairs_of
+from .calibrations import matches_of, pairs_of
 
 # the pattern of W3 is small beside its noise
 PAIRS = {"W1": 150_000, "W2": 150_000, "W3": 600_000, "W4": 150_000}
