@@ -54,13 +54,13 @@ def sketched(full) -> Iterator[None]:
         yield
 
 
-def _sketch(plot):
+def _sketch(plot, *, pdf):
     """The words of a figure, and a speck in place of it."""
     from bayesdist.report.drawing import Drawing
 
     page = io.BytesIO()
     Image.new("RGB", (4, 3), "white").save(page, format="png")
-    return Drawing(page.getvalue(), b"%PDF-1.7", plot.title, plot.text, plot.alt)
+    return Drawing(page.getvalue(), b"%PDF-1.7" if pdf else None, plot.title, plot.text, plot.alt)
 
 
 @pytest.fixture(scope="package")

@@ -49,7 +49,7 @@ def drawings_of(plots: dict[str, Plot], *, speck: bool = False) -> dict[str, Dra
     """PNG files with the words, without PDF; as specks where only words are looked at."""
     return {
         name: Drawing(
-            _speck() if speck else png_of(plot.figure), b"", plot.title, plot.text, plot.alt
+            _speck() if speck else png_of(plot.figure), None, plot.title, plot.text, plot.alt
         )
         for name, plot in plots.items()
     }
