@@ -105,7 +105,7 @@ def _draw_marginal(ax: Axes, draws: Float, limits: Float) -> None:
 
 def _draw_joint(ax: Axes, draws: Float, limits: Float) -> None:
     """Draw the regions that hold as many draws (N, 2) as 1 and 2 sigma of a Gaussian."""
-    counts, *edges = np.histogram2d(*draws.T, bins=BINS, range=limits)
+    counts, *edges = np.histogram2d(draws[:, 0], draws[:, 1], bins=BINS, range=limits)
     # continued beyond the edges by its outermost values, so that regions end at the frame
     smooth = np.pad(gaussian_filter(counts, 1.0), 1, mode="edge")
     x, y = (np.append(e - 0.5 * (e[1] - e[0]), e[-1] + 0.5 * (e[1] - e[0])) for e in edges)
