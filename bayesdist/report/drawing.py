@@ -19,6 +19,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.spines import Spine
 from matplotlib.transforms import Bbox
 from PIL import Image
 
@@ -111,6 +112,10 @@ def png_of(figure: Figure) -> bytes:
 def _laid_out(figure: Figure) -> tuple[FigureCanvasAgg, Bbox]:
     """Area of a figure that is drawn on, in inches, with room around it, after its only layout."""
     plain_ticks(figure)
+    for ax in figure.axes:
+        for spine in ax.spines.values():
+            if type(spine) is Spine:  # it lies on the frame, and would measure all ticks again
+                spine.set_in_layout(False)
     figure.set_dpi(DPI)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
