@@ -29,21 +29,22 @@ log = logging.getLogger("bayesdist")
 VECTOR_GRID = 17  # vectors along the longer side of a diagram: more would hide each other
 
 
-def report(results: Results) -> list[str]:
+def report(results: Results, *, pdf: bool = False) -> list[str]:
     """Names of the figures of a report, which is written into the folder of the run.
 
     Parameters
     ----------
     results : Results
+    pdf : bool
+        Whether figures are drawn as PDF, too.
     """
     # figures take seconds to import
     from bayesdist.report.drawing import save_drawings
     from bayesdist.report.run_report import draw_report, write_report
 
     run, inputs = results.run, report_input(results)
-    drawings = draw_report(inputs, processes=2 if _is_command_line() else 1)
-    names = [f"{name}.{kind}" for name in drawings for kind in ("png", "pdf")]
-    save_drawings(drawings, run / "figures")
+    drawings = draw_report(inputs, pdf=pdf, processes=2 if _is_command_line() else 1)
+    names = [path.name for path in save_drawings(drawings, run / "figures")]
     write_report(run / "report.html", inputs, drawings)
     log.info("report: %s", run / "report.html")
     return names

@@ -7,13 +7,14 @@ ensemble averages, which shows a drift that all walkers share (Goodman and Weare
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.infer.effective_draws import bulk_draws, mean_draws, rank_rhat, tail_draws
+from bayesdist.infer.pareto import pareto_smoothed
 from bayesdist.limits import DRAWS_PER_WALKER
 
 __all__ = [
@@ -122,36 +123,26 @@ def diagnose(
     fell outside the support and have weight zero.  `coupled` if the walkers of an ensemble
     influence each other.
     """
-    az = _arviz()
-
     E, T, W, D = chains.shape
     in_time = chains.reshape(E, T * W, D)
     by_walker = np.swapaxes(chains, 1, 2).reshape(E, W * T, D)
 
-    def each(function, values: Float, **options: object) -> Float:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            out = function(az.convert_to_dataset({"x": values}), **options)
-        # a parameter that never moved has no variance: no effective draws, no agreement
-        return np.asarray(out["x"].values, float)
-
-    rhat = each(az.rhat, in_time)
+    # a parameter that never moved has no variance: no effective draws, no agreement
+    rhat = rank_rhat(in_time)
     rhat[~np.isfinite(rhat)] = np.inf
-    bulk = each(az.ess, by_walker)
-    tail = each(az.ess, by_walker, method="tail")
+    bulk, tail = bulk_draws(by_walker), tail_draws(by_walker)
     if coupled:
         low, high = np.quantile(in_time.reshape(-1, D), [0.05, 0.95], axis=0)
-        bulk = np.minimum(bulk, _coupled_ess(chains, each))
+        bulk = np.minimum(bulk, _coupled_ess(chains))
         for outside in (chains <= low, chains >= high):
-            tail = np.minimum(tail, _coupled_ess(outside.astype(float), each))
+            tail = np.minimum(tail, _coupled_ess(outside.astype(float)))
     frozen = np.ptp(in_time.reshape(-1, D), axis=0) == 0
     bulk[frozen | ~np.isfinite(bulk)] = 0.0
     tail[frozen | ~np.isfinite(tail)] = 0.0
     spread = in_time.reshape(-1, D).std(axis=0)
-    # delta method; arviz.mcse(method="sd") of 0.23 fails on numpy 2.4
     squares = (by_walker - by_walker.reshape(-1, D).mean(axis=0)) ** 2
-    ess_squares = np.maximum(each(az.ess, squares, method="mean"), 1.0)
-    with np.errstate(invalid="ignore", divide="ignore"):
+    ess_squares = np.maximum(mean_draws(squares), 1.0)
+    with np.errstate(invalid="ignore", divide="ignore"):  # by the delta method
         mcse_sd = squares.reshape(-1, D).std(axis=0) / np.sqrt(ess_squares) / (2 * spread)
     reasons = []
     for label, values, bad, limit in (
@@ -190,24 +181,14 @@ def diagnose(
     )
 
 
-def _arviz() -> Any:
-    """ArviZ, without its daily notice, which does not concern users of this package."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)
-        import arviz  # takes seconds: only where it is needed
-    return arviz
-
-
-def _coupled_ess(chains: Float, each) -> Float:
+def _coupled_ess(chains: Float) -> Float:
     """Effective sample size of the mean over ensembles that may move as one."""
-    az = _arviz()
-
     D = chains.shape[-1]
     averages = chains.mean(axis=2)
     share = averages.reshape(-1, D).var(axis=0)
     total = chains.reshape(-1, D).var(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        ess = each(az.ess, averages, method="mean") * total / share
+        ess = mean_draws(averages) * total / share
     return np.where(np.isfinite(ess), ess, 0.0)
 
 
@@ -225,17 +206,13 @@ def pareto_k(log_weights: Float) -> float:
     0 where no weight is more than twice the mean: there is no tail then, and the shape of nearly
     equal weights means nothing.
     """
-    az = _arviz()
-
     finite = log_weights[np.isfinite(log_weights)]
     if len(finite) < 25 or np.ptp(finite) < 1e-9:
         return float("-inf") if len(finite) >= 25 else float("inf")
     weights = np.exp(finite - finite.max())
     if weights.mean() > 0.5:
         return 0.0
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return float(az.psislw(finite.copy())[1])
+    return pareto_smoothed(finite)[1]
 
 
 def smoothed_weights(log_weights: Float, independent: float) -> tuple[Float, float]:
@@ -244,6 +221,5 @@ def smoothed_weights(log_weights: Float, independent: float) -> tuple[Float, flo
     `independent` is the effective fraction of the draws.  With k above 0.7 the weights cannot be
     trusted.
     """
-    with np.errstate(over="ignore"):  # inside arviz, of draws of negligible weight
-        smoothed, k = _arviz().psislw(log_weights, reff=independent)
-    return np.exp(smoothed), float(k)
+    smoothed, k = pareto_smoothed(log_weights, independent)
+    return np.exp(smoothed), k

@@ -476,7 +476,7 @@ def test_an_interrupted_run_goes_on(finished, posterior, tmp_path, monkeypatch):
     assert result.code == 130 and "--resume" in result.err and "Traceback" not in result.err
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert list(record["stages"]) == ["fit", "sample"]
-    monkeypatch.setattr("bayesdist.app.run.report", lambda results: [])
+    monkeypatch.setattr("bayesdist.app.run.report", lambda results, pdf: [])
     result = good("run", finished.config, "-o", tmp_path / "run", "--resume")
     assert "sample: done before" in result.err
     np.testing.assert_array_equal(load_posterior(tmp_path / "run").theta, posterior.theta)
@@ -565,6 +565,15 @@ def test_figures_are_listed_once_they_are_there(copy, monkeypatch):
     assert cli("stage", "report", copy).code == 1
     assert "figures" not in summary_of(copy)
     assert not (copy / "figures").exists()
+
+
+def test_figures_are_drawn_as_pdf_where_that_is_asked_for(copy):
+    assert not [name for name in summary_of(copy)["figures"] if name.endswith(".pdf")]
+    assert cli("stage", "report", copy, "--pdf").code == 0
+    for kind in ("png", "pdf"):
+        written = {p.name for p in (copy / "figures").glob(f"*.{kind}")}
+        listed = {name for name in summary_of(copy)["figures"] if name.endswith(kind)}
+        assert len(written) >= 8 and written == listed
 
 
 # -- validate, check, init, inspect, demo ---------------------------------------------------------

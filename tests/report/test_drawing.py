@@ -46,7 +46,7 @@ def test_a_picture_is_cut_to_what_is_drawn_and_no_more(at):
 
 def test_the_same_figure_gives_the_same_files():
     first, second = (square(0.1, 0.1, 0.5) for _ in range(2))
-    one, other = (render(Plot(figure, "", "", "")) for figure in (first, second))
+    one, other = (render(Plot(figure, "", "", ""), pdf=True) for figure in (first, second))
     assert one == other
     assert one.png == png_of(second)
 
@@ -138,8 +138,9 @@ def test_words_come_with_the_files(plots, alone):
         assert (one.title, one.text, one.alt) == words and all(words)
 
 
-def test_both_kinds_are_saved(tmp_path):
-    one = render(Plot(square(0.1, 0.1, 0.5), "", "", ""))
-    paths = drawing.save_drawings({"a": one}, tmp_path / "figures")
-    assert [p.name for p in paths] == ["a.png", "a.pdf"]
-    assert paths[0].read_bytes() == one.png and paths[1].read_bytes().startswith(b"%PDF")
+def test_the_kinds_that_were_drawn_are_saved(tmp_path):
+    one, other = (render(Plot(square(0.1, 0.1, 0.5), "", "", ""), pdf=pdf) for pdf in (True, False))
+    paths = drawing.save_drawings({"a": one, "b": other}, tmp_path / "figures")
+    assert [p.name for p in paths] == ["a.png", "b.png", "a.pdf"]
+    assert paths[0].read_bytes() == one.png == other.png
+    assert paths[2].read_bytes().startswith(b"%PDF")

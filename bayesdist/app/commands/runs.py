@@ -88,7 +88,8 @@ def run(
 @click.argument("name", metavar=f"[{'|'.join(STAGES)}]", type=click.Choice(STAGES))
 @click.argument("run", metavar="RUN")
 @click.option("--strict", is_flag=True, help="Of sample: exit 3 unless converged.")
-def stage(name: str, run: str, strict: bool) -> None:
+@click.option("--pdf", is_flag=True, help="Of report: figures as PDF, too.")
+def stage(name: str, run: str, strict: bool, pdf: bool) -> None:
     """One stage of a run.
 
     match: star lists to matches, of a campaign or a self-calibration; fit: the linear fit; sample:
@@ -97,6 +98,8 @@ def stage(name: str, run: str, strict: bool) -> None:
     """
     if strict and name != "sample":
         raise click.UsageError("--strict is an option of the stage 'sample'.")
+    if pdf and name != "report":
+        raise click.UsageError("--pdf is an option of the stage 'report'.")
     from bayesdist.app.run import continue_stage
 
-    continue_stage(run, name, strict=strict)
+    continue_stage(run, name, strict=strict, pdf=pdf)

@@ -46,6 +46,7 @@ Float = NDArray[np.float64]
 
 _MIXTURE_LABELS = {"f": "f", "j": "j", "s_out": r"$s_\mathrm{out}$"}
 _MAX_POINTS = 20_000  # draws that enter a corner plot
+LABEL_AT = (-0.11, 0.5)  # in fractions of the panel of a trace
 _TRACE_POINTS = 2_000  # draws that stand as points in a trace
 
 
@@ -239,9 +240,9 @@ def traces(r: ReportInput) -> Plot:
         _trace_row(trace, density, _by_walker(values * scale.factor, posterior))
         trace.set_ylabel(f"{label}\n[{scale.unit or 'no unit'}]", fontsize=7.5)
         trace.yaxis.set_major_locator(MaxNLocator(4))
+        trace.yaxis.set_label_coords(*LABEL_AT)  # aligned; to measure all ticks takes far longer
     axes[-1, 0].set_xlabel("step after warm-up [count]")
     axes[-1, 1].set_xlabel("density [relative]")
-    fig.align_ylabels(axes[:, 0])
     legend_above(fig, axes[0, 0])
     return Plot(
         fig,
