@@ -30,6 +30,7 @@ REPORT = Registry(
         ),
         Section("selfcal", "Gauge and stars"),
         Section("fit", _fit_title),
+        Section("residuals", "Residuals"),
         Section(
             "outliers",
             "Outliers",

@@ -35,6 +35,7 @@ __all__ = [
     "formal_uncertainty",
     "map_table",
     "pixel_area",
+    "pixel_scale",
     "uncertainty_radius",
 ]
 
@@ -262,4 +263,40 @@ def pixel_area(r: ReportInput) -> Plot:
         f" {high:.5f}, known to {number(sigma, 2)} at worst: flat-fielded"
         f" point-source photometry is to be multiplied by it.{between}",
         "Contour map of the relative pixel area.",
+    )
+
+
+@REPORT.figure("maps")
+def pixel_scale(r: ReportInput) -> Plot:
+    """Map of the pixel scale, the square root of the area of each pixel."""
+    areas = [c.area for c in r.chips]
+    in_pixels = r.unit == "pix" and r.scale_mas is None
+    factor = r.scale_mas or 1.0 if r.unit == "pix" else 1.0
+    values = [factor * np.sqrt(a.area * a.reference_area) for a in areas]
+    scale = display_scale("mas" if r.unit == "pix" else r.unit, max(float(v.max()) for v in values))
+    unit = "reference pix" if in_pixels else scale.unit
+    by = 1.0 if in_pixels else scale.factor
+    grids = [Grid(a.x, a.y, by * v) for a, v in zip(areas, values, strict=True)]
+    panels = ChipPanels(r.mosaic, colorbar=True)
+    panels.frame()
+    scalar_map(
+        panels,
+        grids,
+        [
+            panels.title(k, f"{g.values.min():.6g} to {g.values.max():.6g}")
+            for k, g in enumerate(grids)
+        ],
+        levels=contour_levels(np.concatenate([g.values.ravel() for g in grids])),
+        label=f"pixel scale [{unit}/pix]",
+        labelled=True,
+    )
+    low = min(float(g.values.min()) for g in grids)
+    high = max(float(g.values.max()) for g in grids)
+    return Plot(
+        panels.figure,
+        "Pixel scale",
+        f"Side of the square that has the area of the pixel, from {low:.6g} to {high:.6g} {unit}:"
+        " the geometric mean of the scales along both axes. With u and v in pixels it rests on the"
+        " size of a pixel that the configuration gives.",
+        f"Contour map of the pixel scale, from {low:.6g} to {high:.6g} {unit}.",
     )
