@@ -86,7 +86,7 @@ def test_page_needs_nothing_else(page):
 def test_links_lead_to_sections_in_the_order_of_the_report(page):
     tree = lxml_html.fromstring(page)
     sections = tree.xpath("//section/@id")
-    assert sections == ["status", "data", "fit", "outliers", "coefficients", "maps", "budget",
+    assert sections == ["status", "data", "fit", "residuals", "outliers", "coefficients", "maps", "budget",
                         "margins", "products", "provenance"]  # fmt: skip
     assert [h[1:] for h in tree.xpath("//nav//a/@href")] == sections[1:]
 
@@ -151,7 +151,7 @@ def test_numbers_that_rest_on_the_draws_carry_a_dagger(bad_page):
         for table in tree.xpath(f"//section[@id='{section}']//table"):
             heads = [h.text_content().strip() for h in table.xpath(".//thead//th")]
             drawn = {"Mean", "sd", "95 % interval", "Posterior mean", "Value", "Margin", "P(met)",
-                     "u", "v", "Radial", "68 %", "95 %"}  # fmt: skip
+                     "u", "v", "Per axis", "CE68", "CE95", "68 %", "95 %"}  # fmt: skip
             columns = [k for k, h in enumerate(heads) if h in drawn]
             assert columns, heads
             for row in table.xpath("./tbody/tr"):
@@ -398,3 +398,14 @@ def test_what_residuals_were_asked_and_verdicts_rest_on_stands_on_the_page(conve
         for clause in margins[0].rests_on
     )
     assert (of_all, of_one) == ("all", first.requirement.name)
+
+
+def test_simulated_data_are_named_on_every_page(converged, drawings, page):
+    """In a band on the screen, in the title, and in the margin of each page of paper."""
+    config = {**converged.config, "data": {"simulated": True}}
+    text = render_report(replace(converged, config=config), drawings)
+    tree = lxml_html.fromstring(text)
+    (band,) = tree.xpath("//p[@class='simulated']")
+    assert "SIMULATED" in band.text_content() and "SIMULATED" in tree.xpath("//title")[0].text
+    assert '@top-center { content: "SIMULATED DATA"' in text
+    assert "SIMULATED" not in page

@@ -205,8 +205,9 @@ function sortable(table) {
       const falling = head.getAttribute("aria-sort") === "ascending";
       heads.forEach(h => h.setAttribute("aria-sort", "none"));
       head.setAttribute("aria-sort", falling ? "descending" : "ascending");
-      const numeric = head.classList.contains("n");
-      const key = row => numeric ? worth(row.cells[column].textContent) : row.cells[column].textContent;
+      const numeric = head.classList.contains("n") || "key" in body.rows[0].cells[column].dataset;
+      const text = cell => cell.dataset.key ?? cell.textContent;
+      const key = row => numeric ? worth(text(row.cells[column])) : text(row.cells[column]);
       const order = (a, b) => numeric ? a - b : a.localeCompare(b, "en", { numeric: true });
       const rows = [...body.rows].map(row => ({ row, key: key(row), last: row.classList.contains("total") }));
       rows.sort((a, b) => {

@@ -103,6 +103,9 @@ _DETECTOR = """\
 [detector]
 name = "{name}"
 size = [{nx}, {ny}]             # columns, rows; {how}
+# mission = ""                  # beside the name in the title of the report: mission,
+# instrument = ""               # instrument
+# filter = ""                   # and filter
 # scale_mas = 50.0              # size of a pixel, to state errors in mas beside pixels
 """
 

@@ -48,7 +48,14 @@ def map_table(r: ReportInput) -> TextTable:
         for m in c.maps:
             cells = [
                 with_mas(v, m.unit, r.scale_mas)
-                for v in (m.sigma_u_max, m.sigma_v_max, m.radius_max, float(np.median(m.radius)))
+                for v in (
+                    m.sigma_u_max,
+                    m.sigma_v_max,
+                    float(m.per_axis.max()),
+                    float(np.median(m.per_axis)),
+                    float(m.circular_error(0.68).max()),
+                    float(m.circular_error(0.95).max()),
+                )
             ]
             cells.append("({:.0f}, {:.0f})".format(*m.position_of_max))
             if m is not c.formal_map:
@@ -64,12 +71,15 @@ def map_table(r: ReportInput) -> TextTable:
             "Chip, solution" if r.several else "Solution",
             "Largest σ u",
             "Largest σ v",
-            "Max radius",
-            "Median radius",
+            "Largest per axis",
+            "Median per axis",
+            "Largest CE68",
+            "Largest CE95",
             "At pixel",
         ),
         tuple(rows),
-        note=gauge_of_maps(r),
+        note="Per axis: rms of σ u and σ v. CE68, CE95: radii of the circles that hold 68 and 95 %."
+        f" {gauge_of_maps(r)}".rstrip(),
     )
 
 
@@ -164,7 +174,9 @@ def formal_uncertainty(r: ReportInput) -> Plot:
     panels = ChipPanels(r.mosaic, len(r.chips[0].maps))
     panels.frame(M * widest + 0.02 * r.mosaic.longest_side)
     titles = [
-        panels.title(k, f"{m.kind}, max radius {size_of(m.radius_max, m.unit)}", ", ")
+        panels.title(
+            k, f"{m.kind}, largest {size_of(float(m.per_axis.max()), m.unit)} per axis", ", "
+        )
         for k, c in enumerate(r.chips)
         for m in c.maps
     ]
@@ -173,22 +185,22 @@ def formal_uncertainty(r: ReportInput) -> Plot:
         max(maps, key=lambda m: m.radius_max)
         for maps in zip(*(c.maps for c in r.chips), strict=True)
     ]
-    found = " and ".join(f"{r.length(m.radius_max)} ({m.kind})" for m in by_kind)
+    found = " and ".join(f"{r.length(float(m.per_axis.max()))} ({m.kind})" for m in by_kind)
     return Plot(
         panels.figure,
-        "Formal-uncertainty diagram",
+        "Uncertainty diagram",
         "From each place four vectors to all combinations of ±1 σ in u and ±1 σ in v, enlarged as"
-        f" stated above the panels; the largest radius is {found}.",
-        f"Crosses of ±1 sigma over the detector; largest radius {found}.",
+        f" stated above the panels; the largest error per axis is {found}.",
+        f"Crosses of ±1 sigma over the detector; largest per axis {found}.",
     )
 
 
 @REPORT.figure("maps", printed=True)
 def uncertainty_radius(r: ReportInput) -> Plot:
-    """Radial uncertainty hypot(sigma_u, sigma_v), all maps in one colour scale."""
+    """Uncertainty per axis, rms of sigma_u and sigma_v, all maps in one colour scale."""
     maps = [m for c in r.chips for m in c.maps]
-    scale = display_scale(r.unit, max(m.radius_max for m in maps))
-    grids = [Grid(m.x, m.y, m.radius * scale.factor, m.position_of_max) for m in maps]
+    scale = display_scale(r.unit, max(float(m.per_axis.max()) for m in maps))
+    grids = [Grid(m.x, m.y, m.per_axis * scale.factor, m.position_of_max) for m in maps]
     panels = ChipPanels(r.mosaic, len(r.chips[0].maps), colorbar=True)
     panels.frame()
     kinds = [(k, m.kind) for k, c in enumerate(r.chips) for m in c.maps]
@@ -200,10 +212,14 @@ def uncertainty_radius(r: ReportInput) -> Plot:
             for (k, kind), g in zip(kinds, grids, strict=True)
         ],
         levels=contour_levels(np.concatenate([g.values.ravel() for g in grids])),
-        label=f"radius (1 σ) [{scale.unit}]",
+        label=f"per axis (1 σ) [{scale.unit}]",
     )
     figure = panels.figure
-    text = "Radial uncertainty hypot(σ u, σ v), its largest place ringed."
+    text = (
+        "Uncertainty per axis, the rms of σ u and σ v, ringed where it is largest. The circle that"
+        " holds 68 % has 1.51 times this as its radius where both axes are alike, that of 95 %"
+        " 2.45 times."
+    )
     if r.selfcal is not None:
         text += (
             " That of relative positions is the same whatever fixes place, rotation and scale (and"

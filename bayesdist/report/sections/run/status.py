@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bayesdist.assess.circular import per_axis
 from bayesdist.checks import LEVELS, Check, worst
 from bayesdist.numbers import number, rounded, with_mas
 from bayesdist.report.contents import REPORT
@@ -158,29 +159,38 @@ def _margin_sentence(r: ReportInput) -> str:
 
 
 def _accuracy_sentence(r: ReportInput) -> str:
-    whose = "posterior" if r.posterior is not None else "formal"
+    whose = "posterior" if r.posterior is not None else "formal (least-squares)"
     if r.provisional:
         whose = f"provisional {whose}"
-    worst = max(r.chips, key=lambda c: c.best_map.radius_max)
+    worst = max(r.chips, key=lambda c: c.best_map.radius_max)  # where per-axis errors are largest
     best = worst.best_map
-    median = float(np.median(np.concatenate([c.best_map.radius.ravel() for c in r.chips])))
+    maps = [c.best_map for c in r.chips]
+    median = float(np.median(np.concatenate([m.per_axis.ravel() for m in maps])))
+    largest = with_mas(float(best.per_axis.max()), r.unit, r.scale_mas)
+    circles = " and ".join(
+        f"CE{p} {r.length(max(float(m.circular_error(p / 100).max()) for m in maps))}"
+        for p in (68, 95)
+    )
     text = (
-        f"The {whose} uncertainty of the distortion (radial, 1 σ) is"
-        f" {with_mas(median, r.unit, r.scale_mas)} at the median"
-        f" place and at most {with_mas(best.radius_max, r.unit, r.scale_mas)},"
-        f" at pixel {r.position(best.position_of_max, worst.chip.number)}"
-        f"{_with_shift(r)}"
+        f"The {whose} uncertainty of the distortion (per axis, 1 σ) is"
+        f" {with_mas(median, r.unit, r.scale_mas)} at the median place and at most {largest},"
+        f" at pixel {r.position(best.position_of_max, worst.chip.number)}{_with_shift(r)}"
+        f" ({circles} at most)"
     )
     if r.budget is None:
         return f"{text}."
-    total = r.budget.rows()[-1]["radial"]
-    with_budget = with_mas(total, r.budget.unit, r.scale_mas)
+    total = r.budget.rows()[-1]
+    per_axis_rms = float(per_axis(total["u"], total["v"]))
+    with_budget = with_mas(per_axis_rms, r.budget.unit, r.scale_mas)
     whom = (
         ""
         if r.campaign is None
         else " for a new exposure whose shift and rotation are fitted by whoever uses it"
     )
-    return f"{text}; with all terms of the budget the rms over the detector is {with_budget}{whom}."
+    return (
+        f"{text}; with all terms of the budget the rms over the detector is {with_budget} per"
+        f" axis{whom}."
+    )
 
 
 def _with_shift(r: ReportInput) -> str:
