@@ -22,6 +22,7 @@ from matplotlib.transforms import Bbox
 from PIL import Image
 
 from bayesdist.files import atomic_path, made_folder
+from bayesdist.report.figure_numbers import numbers_of
 from bayesdist.report.registry import Item, Plot, Registry
 from bayesdist.report.style import figure_style, plain_ticks
 
@@ -46,13 +47,14 @@ _received: list[Any] = []  # of a process that draws for another one
 
 @dataclass(frozen=True)
 class Drawing:
-    """Figure as files, with the title, text and text alternative of its `Plot`."""
+    """Figure as files, with the title, text and text alternative of its `Plot`, and its numbers."""
 
     png: bytes
     pdf: bytes
     title: str = ""
     text: str = ""
     alt: str = ""
+    numbers: str = ""  # CSV
 
 
 @figure_style()  # mathematical text and ticks read the settings only when drawn
@@ -60,7 +62,7 @@ def render(plot: Plot) -> Drawing:
     """Figure as PNG and as PDF with text as letters; equal figures give equal files."""
     canvas, box = _laid_out(plot.figure)
     files = _png(plot.figure, canvas, box), _pdf(plot.figure, box)
-    return Drawing(*files, plot.title, plot.text, plot.alt)
+    return Drawing(*files, plot.title, plot.text, plot.alt, numbers_of(plot.figure))
 
 
 def draw_all(registry: Registry, results: Any, *, processes: int = 1) -> dict[str, Drawing]:

@@ -20,7 +20,7 @@ __all__ = ["OverviewRow", "write_overview"]
 class OverviewRow:
     """What the page says of one run; None where the run has not got so far."""
 
-    name: str  # folder of the run
+    name: str  # folder of the run, as it was given
     link: str  # to its report, relative to the page; empty where there is none
     detector: str
     simulated: bool

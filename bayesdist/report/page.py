@@ -12,6 +12,7 @@ import jinja2
 from markupsafe import Markup
 
 from bayesdist.numbers import MISSING
+from bayesdist.report.documentation import page_of
 from bayesdist.report.drawing import DPI, Drawing
 from bayesdist.report.registry import Registry
 from bayesdist.report.texttable import Level, TextTable
@@ -110,6 +111,8 @@ def template(name: str, package: str = REPORT) -> jinja2.Template:
     )
     environment.filters["md"] = _markdown
     environment.filters["css"] = _css
+    environment.filters["base64"] = _base64
+    environment.globals["page_of"] = page_of
     environment.tests["level"] = lambda value: isinstance(value, Level)
     return environment.get_template(name)
 
@@ -130,6 +133,11 @@ def _markdown(value: object) -> str:
     if isinstance(value, Level):
         return {"pass": "pass", "warn": "**warn**", "fail": "**FAIL**", "note": MISSING}[value]
     return str(value).translate(_SPECIAL)
+
+
+def _base64(value: str) -> str:
+    """Text for the address of data: letters and digits that can end no attribute."""
+    return base64.b64encode(value.encode("utf-8")).decode("ascii")
 
 
 def _css(value: object) -> Markup:

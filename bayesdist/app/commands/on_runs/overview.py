@@ -11,6 +11,7 @@ from urllib.parse import quote
 from bayesdist.app.config import config_of_record
 from bayesdist.app.report import title_of
 from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.summary import head_of
 from bayesdist.numbers import with_mas
 from bayesdist.report.overview import OverviewRow, write_overview
 
@@ -32,17 +33,18 @@ def overview(runs: Sequence[str | Path], output: str | Path) -> str:
 def _row(run: RunDirectory, output: Path) -> OverviewRow:
     if not run.is_initialized:
         raise run.not_a_run_error()
-    summary, config = run.summary, config_of_record(run.facts["config"], str(run.path))
+    summary, head = run.summary, head_of(run.facts)
+    config = config_of_record(run.facts["config"], str(run.path))
     margins: list[Mapping[str, Any]] = summary.get("margins") or []
     worst = min(margins, key=lambda row: row["margin_percent"], default=None)
     until, is_open = _validity(summary.get("horizons") or [])
     found, fit = summary.get("map"), summary.get("fit")
     verdict = summary.get("verdict") or {"level": "note", "headline": "no report was made yet"}
     return OverviewRow(
-        name=run.path.resolve().name,
+        name=run.path.as_posix(),
         link=_link(run / "report.html", output),
         detector=title_of(config),
-        simulated=bool(summary["simulated"]),
+        simulated=bool(head["simulated"]),
         level=verdict["level"],
         headline=verdict["headline"],
         worst_margin=None if worst is None else worst["margin_percent"],
@@ -51,11 +53,11 @@ def _row(run: RunDirectory, output: Path) -> OverviewRow:
         open_ended=is_open,
         epoch=None if found is None else found["epoch"],
         uncertainty=""
-        if found is None
+        if found is None or found.get("sigma_max") is None  # of an earlier version
         else with_mas(found["sigma_max"], found["unit"], config.detector.scale_mas),
         n_used=summary["data"]["n_used"] if summary.get("data") else None,
         chi2_per_dof=fit["chi2"] / fit["dof"] if fit and fit["dof"] else None,
-        began=summary["began"],
+        began=head["began"],
     )
 
 

@@ -132,8 +132,9 @@ def _requirements_clause(r: ReportInput) -> str:
     counts = {v: sum(m.verdict == v for m in r.margins) for v in VERDICT_LEVELS}
     if counts["met"] == n:
         return f"every requirement is met{at}"
-    parts = [f"{counts[v]} {v}" for v in ("missed", "undecided") if counts[v]]
-    return f"of {n} requirement{'s' if n > 1 else ''}{at} {' and '.join(parts)}"
+    (first, k), *others = [(v, counts[v]) for v in ("missed", "undecided") if counts[v]]
+    of = f"{k} of {n} requirements {'is' if k == 1 else 'are'}" if n > 1 else "the requirement is"
+    return " and ".join([f"{of} {first}", *(f"{more} {v}" for v, more in others)]) + at
 
 
 def _rows_clause(names: Sequence[str], verb: str) -> str:
