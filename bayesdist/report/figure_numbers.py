@@ -77,7 +77,9 @@ def _of_collection(one: Any) -> tuple[str, Iterable[Sequence[float]]]:
         if one.filled:
             return "contour", ()
         lines = zip(one.levels, one.get_paths(), strict=True)
-        return "contour", ((*xy, level) for level, path in lines for xy in path.vertices)
+        return "contour", (
+            (*xy, level) for level, path in lines for xy in np.asarray(path.vertices)
+        )
     if isinstance(one, LineCollection):
         ends = (s for s in one.get_segments() if len(s) == 2)
         return "segment", ((*first, *last) for first, last in ends)
@@ -90,7 +92,7 @@ def _of_collection(one: Any) -> tuple[str, Iterable[Sequence[float]]]:
 
 
 def _cells(image: AxesImage) -> Iterator[Row]:
-    values = np.ma.filled(np.ma.asarray(image.get_array(), float), np.nan)
+    values: Any = np.ma.filled(np.ma.asarray(image.get_array(), float), np.nan)
     if values.ndim != 2:
         return
     left, right, bottom, top = image.get_extent()

@@ -17,6 +17,8 @@ from bayesdist.report.overview import OverviewRow, write_overview
 
 __all__ = ["overview"]
 
+NO_VERDICT = "no verdict is recorded; 'bayesdist stage report' makes one"
+
 
 def overview(runs: Sequence[str | Path], output: str | Path) -> str:
     """Text to print, once the page that compares runs by their summary.json is written.
@@ -39,7 +41,7 @@ def _row(run: RunDirectory, output: Path) -> OverviewRow:
     worst = min(margins, key=lambda row: row["margin_percent"], default=None)
     until, is_open = _validity(summary.get("horizons") or [])
     found, fit = summary.get("map"), summary.get("fit")
-    verdict = summary.get("verdict") or {"level": "note", "headline": "no report was made yet"}
+    verdict = summary.get("verdict") or {"level": "note", "headline": NO_VERDICT}
     return OverviewRow(
         name=run.path.as_posix(),
         link=_link(run / "report.html", output),

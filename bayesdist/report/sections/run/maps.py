@@ -237,7 +237,7 @@ def uncertainty_radius(r: ReportInput) -> Plot:
     return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")
 
 
-@REPORT.figure("maps", printed=lambda r: r.campaign is None)
+@REPORT.figure("maps")
 def pixel_area(r: ReportInput) -> Plot:
     """Contours of the pixel area relative to that at the reference pixel, in percent.
 

@@ -101,7 +101,7 @@ def verdict(r: ReportInput) -> Verdict:
         sentences.insert(0, f"Why: {'; '.join(reasons) or 'no reason was recorded'}.")
         return Verdict("fail", "NOT CONVERGED: do not rely on these numbers", tuple(sentences))
     clauses = [(worst(groups.get("Requirements", ())), _requirements_clause(r))]
-    own = _OWN_CLAUSE
+    own: tuple[str, ...] = _OWN_CLAUSE
     if r.posterior is None:
         clauses.append(("warn", _UNSAMPLED))
         own = (*own, "Sampling")

@@ -305,7 +305,7 @@ def _listed(names: Sequence[str]) -> str:
     return f"{', '.join(others)} and {last}" if others else last
 
 
-@REPORT.figure("residuals", when=lambda r: np.count_nonzero(r.exposures.n) > 1, printed=True)
+@REPORT.figure("residuals", when=lambda r: int(np.count_nonzero(r.exposures.n)) > 1, printed=True)
 def chi_square_by_exposure(r: ReportInput) -> Plot:
     """Chi-square per degree of freedom of each exposure, with the range that chance gives."""
     found, table = _residuals_of(r), r.stars.table
