@@ -55,14 +55,16 @@ class Drawing:
     text: str = ""
     alt: str = ""
     numbers: str = ""  # CSV
+    svg: str = ""  # of figures that are printed
 
 
 @figure_style()  # mathematical text and ticks read the settings only when drawn
-def render(plot: Plot) -> Drawing:
-    """Figure as PNG and as PDF with text as letters; equal figures give equal files."""
+def render(plot: Plot, *, svg: bool = False) -> Drawing:
+    """Figure as PNG and as PDF with text as letters, and as SVG; equal figures, equal files."""
     canvas, box = _laid_out(plot.figure)
     files = _png(plot.figure, canvas, box), _pdf(plot.figure, box)
-    return Drawing(*files, plot.title, plot.text, plot.alt, numbers_of(plot.figure))
+    vectors = _svg(plot.figure, box) if svg else ""
+    return Drawing(*files, plot.title, plot.text, plot.alt, numbers_of(plot.figure), vectors)
 
 
 def draw_all(registry: Registry, results: Any, *, processes: int = 1) -> dict[str, Drawing]:
@@ -77,7 +79,7 @@ def draw_all(registry: Registry, results: Any, *, processes: int = 1) -> dict[st
             return _drawn_together(items, results, processes)
         except (BrokenProcessPool, OSError, PickleError) as error:
             log.warning("report: figures are drawn by one process, others failed: %s", error)
-    return {item.name: render(item.made(results)) for item in items}
+    return {item.name: render(item.made(results), svg=item.printed) for item in items}
 
 
 def _drawn_together(items: Sequence[Item], results: Any, processes: int) -> dict[str, Drawing]:
@@ -94,7 +96,7 @@ def _receive(results: Any) -> None:
 
 
 def _drawn(item: Item) -> Drawing:
-    return render(item.made(_received[0]))
+    return render(item.made(_received[0]), svg=item.printed)
 
 
 @figure_style()
@@ -130,6 +132,14 @@ def _png(figure: Figure, canvas: FigureCanvasAgg, box: Bbox) -> bytes:
 def _pdf(figure: Figure, box: Bbox) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="pdf", dpi=DPI, bbox_inches=box, metadata={"CreationDate": None})
+    return buffer.getvalue()
+
+
+def _svg(figure: Figure, box: Bbox) -> str:
+    """Figure with letters as outlines: a page on paper has them whatever fonts there are."""
+    buffer = io.StringIO()
+    with rc_context({"svg.fonttype": "path", "svg.hashsalt": "bayesdist"}):
+        figure.savefig(buffer, format="svg", dpi=DPI, bbox_inches=box, metadata={"Date": None})
     return buffer.getvalue()
 
 

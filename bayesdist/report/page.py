@@ -27,7 +27,8 @@ class Picture:
     """Figure as a page holds it."""
 
     name: str
-    data: str  # PNG file, base64
+    data: str  # file, base64
+    kind: str  # of the file, as browsers call it
     width: float  # inches, at which its letters have the size they were set in
     words: Drawing  # title, text and text alternative
     printed: bool = True  # True where it is on paper
@@ -91,8 +92,9 @@ def _several(made: TextTable | Iterable[TextTable] | None) -> Iterable[TextTable
 def picture_of(name: str, drawing: Drawing, *, printed: bool = True) -> Picture:
     """Figure as a page holds it."""
     (pixels,) = struct.unpack(">I", drawing.png[16:20])  # width, in the first chunk of a PNG file
-    data = base64.b64encode(drawing.png).decode("ascii")
-    return Picture(name, data, pixels / DPI, drawing, printed)
+    file, kind = (drawing.svg.encode("utf-8"), "svg+xml") if drawing.svg else (drawing.png, "png")
+    data = base64.b64encode(file).decode("ascii")
+    return Picture(name, data, kind, pixels / DPI, drawing, printed)
 
 
 def template(name: str, package: str = REPORT) -> jinja2.Template:

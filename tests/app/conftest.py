@@ -54,7 +54,7 @@ def sketched(full) -> Iterator[None]:
         yield
 
 
-def _sketch(plot):
+def _sketch(plot, **_):
     """The words of a figure, and a speck in place of it."""
     from bayesdist.report.drawing import Drawing
 

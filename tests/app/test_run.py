@@ -22,7 +22,7 @@ from astropy.table import Table
 from astropy.wcs import WCS, FITSFixedWarning
 
 import bayesdist
-from bayesdist.app.config import load_config, parse_config
+from bayesdist.app.config import CATALOGUE_WORDS, load_config, parse_config
 from bayesdist.app.report import title_of
 from bayesdist.app.screen import progress_bar
 from bayesdist.app.store.rundir import RunDirectory
@@ -545,6 +545,18 @@ def test_max_steps_is_a_total(unconverged, finished):
             },
             "C1 and C2",
         ),
+        (
+            {
+                "detector": {
+                    "name": "WFC",
+                    "size": SIZE,
+                    "mission": "HST",
+                    "instrument": "ACS",
+                    "filter": "F606W",
+                }
+            },
+            "HST ACS WFC, F606W",
+        ),
     ],
 )
 def test_a_report_is_titled_by_what_was_calibrated(sections, title):
@@ -683,6 +695,12 @@ def test_init_writes_what_check_accepts(tmp_path, finished, suffix, errors):
     for size, axis in ((nx, "x"), (ny, "y")):  # from the outermost stars
         assert table[axis].max() <= size + 0.5 < 1.05 * table[axis].max()
     assert ("GUESSED: the table does not say" in text) == (suffix == "csv")
+    # the catalogue's row is there to be filled in, and states nothing until it is
+    config = load_config(tmp_path / "c.toml")[0]
+    assert [row.name for row in config.budget] == ["reference catalogue"]
+    assert not config.states(*CATALOGUE_WORDS) and config.user_terms() == ()
+    filled = text.replace("sigma_u = 0.0 ", "sigma_u = 0.01 ")
+    assert parse_config(filled, "c.toml").states(*CATALOGUE_WORDS)
 
 
 def test_inspect(finished, posterior):

@@ -200,7 +200,7 @@ def _reach(means: Sequence[Sequence[Means]]) -> float:
 
 def _cloud(ax: Axes, t: Float, values: Float) -> None:
     step = max(1, len(t) // _POINTS)
-    ax.plot(t[::step], values[::step], ".", ms=2.2, color=PALE, mew=0, zorder=1)
+    ax.plot(t[::step], values[::step], ".", ms=2.2, color=PALE, mew=0, zorder=1, rasterized=True)
 
 
 def _sample_words(r: ReportInput) -> str:
