@@ -392,3 +392,31 @@ def test_no_error_is_logged_and_nothing_leaves_the_page(opened):
     assert opened.get_log("browser") == []
     asked = requests(opened)
     assert asked and all(url.startswith(("file:", "data:")) for url in asked)
+
+
+def test_a_table_is_downloaded_as_it_is_shown(opened):
+    """As CSV its cells, with plain signs; as LaTeX nothing that TeX would take for a command."""
+    import csv
+    import io
+
+    shown, text, latex = opened.execute_script(
+        "const t = document.querySelector('#margins table');"
+        "const rows = [...t.rows].map(r => [...r.cells].map(c => c.textContent.trim()));"
+        "return [rows, csvOf(textsOf(t)), latexOf(textsOf(t), 'a & b_c')];"
+    )
+    rows = list(csv.reader(io.StringIO(text, newline="")))
+    tidy = {"\N{MINUS SIGN}": "-", "\u202f": " ", "\xa0": " "}
+    assert rows == [
+        [" ".join("".join(tidy.get(c, c) for c in cell).split()) for cell in row] for row in shown
+    ]
+    assert "\\caption{a \\& b\\_c}" in latex
+    body = latex.partition("\\hline\n")[2].partition("\\end{tabular}")[0]
+    assert not re.search(r"(?<!\\)[%#_]", body)
+    assert body.count("\\\\") == len(rows)
+    columns = {len(re.findall(r"(?<!\\)&", line)) for line in body.splitlines() if "&" in line}
+    assert columns == {len(rows[0]) - 1}
+
+
+def test_downloads_are_offered_below_each_table(opened):
+    buttons = opened.find_elements("xpath", "//section[@id='margins']//p[@class='get']/button")
+    assert {one.text for one in buttons} == {"CSV", "LaTeX"}
