@@ -31,6 +31,7 @@ from bayesdist.assess.terms.correlated import STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.data import read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior, memberships, residuals
+from bayesdist.report.documentation import BASE
 from tests.app.support import (
     SIZE,
     begin_stagewise,
@@ -371,8 +372,10 @@ class _Links(HTMLParser):
     def __init__(self):
         super().__init__()
         self.targets = []
+        self.sources = []  # that a browser loads
 
     def handle_starttag(self, tag, attrs):
+        self.sources += [v for k, v in attrs if k == "src" or (k == "href" and tag != "a")]
         self.targets += [v for k, v in attrs if k in ("src", "href") and v]
 
 
@@ -380,7 +383,9 @@ def test_the_report_is_one_file(finished):
     text = (finished.path / "report.html").read_text(encoding="utf-8")
     links = _Links()
     links.feed(text)
-    assert all(t.startswith(("data:", "#")) for t in links.targets)
+    # it needs nothing else: the documentation is linked, and asked by readers alone
+    assert all(t.startswith(("data:", "#", BASE)) for t in links.targets)
+    assert all(t.startswith("data:") for t in links.sources)
     for word in ("too tight", "catalogue", "u_1_0", "sip.hdr", bayesdist.__version__):
         assert word in text
     assert "NOT CONVERGED" not in text

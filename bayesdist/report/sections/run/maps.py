@@ -84,6 +84,48 @@ def map_table(r: ReportInput) -> TextTable:
 
 
 @REPORT.figure("maps", printed=True)
+def uncertainty_radius(r: ReportInput) -> Plot:
+    """Uncertainty per axis, rms of sigma_u and sigma_v, all maps in one colour scale."""
+    maps = [m for c in r.chips for m in c.maps]
+    scale = display_scale(r.unit, max(float(m.per_axis.max()) for m in maps))
+    grids = [Grid(m.x, m.y, m.per_axis * scale.factor, m.position_of_max) for m in maps]
+    panels = ChipPanels(r.mosaic, len(r.chips[0].maps), colorbar=True)
+    panels.frame()
+    kinds = [(k, m.kind) for k, c in enumerate(r.chips) for m in c.maps]
+    scalar_map(
+        panels,
+        grids,
+        [
+            panels.title(k, f"{kind}: {g.values.min():.3g} to {g.values.max():.3g}", ", ")
+            for (k, kind), g in zip(kinds, grids, strict=True)
+        ],
+        levels=contour_levels(np.concatenate([g.values.ravel() for g in grids])),
+        label=f"per axis (1 σ) [{scale.unit}]",
+    )
+    figure = panels.figure
+    text = (
+        "Uncertainty per axis, the rms of σ u and σ v, ringed where it is largest. The circle that"
+        " holds 68 % has 1.51 times this as its radius where both axes are alike, that of 95 %"
+        " 2.45 times."
+    )
+    if r.selfcal is not None:
+        text += (
+            " That of relative positions is the same whatever fixes place, rotation and scale (and"
+            " skew, where all exposures have one roll angle); the other is that of the run's gauge."
+        )
+        return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")
+    pairs = [(c.formal_map, c.posterior_map) for c in r.chips]
+    ratios = [p.radius / f.radius for f, p in pairs if p is not None]
+    if ratios:
+        low, high = (number(float(end(ratios))) for end in (np.min, np.max))
+        text += (
+            f" The posterior's is {low} to {high} times the formal one;"
+            " above 1, least squares with rejection is too sure of itself."
+        )
+    return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")
+
+
+@REPORT.figure("maps", printed=True)
 def distortion(r: ReportInput) -> Plot:
     """Vectors from each array position to where the distortion puts it.
 
@@ -193,48 +235,6 @@ def formal_uncertainty(r: ReportInput) -> Plot:
         f" stated above the panels; the largest error per axis is {found}.",
         f"Crosses of ±1 sigma over the detector; largest per axis {found}.",
     )
-
-
-@REPORT.figure("maps", printed=True)
-def uncertainty_radius(r: ReportInput) -> Plot:
-    """Uncertainty per axis, rms of sigma_u and sigma_v, all maps in one colour scale."""
-    maps = [m for c in r.chips for m in c.maps]
-    scale = display_scale(r.unit, max(float(m.per_axis.max()) for m in maps))
-    grids = [Grid(m.x, m.y, m.per_axis * scale.factor, m.position_of_max) for m in maps]
-    panels = ChipPanels(r.mosaic, len(r.chips[0].maps), colorbar=True)
-    panels.frame()
-    kinds = [(k, m.kind) for k, c in enumerate(r.chips) for m in c.maps]
-    scalar_map(
-        panels,
-        grids,
-        [
-            panels.title(k, f"{kind}: {g.values.min():.3g} to {g.values.max():.3g}", ", ")
-            for (k, kind), g in zip(kinds, grids, strict=True)
-        ],
-        levels=contour_levels(np.concatenate([g.values.ravel() for g in grids])),
-        label=f"per axis (1 σ) [{scale.unit}]",
-    )
-    figure = panels.figure
-    text = (
-        "Uncertainty per axis, the rms of σ u and σ v, ringed where it is largest. The circle that"
-        " holds 68 % has 1.51 times this as its radius where both axes are alike, that of 95 %"
-        " 2.45 times."
-    )
-    if r.selfcal is not None:
-        text += (
-            " That of relative positions is the same whatever fixes place, rotation and scale (and"
-            " skew, where all exposures have one roll angle); the other is that of the run's gauge."
-        )
-        return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")
-    pairs = [(c.formal_map, c.posterior_map) for c in r.chips]
-    ratios = [p.radius / f.radius for f, p in pairs if p is not None]
-    if ratios:
-        low, high = (number(float(end(ratios))) for end in (np.min, np.max))
-        text += (
-            f" The posterior's is {low} to {high} times the formal one;"
-            " above 1, least squares with rejection is too sure of itself."
-        )
-    return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")
 
 
 @REPORT.figure("maps")

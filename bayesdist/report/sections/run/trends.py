@@ -148,7 +148,7 @@ def _against_pixels(r: ReportInput, most: int, *, points: bool) -> tuple[Plot, f
     """Plot without words: u and v against x and y; and the largest mean in units of its error."""
     found, table = _residuals_of(r), r.stars.table
     pixels = table.x[found.shown], table.y[found.shown]
-    fig = new_figure(WIDTH, 4.2)
+    fig = new_figure(WIDTH, 3.6)
     axes = fig.subplots(2, 2, sharey=True, sharex="col")
     means: list[list[Means]] = [[], []]
     for k, _, here in _on_chips(r, found.shown):
@@ -316,7 +316,7 @@ def chi_square_by_exposure(r: ReportInput) -> Plot:
     dof = 2.0 * n[present]
     ratio = np.bincount(codes, square, minlength=bins)[present] / dof
     sd = np.sqrt(2.0 / dof)
-    fig = new_figure(WIDTH, 2.4)
+    fig = new_figure(WIDTH, 1.8)
     ax = fig.subplots()
     at = np.arange(1, len(present) + 1)
     ax.fill_between(at, 1 - 2 * sd, 1 + 2 * sd, color=OUTLINE, alpha=0.3, lw=0, step="mid")
@@ -325,7 +325,7 @@ def chi_square_by_exposure(r: ReportInput) -> Plot:
     ax.set_xlim(0.5, len(present) + 0.5)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("exposure, in the order of the data [number]")
-    ax.set_ylabel("χ² / degrees of freedom [no unit]")
+    ax.set_ylabel("χ² / dof [no unit]")
     guide_lines(ax)
     worst = int(np.argmax(np.abs(ratio - 1) / sd))
     name = table.exposure_names[present[worst]]
