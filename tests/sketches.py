@@ -30,13 +30,13 @@ def sketched() -> Iterator[None]:
         yield
 
 
-def _sketch(plot):
+def _sketch(plot, *, pdf=False, svg=False):
     """The words of a figure, and a speck in place of it."""
     from bayesdist.report.drawing import Drawing
 
     page = io.BytesIO()
     Image.new("RGB", (4, 3), "white").save(page, format="png")
-    return Drawing(page.getvalue(), b"%PDF-1.7", plot.title, plot.text, plot.alt)
+    return Drawing(page.getvalue(), b"%PDF-1.7" if pdf else None, plot.title, plot.text, plot.alt)
 
 
 def main() -> int:

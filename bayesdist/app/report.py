@@ -41,11 +41,14 @@ def report(results: Results, *, pdf: bool = False) -> list[str]:
     # figures take seconds to import
     from bayesdist.report.drawing import save_drawings
     from bayesdist.report.run_report import draw_report, write_report
+    from bayesdist.report.sections.run.status import verdict
 
     run, inputs = results.run, report_input(results)
     drawings = draw_report(inputs, pdf=pdf, processes=2 if _is_command_line() else 1)
     names = [path.name for path in save_drawings(drawings, run / "figures")]
     write_report(run / "report.html", inputs, drawings)
+    found = verdict(inputs)
+    run.summarise(verdict={"level": found.level, "headline": found.headline})
     log.info("report: %s", run / "report.html")
     return names
 
@@ -101,10 +104,12 @@ def report_input(results: Results) -> ReportInput:
 
 
 def title_of(config: Config) -> str:
-    """Name of the detector, or of the chips, and the filter of a campaign; may be empty."""
-    detector = config.detector.name or " and ".join(chip.name for chip in config.chip)
-    band = None if config.campaign is None else config.campaign.filter
-    return ", ".join(part for part in (detector, band) if part)
+    """Mission, instrument, detector or chips, and filter, as far as they are given."""
+    given = config.detector
+    detector = given.name or " and ".join(chip.name for chip in config.chip)
+    band = given.filter or (config.campaign and config.campaign.filter)
+    named = " ".join(part for part in (given.mission, given.instrument, detector) if part)
+    return ", ".join(part for part in (named, band) if part)
 
 
 def _chip_results(results: Results, evaluation: Evaluation) -> tuple[ChipResults, ...]:

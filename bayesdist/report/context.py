@@ -165,6 +165,12 @@ class ReportInput:
         return self.fit.model.unit
 
     @property
+    def simulated(self) -> bool:
+        """True where the configuration says that the input is simulated."""
+        kinds = ("data", "campaign", "selfcal")
+        return any(bool(self.setting(kind, "simulated", False)) for kind in kinds)
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences that belong on top."""
         return warnings_of(self.checks)

@@ -24,6 +24,7 @@ from matplotlib.transforms import Bbox
 from PIL import Image
 
 from bayesdist.files import atomic_path, made_folder
+from bayesdist.report.figure_numbers import numbers_of
 from bayesdist.report.registry import Item, Plot, Registry
 from bayesdist.report.style import figure_style, plain_ticks
 
@@ -48,22 +49,30 @@ _received: list[Any] = []  # of a process that draws for another one
 
 @dataclass(frozen=True)
 class Drawing:
-    """Figure as files, with the title, text and text alternative of its `Plot`."""
+    """Figure as files, with the title, text and text alternative of its `Plot`, and its numbers."""
 
     png: bytes
     pdf: bytes | None = None
     title: str = ""
     text: str = ""
     alt: str = ""
+    numbers: str = ""  # CSV
+    svg: str = ""  # of figures that are printed
 
 
 @figure_style()  # mathematical text and ticks read the settings only when drawn
-def render(plot: Plot, *, pdf: bool = False) -> Drawing:
-    """Figure as PNG, and as PDF with text as letters; equal figures give equal files."""
+def render(plot: Plot, *, pdf: bool = False, svg: bool = False) -> Drawing:
+    """Figure as PNG, and as PDF and SVG with text as letters; equal figures give equal files."""
     canvas, box = _laid_out(plot.figure)
-    png = _png(plot.figure, canvas, box)
-    vectors = _pdf(plot.figure, box) if pdf else None
-    return Drawing(png, vectors, plot.title, plot.text, plot.alt)
+    return Drawing(
+        _png(plot.figure, canvas, box),
+        _pdf(plot.figure, box) if pdf else None,
+        plot.title,
+        plot.text,
+        plot.alt,
+        numbers_of(plot.figure),
+        _svg(plot.figure, box) if svg else "",
+    )
 
 
 def draw_all(
@@ -80,7 +89,7 @@ def draw_all(
             return _drawn_together(items, results, pdf, processes)
         except (BrokenProcessPool, OSError, PickleError) as error:
             log.warning("report: figures are drawn by one process, others failed: %s", error)
-    return {item.name: render(item.made(results), pdf=pdf) for item in items}
+    return {item.name: render(item.made(results), pdf=pdf, svg=item.printed) for item in items}
 
 
 def _drawn_together(
@@ -100,7 +109,7 @@ def _receive(results: Any) -> None:
 
 
 def _drawn(item: Item, pdf: bool) -> Drawing:
-    return render(item.made(_received[0]), pdf=pdf)
+    return render(item.made(_received[0]), pdf=pdf, svg=item.printed)
 
 
 @figure_style()
@@ -140,6 +149,14 @@ def _png(figure: Figure, canvas: FigureCanvasAgg, box: Bbox) -> bytes:
 def _pdf(figure: Figure, box: Bbox) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="pdf", dpi=DPI, bbox_inches=box, metadata={"CreationDate": None})
+    return buffer.getvalue()
+
+
+def _svg(figure: Figure, box: Bbox) -> str:
+    """Figure with letters as outlines: a page on paper has them whatever fonts there are."""
+    buffer = io.StringIO()
+    with rc_context({"svg.fonttype": "path", "svg.hashsalt": "bayesdist"}):
+        figure.savefig(buffer, format="svg", dpi=DPI, bbox_inches=box, metadata={"Date": None})
     return buffer.getvalue()
 
 

@@ -1,8 +1,11 @@
 """Figures as files: nothing cut, numbers as matplotlib sets them, the same whoever draws."""
 
+import base64
 import io
 import re
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -11,6 +14,7 @@ from PIL import Image
 
 from bayesdist.report import drawing
 from bayesdist.report.drawing import DPI, PAD, png_of, render
+from bayesdist.report.page import picture_of
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections import REPORT
 from bayesdist.report.style import figure_style, new_figure, plain_ticks
@@ -49,6 +53,20 @@ def test_the_same_figure_gives_the_same_files():
     one, other = (render(Plot(figure, "", "", ""), pdf=True) for figure in (first, second))
     assert one == other
     assert one.png == png_of(second)
+
+
+def test_what_is_printed_is_drawn_in_vectors():
+    first, second = (
+        render(Plot(square(0.1, 0.1, 0.5), "A square", "", ""), svg=True) for _ in range(2)
+    )
+    assert first == second
+    tree = ElementTree.fromstring(first.svg)
+    # in points: the square and its margin
+    assert float(tree.get("width").removesuffix("pt")) == pytest.approx(72 * (1 + 2 * PAD), abs=1)
+    assert not render(Plot(square(0.1, 0.1, 0.5), "", "", "")).svg
+    shown, plain = (picture_of("square", one) for one in (first, replace(first, svg="")))
+    assert (shown.kind, plain.kind) == ("svg+xml", "png") and shown.width == plain.width
+    assert base64.b64decode(shown.data).decode() == first.svg
 
 
 # -- numbers at ticks ------------------------------------------------------------------------------

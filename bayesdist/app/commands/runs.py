@@ -103,3 +103,18 @@ def stage(name: str, run: str, strict: bool, pdf: bool) -> None:
     from bayesdist.app.run import continue_stage
 
     continue_stage(run, name, strict=strict, pdf=pdf)
+
+
+@command()
+@click.argument("runs", metavar="RUN...", nargs=-1, required=True)
+@click.option(
+    "-o", "--output", default="reports.html", metavar="FILE", help="The page that is written."
+)
+def report(runs: tuple[str, ...], output: str) -> None:
+    """One page for many runs, with status, worst margin and validity of each.
+
+    The report of a single run is made by 'bayesdist stage report RUN'.
+    """
+    from bayesdist.app.commands.on_runs.overview import overview
+
+    click.echo(overview(runs, output))

@@ -28,6 +28,9 @@ class Detector(Section):
     """A detector of one chip."""
 
     name: str = ""
+    mission: str = ""
+    instrument: str = ""
+    filter: str = ""
     size: Pair | None = None
     scale_mas: PositiveFloat | None = None
 

@@ -145,7 +145,7 @@ class RunConfig(Section):
                 varies=b.of_catalogue,
             )
             for b in self.budget
-            if b.sigma_u is not None and b.sigma_v is not None
+            if b.stated and b.sigma_u is not None and b.sigma_v is not None
         )
 
     def linear_terms(self, solution: Solution) -> tuple[ErrorTerm, ...]:

@@ -28,7 +28,7 @@ STAGES = {
     "fit": Stage(),
     "sample": Stage(checkpoints=("chain-*.h5",)),
     "diagnose": Stage(),
-    "evaluate": Stage(),
+    "evaluate": Stage(revision=2),
     "export": Stage(),
     "report": Stage(),
 }
@@ -101,6 +101,7 @@ def _of_diagnoses(later: Mapping[str, Any], own: list[Any], config: Config) -> d
         found["requirement"] = own  # the tightest limit is the tolerance of periods
     if config.holdout is not None:  # what is held out is predicted with all errors of a position
         found |= {key: later[key] for key in ("assess", "budget")}
+        found["useafter"] = config.products.useafter_years()  # which may be the epoch of assess
     return found
 
 

@@ -132,6 +132,13 @@ class Periods(Part):
     first_vs_last: dict[str, Any]
 
 
+class Verdict(Part):
+    """The worst of all checks, requirements and validity periods, in words."""
+
+    level: Literal["pass", "warn", "fail"]
+    headline: str
+
+
 class Summary(Part):
     """Content of summary.json: what the stages that have ended found."""
 
@@ -160,6 +167,7 @@ class Summary(Part):
     warnings: list[str] | None = None
     products: list[ProductRow] | None = None
     figures: list[str] | None = None
+    verdict: Verdict | None = Field(None, description="headline of the report")
 
 
 def head_of(facts: Mapping[str, Any]) -> dict[str, Any]:

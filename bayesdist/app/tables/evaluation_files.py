@@ -166,6 +166,9 @@ def _map_summary(found: Evaluation) -> dict[str, Any]:
             "chip": m.chip,
             "sigma_u_max": m.sigma_u_max,
             "sigma_v_max": m.sigma_v_max,
+            "sigma_max": float(m.per_axis.max()),
+            "ce68_max": float(m.circular_error(0.68).max()),
+            "ce95_max": float(m.circular_error(0.95).max()),
             "radius_max": m.radius_max,
             "position_of_max": list(m.position_of_max),
             "radius_max_least_squares": least_squares.radius_max,
@@ -175,7 +178,10 @@ def _map_summary(found: Evaluation) -> dict[str, Any]:
     for chip, one in zip(chips, found.relative, strict=bool(found.relative)):
         chip["radius_max_relative"] = one.radius_max
     worst = max(chips, key=lambda c: c["radius_max"])
-    largest = ("sigma_u_max", "sigma_v_max", "radius_max_least_squares", "radius_max_relative")
+    largest = (
+        *("sigma_u_max", "sigma_v_max", "ce68_max", "ce95_max"),
+        *("radius_max_least_squares", "radius_max_relative"),
+    )
     return {
         "unit": found.maps[0].unit,
         "epoch": found.maps[0].epoch,

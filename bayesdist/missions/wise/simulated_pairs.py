@@ -28,6 +28,7 @@ band = "{band}"
 columns = {{exposure = ""}}    # without the frames: one distortion serves all
 
 [detector]
+mission = "WISE"
 name = "{band}"
 size = [{columns:.0f}, {rows:.0f}]
 scale_mas = {scale_mas:.1f}
