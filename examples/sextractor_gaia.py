@@ -33,7 +33,8 @@ def table(rng: np.random.Generator) -> Table:
     x, y = rng.uniform(0.5, SIZE + 0.5, (2, N))
     gaia = 21.0 - rng.exponential(1.5, N).clip(0, 7)
     centroid = np.hypot(0.01, 0.003 * 10 ** (0.3 * (gaia - 16.0)))
-    sky = camera().pixel_to_world(x, y)
+    # SExtractor counts pixels from 1, astropy from 0
+    sky = camera().pixel_to_world(x - 1, y - 1)
     motion = rng.normal(0.0, 3.0, (2, N))  # mas / yr
     error = 0.03 * 10 ** (0.2 * (gaia - 16.0)).clip(0.7)  # mas
     years = EPOCH - 2016.0

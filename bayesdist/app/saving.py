@@ -145,7 +145,7 @@ def save_evaluation(results: Results) -> None:
     for one in found.validity:
         log.info("evaluate: %s", one.sentence)
     worst = max(found.maps, key=lambda m: m.radius_max)
-    log.info("evaluate: largest formal radius %.4g %s", worst.radius_max, worst.unit)
+    log.info("evaluate: largest position uncertainty %.4g %s", worst.radius_max, worst.unit)
 
 
 def save_products(results: Results) -> None:

@@ -37,7 +37,7 @@ def test_a_run_knows_of_the_circle(tmp_path, no_report):
     outliers = {"model": "none", "match_radius": RADIUS}
     config = write_job(tmp_path, table, outliers=outliers)
     said = good("check", config).out
-    assert "match circle" not in said or "posterior knows of the circle" in said
+    assert "match circle" not in said or "posterior accounts for the circle" in said
     run = tmp_path / "run"
     good("run", config, "-o", run)
     summary = summary_of(run)

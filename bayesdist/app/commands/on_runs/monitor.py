@@ -189,7 +189,7 @@ def _lines(found: Monitored, facts: dict[str, Any], scores: Sequence[PeriodScore
         lines.append("exposures deviate as those of the release scatter")
     if facts["left_out"]:
         lines.append(f"left out: {len(facts['left_out'])} exposure(s) that the release has seen")
-    for key, what in (("j", "error beyond the quoted ones"), ("f", "share of false matches")):
+    for key, what in (("j", "error beyond the quoted ones"), ("f", "fraction of false matches")):
         if key in facts["mixture"] and key in facts["mixture_released"]:
             old = facts["mixture_released"][key]
             unit = f" {facts['unit']}" if key == "j" else ""

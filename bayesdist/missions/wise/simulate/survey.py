@@ -104,7 +104,9 @@ def false_matches(survey: Survey, scale: float, share: float) -> FalseMatches:
     """
     if not 0.0 <= share < 1.0:
         raise InputError(
-            f"the share of false matches is {share:g}", where="false_share", do="give one in [0, 1)"
+            f"the fraction of false matches is {share:g}",
+            where="false_share",
+            do="give one in [0, 1)",
         )
     density = survey.density * scale**2
     if share == 0.0:

@@ -176,7 +176,7 @@ def formal_uncertainty(r: ReportInput) -> Plot:
     return Plot(
         panels.figure,
         "Formal-uncertainty diagram",
-        "From each place four vectors to all combinations of ±1 σ in u and ±1 σ in v, enlarged as"
+        "From each position four vectors to all combinations of ±1 σ in u and v, enlarged as"
         f" stated above the panels; the largest radius is {found}.",
         f"Crosses of ±1 sigma over the detector; largest radius {found}.",
     )
@@ -202,10 +202,10 @@ def uncertainty_radius(r: ReportInput) -> Plot:
         label=f"radius (1 σ) [{scale.unit}]",
     )
     figure = panels.figure
-    text = "Radial uncertainty hypot(σ u, σ v), its largest place ringed."
+    text = "Radial uncertainty hypot(σ u, σ v), its maximum ringed."
     if r.selfcal is not None:
         text += (
-            " That of relative positions is the same whatever fixes place, rotation and scale (and"
+            " That of relative positions is the same in any gauge of shift, rotation and scale (and"
             " skew, where all exposures have one roll angle); the other is that of the run's gauge."
         )
         return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")

@@ -139,7 +139,7 @@ def _accuracy_sentence(r: ReportInput) -> str:
     text = (
         f"The {whose} uncertainty of the distortion (radial, 1 σ) is"
         f" {with_mas(median, r.unit, r.scale_mas)} at the median"
-        f" place and at most {with_mas(best.radius_max, r.unit, r.scale_mas)},"
+        f" position and at most {with_mas(best.radius_max, r.unit, r.scale_mas)},"
         f" at pixel {r.position(best.position_of_max, worst.chip.number)}"
         f"{_with_shift(r)}"
     )
