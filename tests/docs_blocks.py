@@ -11,6 +11,7 @@ import contextlib
 import io
 import re
 import shlex
+from collections.abc import Container
 from pathlib import Path
 
 from bayesdist.app.cli import main
@@ -27,11 +28,16 @@ def blocks(page: Path) -> list[tuple[str, str]]:
     return _FENCE.findall(page.read_text(encoding="utf-8"))
 
 
-def run_page(page: Path) -> dict[str, object]:
-    """Run all blocks in the current folder; the namespace of the Python blocks."""
+ALL = frozenset({"toml", "console", "python", "text"})
+
+
+def run_page(page: Path, languages: Container[str] = ALL) -> dict[str, object]:
+    """Run the blocks of these languages in the current folder; the namespace of the Python ones."""
     namespace: dict[str, object] = {}
     printed = ""
     for language, text in blocks(page):
+        if language not in languages:
+            continue
         if language == "toml":
             name = re.match(r"# (\S+\.toml)\n", text)
             assert name, f"{page.name}: a block of toml without a file name in its first line"

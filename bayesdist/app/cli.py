@@ -39,8 +39,8 @@ RENAMED = {
     "order": "select-order",
 }
 EPILOG = (
-    "Exit codes: 0 good, 1 bad input, 2 usage, 3 not converged under --strict, "
-    "4 requirement missed."
+    "Exit codes: 0 success, 1 bad input, 2 wrong usage, 3 not converged under --strict, "
+    "4 requirement missed or undecided."
 )
 
 
@@ -67,7 +67,7 @@ class _Root(LazyGroup):
             return LazyGroup(cmd_name, help=mission.title, lazy=mission.commands)
         if cmd_name == "simulate":
             lazy = {k: v for mission in missions().values() for k, v in mission.simulate.items()}
-            return LazyGroup("simulate", help="Data of known truth.", lazy=lazy)
+            return LazyGroup("simulate", help="Simulate data of known truth.", lazy=lazy)
         for name, mission in missions().items():
             if cmd_name in mission.beside_core:
                 return self.load(mission.beside_core[cmd_name])
@@ -83,7 +83,7 @@ class _Root(LazyGroup):
 bayesdist = click.version_option(__version__, message="bayesdist %(version)s")(
     _Root(
         "bayesdist",
-        help="How well is the geometric distortion of a detector known?",
+        help="Calibrate the geometric distortion of a detector, with its uncertainty.",
         lazy=CORE,
         epilog=EPILOG,
         context_settings={"show_default": True, "help_option_names": ["-h", "--help"]},
@@ -124,7 +124,7 @@ def _exit_code(call: Callable[[], int | None]) -> int:
         print(f"bayesdist: {sentence}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
-        print("bayesdist: interrupted; go on with --resume", file=sys.stderr)
+        print("bayesdist: interrupted; resume with --resume", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of a pipe had enough
         sys.stderr.close()

@@ -33,7 +33,9 @@ def structure_checks(
     size = size_of(one.structure, one.unit, 2)
     found = f"{size} rms in {one.partition}{chip}" if one.structure > 0 else "none"
     if one.power < 1:
-        found += f" ({percent(one.power, 2)} of all patterns can be told from places of stars)"
+        found += (
+            f" ({percent(one.power, 2)} of all patterns can be separated from positions of stars)"
+        )
     held = None if correlated is None else correlated.structure_rms
     sentence = doubt = ""
     if one.significant:
@@ -56,7 +58,7 @@ def structure_checks(
         if one.underpowered:
             sentence = (
                 f"{100 * (1 - one.power):.0f} % of the structure that the model might leave is "
-                "hidden: places of stars take it up where dithers are small"
+                "hidden: positions of stars take it up where dithers are small"
             )
             yield Check(FIT, level="warn", sentence=sentence)
 

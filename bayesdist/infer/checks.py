@@ -41,7 +41,7 @@ def fit_checks(
 ) -> tuple[Check, ...]:
     """Checks of chi-square, of the rows left out and of the condition of a fit.
 
-    `in_circle` if the likelihood knows of the circles that the stars were matched in; `things` are
+    `in_circle` if the likelihood accounts for the circles that stars were matched in; `things` are
     what is fitted, one row each, and `chooser` leaves out rows that are far off.
     """
     ratio = fit.chi2 / fit.dof if fit.dof > 0 else float("nan")
@@ -81,8 +81,8 @@ def _of_chi2(fit: LinearFit, small: bool, in_circle: bool) -> str:
     if small and in_circle:
         return (
             f"chi-square per degree of freedom of least squares is {ratio:.2g}: the match circle "
-            "cuts the residuals, and draws this fit to the nominal solution; the posterior knows "
-            "of the circle"
+            "cuts the residuals, and draws this fit to the nominal solution; the posterior "
+            "accounts for the circle"
         )
     if small:
         return (

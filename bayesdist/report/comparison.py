@@ -81,7 +81,7 @@ def difference_vectors(
         panels.figure.colorbar(
             shades,
             ax=panels.all_axes,
-            label="significance of each place by itself [σ]",
+            label="significance of each position separately [σ]",
             **COLORBAR,
         )
     return panels.figure

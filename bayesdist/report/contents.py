@@ -25,7 +25,7 @@ REPORT = Registry(
         Section("campaign-time", "Linear terms against time", parent="campaign"),
         Section(
             "campaign-release",
-            "Released files and two exposures laid on each other",
+            "Released files and the alignment of two exposures",
             parent="campaign",
         ),
         Section("selfcal", "Gauge and stars"),

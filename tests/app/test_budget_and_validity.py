@@ -211,7 +211,7 @@ def test_errors_larger_than_the_residuals_are_told_by_assess(run, tmp_path, monk
     [told] = [
         w for w in json.loads((folder / "summary.json").read_text())["warnings"] if "'catal" in w
     ]
-    assert told.startswith("Budget term 'catalogue': errors of 0.04 are said to be in residuals")
+    assert told.startswith("Budget term 'catalogue': errors of 0.04 are declared part of residuals")
     assert told in (folder / "bayesdist.log").read_text()
 
 

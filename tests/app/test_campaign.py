@@ -167,7 +167,7 @@ def test_every_cause_has_its_row_and_its_source(run):
         "look-up tables, between nodes",
     ):
         assert 0 < rows[name]["radial"] < rows["total"]["radial"], name
-    assert rows["velocity aberration"]["radial"] < rows["exposure scatter"]["radial"]
+    assert rows["velocity aberration"]["radial"] < rows["exposure-to-exposure variation"]["radial"]
     assert rows["acs_wfc, forward"]["kind"] == "product"
     assert rows["acs_wfc, forward"]["radial"] < 1e-5  # tables in single precision
     text = good("budget", run, "--at", 100, 100, "--chip", 1, "--epoch", 2011.0).out

@@ -39,7 +39,7 @@ def test_a_run_knows_of_the_circle(tmp_path, no_report):
     said = good("check", config).out
     # a side of the distribution is cut off at 0.7 sigma: the variance that is left is half of it
     assert "the match circle cuts the residuals" in said
-    assert "the posterior knows of the circle" in said
+    assert "posterior accounts for the circle" in said
     run = tmp_path / "run"
     good("run", config, "-o", run)
     summary = summary_of(run)

@@ -209,7 +209,12 @@ def test_scatter_adds_to_the_total_in_quadrature(solution_of):
     alone = sigmas(draw_errors(solution, N, rng(), aligned=True), 2)
     parts = np.hypot(alone.sigma("model"), found.sigma(term.name))
     np.testing.assert_allclose(found.sigma("model"), parts, rtol=2 * TOLERANCE)
-    assert found.parts == ("coefficients", "time dependence", "exposure scatter", "model")
+    assert found.parts == (
+        "coefficients",
+        "time dependence",
+        "exposure-to-exposure variation",
+        "model",
+    )
 
 
 def test_in_gauge_held_a_star_may_lie_in_the_first_exposure(solution_of):
@@ -300,7 +305,7 @@ def test_scatter_does_not_know_about_which_point_it_acts(solution_of):
                 aligned=True,
             ),
             1,
-        ).sigma("exposure scatter")
+        ).sigma("exposure-to-exposure variation")
         for m in (model, there)
     )
     np.testing.assert_allclose(here, other, rtol=1e-6)

@@ -89,7 +89,7 @@ def _samplers(part: dict[str, Any]) -> list[str]:
     out.append("")
     head = ("N", "to ESS 400 [s]", "of that linear fit [s]", "longer run: ESS bulk, tail")
     head += ("seconds", "passes", "ESS/pass, all", "ESS/pass, sampling", "us per pass")
-    head += ("share of limit", "share, all", "acceptance", "efficiency")
+    head += ("fraction of limit", "fraction, all", "acceptance", "efficiency")
     out += _table(
         head,
         [
@@ -305,11 +305,11 @@ def _scamp(part: dict[str, Any]) -> list[str]:
         f"{part['exposures']} exposures of {nx:g} x {ny:g} pixels at three roll angles, "
         f"{part['stars']:,} stars, order {part['order']}, {part['distortion']:g} pix of "
         "distortion; both begin without it, from commanded pointings. Pixels, on one axis. "
-        "*Error*: rms of relative places over the detector against the truth, linear maps taken "
+        "*Error*: rms of relative positions over the detector against the truth, linear maps taken "
         "away; *absolute* with them, on the sky of the reference stars. *Claimed*: of the relative "
-        "places, and the share of them within one and two of it. *Scatter*: what SCAMP says, rms "
-        "of its residuals between detections and from reference stars. Seconds by the clock and "
-        "of the processors.",
+        "positions, and the fraction of them within one and two of it. *Scatter*: what SCAMP "
+        "prints, rms of its residuals between detections and from reference stars. Seconds by the "
+        "clock and of the processors.",
         "",
     ]
     if part["absent"]:

@@ -19,7 +19,7 @@ from bayesdist.app.commands.options import (
 @command()
 @click.argument("file", metavar="FILE")
 def inspect(file: str) -> None:
-    """What a product or a posterior holds, and its faults."""
+    """Describe a product, a posterior or a run, and report its faults."""
     from bayesdist.app.commands.on_files.inspect import inspect as described
 
     click.echo(described(file))
@@ -32,16 +32,16 @@ def inspect(file: str) -> None:
 @epoch
 @pixel_scale
 @click.option("-o", "--output", required=True, metavar="OUT", help="An .ecsv, .csv or .fits file.")
-@click.option("--inverse", is_flag=True, help="Back to pixels.")
+@click.option("--inverse", is_flag=True, help="Transform back to pixels.")
 @click.option(
     "--method",
     type=click.Choice(["newton", "polynomial", "table"]),
     default="newton",
-    help="Of the inverse: by Newton, by a polynomial fitted here, by INVERSE rows.",
+    help="Method of the inverse: Newton, a fitted polynomial, or INVERSE rows.",
 )
-@click.option("--order", type=int, metavar="N", help="Of the polynomial fitted.")
-@click.option("--columns", nargs=2, metavar="X Y", help="Names of the positions.")
-@click.option("--chip", type=int, metavar="N", help="In place of a column.")
+@click.option("--order", type=int, metavar="N", help="Order of the fitted polynomial.")
+@click.option("--columns", nargs=2, metavar="X Y", help="Names of the columns with positions.")
+@click.option("--chip", type=int, metavar="N", help="Chip number, in place of a column.")
 @click.option(
     "--origin",
     nargs=2,
@@ -50,16 +50,16 @@ def inspect(file: str) -> None:
     show_default="0 0",
     help="Output pixel of the zero point.",
 )
-@click.option("--vafactor", type=float, default=1.0, metavar="V", help="Of the exposure.")
+@click.option("--vafactor", type=float, default=1.0, metavar="V", help="VAFACTOR of the exposure.")
 @click.option("--image", metavar="FLT", help="A calibrated image whose pixels these are.")
-@click.option("--ltv", nargs=2, type=float, metavar="LTV1 LTV2", help="Of a subarray.")
+@click.option("--ltv", nargs=2, type=float, metavar="LTV1 LTV2", help="LTV keywords of a subarray.")
 @click.option("--corner", nargs=2, type=float, metavar="X Y", help="First pixel of a subarray.")
 @force
 def apply(file: str, table: str, output: str, **options: Any) -> None:
-    """Pixels to the undistorted frame, or back.
+    """Transform pixels to the undistorted frame, or back.
 
-    FILE is an IDCTAB, a run, or whatever 'compare' takes; TABLE has the columns x, y, chip, or
-    x_out, y_out on the way back.
+    FILE is an IDCTAB, a run, or any file that 'compare' takes; TABLE has columns x, y, chip, or
+    x_out, y_out for the inverse.
     """
     from bayesdist.app.commands.on_files.apply import apply_to_table
 
@@ -69,17 +69,17 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
 @command()
 @click.argument("a", metavar="A")
 @click.argument("b", metavar="B")
-@click.option("-o", "--output", metavar="DIR", help="A new folder for tables and figure.")
+@click.option("-o", "--output", metavar="DIR", help="Folder to create for tables and figure.")
 @click.option("--chip", type=int, metavar="N", show_default="all common chips")
-@click.option("--filter", metavar="F", help="Of IDCTABs, or WISE band; F:G for A and B.")
+@click.option("--filter", metavar="F", help="Filter of IDCTABs, or WISE band; F:G for A and B.")
 @epoch
-@click.option("--keep-linear", is_flag=True, help="Leave shift, rotation and scale in.")
+@click.option("--keep-linear", is_flag=True, help="Do not remove shift, rotation and scale.")
 @click.option("--grid", type=int, nargs=2, default=(33, 17), metavar="NX NY")
 @click.pass_obj
 def compare(
     line: str, a: str, b: str, output: str | None, keep_linear: bool, **options: Any
 ) -> None:
-    """How two calibrations differ, and how significantly.
+    """Compare two calibrations: differences and their significance.
 
     A and B are each a run, a posterior, a fit, an IDCTAB, a SIP header or WISE meta-data.
     """
@@ -91,10 +91,10 @@ def compare(
 @command()
 @click.argument("run", metavar="RUN")
 @click.argument("new", metavar="NEW")
-@click.option("-o", "--output", metavar="DIR", help="A new folder for tables and figure.")
+@click.option("-o", "--output", metavar="DIR", help="Folder to create for tables and figure.")
 @click.pass_obj
 def monitor(line: str, run: str, new: str, output: str | None) -> None:
-    """Does a released solution still describe new matches?
+    """Test whether a released calibration still describes new matches.
 
     NEW is a table of matches, or a CONFIG.toml that names them.
     """
@@ -106,10 +106,12 @@ def monitor(line: str, run: str, new: str, output: str | None) -> None:
 @command()
 @click.argument("runs", nargs=-1, required=True, metavar="RUN...")
 @new_folder
-@click.option("--allow-unconverged", is_flag=True, help="Also runs that have not converged.")
+@click.option(
+    "--allow-unconverged", is_flag=True, help="Release runs that have not converged, too."
+)
 @click.pass_obj
 def release(line: str, runs: tuple[str, ...], output: str, allow_unconverged: bool) -> None:
-    """One set of files from the runs of several filters.
+    """Write one set of files from the runs of several filters.
 
     The first run is that of the reference filter.
     """

@@ -78,18 +78,24 @@ def command(**settings: Any) -> Callable[[Callable[..., int | None]], click.Comm
         is_flag=True,
         expose_value=False,
         callback=_begin_logging,
-        help="Only warnings and errors.",
+        help="Print only warnings and errors.",
     )
     return lambda function: click.command(**settings)(quiet(function))
 
 
 column_names = _ColumnNames()
-new_folder = click.option("-o", "--output", required=True, metavar="DIR", help="A new folder.")
-force = click.option("--force", is_flag=True, help="Replace what is there.")
-seed = click.option("--seed", type=click.IntRange(min=0), default=1, metavar="N")
-epoch = click.option("--epoch", type=float, metavar="T", help="Decimal years, for what drifts.")
-filter_name = click.option("--filter", metavar="F", help="Of an IDCTAB, or a WISE band.")
-pixel_scale = click.option("--scale", type=float, metavar="S", help="Of a corrected pixel.")
+new_folder = click.option("-o", "--output", required=True, metavar="DIR", help="Folder to create.")
+force = click.option("--force", is_flag=True, help="Replace an existing output.")
+seed = click.option(
+    "--seed", type=click.IntRange(min=0), default=1, metavar="N", help="Seed of the random numbers."
+)
+epoch = click.option(
+    "--epoch", type=float, metavar="T", help="Date in decimal years, for calibrations that drift."
+)
+filter_name = click.option("--filter", metavar="F", help="Filter of an IDCTAB, or WISE band.")
+pixel_scale = click.option(
+    "--scale", type=float, metavar="S", help="Size of a corrected pixel, arcsec."
+)
 
 
 def chip_of(numbers: Sequence[int], chip: int | None, where: str) -> int:

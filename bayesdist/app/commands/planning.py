@@ -10,16 +10,16 @@ from bayesdist.errors import InputError
 
 @command()
 @click.argument("run", metavar="RUN")
-@click.option("--requirement", metavar="NAME", show_default="all", help="One of them.")
+@click.option("--requirement", metavar="NAME", show_default="all", help="Name of one requirement.")
 @click.option(
     "--epochs",
     type=CommaList(float),
     default=(),
     metavar="T,...",
-    help="Dates of exposures, decimal years, separated by commas.",
+    help="Dates of further exposures, decimal years, separated by commas.",
 )
 def plan(run: str, requirement: str | None, epochs: tuple[float, ...]) -> None:
-    """How many more exposures would meet the requirements."""
+    """Compute how many more exposures would meet the requirements."""
     from bayesdist.app.commands.on_runs.plan import plan as exposures_planned
 
     if run.endswith(".toml"):
@@ -33,10 +33,12 @@ def plan(run: str, requirement: str | None, epochs: tuple[float, ...]) -> None:
 
 @command(name="plan-dither")
 @click.argument("patterns", metavar="PATTERNS.toml")
-@click.option("-o", "--output", metavar="DIR", help="A new folder for table, record and figure.")
+@click.option(
+    "-o", "--output", metavar="DIR", help="Folder to create for table, record and figure."
+)
 @click.pass_obj
 def plan_dither(line: str, patterns: str, output: str | None) -> None:
-    """Which dither pattern determines a self-calibration best."""
+    """Compare dither patterns for a self-calibration, without data."""
     from bayesdist.app.patterns.command import plan_patterns
 
     click.echo(plan_patterns(patterns, output, line))
@@ -45,8 +47,14 @@ def plan_dither(line: str, patterns: str, output: str | None) -> None:
 @command(name="select-order")
 @click.argument("config", metavar="CONFIG.toml")
 @click.option("--orders", nargs=2, type=int, default=(3, 9), metavar="LOW HIGH")
-@click.option("--chip", type=int, metavar="N", show_default="the only one")
-@click.option("-o", "--output", metavar="orders.ecsv", help="The table as a file.")
+@click.option(
+    "--chip",
+    type=int,
+    metavar="N",
+    show_default="the only one",
+    help="Chip that is compared.",
+)
+@click.option("-o", "--output", metavar="orders.ecsv", help="Write the table to a file.")
 @click.option("--figure", metavar="orders.png")
 @force
 def select_order(
@@ -57,7 +65,7 @@ def select_order(
     figure: str | None,
     force: bool,
 ) -> None:
-    """The polynomial order, selected by the data."""
+    """Select the polynomial order."""
     from bayesdist.app.commands.on_runs.order import order
 
     click.echo(order(config, orders, chip=chip, output=output, figure=figure, force=force))

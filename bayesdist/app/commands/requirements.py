@@ -15,7 +15,7 @@ MISSED = 4  # exit code
     "--requirements", required=True, metavar="REQ.toml", help="File of [[requirement]] blocks."
 )
 def requirements(run: str, requirements: str) -> int:
-    """Margins of a run; exit 4 unless all are met."""
+    """Judge a run by requirements; exit with 4 unless all are met."""
     from bayesdist.app.commands.on_runs.validate import validate
 
     text, met = validate(run, requirements)
@@ -32,11 +32,13 @@ def requirements(run: str, requirements: str) -> int:
     nargs=2,
     type=float,
     metavar="X Y",
-    help="Of the difference to this pixel; may be repeated.",
+    help="Budget of the separation from this pixel; may be repeated.",
 )
 @click.option("--chip", type=int, metavar="N", show_default="the only one")
-@click.option("--epoch", type=float, metavar="T", help="Decimal years.")
-@click.option("--magnitude", type=float, metavar="M", help="Adds the centroid's error.")
+@click.option("--epoch", type=float, metavar="T", help="Date in decimal years.")
+@click.option(
+    "--magnitude", type=float, metavar="M", help="Add the centroid error at this magnitude."
+)
 def budget(
     run: str,
     at: tuple[float, float],
@@ -45,7 +47,7 @@ def budget(
     epoch: float | None,
     magnitude: float | None,
 ) -> None:
-    """What the error of a position, or of a distance, is made of."""
+    """Print the error budget of a position, or of a separation."""
     from bayesdist.app.commands.on_runs.budget import budget_at
 
     click.echo(budget_at(run, at, to=list(to), chip=chip, epoch=epoch, magnitude=magnitude))

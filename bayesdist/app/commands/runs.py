@@ -18,7 +18,7 @@ STAGES = ("match", "fit", "sample", "diagnose", "evaluate", "assess", "export", 
     "--columns",
     type=column_names,
     metavar="KEY=NAME,...",
-    help="Columns that are not found by their names; KEY= leaves one out.",
+    help="Names of columns that are not recognised; KEY= leaves one out.",
 )
 @click.option(
     "--size",
@@ -26,7 +26,7 @@ STAGES = ("match", "fit", "sample", "diagnose", "evaluate", "assess", "export", 
     type=int,
     metavar="NX NY",
     show_default="guessed from the positions",
-    help="Columns and rows of each chip.",
+    help="Number of columns and rows of each chip.",
 )
 @force
 def init(
@@ -36,7 +36,7 @@ def init(
     size: tuple[int, int] | None,
     force: bool,
 ) -> None:
-    """A commented configuration for matched stars."""
+    """Write a commented configuration for a table of matched stars."""
     from bayesdist.app.commands.on_files.init import init as write_configuration
 
     n = write_configuration(config, matches, columns=columns, size=size, force=force)
@@ -46,7 +46,7 @@ def init(
 @command()
 @click.argument("config", metavar="CONFIG.toml")
 def check(config: str) -> None:
-    """Units, rank, null space and cost; samples nothing."""
+    """Check units, rank, degeneracies and cost of a configuration, without sampling."""
     from bayesdist.app.commands.on_runs.check import check as checked
 
     click.echo(checked(config))
@@ -55,9 +55,9 @@ def check(config: str) -> None:
 @command()
 @click.argument("config", metavar="CONFIG.toml")
 @click.option("-o", "--output", required=True, metavar="RUN", help="Folder of the run.")
-@click.option("--resume", is_flag=True, help="Go on with the run that is there.")
-@click.option("--force", is_flag=True, help="Replace the run that is there.")
-@click.option("--strict", is_flag=True, help="Exit 3 unless converged.")
+@click.option("--resume", is_flag=True, help="Resume an interrupted run.")
+@click.option("--force", is_flag=True, help="Replace an existing run.")
+@click.option("--strict", is_flag=True, help="Exit with 3 unless converged.")
 @click.option(
     "--seed", type=click.IntRange(min=0), metavar="N", show_default="that of the configuration"
 )
@@ -71,7 +71,7 @@ def run(
     strict: bool,
     seed: int | None,
 ) -> None:
-    """The whole job: match, fit, sample, diagnose, evaluate, export, report."""
+    """Calibrate: match, fit, sample, diagnose, evaluate, export, report."""
     if resume and force:
         raise click.UsageError("--resume and --force exclude each other.")
     from bayesdist.app.run import run as whole_job
@@ -87,14 +87,14 @@ def run(
 @command()
 @click.argument("name", metavar=f"[{'|'.join(STAGES)}]", type=click.Choice(STAGES))
 @click.argument("run", metavar="RUN")
-@click.option("--strict", is_flag=True, help="Of sample: exit 3 unless converged.")
-@click.option("--pdf", is_flag=True, help="Of report: figures as PDF, too.")
+@click.option("--strict", is_flag=True, help="For sample: exit with 3 unless converged.")
+@click.option("--pdf", is_flag=True, help="For report: draw the figures as PDF, too.")
 def stage(name: str, run: str, strict: bool, pdf: bool) -> None:
-    """One stage of a run.
+    """Run one stage of a run again.
 
-    match: star lists to matches, of a campaign or a self-calibration; fit: the linear fit; sample:
-    the posterior, from its checkpoints on; diagnose: what residuals say; evaluate: maps, budget,
-    margins; assess: these two; export: files for pipelines; report: figures and report.html.
+    match: match star lists (campaigns, self-calibrations); fit: linear fit; sample: posterior,
+    resumed from its checkpoints; diagnose: tests of the residuals; evaluate: maps, budget,
+    margins; assess: diagnose and evaluate; export: files for pipelines; report: report.html.
     """
     if strict and name != "sample":
         raise click.UsageError("--strict is an option of the stage 'sample'.")

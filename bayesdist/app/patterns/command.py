@@ -20,7 +20,7 @@ __all__ = ["plan_patterns"]
 LEGEND = (
     "reach: largest distance of two pointings, pix; free: directions that detections leave free; "
     "the rest is errors of positions over the detector, radial, 1 sigma, pix; gauge-free: without "
-    "what is free; shape: without shift, rotation and scale, by which patterns are sorted; "
+    "the free directions; shape: without shift, rotation and scale, by which patterns are sorted; "
     "absolute: without the zero point alone; -: nothing bounds it"
 )
 

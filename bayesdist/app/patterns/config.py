@@ -141,7 +141,7 @@ class PlanConfig(Section):
         given = sum(c.place is not None for c in self.chip)
         if 0 < given < len(self.chip):
             raise ValueError(
-                "some [[chip]] blocks have a place and some have none; give all or none"
+                "some [[chip]] blocks have the key place and some do not; give all or none"
             )
         require_scales(self.gauge.exposure_scale_sigma, self.selfcal.frames)
         return self

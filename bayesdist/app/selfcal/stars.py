@@ -25,7 +25,7 @@ FEW, DOUBTFUL, REFERENCE = 1, 2, 4
 FLAGS = {
     FEW: "two detections: one false one would not show",
     DOUBTFUL: "more than a third of the detections are expected to be false",
-    REFERENCE: "a reference star: its catalogue position is in its place",
+    REFERENCE: "a reference star: its catalogue position is among its measurements",
 }
 MIN_MEMBERS = 2 / 3  # of the detections, below which a star is doubtful
 PARQUET_FROM = 100_000  # stars, above which there is a Parquet file beside the table

@@ -104,7 +104,7 @@ class RunDirectory(RunStore):
                 raise InputError(
                     "the folder holds another run",
                     where=str(path),
-                    do="go on with it by --resume, replace it by --force, or choose another folder",
+                    do="resume it with --resume, replace it with --force, or choose another folder",
                 )
             refuse_another_solution(run.path, run.config, run.facts, config, base, inputs, seed)
             run._adopted = config, text, inputs

@@ -37,7 +37,7 @@ def centroid_errors(
         if too_small.any():
             k = int(np.argmax(too_small))
             raise InputError(
-                f"errors of {known:.3g} are said to be in residuals that scatter by "
+                f"errors of {known:.3g} are declared part of residuals that scatter by "
                 f"{sigma[k]:.3g} at magnitude {scatter.mag[k]:.2f}",
                 where=f"budget term {contained[0][0]!r}",
                 do="correct them, or set included_in_scatter = false",

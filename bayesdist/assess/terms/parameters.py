@@ -42,7 +42,7 @@ Float = NDArray[np.float64]
 
 CATALOGUE = "reference catalogue (shared stars)"
 MOTIONS = "proper motions (shared stars)"
-EXPOSURE_SCATTER = "exposure scatter"
+EXPOSURE_SCATTER = "exposure-to-exposure variation"
 
 
 @dataclass(frozen=True, eq=False)

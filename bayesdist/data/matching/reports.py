@@ -223,7 +223,7 @@ def match_warnings(
     )  # fmt: skip
     for what, values, odd, form in (
         ("completeness", completeness, _away(-completeness, _MIN_COMPLETENESS_STEP) > 0, ".2f"),
-        ("share of false matches", false, _away(false, _MIN_FALSE_STEP) > 0, ".2f"),
+        ("fraction of false matches", false, _away(false, _MIN_FALSE_STEP) > 0, ".2f"),
         ("scale", scale - _median(scale), np.abs(_away(scale, _MIN_SCALE_STEP)) > 0, "+.1e"),
     ):
         named = [

@@ -85,7 +85,7 @@ def between_nodes(
     seen = ((fine.weight > 0) & (coarse.weight > 0)).all(axis=1) & (part > 0)
     if n_pairs < MIN_PAIRS or not seen.any():
         raise DegenerateError(
-            f"{n_pairs} pairs of stars at the same place do not tell what lies between nodes",
+            f"{n_pairs} pairs of stars at the same position do not show what lies between nodes",
             where=f"look-up table of chip {chip.number}",
             do="give more stars or more exposures",
         )

@@ -76,7 +76,7 @@ def pixel_shifts(solution: Solution, matches: Matches) -> PixelShifts:
         k = int(np.argmax(folded))
         number = matches.chip_numbers[matches.chip[k]]
         raise DegenerateError(
-            "the polynomial maps neighbouring pixels to one place",
+            "the polynomial maps neighbouring pixels to one position",
             where=f"pixel ({matches.x[k]:.1f}, {matches.y[k]:.1f}) of chip {number}",
             do="check the match, or give a lower order",
         )

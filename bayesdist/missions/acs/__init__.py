@@ -7,7 +7,7 @@ __all__ = ["MISSION"]
 _COMMANDS = "bayesdist.missions.acs.commands"
 
 MISSION = Mission(
-    title="HST: what its handbooks show of a calibration.",
+    title="HST: handbook figures and pixel area maps.",
     commands={"handbook": f"{_COMMANDS}:handbook", "pam": f"{_COMMANDS}:pam"},
     simulate={"acs": f"{_COMMANDS}:simulate"},
     report="bayesdist.missions.acs.published",

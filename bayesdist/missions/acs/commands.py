@@ -28,14 +28,14 @@ from bayesdist.app.commands.options import (
     "--detector",
     metavar="WFC",
     show_default="that of an IDCTAB of ACS",
-    help="Detector of ACS whose printed numbers stand beside.",
+    help="Detector of ACS whose published numbers are compared.",
 )
-@click.option("--magnification", type=float, metavar="M", help="Of the vectors.")
+@click.option("--magnification", type=float, metavar="M", help="Magnification of the vectors.")
 @click.pass_obj
 def handbook(line: str, file: str, output: str, **options: Any) -> None:
-    """Figures and numbers as in the ACS handbook.
+    """Draw figures and numbers as in the ACS handbook.
 
-    FILE is an IDCTAB, a run, or whatever 'compare' takes.
+    FILE is an IDCTAB, a run, or any file that 'compare' takes.
     """
     from bayesdist.missions.acs.handbook.command import handbook as written
 
@@ -48,15 +48,13 @@ def handbook(line: str, file: str, output: str, **options: Any) -> None:
 @epoch
 @pixel_scale
 @click.option("-o", "--output", required=True, metavar="OUT.fits")
-@click.option(
-    "--chip", type=int, metavar="N", show_default="all", help="The one in the primary HDU."
-)
-@click.option("--image", metavar="FLT", help="A calibrated image that the maps are to fit.")
+@click.option("--chip", type=int, metavar="N", show_default="all", help="Chip of the primary HDU.")
+@click.option("--image", metavar="FLT", help="A calibrated image that the maps shall match.")
 @force
 def pam(file: str, output: str, **options: Any) -> None:
-    """Pixel area maps, with their errors.
+    """Write pixel area maps with their errors.
 
-    FILE is an IDCTAB, a run, or whatever 'compare' takes.
+    FILE is an IDCTAB, a run, or any file that 'compare' takes.
     """
     from bayesdist.missions.acs.pam import write_area_maps
 
@@ -67,24 +65,32 @@ def pam(file: str, output: str, **options: Any) -> None:
 @new_folder
 @seed
 @force
-@click.option("--exposures", type=int, default=110, metavar="N", help="In F606W.")
-@click.option("--stars", type=int, default=53_900, metavar="N", help="Of the catalogue.")
 @click.option(
-    "--filters", type=CommaList(), default="F606W", metavar="F606W,F814W", help="One or several."
+    "--exposures", type=int, default=110, metavar="N", help="Number of exposures in F606W."
+)
+@click.option(
+    "--stars", type=int, default=53_900, metavar="N", help="Number of stars in the catalogue."
+)
+@click.option(
+    "--filters",
+    type=CommaList(),
+    default="F606W",
+    metavar="F606W,F814W",
+    help="One filter or several.",
 )
 @click.option(
     "--secondary-exposures",
     type=int,
     default=15,
     metavar="N",
-    help="Exposures of each further filter.",
+    help="Number of exposures of each further filter.",
 )
-@click.option("--false", type=float, default=0.05, help="Fraction of detections that are none.")
+@click.option("--false", type=float, default=0.05, help="Fraction of false detections.")
 @click.option("--outlying", type=float, default=0.0, help="Fraction of outlying exposures.")
-@click.option("--cte", is_flag=True, help="Trailed charge moves the stars.")
-@click.option("--no-tables", is_flag=True, help="A distortion without look-up tables.")
+@click.option("--cte", is_flag=True, help="Shift stars by trailed charge.")
+@click.option("--no-tables", is_flag=True, help="Leave out the look-up tables.")
 def simulate(output: str, **options: Any) -> None:
-    """Star lists, catalogue and log of the 47 Tuc campaign."""
+    """Simulate star lists, catalogue and log of the 47 Tuc campaign."""
     from bayesdist.missions.acs.simulated_campaign import simulate_campaign
 
     click.echo(simulate_campaign(output, **options))

@@ -8,7 +8,7 @@ _COMMANDS = "bayesdist.missions.wise.commands"
 _PAIRS = "bayesdist.missions.wise.pairs"
 
 MISSION = Mission(
-    title="WISE: its bands beside each other, its pairs and its files.",
+    title="WISE: comparison of bands, RvB pairs, and files.",
     commands={
         "bands": f"{_COMMANDS}:bands",
         "bring-up": f"{_COMMANDS}:bring_up",

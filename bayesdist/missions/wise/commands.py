@@ -22,7 +22,7 @@ from bayesdist.app.commands.options import (
 @click.option("--force", is_flag=True, help="Replace an earlier demo.")
 @click.pass_obj
 def demo(line: str, output: str, force: bool) -> None:
-    """The main job on simulated data, beside the truth."""
+    """Calibrate simulated data and compare with the truth."""
     from bayesdist.missions.wise.demo import demo as simulated_and_run
 
     click.echo(simulated_and_run(output, force=force, command=line))
@@ -31,7 +31,9 @@ def demo(line: str, output: str, force: bool) -> None:
 @command()
 @click.argument("runs", nargs=-1, required=True, metavar="RUN...")
 @new_folder
-@click.option("--bins", type=int, default=31, metavar="N", help="Of residuals, on each axis.")
+@click.option(
+    "--bins", type=int, default=31, metavar="N", help="Number of residual bins on each axis."
+)
 @click.option(
     "--optical",
     type=CommaList(),
@@ -39,8 +41,14 @@ def demo(line: str, output: str, force: bool) -> None:
     metavar="FILE,...",
     help="SIP header or WISE meta-data of an optical model; one, or one for each run.",
 )
-@click.option("--rotation", type=float, default=0.0, metavar="DEG", help="Of the optical model.")
-@click.option("--no-published", is_flag=True, help="Without values of WISE's report.")
+@click.option(
+    "--rotation",
+    type=float,
+    default=0.0,
+    metavar="DEG",
+    help="Rotation of the optical model, degrees.",
+)
+@click.option("--no-published", is_flag=True, help="Leave out the values of WISE's report.")
 @click.pass_obj
 def bands(
     line: str,
@@ -51,9 +59,9 @@ def bands(
     rotation: float,
     no_published: bool,
 ) -> None:
-    """Tables and diagrams of bands beside each other.
+    """Compare bands: tables and diagrams.
 
-    Each RUN is finished, and of another band.
+    Each RUN is a finished run of another band.
     """
     from bayesdist.missions.wise.bands.command import bands_of_runs
 
@@ -74,20 +82,30 @@ def bands(
 @click.argument("reference", metavar="REFERENCE")
 @new_folder
 @click.option("--band", required=True, metavar="W1")
-@click.option("--order", type=int, default=4, metavar="N", help="Of the polynomial in the end.")
+@click.option("--order", type=int, default=4, metavar="N", help="Final order of the polynomial.")
 @click.option(
     "--radius",
     type=float,
     default=1.0,
     metavar="A",
-    help="Within which pairs are accepted in the array's centre, pixels.",
+    help="Acceptance radius of pairs at the array's centre, pixels.",
 )
-@click.option("--corner-radius", type=float, default=3.0, metavar="A", help="... in its corners.")
-@click.option("--optical", metavar="FILE", help="SIP header or WISE meta-data to begin with.")
-@click.option("--rotation", type=float, default=0.0, metavar="DEG", help="Of the optical model.")
+@click.option(
+    "--corner-radius", type=float, default=3.0, metavar="A", help="The same in the corners."
+)
+@click.option(
+    "--optical", metavar="FILE", help="SIP header or WISE meta-data of the initial distortion."
+)
+@click.option(
+    "--rotation",
+    type=float,
+    default=0.0,
+    metavar="DEG",
+    help="Rotation of the optical model, degrees.",
+)
 @click.pass_obj
 def bring_up(line: str, detections: str, reference: str, output: str, **options: Any) -> None:
-    """Pairs and distortion from lists of stars that nobody has paired.
+    """Determine pairs and distortion from unmatched star lists.
 
     DETECTIONS and REFERENCE have columns x, y, sigma and frame, in pixels of the band.
     """
@@ -98,12 +116,14 @@ def bring_up(line: str, detections: str, reference: str, output: str, **options:
 
 @command()
 @click.argument("file", metavar="FILE")
-@click.option("--angle", type=float, default=0.0, metavar="DEG", help="From x towards y.")
+@click.option(
+    "--angle", type=float, default=0.0, metavar="DEG", help="Angle from x towards y, degrees."
+)
 @click.option("--mirror", is_flag=True, help="Change the sign of x first.")
 @click.option("-o", "--output", required=True, metavar="OUT")
 @force
 def rotate(file: str, output: str, angle: float, mirror: bool, force: bool) -> None:
-    """A SIP header or WISE meta-data in rotated pixels."""
+    """Rotate the pixel frame of a SIP header or of WISE meta-data."""
     from bayesdist.missions.wise.rotate import rotate as write_rotated
 
     click.echo(write_rotated(file, output, degrees=angle, mirror=mirror, force=force))
@@ -118,9 +138,12 @@ def _pairs(function: Callable[..., None]) -> Callable[..., None]:
     """Argument and options of pairs, which both commands have."""
     for decorate in (
         click.option(
-            "--columns", type=column_names, metavar="KEY=NAME,...", help="As data.columns."
+            "--columns",
+            type=column_names,
+            metavar="KEY=NAME,...",
+            help="Names of columns, as data.columns.",
         ),
-        click.option("--band", metavar="W1", help="Needed where the files hold several."),
+        click.option("--band", metavar="W1", help="Band, needed where the files hold several."),
         new_folder,
         click.argument("files", nargs=-1, required=True, metavar="FILE..."),
     ):
@@ -147,9 +170,9 @@ def _pairs(function: Callable[..., None]) -> Callable[..., None]:
     help="Relative to one: 1e-4 stretches x by so much.",
 )
 @click.option("--scale-y", type=float, default=0.0, metavar="A", help="Relative to one.")
-@click.option("--fit", is_flag=True, help="These five from the pairs, by least squares.")
+@click.option("--fit", is_flag=True, help="Fit these five to the pairs, by least squares.")
 def transform(files: tuple[str, ...], output: str, **options: Any) -> None:
-    """All pairs by one linear transformation.
+    """Transform all pairs by one linear transformation.
 
     FILE is an IPAC table, Parquet, or a folder.
     """
@@ -161,13 +184,17 @@ def transform(files: tuple[str, ...], output: str, **options: Any) -> None:
 @command()
 @_pairs
 @click.option(
-    "--from", "free", required=True, metavar="TABLE", help="Solutions that pairs were made with."
+    "--from",
+    "free",
+    required=True,
+    metavar="TABLE",
+    help="Solutions with which the pairs were made.",
 )
 @click.option(
-    "--to", "fixed", required=True, metavar="TABLE", help="Those that they are brought to."
+    "--to", "fixed", required=True, metavar="TABLE", help="Solutions to which they are transformed."
 )
 def rereference(files: tuple[str, ...], output: str, **options: Any) -> None:
-    """Each frame from one solution to another."""
+    """Transform each frame from one solution to another."""
     from bayesdist.missions.wise.rvb.command import rereference_files
 
     click.echo(rereference_files(files, output, **options))
@@ -182,14 +209,28 @@ rvb.add_command(rereference)
 @seed
 @force
 @click.option(
-    "--bands", type=CommaList(), default="W1,W2,W3,W4", metavar="W1,...", help="Of full sets."
+    "--bands",
+    type=CommaList(),
+    default="W1,W2,W3,W4",
+    metavar="W1,...",
+    help="Bands of the full sets.",
 )
-@click.option("--pairs", type=int, metavar="N", show_default="as published", help="Of each band.")
-@click.option("--false-fraction", type=float, default=0.03, metavar="F", help="Of false matches.")
-@click.option("--partition-pattern", is_flag=True, help="Blocks in the residuals.")
-@click.option("--stars", type=int, metavar="N", help="One small table of one band instead.")
-@click.option("--band", metavar="W2", help="Of the small table.")
-@click.option("--fraction", type=float, help="Of false matches in the small table.")
+@click.option(
+    "--pairs",
+    type=int,
+    metavar="N",
+    show_default="as published",
+    help="Number of pairs in each band.",
+)
+@click.option(
+    "--false-fraction", type=float, default=0.03, metavar="F", help="Fraction of false matches."
+)
+@click.option("--partition-pattern", is_flag=True, help="Add a pattern of blocks to the residuals.")
+@click.option(
+    "--stars", type=int, metavar="N", help="Make one small table of one band with N stars instead."
+)
+@click.option("--band", metavar="W2", help="Band of the small table.")
+@click.option("--fraction", type=float, help="Fraction of false matches in the small table.")
 def simulate(
     output: str,
     seed: int,
@@ -199,7 +240,7 @@ def simulate(
     fraction: float | None,
     **options: Any,
 ) -> None:
-    """Matched stars of WISE and 2MASS, with a configuration."""
+    """Simulate matched stars of WISE and 2MASS, with a configuration."""
     from bayesdist.missions.wise.simulated_pairs import simulate_sets, simulate_table
 
     if stars is None and band is None and fraction is None:

@@ -183,7 +183,7 @@ def test_parameters_that_are_held_are_not_judged(three_rolls):
 def test_the_report_shows_gauge_and_stars(three_rolls):
     text = (three_rolls.path / "report.md").read_text(encoding="utf-8")
     assert "## Gauge and stars" in text
-    assert "What detections alone cannot tell, and what fixes it" in text
+    assert "Degeneracies of the detections, and the constraints that remove them" in text
     assert "relative positions" in text
     assert (three_rolls.path / "figures" / "selfcal.png").is_file()
     # what is fitted are detections; the test for structure allows for their stars

@@ -116,7 +116,7 @@ def test_residuals_are_those_of_the_fit(rng):
 def test_wrong_input_is_named(turned):
     model, theta, matches = turned
     flat = np.zeros_like(theta)
-    with pytest.raises(DegenerateError, match="neighbouring pixels to one place"):
+    with pytest.raises(DegenerateError, match="neighbouring pixels to one position"):
         pixel_shifts(Solution(model, flat), matches)
     bare = table(matches.x, matches.y, matches.u, matches.v, unit="arcsec")
     with pytest.raises(InputError, match="in arcsec and the model is in pix"):

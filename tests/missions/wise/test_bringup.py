@@ -186,7 +186,7 @@ def test_strangers_give_no_calibration(scene):
     """Another field: the reference stars are shifted by more than any radius."""
     other = scene.reference
     wrong = replace(other, x=other.x + 15.0, y=other.y - 9.0)
-    with pytest.raises(InputError, match="no place on the detector stands out"):
+    with pytest.raises(InputError, match="no position on the detector stands out"):
         bring_up(scene.detections, wrong, scene.model, acceptance=RULE)
 
 
@@ -258,5 +258,5 @@ def test_wrong_requests_are_refused(scene):
         Detections(np.ones(2), np.ones(2), sigma=np.array([1.0, 0.0]))
     with pytest.raises(InputError, match="carries no errors"):
         bring_up(replace(far, sigma=None), scene.reference, scene.model, acceptance=RULE)
-    with pytest.raises(InputError, match="share of common stars"):
+    with pytest.raises(InputError, match="fraction of common stars"):
         simulate_unpaired(1, rng=np.random.default_rng(1), common=1.5)

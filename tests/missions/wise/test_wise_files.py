@@ -249,7 +249,7 @@ def test_what_cannot_be_simulated_is_refused(tmp_path):
     with pytest.raises(InputError, match="pairs is 0"):
         simulated(tmp_path, pairs=0)
     for share in (-0.1, 1.0, np.nan):
-        with pytest.raises(InputError, match="share of false matches"):
+        with pytest.raises(InputError, match="fraction of false matches"):
             simulated(tmp_path, false_fraction=share)
     assert not list(tmp_path.iterdir())
     simulated(tmp_path, bands=["W4"])

@@ -165,7 +165,7 @@ def _check(filters: Sequence[str], **counts: int) -> None:
 def _check_shares(**shares: float) -> None:
     for name, value in shares.items():
         if not 0.0 <= value < 1.0:
-            raise InputError(f"{name} is {value:g}", where=name, do="give a share in [0, 1)")
+            raise InputError(f"{name} is {value:g}", where=name, do="give a fraction in [0, 1)")
 
 
 def _check_sizes(**sizes: float) -> None:

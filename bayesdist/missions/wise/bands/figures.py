@@ -52,7 +52,7 @@ def vectors(inputs: BandsInput) -> Plot:
     return Plot(
         fig,
         "Distortion",
-        "From each place of the array towards where its light comes from, the constant suppressed."
+        "From each position on the array towards the origin of its light, the constant suppressed."
         " All bands are drawn to one scale in arcsec; the ring marks the longest vector.",
         "Maps of arrows over the array of each band, longest in the corners.",
     )
@@ -67,7 +67,7 @@ def differences(inputs: BandsInput) -> Plot:
     return Plot(
         fig,
         "Differences of bands",
-        f"Later bands minus {first} at the same place of the field, in pixels of {first},"
+        f"Later bands minus {first} at the same position in the field, in pixels of {first},"
         " constants suppressed.",
         "Maps of arrows: how the distortion of each band differs from that of the first.",
     )
@@ -244,7 +244,7 @@ def formal_uncertainty(inputs: BandsInput) -> Plot:
     return Plot(
         fig,
         "Formal uncertainty",
-        "Least squares: four vectors from each place to all combinations of ±1 σ in x and in y."
+        "Least squares: four vectors from each position to all combinations of ±1 σ in x and in y."
         " Each panel states its magnification, 2000 or what shows the vectors.",
         "Maps of small crosses over the array of each band, largest in the corners.",
     )

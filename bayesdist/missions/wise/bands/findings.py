@@ -240,7 +240,12 @@ def formal_table(inputs: BandsInput) -> TextTable:
             " weights."
         )
     unit = "pix" if inputs.bands[0].formal_map.unit == "pix" else "unit as given"
-    return TextTable(f"Largest formal radius ({unit})", tuple(columns), tuple(rows), note=note)
+    return TextTable(
+        f"Largest radius, least squares and posterior ({unit})",
+        tuple(columns),
+        tuple(rows),
+        note=note,
+    )
 
 
 @BANDS.table("provenance")

@@ -109,7 +109,7 @@ class Field:
         if not good.any():
             raise InputError(
                 f"{len(index)} pairs are found in round {number} where chance gives "
-                f"{chance.sum():.0f}, and no place on the detector stands out",
+                f"{chance.sum():.0f}, and no position on the detector stands out",
                 where="bring-up",
                 do="check orientation, offset and scale of the frames, or give another start or "
                 "a larger radius",

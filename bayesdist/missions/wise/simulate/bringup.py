@@ -81,7 +81,7 @@ def simulate_unpaired(
         For an unknown band, or a fraction outside 0 to 1.
     """
     if not 0 <= common <= 1:
-        raise InputError(f"the share of common stars is {common}", do="give one from 0 to 1")
+        raise InputError(f"the fraction of common stars is {common}", do="give one from 0 to 1")
     model, theta = wise_solution(band)
     nx, ny = model.chips[0].size
     n = int(rng.poisson(per_frame * n_frames))

@@ -68,7 +68,7 @@ def lint_sip(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Findi
 
 def _frame(sip: SipHeader) -> Iterator[Finding]:
     if np.linalg.det(sip.cd) == 0:
-        yield Finding("error", "CD", "the matrix is singular: no pixel has a place on the sky")
+        yield Finding("error", "CD", "the matrix is singular: no pixel has a position on the sky")
     elif np.linalg.det(sip.cd) > 0:
         yield Finding(
             "note",

@@ -149,7 +149,7 @@ def _check(band: int, sip: SipHeader, skew: float) -> None:
     along_axes = np.count_nonzero(np.abs(sip.cd) > 1e-9 * np.sqrt(scale2)) == 2
     if not along_axes or np.abs(gram - scale2 * np.eye(2)).max() > 1e-9 * scale2:
         raise InputError(
-            "the CD matrix holds more than a scale, and the file has no place for it",
+            "the CD matrix holds more than a scale, and the file cannot hold it",
             where=where,
             do='make the header with linear = "sip", whose A and B hold all linear terms',
         )

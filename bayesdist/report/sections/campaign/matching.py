@@ -223,11 +223,11 @@ def matching(r: ReportInput) -> Plot:
         "Matching by exposure",
         "Top: part of the catalogue's stars in the footprint and range of magnitudes that is"
         f" matched, {percent(completeness['median'])} at the median and"
-        f" {percent(completeness['least'])} at least. Middle: share of the pairs that is expected"
+        f" {percent(completeness['least'])} at least. Middle: fraction of pairs that is expected"
         f" to be false, {number(m['false_fraction'], 2)} over all. Bottom: pairs,"
         f" {count(m['n_pairs'])} in {count(m['n_exposures'])} exposures. Search radii were"
         f" {number(m['radius'][0])} to {size_of(m['radius'][1], c.unit)}.",
-        "Completeness, share of false pairs and number of pairs of each exposure against its date.",
+        "Completeness, fraction of false pairs and number of pairs of each exposure against date.",
     )
 
 

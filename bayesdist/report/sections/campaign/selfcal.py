@@ -54,7 +54,7 @@ def _gauge(found: SelfcalResults) -> TextTable:
         "Fixed by",
     )
     return TextTable(
-        "What detections alone cannot tell, and what fixes it",
+        "Degeneracies of the detections, and the constraints that remove them",
         heads,
         tuple(rows),
         words=(0, 1, 5),
@@ -133,7 +133,7 @@ def _stars(found: SelfcalResults, r: ReportInput) -> TextTable:
             "Reference stars": count(s["n_reference"]),
         },
         note="All stars with their covariances: stars.ecsv. Their errors hold those of distortion"
-        " and exposures, which stars have in common, in the gauge of the run.",
+        " and exposures, which all stars share, in the gauge of the run.",
     )
 
 

@@ -59,7 +59,7 @@ def data_tables(r: ReportInput) -> tuple[TextTable, ...]:
         "Rows left out, by reason",
         ("Reason", "Rows"),
         tuple(reasons) or (("none", "0"),),
-        note=f"The posterior uses all {words.all_rows}: the mixture takes the place of rejection."
+        note=f"The posterior uses all {words.all_rows}: the mixture replaces rejection."
         if r.posterior is not None
         else "",
     )

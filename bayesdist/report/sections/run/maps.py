@@ -231,7 +231,7 @@ def formal_uncertainty(r: ReportInput) -> Plot:
     return Plot(
         panels.figure,
         "Uncertainty diagram",
-        "From each place four vectors to all combinations of ±1 σ in u and ±1 σ in v, enlarged as"
+        "From each position four vectors to all combinations of ±1 σ in u and v, enlarged as"
         f" stated above the panels; the largest error per axis is {found}.",
         f"Crosses of ±1 sigma over the detector; largest per axis {found}.",
     )

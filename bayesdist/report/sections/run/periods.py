@@ -203,7 +203,7 @@ def period_differences(r: ReportInput) -> Plot:
         panels.figure,
         "Difference of the latest and the earliest period",
         f"Positions by the model of {found.last} minus those by the model of {found.first}. Dark"
-        " vectors differ from zero beyond 2 σ at their place (both axes taken together); neighbours"
+        " vectors differ from zero beyond 2 σ at their position (both axes together); neighbours"
         f" share their coefficients and are dark together. The largest is {size} at pixel"
         f" {r.position(change.at, change.chip)}; noise alone makes up to"
         f" {with_mas(change.noise_95, r.unit, mas)} in 95 of 100 cases"

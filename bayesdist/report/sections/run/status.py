@@ -174,7 +174,7 @@ def _accuracy_sentence(r: ReportInput) -> str:
     )
     text = (
         f"The {whose} uncertainty of the distortion (per axis, 1 σ) is"
-        f" {with_mas(median, r.unit, r.scale_mas)} at the median place and at most {largest},"
+        f" {with_mas(median, r.unit, r.scale_mas)} at the median position and at most {largest},"
         f" at pixel {r.position(best.position_of_max, worst.chip.number)}{_with_shift(r)}"
         f" ({circles} at most)"
     )
