@@ -110,7 +110,7 @@ def uncertainty_radius(r: ReportInput) -> Plot:
     )
     if r.selfcal is not None:
         text += (
-            " That of relative positions is the same whatever fixes place, rotation and scale (and"
+            " That of relative positions is the same in any gauge of shift, rotation and scale (and"
             " skew, where all exposures have one roll angle); the other is that of the run's gauge."
         )
         return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")
