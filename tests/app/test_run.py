@@ -87,7 +87,16 @@ def test_the_record(finished):
     digest = hashlib.sha256(stars.read_bytes()).hexdigest()
     assert record["inputs"] == {str(stars): digest}
     assert record["seed"] == 1
-    for package in ("python", "numpy", "scipy", "astropy", "emcee", "numba", "arviz", "bayesdist"):
+    for package in (
+        "python",
+        "numpy",
+        "scipy",
+        "astropy",
+        "emcee",
+        "numba",
+        "arviz-stats",
+        "bayesdist",
+    ):
         assert re.match(r"\d+\.\d+", record["versions"][package]), package
     assert list(record["stages"]) == ["fit", "sample", "diagnose", "evaluate", "export", "report"]
     assert all(s["wall_s"] > 0 for s in record["stages"].values())

@@ -19,6 +19,7 @@ from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import read_wise_meta
+from bayesdist.report.documentation import BASE
 from bayesdist.simulate import simulate_matches
 from tests.app.conftest import sketched  # noqa: F401  (its figures are not looked at here)
 from tests.app.support import (
@@ -247,7 +248,9 @@ def test_every_file_is_there_and_the_page_needs_no_other(compared):
     files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
     assert files == {*record["files"], "bands.json"}
     page = (folder / "bands.html").read_text(encoding="utf-8")
-    assert not re.search(r'(?:src|href)="(?!data:|#)', page)
+    # the documentation is linked, and asked by readers alone
+    assert not re.search(rf'(?:src|href)="(?!data:|#|{re.escape(BASE)})', page)
+    assert not re.search(r"<(?:link|script|iframe|img)[^>]*https:", page)
     assert page.count("<figure") == len([f for f in files if f.endswith(".png")])
     assert "NOT CONVERGED" not in page
     assert "W4" in compared.result.out and "bands.html" in compared.result.out
