@@ -33,6 +33,7 @@ GROUPS = (
     "Assumptions",
     "Periods",
     "Requirements",
+    "Validity",
     "Products",
 )
 

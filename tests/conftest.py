@@ -36,8 +36,9 @@ def full() -> bool:
 # none of them yet compiles once, not in each process.  What takes long is not left for the end.
 FIRST = (
     "tests/app/test_run.py",
-    *("tests/data/", "tests/model/", "tests/wise/", "tests/report/"),
+    *("tests/data/", "tests/model/", "tests/missions/wise/", "tests/report/"),
     *("tests/campaign/", "tests/test_new_instrument.py", "tests/test_docs.py"),
+    *("tests/test_examples.py", "tests/real/"),
 )
 
 

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 import typing
+from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 from pkgutil import resolve_name
@@ -24,11 +25,19 @@ from bayesdist.app.config import KINDS
 from bayesdist.app.config.data import data_sections
 
 from .docs_blocks import DOCS, blocks, run_page
+from .sketches import sketched
 
 ROOT = DOCS.parent
 PAGES = sorted([*DOCS.glob("*.md"), *ROOT.glob("[CR]*.md"), ROOT / "examples" / "README.md"])
 # what make docs needs beyond the test extra's other packages
 SITE = ("sphinx", "myst_parser", "numpydoc", "pydata_sphinx_theme", "sphinx-mathjax-offline")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_reports(full):
+    """Figures of the reports of tutorials are not drawn, unless run in full."""
+    with nullcontext() if full else sketched():
+        yield
 
 
 @pytest.fixture(scope="module")

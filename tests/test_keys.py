@@ -34,6 +34,8 @@ def spelled(annotation: object) -> str:
         return f"{len(parts)} {MANY[spelled(parts[0])]}"
     if origin in (list, tuple):
         inner = spelled(parts[0])
+        if inner.startswith("list of "):
+            return f"list of lists{inner.removeprefix('list')}"
         return f"list of {MANY.get(inner, inner if inner[0].isdigit() else inner + 's')}"
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return "table"

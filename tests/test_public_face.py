@@ -16,7 +16,7 @@ import pytest
 import bayesdist
 
 HEAVY = (
-    *("arviz", "astropy", "corner", "dask", "distributed", "emcee", "h5py", "llvmlite"),
+    *("arviz", "astropy", "dask", "distributed", "emcee", "h5py", "llvmlite"),
     *("matplotlib", "numba", "pyarrow", "scipy", "xarray"),
 )
 

@@ -21,6 +21,7 @@ CORE = {
     "check": f"{COMMANDS}.runs:check",
     "run": f"{COMMANDS}.runs:run",
     "stage": f"{COMMANDS}.runs:stage",
+    "report": f"{COMMANDS}.runs:report",
     "requirements": f"{COMMANDS}.requirements:requirements",
     "budget": f"{COMMANDS}.requirements:budget",
     "plan": f"{COMMANDS}.planning:plan",
@@ -33,7 +34,7 @@ CORE = {
     "release": f"{COMMANDS}.calibrations:release",
 }
 RENAMED = {
-    **{name: f"stage {name}" for name in ("match", "fit", "sample", "assess", "export", "report")},
+    **{name: f"stage {name}" for name in ("match", "fit", "sample", "assess", "export")},
     "validate": "requirements",
     "order": "select-order",
 }

@@ -32,7 +32,7 @@ from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.products.export import export_files
-from bayesdist.app.products.made_files import product_of
+from bayesdist.app.products.made_files import product_input, product_of, solution_of
 from bayesdist.app.products.product_terms import file_errors
 from bayesdist.app.report import report
 from bayesdist.assess import evaluation as assessed
@@ -146,8 +146,8 @@ def evaluate(
     series : mapping, optional
         How linear terms went with time, as summary.json has it.
     """
-    product = product_of(posterior, found, data, config, source)
-    assert isinstance(product.solution, Posterior)
+    solution = solution_of(posterior, found, data.fitted)
+    product = product_input(solution, data, config, source)
     return assessed.evaluate(
         errors,
         found,
@@ -155,7 +155,7 @@ def evaluate(
         evaluation_settings(data, config),
         assessment_rng(config),
         fit=data.fit,
-        solution=product.solution,
+        solution=solution,
         checks=run_checks(data, posterior, found, config, series),
         files=file_errors(product, config, base),
         null=None if data.fitted.solved is None else data.fitted.solved.gauge.null,

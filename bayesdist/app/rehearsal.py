@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from bayesdist.app.assessment.error_terms import errors_of_run
+from bayesdist.app.assessment.error_terms import errors_of_fit
 from bayesdist.app.assessment.periods import check_pairs
 from bayesdist.app.assessment.settings import assessment_rng, rehearsal_settings
 from bayesdist.app.config import Config
@@ -62,7 +62,7 @@ def _check_residuals(data: FitData, config: Config) -> None:
 def _rehearse_evaluation(data: FitData, config: Config, n_draws: int) -> None:
     """Refuse terms and requirements that the run could not be judged by."""
     settings = replace(rehearsal_settings(data, config), draws=n_draws)
-    errors = errors_of_run(data.fit, None, data, config)
+    errors = errors_of_fit(data.fit, data, config)
     budget_over(errors, settings, assessment_rng(config))
     # without a posterior centroids have no errors yet
     has_mag = data.placed.has_mag

@@ -29,22 +29,26 @@ log = logging.getLogger("bayesdist")
 VECTOR_GRID = 17  # vectors along the longer side of a diagram: more would hide each other
 
 
-def report(results: Results) -> list[str]:
+def report(results: Results, *, pdf: bool = False) -> list[str]:
     """Names of the figures of a report, which is written into the folder of the run.
 
     Parameters
     ----------
     results : Results
+    pdf : bool
+        Whether figures are drawn as PDF, too.
     """
     # figures take seconds to import
     from bayesdist.report.drawing import save_drawings
     from bayesdist.report.run_report import draw_report, write_report
+    from bayesdist.report.sections.run.status import verdict
 
     run, inputs = results.run, report_input(results)
-    drawings = draw_report(inputs, processes=2 if _is_command_line() else 1)
-    names = [f"{name}.{kind}" for name in drawings for kind in ("png", "pdf")]
-    save_drawings(drawings, run / "figures")
+    drawings = draw_report(inputs, pdf=pdf, processes=2 if _is_command_line() else 1)
+    names = [path.name for path in save_drawings(drawings, run / "figures")]
     write_report(run / "report.html", inputs, drawings)
+    found = verdict(inputs)
+    run.summarise(verdict={"level": found.level, "headline": found.headline})
     log.info("report: %s", run / "report.html")
     return names
 
@@ -82,7 +86,7 @@ def report_input(results: Results) -> ReportInput:
         budget=evaluation.budget,
         surface=evaluation.surface,
         margins=evaluation.margins,
-        horizons=evaluation.validity,
+        validity=evaluation.validity,
         products=products,
         checks=evaluation.checks,
         score_tests=found.score_tests,
@@ -100,10 +104,12 @@ def report_input(results: Results) -> ReportInput:
 
 
 def title_of(config: Config) -> str:
-    """Name of the detector, or of the chips, and the filter of a campaign; may be empty."""
-    detector = config.detector.name or " and ".join(chip.name for chip in config.chip)
-    band = None if config.campaign is None else config.campaign.filter
-    return ", ".join(part for part in (detector, band) if part)
+    """Mission, instrument, detector or chips, and filter, as far as they are given."""
+    given = config.detector
+    detector = given.name or " and ".join(chip.name for chip in config.chip)
+    band = given.filter or (config.campaign and config.campaign.filter)
+    named = " ".join(part for part in (given.mission, given.instrument, detector) if part)
+    return ", ".join(part for part in (named, band) if part)
 
 
 def _chip_results(results: Results, evaluation: Evaluation) -> tuple[ChipResults, ...]:

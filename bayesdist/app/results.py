@@ -12,7 +12,7 @@ from typing import Any
 from bayesdist.app.assessment.checks import run_checks
 from bayesdist.app.assessment.diagnosing import diagnose_fit_of_run, diagnose_run
 from bayesdist.app.assessment.error_terms import errors_of_run
-from bayesdist.app.assessment.settings import evaluation_settings
+from bayesdist.app.assessment.settings import assessment_epoch, evaluation_settings
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
@@ -195,8 +195,8 @@ class Results:
     def epoch(self) -> float | None:
         """Epoch of the assessment, decimal years; stars are read only where it is theirs."""
         if self.config.assess.epoch is not None or self.fit.model.time is None:
-            return self.config.assess.epoch
-        return self.data.median_epoch
+            return self.config.assess.epoch  # without reading the stars
+        return assessment_epoch(self.data, self.config)
 
     @property
     def product(self) -> ProductInput:

@@ -105,7 +105,9 @@ def run(
     return directory.path
 
 
-def make_stages(results: Results, stages: Collection[str], *, force: bool = False) -> Results:
+def make_stages(
+    results: Results, stages: Collection[str], *, force: bool = False, pdf: bool = False
+) -> Results:
     """Results with the artefacts of some stages: each that does not stand is made and saved.
 
     What the other stages made is loaded where it is needed.
@@ -116,6 +118,8 @@ def make_stages(results: Results, stages: Collection[str], *, force: bool = Fals
     stages : collection of str
     force : bool
         Make them also where they stand.
+    pdf : bool
+        Draw figures as PDF, too.
     """
     r, run, config, base = results, results.run, results.config, results.base
     source = str(run.path)
@@ -136,12 +140,17 @@ def make_stages(results: Results, stages: Collection[str], *, force: bool = Fals
             r = run.make(name, made, force=force).value or r
 
     def evaluated() -> Evaluation:
-        known = r.posterior, r.diagnostics, r.data, config
-        return evaluate(error_model(*known), *known, base, source=source, series=r.series)
+        posterior, found, data = r.posterior, r.diagnostics, r.data
+        errors = error_model(posterior, found, data, config)
+        return evaluate(
+            errors, posterior, found, data, config, base, source=source, series=r.series
+        )
 
     def exported() -> list[dict[str, Any]]:
-        known = r.stored_evaluation, r.posterior, r.stored, r.data, config, base
-        return export(*known, run.path, source=source)
+        evaluation, posterior = r.stored_evaluation, r.posterior
+        return export(
+            evaluation, posterior, r.stored, r.data, config, base, run.path, source=source
+        )
 
     stage("match", "matched", lambda: match(r.inputs, config, base), save_matches)
     stage("fit", "fitted", lambda: _fitted(r), save_fit)
@@ -149,7 +158,7 @@ def make_stages(results: Results, stages: Collection[str], *, force: bool = Fals
     stage("diagnose", "stored", lambda: diagnose(r.posterior, r.data, config, base), save_diagnosed)
     stage("evaluate", "evaluation", evaluated, save_evaluation)
     stage("export", "products", exported, save_products)
-    stage("report", "figures", lambda: report(r), save_figures)
+    stage("report", "figures", lambda: report(r, pdf=pdf), save_figures)
     return r
 
 
@@ -164,8 +173,20 @@ def _sampled(r: Results) -> Posterior:
         return sample(r.data, r.config, folder=r.run.path, progress=progress)
 
 
-def continue_stage(path: str | Path, stage: str, *, strict: bool = False) -> RunDirectory:
+def continue_stage(
+    path: str | Path, stage: str, *, strict: bool = False, pdf: bool = False
+) -> RunDirectory:
     """One stage of a run; 'assess' stands for 'diagnose' and 'evaluate'.
+
+    Parameters
+    ----------
+    path : path
+        Run directory.
+    stage : str
+    strict : bool
+        Of 'sample': as of `run`.
+    pdf : bool
+        Of 'report': whether figures are drawn as PDF, too.
 
     Raises
     ------
@@ -181,7 +202,7 @@ def continue_stage(path: str | Path, stage: str, *, strict: bool = False) -> Run
     needs = (begins_with,) if stage == "fit" != begins_with else NEEDS[stages[0]]
     directory.require(stage, needs, thorough=True)
     with initialized(directory) as results:
-        results = make_stages(results, stages, force=True)
+        results = make_stages(results, stages, force=True, pdf=pdf)
         if stage == "sample":
             _require_converged(results, strict)
     return directory

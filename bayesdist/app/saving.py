@@ -144,8 +144,10 @@ def save_evaluation(results: Results) -> None:
         run.summarise(**line_sections(solution, config.chips()[0].number))
     for one in found.validity:
         log.info("evaluate: %s", one.sentence)
-    worst = max(found.maps, key=lambda m: m.radius_max)
-    log.info("evaluate: largest position uncertainty %.4g %s", worst.radius_max, worst.unit)
+    largest = max(float(one.per_axis.max()) for one in found.maps)
+    log.info(
+        "evaluate: largest uncertainty per axis %.4g %s (1 sigma)", largest, results.fit.model.unit
+    )
 
 
 def save_products(results: Results) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.checks import EITHER, LARGER, Check
+from bayesdist.checks import EITHER, LARGER, Check, level_of
 from bayesdist.limits import MATCH_RADIUS
 from bayesdist.model.timedep import TimeDependence
 
@@ -39,6 +39,14 @@ def matching_checks(
 
 def catalogue_checks(catalogue_stated: bool | None) -> Iterator[Check]:
     """Check that the errors of the reference catalogue are stated; None without a catalogue."""
+    if catalogue_stated is not None:
+        yield Check(
+            GROUP,
+            "Error of the reference catalogue",
+            "stated" if catalogue_stated else "not stated",
+            "a row of [[budget]] or of the table",
+            level_of(catalogue_stated, "warn"),
+        )
     if catalogue_stated is False:
         yield Check(
             GROUP,

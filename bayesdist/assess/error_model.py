@@ -27,7 +27,13 @@ from bayesdist.infer.solution import Solution
 from bayesdist.model import LookupTable
 from bayesdist.model.grid import DEFAULT_GRID
 
-__all__ = ["ErrorModel", "error_budget", "error_model", "solution_with_errors"]
+__all__ = [
+    "ErrorModel",
+    "diagnosed_error_model",
+    "error_budget",
+    "error_model",
+    "solution_with_errors",
+]
 
 Float = NDArray[np.float64]
 
@@ -136,7 +142,39 @@ class ErrorModel:
 
 def error_model(
     solution: Solution,
-    diagnostics: Diagnostics | None = None,
+    terms: Sequence[ErrorTerm] = (),
+    *,
+    aligned: bool = False,
+    pixel_scale: float | None = None,
+) -> ErrorModel:
+    """The error model of a solution by itself, of which residuals say nothing.
+
+    Parameters
+    ----------
+    solution : LinearFit or Posterior
+    terms : sequence of ErrorTerm
+        Other errors.  A `SolutionErrors` among them says what of the solution's errors is shown by
+        itself.
+    aligned : bool
+        As of `ErrorModel`.
+    pixel_scale : float, optional
+        Size of one pixel in mas; `pixel_scale_of` the solution by default.
+
+    Returns
+    -------
+    ErrorModel
+
+    Raises
+    ------
+    InputError
+        For a term whose unit needs a pixel scale that is not known.
+    """
+    return _model(solution, SolutionErrors(solution), terms, aligned, pixel_scale)
+
+
+def diagnosed_error_model(
+    posterior: Posterior,
+    diagnostics: Diagnostics,
     terms: Sequence[ErrorTerm] = (),
     *,
     hierarchy: LinearFit | None = None,
@@ -147,17 +185,16 @@ def error_model(
     structure_left: bool = True,
     pixel_scale: float | None = None,
 ) -> ErrorModel:
-    """The error model of a solution, with what residuals say of it.
+    """The error model of a posterior, with what residuals say of it.
 
     Parameters
     ----------
-    solution : LinearFit or Posterior
-    diagnostics : Diagnostics, optional
-        Its correlated errors, and what errors of the catalogue do, count in; the solution is then a
-        posterior as it was sampled.
+    posterior : Posterior
+        As it was sampled.
+    diagnostics : Diagnostics
+        Its correlated errors, and what errors of the catalogue do, count in.
     terms : sequence of ErrorTerm
-        Other errors.  A `SolutionErrors` among them says what of the solution's errors is shown by
-        itself.
+        As of `error_model`.
     hierarchy : LinearFit, optional
         Of a hierarchy of exposures: its covariance has no noise of draws.
     catalogue : str
@@ -172,7 +209,7 @@ def error_model(
         Whether what the model leaves out at a position counts; not where errors of look-up tables
         stand for it.
     pixel_scale : float, optional
-        Size of one pixel in mas; `pixel_scale_of` the solution by default.
+        As of `error_model`.
 
     Returns
     -------
@@ -181,19 +218,30 @@ def error_model(
     Raises
     ------
     InputError
-        For a term whose unit needs a pixel scale that is not known.
+        As `error_model`.
     """
+    of_solution = _with_diagnosed(posterior, diagnostics, hierarchy, catalogue)
+    measured: list[ErrorTerm] = []
+    correlated = diagnostics.correlated
+    if correlated is not None and correlated.structure:
+        measured.append(StructureErrors(correlated, frames, structure_left))
+    if correlated is not None and correlated.linear is not None:
+        measured.append(Deviations(correlated, single, frames))
+    return _model(posterior, of_solution, terms, aligned, pixel_scale, measured)
+
+
+def _model(
+    solution: Solution,
+    of_solution: SolutionErrors,
+    terms: Sequence[ErrorTerm],
+    aligned: bool,
+    pixel_scale: float | None,
+    measured: Sequence[ErrorTerm] = (),
+) -> ErrorModel:
+    """The error model of a solution, of what was measured, and of other terms."""
     if pixel_scale is None:
         pixel_scale = pixel_scale_of(solution)
-    of_solution, others = SolutionErrors(solution), list[ErrorTerm]()
-    if diagnostics is not None:
-        assert isinstance(solution, Posterior)
-        of_solution = _with_diagnosed(solution, diagnostics, hierarchy, catalogue)
-        correlated = diagnostics.correlated
-        if correlated is not None and correlated.structure:
-            others.append(StructureErrors(correlated, frames, structure_left))
-        if correlated is not None and correlated.linear is not None:
-            others.append(Deviations(correlated, single, frames))
+    others = list(measured)
     for term in terms:
         if isinstance(term, SolutionErrors):
             of_solution = replace(term, solution=solution)
@@ -287,7 +335,7 @@ def solution_with_errors(
 ) -> Posterior:
     """Solution that is exported and shown: all errors of the parameters are in its draws.
 
-    `posterior`: as it was sampled. `hierarchy`: as of `error_model`.
+    `posterior`: as it was sampled. `hierarchy`: as of `diagnosed_error_model`.
     """
     if diagnostics is None:
         return posterior

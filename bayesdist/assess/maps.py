@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.assess.circular import circular_error, per_axis
 from bayesdist.assess.solution import place_of
 from bayesdist.calibration.chip_map import position_moments
 from bayesdist.infer.solution import Solution
@@ -64,6 +65,15 @@ class UncertaintyMap:
     def radius(self) -> Float:
         """hypot(sigma_u, sigma_v), (ny, nx): half the diagonal of the +-1 sigma error box."""
         return np.hypot(self.sigma_u, self.sigma_v)
+
+    @property
+    def per_axis(self) -> Float:
+        """Rms of sigma_u and sigma_v, (ny, nx): 1 sigma of one axis."""
+        return per_axis(self.sigma_u, self.sigma_v)
+
+    def circular_error(self, probability: float) -> Float:
+        """Radius (ny, nx) of the circle that holds the true position with a probability."""
+        return circular_error(self.sigma_u, self.sigma_v, self.correlation, probability)
 
     @property
     def radius_max(self) -> float:

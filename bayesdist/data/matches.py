@@ -17,7 +17,7 @@ from bayesdist.data.columns.checked import SIGMAS, MatchColumns, refuse_repeated
 from bayesdist.data.columns.joining import joined_arguments, joined_columns
 from bayesdist.data.columns.labels import Labels, merged_counts
 from bayesdist.data.magnitude_errors import MagnitudeErrors, no_magnitudes
-from bayesdist.errors import InputError, required
+from bayesdist.errors import InputError
 
 __all__ = ["BatchReader", "Matches"]
 
@@ -196,6 +196,28 @@ class Matches(MatchColumns):
         bool
         """
         return getattr(self, column) is not None if self.in_memory else column in self._stored
+
+    def column(self, name: str) -> NDArray[Any]:
+        """A column that may be missing.
+
+        Parameters
+        ----------
+        name : str
+
+        Returns
+        -------
+        ndarray, shape (N,)
+
+        Raises
+        ------
+        InputError
+            Where the stars do not have it.
+        """
+        found = getattr(self, name)
+        if found is None:
+            where = ", ".join(self.sources)
+            raise InputError(f"there is no column {name!r}", where=where, do="add or map it")
+        return np.asarray(found)
 
     @property
     def has_sigma(self) -> bool:
@@ -489,7 +511,7 @@ class Matches(MatchColumns):
     def _errors(self, errors: Errors) -> tuple[Float, Float]:
         """Errors (N,) of u and of v."""
         if isinstance(errors, MagnitudeErrors):
-            return errors.at(required(self.mag, "errors by magnitude need magnitudes"))
+            return errors.at(self.column("mag"))
         if isinstance(errors, AddedErrors):
             return errors.at(*self.grouped(errors.by))
         pair = errors if isinstance(errors, tuple) else (errors, errors)

@@ -17,11 +17,6 @@ __all__ = ["SCORE_TESTS", "holdout_checks", "score_checks", "structure_checks"]
 
 FIT, HELD_OUT, SCORE_TESTS = "Fit", "Held-out truth", "Score tests"
 
-# tests whose findings correlated errors hold, by their kind
-OF_STRUCTURE = ("order ",)
-OF_NOISE = ("noise by ",)
-OF_EXPOSURES, OF_CURVATURE = "exposures", "curvature in time"
-
 
 def structure_checks(
     misfits: Sequence[Misfit], correlated: Discrepancy | None = None
@@ -78,21 +73,23 @@ def score_checks(
     for test in tests:
         if test.significant:
             sentence = f"{test.finding}: {test.remedy}"
-            doubt = "" if _held(correlated, test.name) else LARGER
+            doubt = "" if _held(correlated, test) else LARGER
             yield Check(SCORE_TESTS, level="warn", sentence=sentence, doubt=doubt)
 
 
-def _held(correlated: Discrepancy | None, test: str) -> bool:
+def _held(correlated: Discrepancy | None, test: ScoreTest) -> bool:
     """True where correlated errors hold what a test has found."""
     if correlated is None:
         return False
     scatter = set() if correlated.linear is None else set(correlated.linear.scatter)
-    return (
-        test.startswith(OF_NOISE)
-        or (bool(correlated.structure) and test.startswith(OF_STRUCTURE))
-        or (test.startswith(OF_EXPOSURES) and bool(scatter - {CURVATURE}))
-        or (test.startswith(OF_CURVATURE) and CURVATURE in scatter)
-    )
+    held = {
+        "": False,
+        "noise": True,
+        "structure": bool(correlated.structure),
+        "exposures": bool(scatter - {CURVATURE}),
+        "curvature": CURVATURE in scatter,
+    }
+    return held[test.held_by]
 
 
 def holdout_checks(found: HoldoutValidation | None) -> Iterator[Check]:

@@ -36,9 +36,9 @@ from bayesdist.diagnose.residuals.star_sums import StarSums, flagged_by_exposure
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.diagnose.score.tests import score_tests
 from bayesdist.diagnose.selfcal.correlated import selfcal_discrepancy
-from bayesdist.diagnose.selfcal.leverage import taken_by_stars
 from bayesdist.diagnose.selfcal.misfit import dithered_misfit
 from bayesdist.diagnose.selfcal.score import selfcal_score_tests
+from bayesdist.diagnose.selfcal.scores import taken_by_stars
 from bayesdist.infer import GaussianPriors, LinearFit, Posterior, Shards
 from bayesdist.infer.catalogue.star_errors import StarCovariance, StarErrors, star_covariance
 from bayesdist.infer.exposures.chip_offsets import Settling
@@ -322,7 +322,9 @@ def diagnose(
     shared = None
     if eliminated is not None:
         estimated = selfcal_discrepancy(eliminated, rng=restarted(rng), priors=discrepancy)
-        tests = selfcal_score_tests(eliminated, mag=stars.mag, epoch=stars.epoch)
+        tests = selfcal_score_tests(
+            eliminated, mag=stars.mag, colour=stars.colour, epoch=stars.epoch
+        )
     else:
         estimated = estimate_discrepancy(
             shards,

@@ -7,12 +7,12 @@ ensemble averages, which shows a drift that all walkers share (Goodman and Weare
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from bayesdist.limits import DRAWS_PER_WALKER
 
@@ -27,6 +27,10 @@ __all__ = [
 ]
 
 Float = NDArray[np.float64]
+
+AXES = {"chain_axis": 0, "draw_axis": 1}
+TAIL = (0.05, 0.95)  # quantiles whose effective sample sizes are those of the tails
+MIN_WEIGHTS = 25  # to a fifth of which a tail is fitted
 
 DIAGNOSTICS = ("rhat", "ess_bulk", "ess_tail", "mcse_mean", "mcse_sd")
 
@@ -122,36 +126,28 @@ def diagnose(
     fell outside the support and have weight zero.  `coupled` if the walkers of an ensemble
     influence each other.
     """
-    az = _arviz()
-
     E, T, W, D = chains.shape
     in_time = chains.reshape(E, T * W, D)
     by_walker = np.swapaxes(chains, 1, 2).reshape(E, W * T, D)
 
-    def each(function, values: Float, **options: object) -> Float:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            out = function(az.convert_to_dataset({"x": values}), **options)
-        # a parameter that never moved has no variance: no effective draws, no agreement
-        return np.asarray(out["x"].values, float)
-
-    rhat = each(az.rhat, in_time)
+    # a parameter that never moved has no variance: no effective draws, no agreement
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rhat = np.array(_arviz().rhat(in_time, **AXES), float)
     rhat[~np.isfinite(rhat)] = np.inf
-    bulk = each(az.ess, by_walker)
-    tail = each(az.ess, by_walker, method="tail")
+    bulk = _effective_draws(by_walker, "bulk")
+    tail = _effective_draws(by_walker, "tail", prob=TAIL)
     if coupled:
-        low, high = np.quantile(in_time.reshape(-1, D), [0.05, 0.95], axis=0)
-        bulk = np.minimum(bulk, _coupled_ess(chains, each))
+        low, high = np.quantile(in_time.reshape(-1, D), TAIL, axis=0)
+        bulk = np.minimum(bulk, _coupled_ess(chains))
         for outside in (chains <= low, chains >= high):
-            tail = np.minimum(tail, _coupled_ess(outside.astype(float), each))
+            tail = np.minimum(tail, _coupled_ess(outside.astype(float)))
     frozen = np.ptp(in_time.reshape(-1, D), axis=0) == 0
     bulk[frozen | ~np.isfinite(bulk)] = 0.0
     tail[frozen | ~np.isfinite(tail)] = 0.0
     spread = in_time.reshape(-1, D).std(axis=0)
-    # delta method; arviz.mcse(method="sd") of 0.23 fails on numpy 2.4
     squares = (by_walker - by_walker.reshape(-1, D).mean(axis=0)) ** 2
-    ess_squares = np.maximum(each(az.ess, squares, method="mean"), 1.0)
-    with np.errstate(invalid="ignore", divide="ignore"):
+    ess_squares = np.maximum(_effective_draws(squares, "mean"), 1.0)
+    with np.errstate(invalid="ignore", divide="ignore"):  # by the delta method
         mcse_sd = squares.reshape(-1, D).std(axis=0) / np.sqrt(ess_squares) / (2 * spread)
     reasons = []
     for label, values, bad, limit in (
@@ -191,23 +187,26 @@ def diagnose(
 
 
 def _arviz() -> Any:
-    """ArviZ, without its daily notice, which does not concern users of this package."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)
-        import arviz  # takes seconds: only where it is needed
-    return arviz
+    """ArviZ's functions of arrays, whose import takes half a second."""
+    from arviz_stats.base import array_stats
+
+    return array_stats
 
 
-def _coupled_ess(chains: Float, each) -> Float:
+def _effective_draws(chains: Float, method: str, **options: Any) -> Float:
+    """Effective sample sizes (D,) of chains (C, N, D), by a method of ArviZ."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.array(_arviz().ess(chains, method=method, **AXES, **options), float)
+
+
+def _coupled_ess(chains: Float) -> Float:
     """Effective sample size of the mean over ensembles that may move as one."""
-    az = _arviz()
-
     D = chains.shape[-1]
     averages = chains.mean(axis=2)
     share = averages.reshape(-1, D).var(axis=0)
     total = chains.reshape(-1, D).var(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        ess = each(az.ess, averages, method="mean") * total / share
+        ess = _effective_draws(averages, "mean") * total / share
     return np.where(np.isfinite(ess), ess, 0.0)
 
 
@@ -225,17 +224,13 @@ def pareto_k(log_weights: Float) -> float:
     0 where no weight is more than twice the mean: there is no tail then, and the shape of nearly
     equal weights means nothing.
     """
-    az = _arviz()
-
     finite = log_weights[np.isfinite(log_weights)]
-    if len(finite) < 25 or np.ptp(finite) < 1e-9:
-        return float("-inf") if len(finite) >= 25 else float("inf")
+    if len(finite) < MIN_WEIGHTS or np.ptp(finite) < 1e-9:
+        return float("-inf") if len(finite) >= MIN_WEIGHTS else float("inf")
     weights = np.exp(finite - finite.max())
     if weights.mean() > 0.5:
         return 0.0
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return float(az.psislw(finite.copy())[1])
+    return _pareto_smoothed(finite, 1.0)[1]
 
 
 def smoothed_weights(log_weights: Float, independent: float) -> tuple[Float, float]:
@@ -244,6 +239,19 @@ def smoothed_weights(log_weights: Float, independent: float) -> tuple[Float, flo
     `independent` is the effective fraction of the draws.  With k above 0.7 the weights cannot be
     trusted.
     """
-    with np.errstate(over="ignore"):  # inside arviz, of draws of negligible weight
-        smoothed, k = _arviz().psislw(log_weights, reff=independent)
-    return np.exp(smoothed), float(k)
+    smoothed, k = _pareto_smoothed(log_weights, independent)
+    return np.exp(smoothed), k
+
+
+def _pareto_smoothed(log_weights: Float, independent: float) -> tuple[Float, float]:
+    """Log weights (n,) of sum 1 whose largest follow a Pareto distribution, and its shape k.
+
+    k is infinite, and the weights are as they were, where there is no tail to be fitted.
+    """
+    try:
+        with np.errstate(all="ignore"):  # draws of negligible weight
+            # ArviZ takes log likelihoods, of which importance weights are the inverse
+            smoothed, k = _arviz().psislw(-log_weights, r_eff=independent)
+    except ValueError:  # equal weights in the tail, or too few
+        return log_weights - logsumexp(log_weights), float("inf")
+    return np.asarray(smoothed, float), float(k)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import pkgutil
+from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
 
@@ -24,6 +25,7 @@ from bayesdist.products.formats.common.document import (
     Format,
     FormatSettings,
 )
+from bayesdist.products.formats.common.read_back import ReadBack, by_calibrations
 
 __all__ = [
     "all_formats",
@@ -32,6 +34,7 @@ __all__ = [
     "lint",
     "open_document",
     "product_settings",
+    "read_back",
     "read_calibration",
     "recognized",
 ]
@@ -120,3 +123,20 @@ def build(
         f"there is no format {key!r} that can be built",
         do=f"choose one of {', '.join(product_settings())}",
     )
+
+
+def read_back(
+    key: str, files: Sequence[Built], calibration: Calibration, options: BuildOptions
+) -> Sequence[ReadBack]:
+    """What files of a format say of positions; they were built of a calibration with options."""
+    found = next(one.read_back for one in all_formats() if one.key == key)
+    if found is not None:
+        return found(files, calibration, options)
+    return [
+        by_calibrations(
+            one.file_name,
+            [recognized(Content(one.file_name, one.content)).calibration()],
+            calibration.model.time,
+        )
+        for one in files
+    ]

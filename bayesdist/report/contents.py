@@ -30,13 +30,15 @@ REPORT = Registry(
         ),
         Section("selfcal", "Gauge and stars"),
         Section("fit", _fit_title),
+        Section("residuals", "Residuals"),
         Section(
             "outliers",
             "Outliers",
+            printed=False,
             empty="Nothing was sampled: the fit rejects outliers by its limits and does not model"
             " them.",
         ),
-        Section("coefficients", "Coefficients"),
+        Section("coefficients", "Coefficients", printed=False),
         Section("maps", "Distortion and its uncertainty over the detector"),
         Section("periods", "Time variation"),
         Section("budget", "Error budget", empty="No error budget was made."),

@@ -146,7 +146,7 @@ class ReportInput:
     budget: ErrorBudget | None = None
     surface: BudgetSurface | None = None  # budget at every position and epoch, for the page
     margins: tuple[Margin, ...] = ()
-    horizons: tuple[ValidityPeriod, ...] = ()  # empty where nothing depends on time
+    validity: tuple[ValidityPeriod, ...] = ()  # empty where nothing depends on time
     products: tuple[Product, ...] = ()
     checks: tuple[Check, ...] = ()  # criteria and remarks but those of requirements and products
     score_tests: tuple[ScoreTest, ...] = ()  # of the residuals
@@ -163,6 +163,12 @@ class ReportInput:
     def unit(self) -> str:
         """Unit of u and v."""
         return self.fit.model.unit
+
+    @property
+    def simulated(self) -> bool:
+        """True where the configuration says that the input is simulated."""
+        kinds = ("data", "campaign", "selfcal")
+        return any(bool(self.setting(kind, "simulated", False)) for kind in kinds)
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -33,8 +33,8 @@ class Column:
     draws: Float
 
 
-def corner_figure(columns: Sequence[Column], *, formal: Float | None = None) -> Figure:
-    """Corner plot of draws, at 1 and 2 sigma, with a Gaussian about zero of a covariance (n, n)."""
+def corner_figure(columns: Sequence[Column]) -> Figure:
+    """Corner plot of draws of quantities that are never negative, at 1 and 2 sigma."""
     with warnings.catch_warnings():
         # corner imports arviz where it is installed, which then announces its own future
         warnings.simplefilter("ignore", FutureWarning)
@@ -42,7 +42,7 @@ def corner_figure(columns: Sequence[Column], *, formal: Float | None = None) -> 
 
     n = len(columns)
     raw = np.stack([c.draws for c in columns], axis=-1)
-    ranges = _ranges(raw, formal)
+    ranges = _ranges(raw)
     scales = [display_scale(c.unit, limits) for c, limits in zip(columns, ranges, strict=True)]
     factors = np.array([s.factor for s in scales])
     side = WIDTH if n > 3 else 1.6 * n + 0.9
@@ -68,12 +68,6 @@ def corner_figure(columns: Sequence[Column], *, formal: Float | None = None) -> 
             hist_kwargs={"lw": 1.0, "density": True},
         )
         handles = [Patch(fc=PALETTE["blue"], alpha=0.6, label="posterior\n(1 σ and 2 σ)")]
-        if formal is not None:
-            panels = np.array(fig.axes).reshape(n, n)
-            _draw_gaussian(panels, formal * np.outer(factors, factors))
-            handles.append(
-                Patch(fill=False, ec=PALETTE["vermilion"], label="least squares,\nformal")
-            )
         if n > 1:
             fig.legend(handles=handles, loc="upper right", fontsize=8.5)
         else:
@@ -85,33 +79,8 @@ def corner_figure(columns: Sequence[Column], *, formal: Float | None = None) -> 
     return fig
 
 
-def _ranges(draws: Float, formal: Float | None) -> Float:
-    """Limits (n, 2) of each column: four standard deviations, and the formal Gaussian if any."""
+def _ranges(draws: Float) -> Float:
+    """Limits (n, 2) of each column: four standard deviations, from zero at least."""
     middle, spread = np.median(draws, axis=0), np.std(draws, axis=0)
     spread = np.where(spread > 0, spread, 1e-6 * np.abs(middle) + 1e-12)
-    low, high = middle - 4 * spread, middle + 4 * spread
-    if formal is None:
-        low = np.maximum(low, 0.0)  # f, j and s_out are never negative
-    else:
-        reach = 3 * np.sqrt(np.diag(formal))
-        low, high = np.minimum(low, -reach), np.maximum(high, reach)
-    return np.stack([low, high], axis=-1)
-
-
-def _draw_gaussian(panels: NDArray[np.object_], cov: Float) -> None:
-    """Draw the Gaussian of a covariance about zero, at 1 and 2 sigma, over a corner plot."""
-    style = {"color": PALETTE["vermilion"], "lw": 1.1, "zorder": 6}
-    turn = np.linspace(0.0, 2.0 * np.pi, 100)
-    circle = np.stack([np.cos(turn), np.sin(turn)])
-    for row in range(len(panels)):
-        own = panels[row, row]
-        low, high = own.get_xlim()
-        at = np.linspace(low, high, 200)
-        density = np.exp(-0.5 * at**2 / cov[row, row]) / np.sqrt(2.0 * np.pi * cov[row, row])
-        own.plot(at, density, **style)
-        own.set_ylim(0, max(own.get_ylim()[1], 1.1 * density.max()))
-        for column in range(row):
-            index = [column, row]
-            root = np.linalg.cholesky(cov[np.ix_(index, index)])
-            for radius in (1.0, 2.0):
-                panels[row, column].plot(*(radius * root @ circle), **style)
+    return np.stack([np.maximum(middle - 4 * spread, 0.0), middle + 4 * spread], axis=-1)

@@ -1,4 +1,4 @@
-"""Figures as files: each laid out and drawn once as PNG, and once more as PDF."""
+"""Figures as files: each laid out and drawn once as PNG, and once more as PDF if asked for."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from pickle import PickleError
@@ -18,10 +19,12 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.spines import Spine
 from matplotlib.transforms import Bbox
 from PIL import Image
 
 from bayesdist.files import atomic_path, made_folder
+from bayesdist.report.figure_numbers import numbers_of
 from bayesdist.report.registry import Item, Plot, Registry
 from bayesdist.report.style import figure_style, plain_ticks
 
@@ -46,25 +49,36 @@ _received: list[Any] = []  # of a process that draws for another one
 
 @dataclass(frozen=True)
 class Drawing:
-    """Figure as files, with the title, text and text alternative of its `Plot`."""
+    """Figure as files, with the title, text and text alternative of its `Plot`, and its numbers."""
 
     png: bytes
-    pdf: bytes
+    pdf: bytes | None = None
     title: str = ""
     text: str = ""
     alt: str = ""
+    numbers: str = ""  # CSV
+    svg: str = ""  # of figures that are printed
 
 
 @figure_style()  # mathematical text and ticks read the settings only when drawn
-def render(plot: Plot) -> Drawing:
-    """Figure as PNG and as PDF with text as letters; equal figures give equal files."""
+def render(plot: Plot, *, pdf: bool = False, svg: bool = False) -> Drawing:
+    """Figure as PNG, and as PDF and SVG with text as letters; equal figures give equal files."""
     canvas, box = _laid_out(plot.figure)
-    files = _png(plot.figure, canvas, box), _pdf(plot.figure, box)
-    return Drawing(*files, plot.title, plot.text, plot.alt)
+    return Drawing(
+        _png(plot.figure, canvas, box),
+        _pdf(plot.figure, box) if pdf else None,
+        plot.title,
+        plot.text,
+        plot.alt,
+        numbers_of(plot.figure),
+        _svg(plot.figure, box) if svg else "",
+    )
 
 
-def draw_all(registry: Registry, results: Any, *, processes: int = 1) -> dict[str, Drawing]:
-    """Figures of a page, by name in its order, each made, drawn and released.
+def draw_all(
+    registry: Registry, results: Any, *, pdf: bool = False, processes: int = 1
+) -> dict[str, Drawing]:
+    """Figures of a page, by name in its order, each made, drawn and released; `pdf`: as PDF too.
 
     More than one of `processes` import the main module of this process anew: a script must guard
     its work by ``if __name__ == "__main__"``.
@@ -72,18 +86,21 @@ def draw_all(registry: Registry, results: Any, *, processes: int = 1) -> dict[st
     items = registry.items(results, "figure")
     if processes > 1 and len(items) >= MIN_FIGURES_SHARED:
         try:
-            return _drawn_together(items, results, processes)
+            return _drawn_together(items, results, pdf, processes)
         except (BrokenProcessPool, OSError, PickleError) as error:
             log.warning("report: figures are drawn by one process, others failed: %s", error)
-    return {item.name: render(item.made(results)) for item in items}
+    return {item.name: render(item.made(results), pdf=pdf, svg=item.printed) for item in items}
 
 
-def _drawn_together(items: Sequence[Item], results: Any, processes: int) -> dict[str, Drawing]:
+def _drawn_together(
+    items: Sequence[Item], results: Any, pdf: bool, processes: int
+) -> dict[str, Drawing]:
     # not a fork: threads of numerical libraries run here
     with ProcessPoolExecutor(
         processes, mp_context=get_context("spawn"), initializer=_receive, initargs=(results,)
     ) as pool:
-        return {item.name: one for item, one in zip(items, pool.map(_drawn, items), strict=True)}
+        drawn = pool.map(partial(_drawn, pdf=pdf), items)
+        return {item.name: one for item, one in zip(items, drawn, strict=True)}
 
 
 def _receive(results: Any) -> None:
@@ -91,8 +108,8 @@ def _receive(results: Any) -> None:
     _received.append(results)
 
 
-def _drawn(item: Item) -> Drawing:
-    return render(item.made(_received[0]))
+def _drawn(item: Item, pdf: bool) -> Drawing:
+    return render(item.made(_received[0]), pdf=pdf, svg=item.printed)
 
 
 @figure_style()
@@ -104,6 +121,10 @@ def png_of(figure: Figure) -> bytes:
 def _laid_out(figure: Figure) -> tuple[FigureCanvasAgg, Bbox]:
     """Area of a figure that is drawn on, in inches, with room around it, after its only layout."""
     plain_ticks(figure)
+    for ax in figure.axes:
+        for spine in ax.spines.values():
+            if type(spine) is Spine:  # it lies on the frame, and would measure all ticks again
+                spine.set_in_layout(False)
     figure.set_dpi(DPI)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
@@ -128,6 +149,14 @@ def _png(figure: Figure, canvas: FigureCanvasAgg, box: Bbox) -> bytes:
 def _pdf(figure: Figure, box: Bbox) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="pdf", dpi=DPI, bbox_inches=box, metadata={"CreationDate": None})
+    return buffer.getvalue()
+
+
+def _svg(figure: Figure, box: Bbox) -> str:
+    """Figure with letters as outlines: a page on paper has them whatever fonts there are."""
+    buffer = io.StringIO()
+    with rc_context({"svg.fonttype": "path", "svg.hashsalt": "bayesdist"}):
+        figure.savefig(buffer, format="svg", dpi=DPI, bbox_inches=box, metadata={"Date": None})
     return buffer.getvalue()
 
 
@@ -157,14 +186,16 @@ def save_figures(figures: Mapping[str, Figure], folder: str | os.PathLike[str]) 
 def save_drawings(
     drawings: Mapping[str, Drawing], folder: str | os.PathLike[str]
 ) -> tuple[Path, ...]:
-    """Paths of figures, written as PNG and as PDF files to a folder, which is made if need be.
+    """Paths of figures, written as PNG files to a folder, which is made if need be.
+
+    Those that were drawn as PDF are written as such, too.
 
     InputError when the folder cannot be made or a file cannot be written.
     """
     made = made_folder(folder)
     return (
         *_saved({name: one.png for name, one in drawings.items()}, "png", made),
-        *_saved({name: one.pdf for name, one in drawings.items()}, "pdf", made),
+        *_saved({name: one.pdf for name, one in drawings.items() if one.pdf}, "pdf", made),
     )
 
 

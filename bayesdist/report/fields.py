@@ -114,7 +114,7 @@ def _contours(
     if crossed:
         lines = ax.contour(*at, fine, crossed, colors="white", linewidths=0.6)
         if labelled:
-            ax.clabel(lines, fontsize=7, fmt=lambda v: f"{v:.4g}".replace("-", "−"))
+            ax.clabel(lines, fontsize=7.5, fmt=lambda v: f"{v:.4g}".replace("-", "−"))
     return filled
 
 

@@ -12,6 +12,7 @@ import jinja2
 from markupsafe import Markup
 
 from bayesdist.numbers import MISSING
+from bayesdist.report.documentation import page_of
 from bayesdist.report.drawing import DPI, Drawing
 from bayesdist.report.registry import Registry
 from bayesdist.report.texttable import Level, TextTable
@@ -26,7 +27,8 @@ class Picture:
     """Figure as a page holds it."""
 
     name: str
-    data: str  # PNG file, base64
+    data: str  # file, base64
+    kind: str  # of the file, as browsers call it
     width: float  # inches, at which its letters have the size they were set in
     words: Drawing  # title, text and text alternative
     printed: bool = True  # True where it is on paper
@@ -90,8 +92,9 @@ def _several(made: TextTable | Iterable[TextTable] | None) -> Iterable[TextTable
 def picture_of(name: str, drawing: Drawing, *, printed: bool = True) -> Picture:
     """Figure as a page holds it."""
     (pixels,) = struct.unpack(">I", drawing.png[16:20])  # width, in the first chunk of a PNG file
-    data = base64.b64encode(drawing.png).decode("ascii")
-    return Picture(name, data, pixels / DPI, drawing, printed)
+    file, kind = (drawing.svg.encode("utf-8"), "svg+xml") if drawing.svg else (drawing.png, "png")
+    data = base64.b64encode(file).decode("ascii")
+    return Picture(name, data, kind, pixels / DPI, drawing, printed)
 
 
 def template(name: str, package: str = REPORT) -> jinja2.Template:
@@ -110,6 +113,8 @@ def template(name: str, package: str = REPORT) -> jinja2.Template:
     )
     environment.filters["md"] = _markdown
     environment.filters["css"] = _css
+    environment.filters["base64"] = _base64
+    environment.globals["page_of"] = page_of
     environment.tests["level"] = lambda value: isinstance(value, Level)
     return environment.get_template(name)
 
@@ -130,6 +135,11 @@ def _markdown(value: object) -> str:
     if isinstance(value, Level):
         return {"pass": "pass", "warn": "**warn**", "fail": "**FAIL**", "note": MISSING}[value]
     return str(value).translate(_SPECIAL)
+
+
+def _base64(value: str) -> str:
+    """Text for the address of data: letters and digits that can end no attribute."""
+    return base64.b64encode(value.encode("utf-8")).decode("ascii")
 
 
 def _css(value: object) -> Markup:

@@ -41,9 +41,9 @@ _PRINT_WORDS = (
 )
 
 
-def draw_report(r: ReportInput, *, processes: int = 1) -> dict[str, Drawing]:
-    """Figures of the report of a run as files, by name, in its order."""
-    return draw_all(REPORT, r, processes=processes)
+def draw_report(r: ReportInput, *, pdf: bool = False, processes: int = 1) -> dict[str, Drawing]:
+    """Figures of the report of a run as files, by name, in its order; `pdf`: as PDF too."""
+    return draw_all(REPORT, r, pdf=pdf, processes=processes)
 
 
 def render_report(r: ReportInput, drawings: Mapping[str, Drawing]) -> str:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 __all__ = [
     "COLORBAR",
     "CYCLE",
+    "DIVERGING",
     "GUIDE",
     "INK",
     "LEVEL_COLORS",
@@ -60,6 +61,7 @@ LEVEL_COLORS = {
     "note": "#666666",
 }
 SEQUENTIAL = "cividis"
+DIVERGING = "RdBu_r"  # of values on both sides of zero; told apart in every common colour blindness
 INK = "#1F2A37"
 PALE = "#A9B4C0"  # vectors that may be noise alone, and stars in the background
 OUTLINE = "#9AA5B1"  # of chips, and lines at zero

@@ -19,7 +19,7 @@ from .truth import Truth
 from .written import toml_text
 
 
-@pytest.fixture(params=[name for name in KINDS if not name.startswith("campaign")])
+@pytest.fixture(scope="module", params=[k for k in KINDS if not k.startswith("campaign")])
 def truth(request) -> Truth:
     return KINDS[request.param].truth(3, 200)
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from bayesdist.simulate import Truth
+from tests import sketches
 from tests.app.support import Result, as_table, cli, simulated, write_job
 
 REQUIREMENTS = [
@@ -37,30 +37,9 @@ class Finished:
 
 @pytest.fixture(scope="package", autouse=True)
 def sketched(full) -> Iterator[None]:
-    """Figures of reports are made but not drawn, and corner plots not made, unless run in full.
-
-    That takes most of the time of a small run.  Figures as they look are the subject of
-    tests/report, and programs of their own (the demo, the examples) draw them here, too.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        if not full:
-            from matplotlib.figure import Figure
-
-            from bayesdist.report import drawing
-            from bayesdist.report.sections.run import posterior
-
-            patch.setattr(drawing, "render", _sketch)
-            patch.setattr(posterior, "corner_figure", lambda *_, **__: Figure())
+    """Figures of reports are made but not drawn, and corner plots not made, unless run in full."""
+    with nullcontext() if full else sketches.sketched():
         yield
-
-
-def _sketch(plot):
-    """The words of a figure, and a speck in place of it."""
-    from bayesdist.report.drawing import Drawing
-
-    page = io.BytesIO()
-    Image.new("RGB", (4, 3), "white").save(page, format="png")
-    return Drawing(page.getvalue(), b"%PDF-1.7", plot.title, plot.text, plot.alt)
 
 
 @pytest.fixture(scope="package")

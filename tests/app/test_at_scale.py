@@ -179,7 +179,7 @@ def test_errors_by_magnitude_on_disk(tmp_path, on_disk):
     assert not summary_of(run)["warnings"]
 
 
-def test_the_epoch_of_the_assessment_is_in_the_middle_of_the_data(tmp_path, on_disk):
+def test_the_epoch_of_the_assessment_is_the_latest_of_the_data(tmp_path, on_disk):
     names = ("a", "b", "c")
     model = model_of(time=TimeDependence((("u", 1, 0),), (2004.5,)), exposures=names)
     matches, _ = simulate_matches(
@@ -193,7 +193,7 @@ def test_the_epoch_of_the_assessment_is_in_the_middle_of_the_data(tmp_path, on_d
         **{"model.tdd": {"epoch0": 2004.5, "terms": [["u", 1, 0]]}},
     )
     run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess")
-    assert summary_of(run)["map"]["epoch"] == 2007.0
+    assert summary_of(run)["map"]["epoch"] == 2008.0
 
 
 def test_a_run_inside_the_folder_of_its_input_is_refused(job, tmp_path):

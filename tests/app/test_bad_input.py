@@ -516,6 +516,7 @@ def test_simulate_and_demo_refuse(tmp_path):
         ["run", "c.toml", "-o", "r", "--seed", "one"],
         ["stage", "sample", "r", "--force"],
         ["stage", "fit", "r", "--strict"],
+        ["stage", "fit", "r", "--pdf"],
         ["stage", "fitt", "r"],
         ["requirements", "r"],
         ["simulate", "galaxy", "-o", "d"],

@@ -26,7 +26,7 @@ from tests.app.support import (
     write_config,
 )
 
-N, PART, GROUP = 100_000, 50_000, 5_000
+N, PART, GROUP = 20_000, 10_000, 1_000
 
 
 @pytest.fixture(autouse=True)
@@ -85,7 +85,7 @@ def _null(name: str, row: int) -> Change:
 def _text(name: str) -> Change:
     def change(table: pa.Table) -> pa.Table:
         values = [f"{value:.6f}" for value in table[name].to_pylist()]
-        values[33332] = "12.3.4"
+        values[6666] = "12.3.4"
         return table.set_column(table.column_names.index(name), name, pa.array(values))
 
     return change
@@ -106,13 +106,13 @@ def _unit(table: pa.Table) -> pa.Table:
 # what is done to the second part, and what the sentence has to name
 CASES: dict[str, tuple[Change, list[str]]] = {
     "not a number": (
-        _value("u", 33_333, np.nan), ["b.parquet, row group 7 of 10, row 33333", "'u'", "nan"]
+        _value("u", 6_667, np.nan), ["b.parquet, row group 7 of 10, row 6667", "'u'", "nan"]
     ),
-    "infinite": (_value("y", 50_000, np.inf), ["row group 10 of 10, row 50000", "'y'", "inf"]),
-    "no error": (_value("sigma_v", 5_001, 0.0), ["row group 2 of 10, row 5001", "'sigma_v'"]),
-    "null": (_null("v", 12_345), ["b.parquet, row group 3 of 10, row 12345", "'v'"]),
+    "infinite": (_value("y", 10_000, np.inf), ["row group 10 of 10, row 10000", "'y'", "inf"]),
+    "no error": (_value("sigma_v", 1_001, 0.0), ["row group 2 of 10, row 1001", "'sigma_v'"]),
+    "null": (_null("v", 2_345), ["b.parquet, row group 3 of 10, row 2345", "'v'"]),
     "text": (_text("x"), ["b.parquet", "'x'"]),
-    "outside": (_value("x", 20_000, 1200.0), ["row 20000", "b.parquet", "1200.00", "1000 x 800"]),
+    "outside": (_value("x", 4_000, 1200.0), ["row 4000", "b.parquet", "1200.00", "1000 x 800"]),
     "no column": (lambda t: t.drop_columns("sigma_u"), ["b.parquet", "'sigma_u'"]),
     "no errors": (
         lambda t: t.drop_columns(["sigma_u", "sigma_v"]), ["b.parquet", "a.parquet", "'sigma_u'"]
@@ -121,7 +121,7 @@ CASES: dict[str, tuple[Change, list[str]]] = {
     "other unit": (_unit, ["b.parquet", "a.parquet", "mas", "pix"]),
     "twice": (
         _repeated,
-        ["b.parquet, row group 10 of 10, row 50000", "b.parquet, row group 1 of 10, row 778"],
+        ["b.parquet, row group 10 of 10, row 10000", "b.parquet, row group 1 of 10, row 778"],
     ),
 }  # fmt: skip
 
@@ -145,7 +145,7 @@ def _flip(path: Path, group: int, column: int) -> None:
 
 DAMAGE: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "a bit": (
-        lambda p: _flip(p, 6, 3), ["b.parquet, row group 7 of 10 (rows 30001 to 35000)"]
+        lambda p: _flip(p, 6, 3), ["b.parquet, row group 7 of 10 (rows 6001 to 7000)"]
     ),
     "half": (lambda p: p.write_bytes(p.read_bytes()[: p.stat().st_size // 2]), ["b.parquet"]),
     "empty": (lambda p: p.write_bytes(b""), ["b.parquet"]),
@@ -165,16 +165,16 @@ def test_a_damaged_part(job, case):
 def test_the_same_from_a_shell(tmp_path, stars):
     """In a process of its own, where more than a million rows stay on disk."""
     (tmp_path / "stars").mkdir()
-    for k in range(11):
+    for k in range(51):
         moved = stars.set_column(0, stars.schema.field("x"), pa.array(
             np.clip(stars["x"].to_numpy() + 1e-6 * k, 0.5, 1000.5)
         ))  # fmt: skip
         write(tmp_path / "stars" / f"{k:02d}.parquet", moved)
-    _flip(tmp_path / "stars" / "10.parquet", 19, 2)
+    _flip(tmp_path / "stars" / "50.parquet", 19, 2)
     config = write_config(tmp_path / "c.toml", data={"matches": "stars"})
     done = process("run", config, "-o", tmp_path / "run", "-q", cwd=tmp_path)
     assert done.returncode == 1 and done.stdout == ""
-    one_sentence(done.stderr, "10.parquet, row group 20 of 20 (rows 95001 to 100000)")
+    one_sentence(done.stderr, "50.parquet, row group 20 of 20 (rows 19001 to 20000)")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["c.toml", "stars"]
 
 

@@ -127,6 +127,17 @@ def test_functions_find_what_the_run_has_found(run) -> None:
     np.testing.assert_array_equal(fitted.scatter.tau, results.fitted.scatter.tau)
 
 
+def test_stages_can_be_run_again(later, tmp_path) -> None:
+    again = shutil.copytree(later, tmp_path / "again")
+    found = []
+    for _ in range(2):
+        for stage in ("match", "fit"):
+            good("stage", stage, again, "-q")
+        summary = summary_of(again)
+        found.append([summary[section] for section in ("matching", "scatter", "fit")])
+    assert found[0] == found[1] and found[0][0] == summary_of(later)["matching"]
+
+
 def test_what_is_held_out_agrees_with_the_prediction(run) -> None:
     found, table = summary_of(run)["holdout"], Table.read(run / "holdout.ecsv")
     assert found["level"] != "fail", found["verdict"]

@@ -399,3 +399,10 @@ def test_an_old_key_names_the_new_one(path):
     assert f"it is called '{RENAMED[path]}' now" in error.cause
     assert error.where.endswith(key)
     assert f'"{RENAMED[path]}"' in json.dumps(KINDS[kind].model_json_schema())
+
+
+def test_a_unit_of_what_has_none_is_refused():
+    block = {"name": "tilt", "kind": "rotation", "sigma": 1e-6}
+    error = refusal(of_kind("campaign", budget=[block | {"unit": "mas"}]))
+    assert "relative or in radians, and unit is 'mas'" in error.cause
+    assert error.do == "leave unit out"

@@ -86,7 +86,8 @@ def test_the_old_matches_are_not_needed(finished, tmp_path) -> None:
     record["base"] = str(tmp_path / "gone")
     (run / "run.json").write_text(json.dumps(record))
     as_table(new_matches()).write(tmp_path / "new.ecsv")
-    good("monitor", run, tmp_path / "new.ecsv")
+    said = good("monitor", run, tmp_path / "new.ecsv").out
+    assert said == good("monitor", finished.path, tmp_path / "new.ecsv").out
 
 
 def test_what_does_not_go_is_refused(finished, tmp_path) -> None:

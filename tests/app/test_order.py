@@ -8,17 +8,24 @@ from astropy.table import Table
 
 from bayesdist.app.matches import reading as app_matches
 from bayesdist.data import write_partitioned
+from bayesdist.simulate import simulate_matches
 from tests.app.support import (
+    SIGMA,
     SIZE,
     as_table,
     good,
+    model_of,
     refused,
     simulated,
+    truth_of,
     write_config,
     write_job,
 )
 
 BINS = 31
+CHIPS = [
+    {"number": n, "name": f"C{n}", "size": SIZE, "reference_pixel": (500.5, 400.5)} for n in (1, 2)
+]
 
 
 @pytest.fixture(scope="module")
@@ -136,6 +143,23 @@ def test_an_order_that_cannot_be_fitted_is_a_row_that_says_so(tmp_path):
     assert found["not_fitted"].mask[0] and np.isfinite(found["chi2_u"][0])
 
 
+def test_exposures_with_frames_ask_for_the_order_of_their_polynomials(tmp_path):
+    """The exposures are rolled by tens of degrees, which no order could follow without frames."""
+    model = model_of(frames="shift_rotation", exposures=("a", "b", "c"))
+    theta = truth_of(model)
+    for code in (1, 2):
+        theta[model.frame_slice(code)] = [40.0, -70.0, 0.4 * code]
+    rng = np.random.default_rng(4)
+    matches, _ = simulate_matches(model, theta, 9000, rng=rng, fraction=0.0, sigma=SIGMA)
+    config = write_job(tmp_path, as_table(matches), model={"order": 3, "frames": "shift_rotation"})
+    output = tmp_path / "o.ecsv"
+    result = good("select-order", config, "--orders", 1, 4, "-o", output)
+    table = Table.read(output)
+    assert table.meta["order"] == 2 and "Order 2 is as good" in result.out
+    assert table.meta["error_scale"] == pytest.approx(1.0, abs=0.03)
+    assert table.meta["n_used"] == 9000
+
+
 def test_wrong_requests_are_refused(job, tmp_path):
     _, folder, config, _ = job
     refused(
@@ -157,6 +181,7 @@ def test_wrong_requests_are_refused(job, tmp_path):
             high,
             words=(f"go from {low} to {high}",),
         )
-    frames = write_job(tmp_path, model={"order": 2, "frames": "shift"})
-    refused(tmp_path, "select-order", frames, words=("one chip, without frames",))
+    several = write_job(tmp_path, detector=None, model={"order": 2}, chip=CHIPS)
+    refused(tmp_path, "select-order", several, words=("2 chips", "--chip"))
+    refused(tmp_path, "select-order", several, "--chip", 7, words=("has no chip 7", "one of 1, 2"))
     refused(tmp_path, "select-order", tmp_path / "none.toml", words=("none.toml",))

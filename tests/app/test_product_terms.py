@@ -10,7 +10,6 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
 
-from bayesdist.app.products.file_positions import sip_positions
 from bayesdist.app.products.made_files import ProductInput
 from bayesdist.app.products.product_terms import _Laid, product_terms
 from bayesdist.app.results import open_results
@@ -18,6 +17,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.calibration.calibration import GaussianSolution
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import read_wise_meta, sip_from_solution, write_wise_meta
+from bayesdist.products.formats.sip.positions import sip_positions
 from tests.app.support import good, summary_of
 
 SIZE, GRID, REFERENCE = (512, 256), (9, 5), (256.0, 128.0)

@@ -1,7 +1,6 @@
 """Requirements with a scope, through the command line."""
 
 import json
-import re
 
 import pytest
 from astropy.table import Table
@@ -55,8 +54,8 @@ def test_scopes_are_judged_and_kept(run, capsys):
     assert corner["worst"]["x"] < 300 and corner["worst"]["y"] < 300
     assert inner["margin_percent"] == pytest.approx(100 * inner["margin"] / 0.5)
     printed = capsys.readouterr().out
-    # what would have to shrink, or that no single term would do
-    assert re.search("between two stars: (it would be met if|no term can do it alone)", printed)
+    # every term of a difference is far above the limit
+    assert "between two stars: no term can do it alone" in printed
     rows = dict(zip(("inner", "pair", "corner"), printed.splitlines()[2:], strict=False))
     assert "over the inner 80 %" in rows["inner"]
     assert "between two positions up to 200 px apart" in rows["pair"]
@@ -74,7 +73,7 @@ def test_the_report_judges_them_again_as_they_were_asked(run):
     assert main(["stage", "report", str(run), "-q"]) == 0
     text = (run / "report.html").read_text()
     assert "between two positions up to 200 px apart" in text
-    assert "fell from" in text or "no term can do it alone" in text
+    assert "no term can do it alone" in text
     assert json.loads((run / "summary.json").read_text())["margins"] == before
 
 

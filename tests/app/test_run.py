@@ -22,7 +22,7 @@ from astropy.table import Table
 from astropy.wcs import WCS, FITSFixedWarning
 
 import bayesdist
-from bayesdist.app.config import load_config, parse_config
+from bayesdist.app.config import CATALOGUE_WORDS, load_config, parse_config
 from bayesdist.app.report import title_of
 from bayesdist.app.screen import progress_bar
 from bayesdist.app.store.rundir import RunDirectory
@@ -31,6 +31,7 @@ from bayesdist.assess.terms.correlated import STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.data import read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior, memberships, residuals
+from bayesdist.report.documentation import BASE
 from tests.app.support import (
     SIZE,
     begin_stagewise,
@@ -371,8 +372,10 @@ class _Links(HTMLParser):
     def __init__(self):
         super().__init__()
         self.targets = []
+        self.sources = []  # that a browser loads
 
     def handle_starttag(self, tag, attrs):
+        self.sources += [v for k, v in attrs if k == "src" or (k == "href" and tag != "a")]
         self.targets += [v for k, v in attrs if k in ("src", "href") and v]
 
 
@@ -380,7 +383,9 @@ def test_the_report_is_one_file(finished):
     text = (finished.path / "report.html").read_text(encoding="utf-8")
     links = _Links()
     links.feed(text)
-    assert all(t.startswith(("data:", "#")) for t in links.targets)
+    # it needs nothing else: the documentation is linked, and asked by readers alone
+    assert all(t.startswith(("data:", "#", BASE)) for t in links.targets)
+    assert all(t.startswith("data:") for t in links.sources)
     for word in ("too tight", "catalogue", "u_1_0", "sip.hdr", bayesdist.__version__):
         assert word in text
     assert "NOT CONVERGED" not in text
@@ -476,7 +481,7 @@ def test_an_interrupted_run_goes_on(finished, posterior, tmp_path, monkeypatch):
     assert result.code == 130 and "--resume" in result.err and "Traceback" not in result.err
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert list(record["stages"]) == ["fit", "sample"]
-    monkeypatch.setattr("bayesdist.app.run.report", lambda results: [])
+    monkeypatch.setattr("bayesdist.app.run.report", lambda results, pdf: [])
     result = good("run", finished.config, "-o", tmp_path / "run", "--resume")
     assert "sample: done before" in result.err
     np.testing.assert_array_equal(load_posterior(tmp_path / "run").theta, posterior.theta)
@@ -545,6 +550,18 @@ def test_max_steps_is_a_total(unconverged, finished):
             },
             "C1 and C2",
         ),
+        (
+            {
+                "detector": {
+                    "name": "WFC",
+                    "size": SIZE,
+                    "mission": "HST",
+                    "instrument": "ACS",
+                    "filter": "F606W",
+                }
+            },
+            "HST ACS WFC, F606W",
+        ),
     ],
 )
 def test_a_report_is_titled_by_what_was_calibrated(sections, title):
@@ -565,6 +582,15 @@ def test_figures_are_listed_once_they_are_there(copy, monkeypatch):
     assert cli("stage", "report", copy).code == 1
     assert "figures" not in summary_of(copy)
     assert not (copy / "figures").exists()
+
+
+def test_figures_are_drawn_as_pdf_where_that_is_asked_for(copy):
+    assert not [name for name in summary_of(copy)["figures"] if name.endswith(".pdf")]
+    assert cli("stage", "report", copy, "--pdf").code == 0
+    for kind in ("png", "pdf"):
+        written = {p.name for p in (copy / "figures").glob(f"*.{kind}")}
+        listed = {name for name in summary_of(copy)["figures"] if name.endswith(kind)}
+        assert len(written) >= 8 and written == listed
 
 
 # -- validate, check, init, inspect, demo ---------------------------------------------------------
@@ -683,6 +709,12 @@ def test_init_writes_what_check_accepts(tmp_path, finished, suffix, errors):
     for size, axis in ((nx, "x"), (ny, "y")):  # from the outermost stars
         assert table[axis].max() <= size + 0.5 < 1.05 * table[axis].max()
     assert ("GUESSED: the table does not say" in text) == (suffix == "csv")
+    # the catalogue's row is there to be filled in, and states nothing until it is
+    config = load_config(tmp_path / "c.toml")[0]
+    assert [row.name for row in config.budget] == ["reference catalogue"]
+    assert not config.states(*CATALOGUE_WORDS) and config.user_terms() == ()
+    filled = text.replace("sigma_u = 0.0 ", "sigma_u = 0.01 ")
+    assert parse_config(filled, "c.toml").states(*CATALOGUE_WORDS)
 
 
 def test_inspect(finished, posterior):

@@ -159,7 +159,7 @@ def drifting_errors(solution_of, sigma, n_draws=4000):
     return error_model(solution).drawn(n_draws, np.random.default_rng(2))
 
 
-def test_the_horizon_is_where_a_growing_error_passes_the_limit(solution_of):
+def test_the_validity_period_ends_where_a_growing_error_passes_the_limit(solution_of):
     model = DistortionModel(1, (CHIP,), time=TimeDependence((("u", 1, 0),), (2010.0,)))
     [rate] = [n for n in model.names if n.startswith("tdd.u_1_0.rate")]
     solution = with_sigma(solution_of, model, **{rate: S / EDGE})
@@ -179,7 +179,7 @@ def test_the_horizon_is_where_a_growing_error_passes_the_limit(solution_of):
     assert (found.low[k], found.high[k]) == clopper_pearson(found.probability[k], 4000, 0.95)
 
 
-def test_a_horizon_may_lie_beyond_and_may_have_passed(solution_of):
+def test_a_validity_period_may_lie_beyond_and_may_have_passed(solution_of):
     errors = drifting_errors(solution_of, 1e-9)
     r = Requirement("edge", "max", 0.2)
     assert validity_period(errors, r, [2015.0, 2030.0]).date is None

@@ -5,15 +5,15 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from unittest import mock
 
 import numpy as np
 
 from bayesdist.app.campaign import fit as stage
-from bayesdist.app.campaign.matched import CampaignMatched, campaign_matches
+from bayesdist.app.campaign.matched import CampaignMatched
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.results import Results, open_results
@@ -93,6 +93,11 @@ ISR = Setting("isr", 64.0)
 PUBLISHED_SIZE = Setting("matern", WIDE, 110, 53_900)
 # a chip that is as restless by itself as both are together: its gap to the other is no ruler
 LOOSE = Setting("none", WIDE, own=1.0)
+# what a reduced suite makes of the two: as many lines and nodes, from fewer exposures and stars
+SHORT = {
+    MATERN: replace(MATERN, exposures=24, stars=12_000),
+    LOOSE: replace(LOOSE, exposures=18, stars=5_000),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +126,7 @@ class Calibrated:
     @property
     def matched(self) -> CampaignMatched:
         """Pairs as they were matched."""
-        return campaign_matches(self.results.matched)
+        return cast(CampaignMatched, self.results.matched)
 
 
 @contextmanager
@@ -209,7 +214,7 @@ def _results_of(*names: str) -> Iterator[dict[str, Any]]:
 
 def _with_catalogue(bare: HierarchicalFit, data: FitData) -> TransformedSolution:
     """The joint fit with the errors that a star of the catalogue has in all exposures."""
-    catalog, matches = campaign_matches(data.matched).inputs.catalog, data.stars
+    catalog, matches = data.matched.catalogue, data.stars
 
     def by_code(values: Any) -> np.ndarray:
         out = np.zeros(int(catalog.star.max()) + 1)

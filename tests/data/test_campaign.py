@@ -33,7 +33,7 @@ def test_every_star_finds_itself(rng, left):
     right = true + 1000 == t.star
     assert right.sum() > 0.999 * real
     # junk and strangers: as few as the reports say
-    assert (~right).sum() <= 3 + 3 * sum(r.false_share * r.matched for r in found.reports)
+    assert (~right).sum() <= 3 + 3 * sum(r.false_fraction * r.matched for r in found.reports)
     for report, roll in zip(found.reports, rolls, strict=True):
         assert (report.rotation - roll + 180) % 360 - 180 == pytest.approx(0.0, abs=0.15)
         assert report.scale == pytest.approx(1.0, abs=0.003)
@@ -95,7 +95,7 @@ def test_completeness_and_false_matches_are_what_happens(rng):
     found = match_campaign(lists, log, catalog, start, radius=4.0)
     false, predicted = 0, 0.0
     for k, report in enumerate(found.reports):
-        assert report.completeness == pytest.approx(0.7, abs=0.02 + report.false_share)
+        assert report.completeness == pytest.approx(0.7, abs=0.02 + report.false_fraction)
         here = found.table.exposure == k
         rows = truth_of(found.table.select(here), truth)
         false += int((rows < 0).sum())
@@ -103,7 +103,7 @@ def test_completeness_and_false_matches_are_what_happens(rng):
         predicted += report.false_rate * unreal
         # a third of the detections are junk, spread evenly over a field with a gradient
         hits = int((rows < 0).sum())
-        assert report.false_share * len(rows) == pytest.approx(hits, abs=4 * np.sqrt(hits))
+        assert report.false_fraction * len(rows) == pytest.approx(hits, abs=4 * np.sqrt(hits))
     assert false > 300
     # competition for one star: as in test_matching, some per cent beside the Poisson error
     assert predicted == pytest.approx(false, rel=0.08, abs=3 * np.sqrt(false))

@@ -8,8 +8,10 @@ from scipy import stats
 
 from bayesdist.diagnose.score.exposures import exposure_test
 from bayesdist.diagnose.score.projection import Projection, projection_of
+from bayesdist.diagnose.score.questions import CONSTANT, Products, Question
 from bayesdist.diagnose.score.regressor_tests import regressor_tests
 from bayesdist.diagnose.score.regressors import functions_for
+from bayesdist.diagnose.score.result import Family
 from bayesdist.diagnose.score.sample import scored_sample
 from bayesdist.infer import GaussianPriors, Rejection, fit_linear
 from bayesdist.infer.solution import likelihood_of
@@ -149,6 +151,35 @@ def test_regressor_tests_are_those_of_dense_matrices(case, shared):
         assert found[name].statistic == pytest.approx(T, rel=1e-6)
         assert found[name].dof_residual == pytest.approx(dof, rel=1e-6)
         assert found[name].p_value == pytest.approx(stats.f.sf(T / q, q, dof), rel=1e-5)
+
+
+def test_patterns_along_a_direction_are_those_of_dense_matrices():
+    """Along the diagonal of the detector, and of the sky, with the fourth power of the radius."""
+    table, fit = CASES["chips"].fitted(5)
+    model, sample, dense = fit.model, scored_sample(table, fit), Dense(table, fit)
+    diagonal, radius4 = np.array([0.6, 0.8]), (sample.X**2 + sample.Y**2) ** 2
+    X, Y = np.empty((2, len(table)))
+    for code, chip in enumerate(model.chips):
+        here = table.chip == code
+        X[here], Y[here] = model.basis(chip.number).scaled(table.x[here], table.y[here])
+    turn = np.stack([model.frame(fit.mean, e)[0] for e in range(len(model.exposures))])
+    statistics = []
+    for along, moved in (
+        (diagonal, turn[table.exposure] @ diagonal),
+        (sample.along_detector(diagonal), np.tile(diagonal, (len(table), 1))),
+    ):
+        asked = Question(Family("diagonal", "", "", ""), (Products(CONSTANT, radius4, along),))
+        projection = projection_of(
+            functions_for(sample, [asked]), fit.mean, GaussianPriors.none(model)
+        )
+        [found] = regressor_tests(projection)
+        Z = [((X**2 + Y**2) ** 2 * (table.chip == c))[:, None] * moved for c in (0, 1)]
+        T, q, dof = dense.statistic(np.stack(Z, axis=2))
+        assert found.dof == q == 2  # one amplitude on each chip
+        assert found.statistic == pytest.approx(T, rel=1e-6)
+        assert found.dof_residual == pytest.approx(dof, rel=1e-6)
+        statistics.append(T)
+    assert statistics[0] != pytest.approx(statistics[1], rel=1e-4)
 
 
 def test_curvature_in_time_is_what_the_lines_leave():

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from bayesdist.diagnose.selfcal.leverage import taken_by_stars
 from bayesdist.diagnose.selfcal.misfit import _shifts, dithered_misfit
+from bayesdist.diagnose.selfcal.scores import taken_by_stars
 from bayesdist.infer.selfcal import self_calibrate
 from bayesdist.infer.selfcal.elimination import memberships
 from bayesdist.simulate.dithers import simulate_dithers, smooth_distortion

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import stats
 
 from bayesdist.diagnose import score_tests
+from bayesdist.diagnose.checks import score_checks
 from bayesdist.diagnose.score import sample as sample_module
-from bayesdist.diagnose.score.families import Family
-from bayesdist.diagnose.score.result import Outcome, corrected, noncentrality
+from bayesdist.diagnose.score.result import Family, Outcome, corrected, noncentrality
 from bayesdist.diagnose.score.sample import SAMPLE, scored_sample
 from bayesdist.errors import InputError
 from bayesdist.infer.transforms import without_frames
@@ -99,6 +102,47 @@ def test_remedies_name_what_to_do():
     assert "terms of order 9" in found["order 9"].finding
     assert "hierarchy of deviations" in found["exposures"].remedy
     assert found["order 9"].unit == "pix"
+
+
+def test_every_test_says_which_correlated_errors_hold_it():
+    found = Scene(1500, 2, "shift", 5, time=TIME).tests(1)
+    held = {name: one.held_by for name, one in found.items() if one.held_by}
+    assert held == {
+        "order 3": "structure", "order 4": "structure", "exposures": "exposures",
+        "curvature in time": "curvature", "noise by position": "noise",
+        "noise by magnitude": "noise", "noise by exposure": "noise", "noise by axis": "noise",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("scatter", "structure", "held"),
+    [
+        ((), (), {"noise"}),
+        ((), ("a field",), {"noise", "structure"}),
+        (("shape",), (), {"noise", "exposures"}),
+        (("curvature",), (), {"noise", "curvature"}),
+    ],
+)
+def test_verdicts_stand_where_correlated_errors_hold_a_finding(scatter, structure, held):
+    linear = SimpleNamespace(scatter=dict.fromkeys(scatter)) if scatter else None
+    correlated = SimpleNamespace(linear=linear, structure=structure)
+    for kind in ("", "noise", "structure", "exposures", "curvature"):
+        one = outcome(0.0)
+        tests = corrected([replace(one, family=replace(one.family, held_by=kind))])
+        [alone], [beside] = score_checks(tests), score_checks(tests, correlated)
+        assert alone.doubt
+        assert bool(beside.doubt) == (kind not in held)
+
+
+def test_findings_name_another_one_that_may_explain_them():
+    first = replace(outcome(0.0), family=Family("a", "", "a", "", group="g", denial="it is not a"))
+    second = replace(outcome(0.0), family=Family("b", "", "b", "", explained_by="g"))
+    assert [one.finding.split(" (")[0] for one in corrected([second, first])] == [
+        "b, if it is not a",
+        "a",
+    ]
+    absent = replace(first, p_value=0.5)
+    assert corrected([second, absent])[0].finding.startswith("b (")
 
 
 def test_drift_of_exposures_that_deviate_is_doubtful():

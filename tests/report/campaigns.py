@@ -106,7 +106,7 @@ def summary() -> dict:
             "n_catalog": 5_390,
             "n_catalog_used": 4_964,
             "completeness": {"median": 0.9734, "least": 0.9123},
-            "false_share": 3.21e-5,
+            "false_fraction": 3.21e-5,
             "radius": [0.171, 0.321],
         },
         "tables": {
@@ -193,7 +193,7 @@ def results(chips, **changes) -> CampaignResults:
             "exposure": series.exposures["exposure"],
             "epoch": series.epoch,
             "completeness": rng.uniform(0.95, 0.99, N),
-            "false_share": rng.uniform(0, 1e-4, N),
+            "false_fraction": rng.uniform(0, 1e-4, N),
             "matched": rng.integers(600, 900, N),
             "too bright": rng.integers(10, 20, N),
             "pa_v3": series.pa_v3,

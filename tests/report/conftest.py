@@ -7,6 +7,7 @@ import pytest
 from bayesdist.report.context import ReportInput
 from bayesdist.report.run_report import render_report
 
+from .campaigns import campaign_input
 from .plots import drawings_of, plots_of
 from .runs import report_input
 
@@ -33,7 +34,13 @@ def figures(plots):
 
 @pytest.fixture(scope="session")
 def drawings(plots):
+    """Specks with the words of the figures; other files of this folder look at pictures."""
     return drawings_of(plots)
+
+
+@pytest.fixture(scope="session")
+def campaign_plots():
+    return plots_of(campaign_input())
 
 
 @pytest.fixture(scope="session")

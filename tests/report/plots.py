@@ -1,4 +1,4 @@
-"""Figures of a run as plots, and as drawings that cost less than a report's."""
+"""Figures of a run as plots, and as drawings that cost nothing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from bayesdist.report.context import ReportInput
-from bayesdist.report.drawing import Drawing, png_of
+from bayesdist.report.drawing import Drawing
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections import REPORT
 
@@ -45,11 +45,9 @@ def _speck() -> bytes:
     return page.getvalue()
 
 
-def drawings_of(plots: dict[str, Plot], *, speck: bool = False) -> dict[str, Drawing]:
-    """PNG files with the words, without PDF; as specks where only words are looked at."""
+def drawings_of(plots: dict[str, Plot]) -> dict[str, Drawing]:
+    """The words of figures, and specks in place of them."""
     return {
-        name: Drawing(
-            _speck() if speck else png_of(plot.figure), b"", plot.title, plot.text, plot.alt
-        )
+        name: Drawing(_speck(), None, plot.title, plot.text, plot.alt)
         for name, plot in plots.items()
     }

@@ -129,12 +129,17 @@ def put(browser, **values):
 
 
 def shown(browser) -> dict[str, tuple[str, ...]]:
-    """Texts of u, v and radial by term."""
+    """Texts of u, v and per axis by term."""
     rows = browser.execute_script(
         "return [...document.querySelectorAll('#budget-explorer tbody tr')]"
         ".map(r => [...r.cells].map(c => c.textContent))"
     )
     return {name: tuple(cells[:3]) for name, *cells in rows}
+
+
+def _sizes(row) -> tuple[float, float, float]:
+    """Errors in u, in v, and per axis."""
+    return row["u"], row["v"], row["radial"] / np.sqrt(2)
 
 
 def agree(text: str, value: float) -> bool:
@@ -156,7 +161,7 @@ def test_at_first_it_is_the_table_of_the_budget(asked, opened):
     found = shown(opened)
     for row in asked.budget.rows():
         texts = found[row["name"]]
-        assert all(agree(t, row[k]) for t, k in zip(texts, ("u", "v", "radial"), strict=True)), (
+        assert all(agree(t, size) for t, size in zip(texts, _sizes(row), strict=True)), (
             row,
             texts,
         )
@@ -189,7 +194,7 @@ def test_a_position_is_that_of_the_assessment(asked, opened, chip, x, y, epoch, 
     found = shown(opened)
     assert [t.name for t in truth.every if t.name not in found] == []
     for term in truth.every:
-        values = (term.u[0], term.v[0], term.radial[0])
+        values = (term.u[0], term.v[0], term.radial[0] / np.sqrt(2))
         assert all(map(agree, found[term.name], values)), (term.name, found[term.name], values)
 
 
@@ -215,7 +220,7 @@ def test_the_difference_of_two_positions_is_that_of_the_assessment(asked, opened
     )
     found = shown(opened)
     for term in truth.every:
-        values = (term.u[0], term.v[0], term.radial[0])
+        values = (term.u[0], term.v[0], term.radial[0] / np.sqrt(2))
         assert all(map(agree, found[term.name], values)), (term.name, found[term.name], values)
     # what both positions share: the frames of this run are shifts
     assert [t.name for t in truth.every if t.radial[0] == 0] == [
@@ -233,7 +238,7 @@ def test_the_slider_and_the_button_change_the_numbers(asked, opened):
     assert early["coefficients"] == late["coefficients"]  # at the zero point of the drift
     opened.find_element("xpath", "//button[text()='As in the table']").click()
     total = asked.budget.rows()[-1]
-    assert agree(shown(opened)["total"][2], total["radial"])
+    assert agree(shown(opened)["total"][2], total["radial"] / np.sqrt(2))
 
 
 def test_keys_and_clicks_choose_a_position(opened):
@@ -305,7 +310,7 @@ def test_a_pointer_reads_the_maps(asked, opened):
         "return document.querySelector('#map-reader .reading').textContent")  # fmt: skip
     where, value = reading.split(": ")
     assert where == "pixel (1, 1) of WFC2"
-    assert agree(value, best.radius[0, 0])
+    assert agree(value, best.radius[0, 0] / np.sqrt(2))
 
 
 @pytest.mark.parametrize("width", [390, 1440])
@@ -387,3 +392,31 @@ def test_no_error_is_logged_and_nothing_leaves_the_page(opened):
     assert opened.get_log("browser") == []
     asked = requests(opened)
     assert asked and all(url.startswith(("file:", "data:")) for url in asked)
+
+
+def test_a_table_is_downloaded_as_it_is_shown(opened):
+    """As CSV its cells, with plain signs; as LaTeX nothing that TeX would take for a command."""
+    import csv
+    import io
+
+    shown, text, latex = opened.execute_script(
+        "const t = document.querySelector('#margins table');"
+        "const rows = [...t.rows].map(r => [...r.cells].map(c => c.textContent.trim()));"
+        "return [rows, csvOf(textsOf(t)), latexOf(textsOf(t), 'a & b_c')];"
+    )
+    rows = list(csv.reader(io.StringIO(text, newline="")))
+    tidy = {"\N{MINUS SIGN}": "-", "\u202f": " ", "\xa0": " "}
+    assert rows == [
+        [" ".join("".join(tidy.get(c, c) for c in cell).split()) for cell in row] for row in shown
+    ]
+    assert "\\caption{a \\& b\\_c}" in latex
+    body = latex.partition("\\hline\n")[2].partition("\\end{tabular}")[0]
+    assert not re.search(r"(?<!\\)[%#_]", body)
+    assert body.count("\\\\") == len(rows)
+    columns = {len(re.findall(r"(?<!\\)&", line)) for line in body.splitlines() if "&" in line}
+    assert columns == {len(rows[0]) - 1}
+
+
+def test_downloads_are_offered_below_each_table(opened):
+    buttons = opened.find_elements("xpath", "//section[@id='margins']//p[@class='get']/button")
+    assert {one.text for one in buttons} == {"CSV", "LaTeX"}

@@ -39,20 +39,17 @@ def run():
 
 
 @pytest.fixture(scope="module")
-def plots(run):
-    return plots_of(run)
-
-
-@pytest.fixture(scope="module")
-def plan(run, plots):
+def plan(run, campaign_plots):
     """The figures that a campaign adds."""
     items = REPORT.items(run, "figure")
-    return {one.name: plots[one.name] for one in items if one.section.startswith("campaign-")}
+    return {
+        one.name: campaign_plots[one.name] for one in items if one.section.startswith("campaign-")
+    }
 
 
 @pytest.fixture(scope="module")
-def page(run, plots):
-    return render_report(run, drawings_of(plots, speck=True))
+def page(run, campaign_plots):
+    return render_report(run, drawings_of(campaign_plots))
 
 
 def number_in(text: str) -> float:
@@ -63,7 +60,7 @@ def number_in(text: str) -> float:
 # -- the page -------------------------------------------------------------------------------------
 
 
-def test_every_figure_of_the_plan_is_drawn_and_placed(run, plots, plan, page):
+def test_every_figure_of_the_plan_is_drawn_and_placed(run, campaign_plots, plan, page):
     parts = {s.name for s in REPORT.sections if s.parent == "campaign"}
     items = REPORT.items(run, "figure")
     assert {one.section for one in items if one.name in plan} == parts
@@ -76,7 +73,7 @@ def test_every_figure_of_the_plan_is_drawn_and_placed(run, plots, plan, page):
         assert png.startswith(b"\x89PNG") and png.endswith(b"IEND\xaeB`\x82")
         assert len(image.get("alt")) > 20
     every = tree.xpath("//figure/@id")
-    assert sorted(every) == sorted(f"figure-{name}" for name in plots)
+    assert sorted(every) == sorted(f"figure-{name}" for name in campaign_plots)
 
 
 def test_the_page_is_well_formed_and_its_links_lead_somewhere(page):
@@ -89,8 +86,8 @@ def test_the_page_is_well_formed_and_its_links_lead_somewhere(page):
     assert not re.search(r"\b(nan|None|inf)\b", words(page), re.IGNORECASE)
 
 
-def test_binned_residuals_of_rolled_exposures_say_along_which_axes(run, plots):
-    text = plots["residual_vectors"].text
+def test_binned_residuals_of_rolled_exposures_say_along_which_axes(run, campaign_plots):
+    text = campaign_plots["residual_vectors"].text
     assert "cells of the test for structure" in text
     assert "axes of the polynomials" not in text  # frames that only shift turn nothing
     turning = replace(run.fit, model=replace(run.fit.model, frames="shift_rotation"))
@@ -287,7 +284,7 @@ def test_a_campaign_without_tables_drift_and_overlap(run):
         series=None, overlap=None, catalog=None, detections=None,
     )  # fmt: skip
     small = replace(run, campaign=less)
-    page = render_report(small, drawings_of(plots_of(small), speck=True))
+    page = render_report(small, drawings_of(plots_of(small)))
     parsed(page)
     shown = lxml_html.fromstring(page).get_element_by_id("campaign").xpath(".//figure/@id")
     assert shown == [f"figure-{n}" for n in ("matching", "footprints", "residuals_without_tables")]
@@ -336,7 +333,7 @@ def test_a_good_campaign_passes(run):
     ("section", "changes", "name"),
     [
         ("matching", {"completeness": {"median": 0.9, "least": 0.3}}, "completeness"),
-        ("matching", {"false_share": 0.1}, "false pairs"),
+        ("matching", {"false_fraction": 0.1}, "false pairs"),
         ("matching", {"left_out": {"e001": "no match"}}, "left out"),
         ("tables", {"converged": False}, "tables converged"),
         ("time_dependence", {"converged": False}, "Series"),

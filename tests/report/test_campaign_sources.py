@@ -63,10 +63,12 @@ def test_residuals_show_the_pattern_of_the_detector_whatever_the_roll(margin):
             errors=ErrorLaw(),
             inside=lambda stars: kept,
         ),
+        matched=SimpleNamespace(stars=pairs),
     )
-    inputs = SimpleNamespace(config=SimpleNamespace(fit=SimpleNamespace(clip_abs=2.0)))
-    matched = SimpleNamespace(stars=pairs, affine_model=model, inputs=inputs)
-    (found,) = _residuals(data, matched)
+    config = SimpleNamespace(
+        fit=SimpleNamespace(clip_abs=2.0), model=SimpleNamespace(order=2), chips=lambda: (chip,)
+    )
+    (found,) = _residuals(data, config)
     pairs = pairs.select(kept)
     without, after = found.binned_without, found.binned_with
     shift = table.evaluate(pairs.x, pairs.y)

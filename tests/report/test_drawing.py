@@ -1,8 +1,11 @@
 """Figures as files: nothing cut, numbers as matplotlib sets them, the same whoever draws."""
 
+import base64
 import io
-import os
 import re
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -11,6 +14,7 @@ from PIL import Image
 
 from bayesdist.report import drawing
 from bayesdist.report.drawing import DPI, PAD, png_of, render
+from bayesdist.report.page import picture_of
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections import REPORT
 from bayesdist.report.style import figure_style, new_figure, plain_ticks
@@ -46,9 +50,23 @@ def test_a_picture_is_cut_to_what_is_drawn_and_no_more(at):
 
 def test_the_same_figure_gives_the_same_files():
     first, second = (square(0.1, 0.1, 0.5) for _ in range(2))
-    one, other = (render(Plot(figure, "", "", "")) for figure in (first, second))
+    one, other = (render(Plot(figure, "", "", ""), pdf=True) for figure in (first, second))
     assert one == other
     assert one.png == png_of(second)
+
+
+def test_what_is_printed_is_drawn_in_vectors():
+    first, second = (
+        render(Plot(square(0.1, 0.1, 0.5), "A square", "", ""), svg=True) for _ in range(2)
+    )
+    assert first == second
+    tree = ElementTree.fromstring(first.svg)
+    # in points: the square and its margin
+    assert float(tree.get("width").removesuffix("pt")) == pytest.approx(72 * (1 + 2 * PAD), abs=1)
+    assert not render(Plot(square(0.1, 0.1, 0.5), "", "", "")).svg
+    shown, plain = (picture_of("square", one) for one in (first, replace(first, svg="")))
+    assert (shown.kind, plain.kind) == ("svg+xml", "png") and shown.width == plain.width
+    assert base64.b64decode(shown.data).decode() == first.svg
 
 
 # -- numbers at ticks ------------------------------------------------------------------------------
@@ -121,14 +139,14 @@ def test_several_processes_draw_what_one_draws(converged, alone, monkeypatch):
 
 def test_processes_that_fail_are_made_up_for(converged, alone, monkeypatch, caplog):
     monkeypatch.setattr(drawing, "MIN_FIGURES_SHARED", 1)
-    monkeypatch.setattr(drawing, "_receive", _end)
+    monkeypatch.setattr(drawing, "ProcessPoolExecutor", _ended)
     assert drawing.draw_all(Few, converged, processes=2) == alone
     assert "drawn by one process" in caplog.text
 
 
-def _end(results):
-    """End the process that begins with this."""
-    os._exit(3)
+def _ended(*_, **__):
+    """What a pool says whose processes have ended as they began."""
+    raise BrokenProcessPool("they have ended")
 
 
 def test_words_come_with_the_files(plots, alone):
@@ -138,8 +156,9 @@ def test_words_come_with_the_files(plots, alone):
         assert (one.title, one.text, one.alt) == words and all(words)
 
 
-def test_both_kinds_are_saved(tmp_path):
-    one = render(Plot(square(0.1, 0.1, 0.5), "", "", ""))
-    paths = drawing.save_drawings({"a": one}, tmp_path / "figures")
-    assert [p.name for p in paths] == ["a.png", "a.pdf"]
-    assert paths[0].read_bytes() == one.png and paths[1].read_bytes().startswith(b"%PDF")
+def test_the_kinds_that_were_drawn_are_saved(tmp_path):
+    one, other = (render(Plot(square(0.1, 0.1, 0.5), "", "", ""), pdf=pdf) for pdf in (True, False))
+    paths = drawing.save_drawings({"a": one, "b": other}, tmp_path / "figures")
+    assert [p.name for p in paths] == ["a.png", "b.png", "a.pdf"]
+    assert paths[0].read_bytes() == one.png == other.png
+    assert paths[2].read_bytes().startswith(b"%PDF")

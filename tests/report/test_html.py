@@ -18,6 +18,7 @@ from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.errors import InputError
 from bayesdist.infer.checks import sampling_checks
 from bayesdist.report.context import Product
+from bayesdist.report.documentation import BASE
 from bayesdist.report.run_report import render_report, write_report
 from bayesdist.report.sections import REPORT
 from bayesdist.report.sections.run.coefficients import coefficient_tables
@@ -71,7 +72,9 @@ def test_page_is_well_formed(page, bad_page):
 
 def test_page_needs_nothing_else(page):
     parser = parsed(page)
-    assert all(link.startswith(("data:image/png;base64,", "#")) for link in parser.links)
+    # the documentation is linked, and asked by readers alone
+    own = ("data:image/png;base64,", "data:text/csv;charset=utf-8;base64,", "#", BASE)
+    assert all(link.startswith(own) for link in parser.links)
     assert not {"link", "iframe", "object"} & {tag for tag, _ in parser.tags}
     scripts = [attributes for tag, attributes in parser.tags if tag == "script"]
     assert scripts and not any("src" in s for s in scripts)
@@ -79,15 +82,18 @@ def test_page_needs_nothing_else(page):
     style = re.search(r"<style>(.*?)</style>", page, re.DOTALL).group(1)
     assert "url(" not in style and "@import" not in style
     without_pictures = re.sub(r"base64,[^\"]+", "", page)
-    # the name of a vocabulary is no address that is asked
-    assert "http" not in without_pictures.replace('"http://www.w3.org/2000/svg"', "")
+    # the name of a vocabulary is no address that is asked, and links are asked by readers alone
+    without_links = without_pictures.replace(f'<a href="{BASE}', "").replace(
+        f'<a class="help" href="{BASE}', ""
+    )
+    assert "http" not in without_links.replace('"http://www.w3.org/2000/svg"', "")
 
 
 def test_links_lead_to_sections_in_the_order_of_the_report(page):
     tree = lxml_html.fromstring(page)
     sections = tree.xpath("//section/@id")
-    assert sections == ["status", "data", "fit", "outliers", "coefficients", "maps", "budget",
-                        "margins", "products", "provenance"]  # fmt: skip
+    assert sections == ["status", "data", "fit", "residuals", "outliers", "coefficients", "maps",
+                        "budget", "margins", "products", "provenance"]  # fmt: skip
     assert [h[1:] for h in tree.xpath("//nav//a/@href")] == sections[1:]
 
 
@@ -97,7 +103,7 @@ def test_pictures_are_whole_and_described(page, figures):
     # periods, held-out stars and no catalogue were not asked for, and nothing depends on time
     others = ("periods", "holdout", "selfcal", "campaign")
     named = {one.name for one in every if not one.section.startswith(others)}
-    assert set(figures) == named - {"horizon"}
+    assert set(figures) == named - {"validity_period"}
     assert len(images) == len(figures)
     for image in images:
         png = base64.b64decode(image.get("src").split(",", 1)[1], validate=True)
@@ -151,7 +157,7 @@ def test_numbers_that_rest_on_the_draws_carry_a_dagger(bad_page):
         for table in tree.xpath(f"//section[@id='{section}']//table"):
             heads = [h.text_content().strip() for h in table.xpath(".//thead//th")]
             drawn = {"Mean", "sd", "95 % interval", "Posterior mean", "Value", "Margin", "P(met)",
-                     "u", "v", "Radial", "68 %", "95 %"}  # fmt: skip
+                     "u", "v", "Per axis", "CE68", "CE95", "68 %", "95 %"}  # fmt: skip
             columns = [k for k, h in enumerate(heads) if h in drawn]
             assert columns, heads
             for row in table.xpath("./tbody/tr"):
@@ -398,3 +404,14 @@ def test_what_residuals_were_asked_and_verdicts_rest_on_stands_on_the_page(conve
         for clause in margins[0].rests_on
     )
     assert (of_all, of_one) == ("all", first.requirement.name)
+
+
+def test_simulated_data_are_named_on_every_page(converged, drawings, page):
+    """In a band on the screen, in the title, and in the margin of each page of paper."""
+    config = {**converged.config, "data": {"simulated": True}}
+    text = render_report(replace(converged, config=config), drawings)
+    tree = lxml_html.fromstring(text)
+    (band,) = tree.xpath("//p[@class='simulated']")
+    assert "SIMULATED" in band.text_content() and "SIMULATED" in tree.xpath("//title")[0].text
+    assert '@top-center { content: "SIMULATED DATA"' in text
+    assert "SIMULATED" not in page

@@ -20,7 +20,7 @@ from bayesdist.report.sections import REPORT
 from bayesdist.report.texttable import Level, TextTable
 
 from .campaigns import campaign_input
-from .plots import drawings_of, plots_of
+from .plots import drawings_of
 
 RESULTS = {"report": ReportInput, "bands": BandsInput}
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -45,12 +45,11 @@ def test_entries_have_names_of_their_own_and_needs_that_exist(registry):
         assert one.section in named | {""} and one.make.__doc__, one.name
 
 
-def test_figures_and_words_stand_in_the_page_and_in_markdown():
-    run = campaign_input()
-    plots = plots_of(run)
+def test_figures_and_words_stand_in_the_page_and_in_markdown(campaign_plots):
+    run, plots = campaign_input(), campaign_plots
     for name, plot in plots.items():
         assert plot.title and plot.text and len(plot.alt) > 20, name
-    drawings = drawings_of(plots, speck=True)
+    drawings = drawings_of(plots)
     page, text = render_report(run, drawings), render_markdown(run, drawings)
     assert re.findall(r'<figure id="figure-(\w+)"', page) == list(plots)
     assert re.findall(r"\(figures/(\w+)\.png\)", text) == list(plots)

@@ -7,14 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from bayesdist.app.assessment.settings import assessment_epoch
-from bayesdist.app.campaign.aberration import aberration_term
-from bayesdist.app.campaign.matched import campaign_matches
 from bayesdist.app.config import Config
+from bayesdist.app.kinds.exposures import ExposureScatter
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.fitted import required
+from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.table_file import StoredLookupTables
 from bayesdist.assess import pixel_scale_of
-from bayesdist.assess.error_model import ErrorModel, error_model
+from bayesdist.assess.error_model import ErrorModel, diagnosed_error_model, error_model
 from bayesdist.assess.terms.between_nodes import interpolation_term
 from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorTerm
 from bayesdist.assess.terms.local import LocalErrors
@@ -24,31 +23,25 @@ from bayesdist.infer import Posterior
 from bayesdist.infer.solution import Solution
 from bayesdist.model import LookupTable
 
-__all__ = ["errors_of_run", "published_tables"]
+__all__ = ["errors_of_fit", "errors_of_run", "published_tables"]
+
+
+def errors_of_fit(solution: Solution, data: FitData, config: Config) -> ErrorModel:
+    """The error model of a solution alone, without terms that rest on residuals."""
+    scale = pixel_scale_of(solution, scale_mas=config.detector.scale_mas)
+    return error_model(solution, _given_terms(solution, data, config), pixel_scale=scale)
 
 
 def errors_of_run(
-    solution: Solution, found: Diagnostics | None, data: FitData, config: Config
+    posterior: Posterior, found: Diagnostics, data: FitData, config: Config
 ) -> ErrorModel:
-    """The error model of a posterior with what residuals say, or of a solution alone.
-
-    Without diagnostics there are no terms that rest on residuals.
-    """
-    fitted = data.fitted
-    terms: list[ErrorTerm] = []
-    if found is not None and fitted.scatter is not None:
-        assert isinstance(solution, Posterior)
-        terms.append(_variation(solution, data))
-    terms += config.linear_terms(solution)
+    """The error model of a posterior with what residuals say."""
+    fitted, joint = data.fitted, data.fitted.scatter is not None
+    terms = _given_terms(posterior, data, config)
     if fitted.scatter is not None:
-        terms += _table_terms(solution, data, config)
-    terms += config.user_terms()
-    scale = pixel_scale_of(solution, scale_mas=config.detector.scale_mas)
-    if found is None:
-        return error_model(solution, None, terms, pixel_scale=scale)
-    joint = fitted.scatter is not None
-    return error_model(
-        solution,
+        terms.insert(0, _variation(posterior, fitted.scatter, data.matched))
+    return diagnosed_error_model(
+        posterior,
         found,
         terms,
         hierarchy=fitted.linear if joint else None,
@@ -57,19 +50,24 @@ def errors_of_run(
         single=not joint and config.assess.exposure == "single",
         frames=fitted.solved is not None,  # exposures overlap in part
         structure_left=not fitted.tables.position_sigma,  # errors of tables stand for it
-        pixel_scale=scale,
+        pixel_scale=pixel_scale_of(posterior, scale_mas=config.detector.scale_mas),
     )
 
 
-def _variation(solution: Posterior, data: FitData) -> ExposureVariation:
+def _given_terms(solution: Solution, data: FitData, config: Config) -> list[ErrorTerm]:
+    """Terms of the user, and of tables where exposures were fitted jointly."""
+    tables = () if data.fitted.scatter is None else _table_terms(solution, data, config)
+    return [*config.linear_terms(solution), *tables, *config.user_terms()]
+
+
+def _variation(solution: Solution, scatter: ExposureScatter, matched: Matched) -> ExposureVariation:
     """Deviation of a new exposure: as those at hand scatter, velocity aberration among it."""
-    scatter = required(data.fitted.scatter, "joint fit of exposures")
     return ExposureVariation(
         solution.model,
         np.asarray(solution.mean, float),
         scatter.kinds,
         scatter.tau,
-        aberration=aberration_term(scatter, campaign_matches(data.matched).inputs, solution),
+        aberration=matched.aberration(scatter, solution),
     )
 
 

@@ -36,8 +36,7 @@ def check_pairs(raw: Matches, config: Config) -> dict[str, int]:
             "[periods] needs an epoch for every pair", where=where, do="map column 'epoch'"
         )
     some = raw if raw.in_memory else raw.sample(SAMPLE)
-    epoch = some.epoch
-    assert epoch is not None
+    epoch = some.column("epoch")
     share = len(raw) / len(some)
     out = {}
     for name, (start, stop) in spans.items():

@@ -29,10 +29,14 @@ def assessment_rng(config: Config) -> np.random.Generator:
 
 
 def assessment_epoch(data: FitData, config: Config) -> float | None:
-    """Epoch of the assessment, decimal years; the median of the stars where none is given."""
+    """Epoch of the assessment, decimal years.
+
+    Where none is given, the date from which a product is to be used, or the latest date of the
+    stars if that is later: errors of a drift grow with time.
+    """
     if config.assess.epoch is not None or data.model.time is None:
         return config.assess.epoch
-    return data.median_epoch
+    return max((data.last_epoch, *config.products.useafter_years()))
 
 
 def evaluation_settings(data: FitData, config: Config) -> EvaluationSettings:
@@ -47,12 +51,12 @@ def rehearsal_settings(data: FitData, config: Config) -> EvaluationSettings:
         grid=config.assess.grid,
         epoch=assessment_epoch(data, config),
         draws=config.assess.draws,
-        years_ahead=config.assess.horizon or 0.0,
+        years_ahead=config.assess.years_ahead,
         scale_mas=config.detector.scale_mas,
         single=config.assess.exposure == "single",
         # errors of centroids that the fit has found hold nothing else
         contained=() if measured else config.held_in_residuals(data.model.unit),
-        given=tuple(block.name for block in config.budget),
+        given=tuple(block.name for block in config.budget if block.stated),
     )
 
 

@@ -39,7 +39,7 @@ def campaign_checks(summary: Mapping[str, Any], remarks: Sequence[Check] = ()) -
     """
     m, tables, time = (summary.get(k) or {} for k in ("matching", "tables", "time_dependence"))
     least = float(m["completeness"]["least"])
-    false = float(m["false_share"])
+    false = float(m["false_fraction"])
     out = [
         Check(
             GROUP,

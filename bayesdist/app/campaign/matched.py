@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
+from bayesdist.app.campaign.aberration import aberration_term
 from bayesdist.app.campaign.catalogue import errors_by_star
 from bayesdist.app.campaign.inputs import Inputs
+from bayesdist.app.config import CampaignConfig
+from bayesdist.app.kinds.exposures import ExposureScatter
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.split import set_aside
 from bayesdist.app.kinds.star_lists import known_calibration
 from bayesdist.app.store.rundir import PAIRS, part_files
+from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.data import read_matches, write_partitioned
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.overlap import OverlapTest, overlap_test
-from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_influence import StarErrors
+from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel, LookupTable
 
-__all__ = ["CampaignMatched", "campaign_matches", "load_matched_campaign", "matched_campaign"]
+__all__ = ["CampaignMatched", "affine_model_of", "load_matched_campaign", "matched_campaign"]
 
 GAUGE_EXPOSURES = 1  # the first ones, which cannot be held out: they define the gauge
 
@@ -46,25 +50,15 @@ class CampaignMatched(Matched):
     inputs: Inputs = field(kw_only=True)
     pairs: Matches = field(kw_only=True)
 
-    @property
-    def mirrored(self) -> bool:
-        """Boolean: u has the sign opposite to the catalogue's."""
-        return self.facts.get("parity") == "mirrored"
-
     @cached_property
     def affine_model(self) -> DistortionModel:
-        """The configured polynomial with a free linear part of each exposure.
+        """The configured polynomial with a free linear part of each exposure."""
+        return affine_model_of(self.inputs.config, self.stars)
 
-        For tables and errors: whatever drifts or scatters in the linear terms is taken up.
-        """
-        config = self.inputs.config
-        return DistortionModel(
-            config.model.order,
-            config.chips(),
-            unit=self.inputs.catalog.unit,
-            frames="affine",
-            exposures=self.stars.exposure_names,
-        )
+    def of_order(self, order: int) -> Self:
+        """Matches to be fitted by polynomials of another order."""
+        config = self.inputs.config.of_order(order)
+        return replace(self, inputs=replace(self.inputs, config=config))
 
     @property
     def tangent_point(self) -> None:
@@ -80,6 +74,10 @@ class CampaignMatched(Matched):
     def star_errors(self) -> StarErrors | None:
         """Errors of the catalogue by code of the star; None where it has none."""
         return errors_by_star(self.inputs.catalog, self.inputs.largest_vafactor)
+
+    def aberration(self, scatter: ExposureScatter, solution: Solution) -> ScaleError:
+        """Error of the scale by velocity aberration, which is among the scatter."""
+        return aberration_term(scatter, self.inputs, solution)
 
     def overlap(self, posterior: Posterior, tables: tuple[LookupTable, ...]) -> OverlapTest | None:
         """Two exposures far apart in time laid on each other; None where none are known so."""
@@ -114,17 +112,18 @@ def matched_campaign(pairs: Matches, inputs: Inputs, **more: Any) -> CampaignMat
     return CampaignMatched(*parts, catalogue=inputs.catalog, inputs=inputs, pairs=pairs, **more)
 
 
-def campaign_matches(matched: Matched) -> CampaignMatched:
-    """Matches that are those of a campaign.
+def affine_model_of(config: CampaignConfig, stars: Matches) -> DistortionModel:
+    """The configured polynomial with a free linear part of each exposure.
 
-    Raises
-    ------
-    InputError
-        For others.
+    For tables and errors: whatever drifts or scatters in the linear terms is taken up.
     """
-    if not isinstance(matched, CampaignMatched):
-        raise InputError("are no matches of a campaign", do="give runs that began with star lists")
-    return matched
+    return DistortionModel(
+        config.model.order,
+        config.chips(),
+        unit=stars.unit,
+        frames="affine",
+        exposures=stars.exposure_names,
+    )
 
 
 def load_matched_campaign(

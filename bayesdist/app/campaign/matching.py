@@ -93,7 +93,7 @@ def _facts(
     found: CampaignMatches, table: Table, inputs: Inputs, warnings: list[str]
 ) -> dict[str, Any]:
     """Section 'matching' of summary.json."""
-    false = np.sum(table["false_share"] * table["matched"]) / table["matched"].sum()
+    false = np.sum(table["false_fraction"] * table["matched"]) / table["matched"].sum()
     return {
         "n_exposures": len(found.reports),
         "n_detections": len(inputs.star_lists),
@@ -105,7 +105,7 @@ def _facts(
             "median": float(np.median(table["completeness"])),
             "least": float(np.min(table["completeness"])),
         },
-        "false_share": float(false),
+        "false_fraction": float(false),
         "parity": "mirrored" if found.mirrored else "direct",
         "tangent_point": inputs.catalog.tangent_point,
         "radius": [float(table["radius_min"].min()), float(table["radius_max"].max())],
@@ -121,7 +121,7 @@ def _log(matched: CampaignMatched, n_detected: int) -> None:
         n_detected,
         facts["n_exposures"],
         facts["completeness"]["median"],
-        facts["false_share"],
+        facts["false_fraction"],
     )
     if matched.mirrored:
         log.info(

@@ -7,6 +7,7 @@ from pathlib import Path
 from bayesdist.app.campaign.gap import with_gap
 from bayesdist.app.config import Config
 from bayesdist.app.config.model import TablesBlock
+from bayesdist.app.config.other_runs import FREE, TABLES, rates_file, tables_file
 from bayesdist.app.kinds.table_file import read_tables
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Posterior, load_posterior
@@ -15,40 +16,11 @@ from bayesdist.model import Chip, DistortionModel, LookupTable
 from bayesdist.products import read_d2im
 
 __all__ = [
-    "FREE",
     "free_rates",
     "held_tables",
     "rate_priors",
-    "reference_files",
     "rehearse_references",
 ]
-
-FREE = "free"  # rates that no other run says anything of
-TABLES, POSTERIOR = "tables.h5", "posterior.nc"
-
-
-def reference_files(block: TablesBlock, rates: str, base: Path) -> list[Path]:
-    """Files of other runs that a run goes by.
-
-    Parameters
-    ----------
-    block : TablesBlock
-    rates : str
-        `model.tdd.rates`.
-    base : Path
-        What the configuration's paths are relative to.
-
-    Raises
-    ------
-    InputError
-        For a folder that is no finished run.
-    """
-    out = []
-    if block.detector is not None:
-        out.append(_tables_file(base / block.detector))
-    if rates != FREE:
-        out.append(_file_of_run(base / rates, POSTERIOR, "model.tdd.rates"))
-    return out
 
 
 def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tuple[LookupTable, ...]:
@@ -68,7 +40,7 @@ def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tupl
     """
     if block.detector is None:
         return ()
-    path = _tables_file(base / block.detector)
+    path = tables_file(base / block.detector)
     if path.name == TABLES:
         found = read_tables(path, do="run its stage 'fit' again").tables
         tables = tuple(table for table in found if not table.filter)
@@ -104,7 +76,7 @@ def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianP
     tdd, chip = config.model.tdd, config.chips()[0].number
     if tdd is None or free_rates(config):
         return None
-    path = _file_of_run(base / tdd.rates, POSTERIOR, "model.tdd.rates")
+    path = rates_file(base / tdd.rates)
     posterior: Posterior = load_posterior(path)
     if not posterior.convergence.converged:
         raise InputError(
@@ -132,17 +104,3 @@ def rehearse_references(config: Config, unit: str, base: Path) -> None:
     if not free_rates(config):
         model = with_gap(DistortionModel(config.model.order, chips, unit, config.time()))
         rate_priors(config, model, base)
-
-
-def _tables_file(path: Path) -> Path:
-    return path if path.is_file() else _file_of_run(path, TABLES, "tables.detector")
-
-
-def _file_of_run(folder: Path, name: str, key: str) -> Path:
-    if not (folder / name).exists():
-        raise InputError(
-            f"has no {name}" if folder.is_dir() else "is not there",
-            where=str(folder),
-            do=f"name a finished run in {key}",
-        )
-    return folder / name

@@ -7,7 +7,8 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.inputs import Inputs
-from bayesdist.app.campaign.matched import CampaignMatched, campaign_matches
+from bayesdist.app.campaign.matched import affine_model_of
+from bayesdist.app.config import CampaignConfig
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.results import Results
 from bayesdist.app.store import as_json
@@ -50,8 +51,8 @@ def campaign_results(results: Results) -> CampaignResults:
         Of a run that has been assessed.
     """
     run, config, fitted = results.run, results.config, results.fitted
-    matched, matching = campaign_matches(results.matched), Table.read(run / "matching.ecsv")
-    inputs = matched.inputs
+    matched, matching = results.matched, Table.read(run / "matching.ecsv")
+    inputs: Inputs = results.inputs
     return CampaignResults(
         summary=dict(run.summary),
         config=as_json(config.model_dump(exclude_none=True)),
@@ -62,8 +63,8 @@ def campaign_results(results: Results) -> CampaignResults:
         catalog=_catalog_stars(inputs, matching),
         centroids=fitted.errors.by_magnitude,
         detections=_detections(inputs),
-        footprints=_footprints(results.posterior, matched),
-        residuals=_residuals(results.data, matched),
+        footprints=_footprints(results.posterior, inputs, matched.mirrored),
+        residuals=_residuals(results.data, inputs.config),
         tables=fitted.tables.tables,
         series=_series(run, fitted.linear.model, matching),
         overlap=results.diagnostics.overlap,
@@ -142,11 +143,12 @@ def _detections(inputs: Inputs) -> Detections | None:
     )
 
 
-def _footprints(posterior: Posterior, matched: CampaignMatched) -> Footprints:
-    model, theta, catalog = posterior.model, posterior.mean, matched.inputs.catalog
+def _footprints(posterior: Posterior, inputs: Inputs, mirrored: bool) -> Footprints:
+    """Outlines of all exposures over the catalogue; `mirrored`: u has the opposite sign there."""
+    model, theta, catalog = posterior.model, posterior.mean, inputs.catalog
     outlines, epochs = [], []
     for name in model.exposures:
-        exposure = matched.inputs.log[name]
+        exposure = inputs.log[name]
         for chip in model.chips:
             x, y = outline_pixels(chip.size)
             place = {"exposure": name, "chip": chip.number}
@@ -154,16 +156,17 @@ def _footprints(posterior: Posterior, matched: CampaignMatched) -> Footprints:
             outlines.append(model.predict(theta, x, y, epoch=when, **place))
             epochs.append(exposure.epoch)
     rows = _spread_rows(len(catalog), MAX_MARKERS // 2)
-    u = -catalog.u if matched.mirrored else catalog.u
+    u = -catalog.u if mirrored else catalog.u
     return Footprints(u[rows], catalog.v[rows], tuple(outlines), np.array(epochs), catalog.unit)
 
 
 @one_thread
-def _residuals(data: FitData, matched: CampaignMatched) -> tuple[ChipResiduals, ...]:
+def _residuals(data: FitData, config: CampaignConfig) -> tuple[ChipResiduals, ...]:
     """Pairs of each chip without the tables and with them, along the detector's axes."""
-    pairs, moved, model = matched.stars, data.stars, matched.affine_model
+    pairs, moved = data.matched.stars, data.stars
+    model = affine_model_of(config, pairs)
     tables = data.fitted.tables.tables
-    errors, farthest = data.fitted.errors.by_magnitude, matched.inputs.config.fit.clip_abs
+    errors, farthest = data.fitted.errors.by_magnitude, config.fit.clip_abs
     plain = pairs if errors is None else pairs.with_errors(errors, in_quadrature=True)
     if any(table.filter for table in tables):  # those of the detector are not of this run
         detector = [table for table in tables if not table.filter]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import click
@@ -12,6 +12,7 @@ from bayesdist.errors import InputError
 
 __all__ = [
     "CommaList",
+    "chip_of",
     "column_names",
     "command",
     "epoch",
@@ -95,3 +96,25 @@ filter_name = click.option("--filter", metavar="F", help="Filter of an IDCTAB, o
 pixel_scale = click.option(
     "--scale", type=float, metavar="S", help="Size of a corrected pixel, arcsec."
 )
+
+
+def chip_of(numbers: Sequence[int], chip: int | None, where: str) -> int:
+    """Number of the chip that --chip names, which may be left out where there is one.
+
+    Raises
+    ------
+    InputError
+        For none, or one that is not there, among several.
+    """
+    listed = ", ".join(map(str, numbers))
+    if chip is None and len(numbers) == 1:
+        return numbers[0]
+    if chip is None:
+        raise InputError(
+            f"has {len(numbers)} chips, and none is named",
+            where=where,
+            do=f"add --chip, one of {listed}",
+        )
+    if chip not in numbers:
+        raise InputError(f"has no chip {chip}", where=where, do=f"choose one of {listed}")
+    return chip

@@ -47,13 +47,25 @@ def plan_dither(line: str, patterns: str, output: str | None) -> None:
 @command(name="select-order")
 @click.argument("config", metavar="CONFIG.toml")
 @click.option("--orders", nargs=2, type=int, default=(3, 9), metavar="LOW HIGH")
+@click.option(
+    "--chip",
+    type=int,
+    metavar="N",
+    show_default="the only one",
+    help="Chip that is compared.",
+)
 @click.option("-o", "--output", metavar="orders.ecsv", help="Write the table to a file.")
 @click.option("--figure", metavar="orders.png")
 @force
 def select_order(
-    config: str, orders: tuple[int, int], output: str | None, figure: str | None, force: bool
+    config: str,
+    orders: tuple[int, int],
+    chip: int | None,
+    output: str | None,
+    figure: str | None,
+    force: bool,
 ) -> None:
     """Select the polynomial order."""
     from bayesdist.app.commands.on_runs.order import order
 
-    click.echo(order(config, orders, output=output, figure=figure, force=force))
+    click.echo(order(config, orders, chip=chip, output=output, figure=figure, force=force))

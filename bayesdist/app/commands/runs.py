@@ -88,7 +88,8 @@ def run(
 @click.argument("name", metavar=f"[{'|'.join(STAGES)}]", type=click.Choice(STAGES))
 @click.argument("run", metavar="RUN")
 @click.option("--strict", is_flag=True, help="For sample: exit with 3 unless converged.")
-def stage(name: str, run: str, strict: bool) -> None:
+@click.option("--pdf", is_flag=True, help="For report: draw the figures as PDF, too.")
+def stage(name: str, run: str, strict: bool, pdf: bool) -> None:
     """Run one stage of a run again.
 
     match: match star lists (campaigns, self-calibrations); fit: linear fit; sample: posterior,
@@ -97,6 +98,23 @@ def stage(name: str, run: str, strict: bool) -> None:
     """
     if strict and name != "sample":
         raise click.UsageError("--strict is an option of the stage 'sample'.")
+    if pdf and name != "report":
+        raise click.UsageError("--pdf is an option of the stage 'report'.")
     from bayesdist.app.run import continue_stage
 
-    continue_stage(run, name, strict=strict)
+    continue_stage(run, name, strict=strict, pdf=pdf)
+
+
+@command()
+@click.argument("runs", metavar="RUN...", nargs=-1, required=True)
+@click.option(
+    "-o", "--output", default="reports.html", metavar="FILE", help="The page that is written."
+)
+def report(runs: tuple[str, ...], output: str) -> None:
+    """One page for many runs, with status, worst margin and validity of each.
+
+    The report of a single run is made by 'bayesdist stage report RUN'.
+    """
+    from bayesdist.app.commands.on_runs.overview import overview
+
+    click.echo(overview(runs, output))

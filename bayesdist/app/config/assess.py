@@ -56,7 +56,7 @@ class Assess(Section):
     grid: tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]] = (33, 17)
     draws: Annotated[int, Field(ge=100)] = 4000
     exposure: Literal["mean", "single"] = "mean"
-    horizon: Annotated[float, Field(ge=0)] = 10.0
+    years_ahead: Annotated[float, Field(ge=0)] = 10.0
 
 
 class BudgetBlock(Section):
@@ -67,7 +67,7 @@ class BudgetBlock(Section):
     sigma_u: Annotated[float, Field(ge=0)] | None = None
     sigma_v: Annotated[float, Field(ge=0)] | None = None
     sigma: Annotated[float, Field(ge=0)] | None = None
-    unit: Unit = "pix"
+    unit: Unit | None = None  # of sigma_u and sigma_v: pixels by default
     source: str = GIVEN
     included_in_scatter: bool = False
 
@@ -104,6 +104,11 @@ class BudgetBlock(Section):
                 raise ValueError(
                     f"a budget term of kind {self.kind!r} has one sigma, relative or in radians; "
                     "give sigma, and neither sigma_u nor sigma_v"
+                )
+            if self.unit is not None:
+                raise ValueError(
+                    f"a budget term of kind {self.kind!r} is relative or in radians, and unit is "
+                    f"{self.unit!r}; leave unit out"
                 )
         elif not axes or self.sigma is not None:
             raise ValueError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import ClassVar, Literal
 
 from pydantic import PositiveFloat, model_validator
@@ -14,6 +15,7 @@ from bayesdist.app.config.fit import (
     Sampler,
 )
 from bayesdist.app.config.model import CampaignModel, PriorBlock, TablesBlock
+from bayesdist.app.config.other_runs import FREE, rates_file, tables_file
 from bayesdist.app.config.products import CampaignProducts
 from bayesdist.app.config.run import RunConfig
 from bayesdist.app.config.section import Section, Unit
@@ -30,6 +32,11 @@ class StarListsBlock(Section):
     saturation: float | None = None
     q_max: PositiveFloat | None = None
     simulated: bool = False
+
+    @property
+    def list_names(self) -> list[str]:
+        """Names of the star lists as they are given."""
+        return [self.lists] if isinstance(self.lists, str) else self.lists
 
 
 class CampaignBlock(StarListsBlock):
@@ -71,6 +78,17 @@ class CampaignConfig(RunConfig):
         if not self.chip:
             raise ValueError("a [campaign] has no [[chip]] blocks; give them, one as the reference")
         return self
+
+    def named_files(self, base: Path) -> list[Path]:
+        """Lists, catalogue and log, and what is taken over from other runs."""
+        block, tdd = self.campaign, self.model.tdd
+        named = [block.catalog, block.exposures, block.initial_distortion, *block.list_names]
+        files = [base / name for name in dict.fromkeys(named)]
+        if self.tables.detector is not None:
+            files.append(tables_file(base / self.tables.detector))
+        if tdd is not None and tdd.rates != FREE:
+            files.append(rates_file(base / tdd.rates))
+        return files
 
     @property
     def named_detector(self) -> str:

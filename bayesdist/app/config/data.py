@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import (
     Field,
@@ -55,6 +56,12 @@ class Data(Section):
     def has_nominal(self) -> bool:
         """Boolean: columns of nominal positions are named."""
         return names_nominal(self.columns)
+
+    def paths(self, base: Path) -> Path | list[Path]:
+        """The files of matches; one path where one name is given, which may be a pattern."""
+        if isinstance(self.matches, str):
+            return base / self.matches
+        return [base / name for name in self.matches]
 
     @field_validator("unit", mode="before")
     @classmethod
@@ -148,6 +155,18 @@ class MatchesConfig(RunConfig):
     holdout: HoldoutBlock | None = None
     prior: list[PriorBlock] = Field(default_factory=list)
     products: MatchedProducts = MatchedProducts()
+
+    def named_files(self, base: Path) -> Path | list[Path]:
+        """The files of matches; one path where one name is given."""
+        return self.data.paths(base)
+
+    def of_order(self, order: int) -> Self:
+        """This configuration with polynomials of another order, without priors and extra weights.
+
+        Names of priors may be those of parameters that another order does not have.
+        """
+        fit = self.fit.model_copy(update={"radial_weight": 1.0})
+        return super().of_order(order).model_copy(update={"prior": [], "fit": fit})
 
     @model_validator(mode="after")
     def _one_array(self) -> MatchesConfig:

@@ -28,6 +28,9 @@ class Detector(Section):
     """A detector of one chip."""
 
     name: str = ""
+    mission: str = ""
+    instrument: str = ""
+    filter: str = ""
     size: Pair | None = None
     scale_mas: PositiveFloat | None = None
 
@@ -80,8 +83,15 @@ def chips_of(chips: Sequence[ChipBlock]) -> tuple[Chip, ...]:
 
 
 def one_chip(detector: Detector, reference_pixel: Pair | None, number: int, name: str) -> Chip:
-    """The chip of a detector that has one; its middle where no pixel is named."""
-    assert detector.size is not None  # `require_detector`
+    """The chip of a detector that has one; its middle where no pixel is named.
+
+    Raises
+    ------
+    ValueError
+        For a detector without a size.
+    """
+    if detector.size is None:
+        raise ValueError("detector.size is missing; give columns and rows")
     nx, ny = detector.size
     middle = ((nx + 1) / 2, (ny + 1) / 2)
     return Chip(number, detector.name or name, detector.size, reference_pixel or middle)

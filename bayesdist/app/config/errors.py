@@ -33,6 +33,7 @@ _BRANCHES = ("float", "str", "int", "constrained-float", "constrained-int", "con
 
 # new names of old keys, by section
 RENAMED = {
+    "assess.horizon": "years_ahead",
     "budget.in_residuals": "included_in_scatter",
     "campaign.aberration": "vafactor_source",
     "campaign.motions": "pm_selection",

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar
+from datetime import datetime
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import Field, PositiveFloat, create_model
+from pydantic import Field, PositiveFloat, create_model, model_validator
 
 from bayesdist.app.config.section import Section
+from bayesdist.data.tables.column import year_of
+from bayesdist.errors import InputError
 from bayesdist.products.formats.common.document import FormatSettings
 from bayesdist.products.registry import product_settings
 
 __all__ = ["CampaignProducts", "MatchedProducts", "Products", "ReleaseBlock", "SelfcalProducts"]
+
+_USEAFTER = ("%b %d %Y %H:%M:%S", "%b %d %Y")  # as reference files of HST have it
 
 
 class PeriodBlock(Section):
@@ -38,10 +43,46 @@ class ReleaseBlock(Section):
 class Products(Section):
     """Files for pipelines."""
 
+    if TYPE_CHECKING:
+
+        @property
+        def release(self) -> ReleaseBlock | None:
+            """What a release is made of, where the kind of run has one."""
+
+    @model_validator(mode="after")
+    def _dates_of_use(self) -> Products:
+        try:
+            self.useafter_years()
+        except InputError as error:
+            raise ValueError(f"useafter: {error.cause}; give 'Mar 01 2002 00:00:00'") from None
+        return self
+
+    def useafter_years(self) -> tuple[float, ...]:
+        """Dates from which the files are to be used, decimal years; none where none is given.
+
+        InputError for text that is no date.
+        """
+        release = getattr(self, "release", None)
+        files = (*self.asked().values(), *(() if release is None else release.period))
+        given = (getattr(one, "useafter", None) for one in files)
+        return tuple(_year_of_keyword(text) for text in given if text)
+
     def asked(self) -> dict[str, FormatSettings]:
         """Settings of the files that are asked for, by format."""
         found = {key: getattr(self, key, None) for key in product_settings()}
         return {key: settings for key, settings in found.items() if settings is not None}
+
+
+def _year_of_keyword(text: str) -> float:
+    """Decimal year of a date as USEAFTER has it, 'Mar 01 2002 00:00:00', or of an ISO date."""
+    date = " ".join(text.split())
+    for pattern in _USEAFTER:
+        try:
+            date = datetime.strptime(date, pattern).isoformat()
+        except ValueError:
+            continue
+        break
+    return year_of(date, where="useafter")
 
 
 class _Single(Products):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
 
 from pydantic import Field, model_validator
 
@@ -89,6 +90,24 @@ class RunConfig(Section):
         """Boolean: groups of stars may have jitters of their own, if the data ask for it."""
         return False
 
+    def named_files(self, base: Path) -> Path | list[Path]:
+        """Files, patterns and folders that the solution is made from, each once.
+
+        Relative names are relative to `base`; matches have one path where one name is given.
+        """
+        raise NotImplementedError
+
+    def files_of_products(self, base: Path) -> list[Path]:
+        """Files that only the products of a run are made from."""
+        release, named = self.products.release, self.named_files(base)
+        found = [] if release is None else [base / release.reference]
+        others = named if isinstance(named, list) else [named]
+        return [path for path in found if path not in others]
+
+    def of_order(self, order: int) -> Self:
+        """This configuration with polynomials of another order."""
+        return self.model_copy(update={"model": self.model.model_copy(update={"order": order})})
+
     def chips(self) -> tuple[Chip, ...]:
         """Chips of the model; empty for a detector of one chip."""
         return chips_of(self.chip)
@@ -121,12 +140,12 @@ class RunConfig(Section):
                 b.kind,
                 b.sigma_u,
                 b.sigma_v,
-                b.unit,
+                b.unit or "pix",
                 said_by_user(b.source),
                 varies=b.of_catalogue,
             )
             for b in self.budget
-            if b.sigma_u is not None and b.sigma_v is not None
+            if b.stated and b.sigma_u is not None and b.sigma_v is not None
         )
 
     def linear_terms(self, solution: Solution) -> tuple[ErrorTerm, ...]:

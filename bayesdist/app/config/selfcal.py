@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, PositiveFloat, model_validator
@@ -10,6 +11,7 @@ from bayesdist.app.config.campaign import StarListsBlock
 from bayesdist.app.config.data import names_nominal
 from bayesdist.app.config.fit import ComputeBlock, Fit, SelfcalOutliers, SelfcalSampler
 from bayesdist.app.config.model import PriorBlock, SelfcalModel, TablesBlock
+from bayesdist.app.config.other_runs import POSTERIOR
 from bayesdist.app.config.products import SelfcalProducts
 from bayesdist.app.config.run import RunConfig
 from bayesdist.app.config.section import Section, Unit
@@ -153,6 +155,16 @@ class SelfcalConfig(RunConfig):
                 "detector.scale_mas is missing, which turns pixels into seconds of arc; give it"
             )
         return self
+
+    def named_files(self, base: Path) -> list[Path]:
+        """Lists, the first solution, and what is known beside the detections."""
+        block, gauge = self.selfcal, self.gauge
+        first, reference = block.initial_distortion, gauge.reference
+        if first is not None and (base / first).is_dir():
+            first = f"{first}/{POSTERIOR}"  # of a run
+        named = [*block.list_names, block.exposures, first, gauge.offsets]
+        named.append(None if reference is None else reference.catalog)
+        return [base / name for name in dict.fromkeys(named) if name is not None]
 
     def mixture(self) -> OutlierMixture:
         """The outlier mixture."""

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.config import Config
+from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.calibration.calibration import calibration_of
 from bayesdist.calibration.orientation import lay_on
 from bayesdist.infer.solution import Solution
@@ -20,7 +20,8 @@ __all__ = ["write_files"]
 
 
 def write_files(
-    config: Config,
+    block: ReleaseBlock,
+    chip: int,
     base: Path,
     folder: Path,
     solutions: Mapping[str, Solution],
@@ -31,8 +32,10 @@ def write_files(
 
     Parameters
     ----------
-    config : Config
-        With a section [products.release].
+    block : ReleaseBlock
+        Its section [products.release].
+    chip : int
+        Number of the chip whose axes and zero point define the gauge.
     base : Path
         Folder that its files are relative to.
     folder : Path
@@ -48,12 +51,9 @@ def write_files(
     list of dict
         One entry for each file: path, kind, findings, and of an IDCTAB period and lost.
     """
-    block = config.products.release
-    assert block is not None
-    number = config.chips()[0].number  # its axes and zero point define the gauge
     calibrations = {
         filter: calibration_of(
-            reference_gauge(without_frames(solution), number), filter, filter=filter
+            reference_gauge(without_frames(solution), chip), filter, filter=filter
         )
         for filter, solution in solutions.items()
     }
@@ -62,7 +62,7 @@ def write_files(
     orientation = lay_on(
         first,
         read_calibration(base / block.reference),
-        chip=number,
+        chip=chip,
         epoch=None if time is None else time.epoch0[0],
         scale_arcsec=block.scale_arcsec,
     )

@@ -88,11 +88,11 @@ class FitData:
         return np.zeros(0) if table.epoch is None else np.unique(table.epoch)
 
     @cached_property
-    def median_epoch(self) -> float:
-        """Median date of the stars, decimal years; they have dates where the model drifts."""
-        table = self.placed if self.placed.in_memory else self.placed.sample(SAMPLE)
-        assert table.epoch is not None
-        return float(np.median(table.epoch))
+    def last_epoch(self) -> float:
+        """Latest date of the stars, decimal years; they have dates where the model drifts."""
+        if self.placed.in_memory:
+            return float(np.max(self.placed.column("epoch")))
+        return float(np.max(self.shards.groups.epoch))
 
     @cached_property
     def better_frames(self) -> FrameChoice | None:

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 from bayesdist.app.campaign.fit import fit_campaign
 from bayesdist.app.campaign.input_validation import refuse_campaign
 from bayesdist.app.campaign.inputs import read_campaign
-from bayesdist.app.campaign.matched import campaign_matches, load_matched_campaign
+from bayesdist.app.campaign.matched import load_matched_campaign
 from bayesdist.app.campaign.matching import match_lists
 from bayesdist.app.campaign.preview import campaign_lines
 from bayesdist.app.config import Config
@@ -27,7 +27,7 @@ from bayesdist.app.kinds.stars import (
 )
 from bayesdist.app.selfcal.fit import fit_selfcal, sample_detections
 from bayesdist.app.selfcal.inputs import read_selfcal, refuse_selfcal
-from bayesdist.app.selfcal.matched import load_matched_selfcal, selfcal_matches
+from bayesdist.app.selfcal.matched import load_matched_selfcal
 from bayesdist.app.selfcal.matching import match_dithers
 from bayesdist.app.selfcal.preview import selfcal_lines
 from bayesdist.app.selfcal.solved import read_solution, solved_of
@@ -51,7 +51,9 @@ class Sampler(Protocol):
 
 @dataclass(frozen=True)
 class Kind:
-    """Matched stars, a campaign, or a self-calibration; each takes configurations of its own type.
+    """Matched stars, a campaign, or a self-calibration.
+
+    Each takes configurations, inputs and matches of its own types.
 
     Parameters
     ----------
@@ -87,10 +89,10 @@ class Kind:
     read: Callable[[Any, Path], Any]
     refuse: Callable[[Any, Any, Path], None]
     match: Callable[[Any, Any, Path], Matched]
-    fit: Callable[[Matched, Config, Path, StarReader], Fitted]
+    fit: Callable[[Any, Any, Path, StarReader], Fitted]
     sample: Sampler
     load_matched: Callable[[Path, Any, Any, Path, Mapping[str, Any]], Matched]
-    load_fitted: Callable[[Path, Callable[[], Matched], Config, Mapping[str, Any]], Fitted]
+    load_fitted: Callable[[Path, Callable[[], Any], Any, Mapping[str, Any]], Fitted]
     lines: Callable[[Any, Any], Iterator[str] | None]
 
 
@@ -117,7 +119,7 @@ CAMPAIGN = Kind(
     read=read_campaign,
     refuse=lambda inputs, config, base: refuse_campaign(inputs),
     match=lambda inputs, config, base: match_lists(inputs),
-    fit=lambda matched, config, base, reader: fit_campaign(campaign_matches(matched)),
+    fit=lambda matched, config, base, reader: fit_campaign(matched),
     sample=sample_stars,
     load_matched=lambda folder, inputs, config, base, summary: load_matched_campaign(
         folder, inputs, summary
@@ -133,7 +135,7 @@ SELFCAL = Kind(
     read=read_selfcal,
     refuse=lambda inputs, config, base: refuse_selfcal(inputs),
     match=lambda inputs, config, base: match_dithers(inputs),
-    fit=lambda matched, config, base, reader: fit_selfcal(selfcal_matches(matched)),
+    fit=lambda matched, config, base, reader: fit_selfcal(matched),
     sample=sample_detections,
     load_matched=lambda folder, inputs, config, base, summary: load_matched_selfcal(
         folder, inputs, summary
@@ -141,7 +143,7 @@ SELFCAL = Kind(
     load_fitted=lambda folder, matched, config, summary: load_fitted(
         folder,
         summary,
-        solved=lambda model: solved_of(selfcal_matches(matched()), model, read_solution(folder)),
+        solved=lambda model: solved_of(matched(), model, read_solution(folder)),
     ),
     lines=lambda inputs, config: selfcal_lines(inputs),
 )

@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
+from bayesdist.app.kinds.exposures import ExposureScatter
 from bayesdist.app.tables.output import write_table
+from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_influence import StarErrors
+from bayesdist.infer.solution import Solution
 from bayesdist.model import LookupTable
 
 __all__ = ["Matched", "columns_by_code"]
@@ -72,6 +75,11 @@ class Matched:
         return self.stars.tangent_point
 
     @property
+    def mirrored(self) -> bool:
+        """Boolean: u has the sign opposite to the catalogue's."""
+        return self.facts.get("parity") == "mirrored"
+
+    @property
     def filter(self) -> str:
         """The one filter of the exposures; empty where it has no name."""
         return ""
@@ -96,6 +104,10 @@ class Matched:
         """Name of the file of the reference catalogue, or what it is."""
         return "catalogue" if self.catalogue is None else Path(self.catalogue.source).name
 
+    def of_order(self, order: int) -> Self:
+        """Matches to be fitted by polynomials of another order."""
+        return self
+
     def with_motions(self, table: Matches) -> Matches:
         """Matches with what the catalogue states of the motions of their stars."""
         if self.catalogue is None or table.star is None:
@@ -105,6 +117,10 @@ class Matched:
         if motions is None:
             return table
         return table.with_columns(**dict(zip(names, motions[table.star].T, strict=True)))
+
+    def aberration(self, scatter: ExposureScatter, solution: Solution) -> ScaleError | None:
+        """Error of the scale by velocity aberration, which is among the scatter; None for none."""
+        return None
 
     def overlap(self, posterior: Posterior, tables: tuple[LookupTable, ...]) -> OverlapTest | None:
         """Two exposures far apart in time laid on each other; None where none are known so."""

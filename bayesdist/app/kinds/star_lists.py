@@ -89,7 +89,7 @@ def lists_of(block: StarListsBlock, base: Path) -> StarLists:
 
     Each place is read alone: a list whose name stands in two is an exposure given twice, not two.
     """
-    names = block.lists if isinstance(block.lists, list) else [block.lists]
+    names = block.list_names
     lists = (one for name in names for one in read_star_lists(base / name, block.columns))
     return StarLists(tuple(lists), StarCuts(block.mag, block.saturation, block.q_max))
 

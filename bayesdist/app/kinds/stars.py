@@ -76,9 +76,8 @@ def read_stars(config: MatchesConfig, base: Path) -> Matches:
     InputError
         For a configuration that names none, and for files that cannot be read.
     """
-    data, names = config.data, config.data.matches
-    path = base / names if isinstance(names, str) else [base / name for name in names]
-    return read_configured(path, data, size=config.detector.size, chips=config.chip)
+    data = config.data
+    return read_configured(data.paths(base), data, size=config.detector.size, chips=config.chip)
 
 
 def model_of(stars: Matches, config: Config) -> DistortionModel:

@@ -212,15 +212,15 @@ def _pattern(block: PatternBlock, side: float, seed: int) -> DitherPattern:
         step = block.grid.step
         pair = step if isinstance(step, tuple) else (step, step)
         round_ = unit * grid_offsets(block.grid.n, pair)
-    else:
-        assert block.scales is not None
-        assert block.exposures is not None
+    elif block.scales is not None and block.exposures is not None:
         # the same offsets for patterns that differ in their rolls alone
         rng = np.random.default_rng([seed, 2])
         low, high = block.scales.least, block.scales.largest
         round_, _ = dither_pattern(
             block.exposures, (side, side), [0.0], rng, least=low, largest=high
         )
+    else:
+        raise ValueError(f"pattern {block.name!r} has no offsets, grid or scales; give one")
     n = block.exposures or len(round_) * len(own)
     return _against_first(block.name, round_, rolls_in_turn(n, len(round_), own))
 

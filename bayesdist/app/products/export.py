@@ -41,10 +41,12 @@ def export_files(
     `budget`.  Each entry has path, kind, findings, and what else is known of the file.
     """
     products: list[dict[str, Any]] = []
-    if config.products.release is not None:
+    release = config.products.release
+    if release is not None:
         held = config.tables.detector is not None
         tables = published_tables(fitted.tables, held=held)
-        products += write_files(config, base, folder, {product.filter: product.solution}, tables)
+        number, solutions = config.chips()[0].number, {product.filter: product.solution}
+        products += write_files(release, number, base, folder, solutions, tables)
     for files in made_files(product, config).values():
         for built in files:
             path = folder / built.file_name

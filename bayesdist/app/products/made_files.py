@@ -18,7 +18,14 @@ from bayesdist.model import LookupTable
 from bayesdist.products.formats.common.document import BuildOptions, Built
 from bayesdist.products.registry import build
 
-__all__ = ["ProductInput", "made_files", "product_input", "product_of", "solution_of"]
+__all__ = [
+    "ProductInput",
+    "ingredients",
+    "made_files",
+    "product_input",
+    "product_of",
+    "solution_of",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +69,12 @@ class ProductInput:
 
 
 def product_input(solution: Solution, data: FitData, config: Config, source: str) -> ProductInput:
-    """Ingredients of the files of a solution; they say that it is from `source`."""
+    """Ingredients of the files of a solution; they say that it is from `source`, or a detector."""
     mas, fitted, model = config.detector.scale_mas, data.fitted, data.model
     several = model.frames != "none" and len(model.exposures) > 1
     return ProductInput(
         solution,
-        source,
+        source or config.detector.name or "solution",
         config.detector.name,
         assessment_epoch(data, config),
         None if mas is None else mas / 1000,
@@ -92,26 +99,25 @@ def product_of(
     posterior: Posterior, found: Diagnostics | None, data: FitData, config: Config, source: str
 ) -> ProductInput:
     """Ingredients of the files of a posterior with all errors of the parameters."""
-    source = source or config.detector.name or "solution"
     return product_input(solution_of(posterior, found, data.fitted), data, config, source)
 
 
 def made_files(product: ProductInput, config: Config) -> dict[str, tuple[Built, ...]]:
     """Files by the key of their format."""
-    calibration = _calibration(product)
-    options = BuildOptions(product.epoch, product.scale_arcsec)
+    calibration, options = ingredients(product)
     return {
         key: build(key, calibration, settings, options)
         for key, settings in config.products.asked().items()
     }
 
 
-def _calibration(product: ProductInput) -> Calibration:
-    """The calibration that the files hold, with what they have to say of the run it is from."""
+def ingredients(product: ProductInput) -> tuple[Calibration, BuildOptions]:
+    """The calibration that the files hold, with what they say of its run; and their options."""
     point, plane = product.tangent_point, Plane()
     if point is not None:
         # for which exposure a file is right on the sky, where they differ
         note = f"On the sky it is exposure {product.exposure}: others have frames of their own."
         plane = Plane("sky", point=point, note=note if product.exposure else "")
     found = calibration_of(product.solution, product.source, plane=plane, detector=product.detector)
-    return replace(found, notes=(product.gauge,) if product.gauge else ())
+    found = replace(found, notes=(product.gauge,) if product.gauge else ())
+    return found, BuildOptions(product.epoch, product.scale_arcsec, product.tables)

@@ -1,15 +1,16 @@
 """Differences of the files of a run from its solution, read back from the files as written.
 
-A SIP header holds one chip at one date: drift is left out at any other, look-up tables always.  An
-IDCTAB lies along axes of its own and counts in its own pixels: the best shift, rotation and, once
-for all dates, scale are taken out; of a released set the look-up tables are applied as well.  An
-inverse is compared with the forward terms of its own file, between which a user goes to and fro.
+What a file says of positions its format knows (`read_back`).  A SIP header holds one chip at one
+date: drift is left out at any other, look-up tables always.  An IDCTAB lies along axes of its own
+and counts in its own pixels: the best shift, rotation and, once for all dates, scale are taken out;
+of a released set the look-up tables are applied as well.  An inverse is compared with the forward
+terms of its own file, between which a user goes to and fro.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
+from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.exposures.release_files import write_files
-from bayesdist.app.products.file_positions import sip_positions
-from bayesdist.app.products.made_files import ProductInput, made_files
+from bayesdist.app.products.made_files import ProductInput, ingredients, made_files
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import MEASURED, PRODUCT, Known, Row
 from bayesdist.calibration.calibration import Calibration
@@ -28,19 +29,15 @@ from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import BayesdistError
 from bayesdist.model import corrected
 from bayesdist.model.grid import grid_pixels, mesh
-from bayesdist.products import SipHeader, read_d2im, read_lookup_file
-from bayesdist.products.formats.common.content import Content
-from bayesdist.products.formats.common.document import Built
-from bayesdist.products.formats.sip.read import sip_of
-from bayesdist.products.formats.wise.meta import bands_of
-from bayesdist.products.registry import read_calibration, recognized
+from bayesdist.products import read_d2im, read_lookup_file
+from bayesdist.products.formats.common.read_back import Positions, ReadBack, by_calibrations
+from bayesdist.products.registry import read_back, read_calibration
 
 __all__ = ["file_errors", "product_terms"]
 
 log = logging.getLogger("bayesdist")
 
 Float = NDArray[np.float64]
-Positions = Callable[[Float, Float, int, float | None], Float]
 
 FORWARD, INVERSE = "forward", "inverse"
 GRID = (33, 33)  # points over which files are laid on the solution
@@ -54,23 +51,18 @@ def product_terms(product: ProductInput, config: Config, base: Path) -> tuple[Kn
     They are read back from their bytes, so that digits and orders are those of the files; nothing
     of the run is touched.
     """
-    release, made = config.products.release, made_files(product, config)
-    out: list[Known] = []
-    if "sip" in made:
-        headers = {one.chip: sip_of(_content(one)) for one in made["sip"] if one.chip is not None}
-        out += _sip_terms(product, ", ".join(one.file_name for one in made["sip"]), headers)
-    for one in made.get("idctab", ()):
-        of_file = recognized(_content(one)).calibration()
-        out += _idctab_terms(product, one.file_name, [of_file])
-    for one in made.get("wise_meta", ()):
-        [band] = bands_of(_content(one))
-        chip = product.solution.model.chips[0].number
-        out += _sip_terms(product, one.file_name, {chip: band.sip}, like=one.made)
-    if release is not None:
-        with TemporaryDirectory() as folder:
-            sets = _released(product, config, base, Path(folder))
-            out += _idctab_terms(product, release.name, sets)
-    return tuple(out)
+    calibration, options = ingredients(product)
+    found: list[ReadBack] = []
+    for key, files in made_files(product, config).items():
+        found += read_back(key, files, calibration, options)
+    release = config.products.release
+    if release is None:
+        return tuple(_terms(product, found))
+    with TemporaryDirectory() as folder:
+        number = config.chips()[0].number
+        sets = _released(product, release, number, base, Path(folder))
+        found.append(by_calibrations(release.name, sets, product.solution.model.time))
+        return tuple(_terms(product, found))
 
 
 def file_errors(product: ProductInput, config: Config, base: Path) -> tuple[Known, ...]:
@@ -82,70 +74,28 @@ def file_errors(product: ProductInput, config: Config, base: Path) -> tuple[Know
         return ()
 
 
-def _content(built: Built) -> Content:
-    return Content(built.file_name, built.content)
+def _terms(product: ProductInput, files: Sequence[ReadBack]) -> Iterator[Known]:
+    """Forward terms against the solution, and the inverse where a file has one."""
+    for one in files:
+        yield _term(product, one.file, FORWARD, _forward(product, one))
+        if one.missed is not None:
+            yield _term(product, one.file, INVERSE, _in_unit(product, one.missed))
 
 
-def _sip_terms(
-    product: ProductInput,
-    file: str,
-    headers: Mapping[int, SipHeader],
-    like: SipHeader | None = None,
-) -> list[Known]:
-    """Forward and inverse of one header for each chip."""
-    unit, scale = product.solution.model.unit, product.scale_arcsec
-    point = product.tangent_point if like is None else None  # WISE's entries have no CRVAL
-
-    def place(x: Float, y: Float, chip: int, _: float | None) -> Float:
-        return sip_positions(
-            headers[chip], x, y, unit=unit, scale_arcsec=scale, like=like, tangent_point=point
-        )
-
-    def missed(x: Float, y: Float, chip: int, _: float | None) -> Float:
-        sip = headers[chip]
-        back_x, back_y = sip.inverse(*sip.forward(x, y))
-        return np.stack([back_x - x, back_y - y], axis=-1)
-
-    rotates = product.aligned
-    turned = _Laid(product, place, scaled=False) if rotates else None
-    forward = turned or (lambda x, y, c, t: place(x, y, c, t) - _solution(product, x, y, c, t))
-    return [
-        _term(product, file, FORWARD, forward),
-        _term(product, file, INVERSE, _in_unit(product, missed)),
-    ]
+def _forward(product: ProductInput, file: ReadBack) -> Positions:
+    """Positions by a file less those of the solution, as its user sees them."""
+    if file.own_axes or product.aligned:
+        return _Laid(product, file.forward, scaled=file.own_axes)
+    return lambda x, y, c, t: file.forward(x, y, c, t) - _solution(product, x, y, c, t)
 
 
-def _idctab_terms(product: ProductInput, file: str, sets: Sequence[Calibration]) -> list[Known]:
-    """Forward, and inverse where there are such rows; one set for each segment of the drift."""
-    time = product.solution.model.time
-
-    def of(epoch: float | None) -> Calibration:
-        if time is None or epoch is None or len(sets) == 1:
-            return sets[0]
-        return sets[int(np.searchsorted(time.breaks, epoch, side="right"))]
-
-    def place(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
-        # a table without drift would refuse a date
-        return of(epoch).forward(x, y, chip=chip, epoch=None if time is None else epoch)
-
-    def missed(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
-        one = of(epoch)
-        about_zero = one.at(origin="chip")[chip]  # at the reference date, for which the rows are
-        back = one.inverses[chip].pixels(*about_zero.at(x, y))
-        return np.stack([back[0] - x, back[1] - y], axis=-1)
-
-    out = [_term(product, file, FORWARD, _Laid(product, place, scaled=True))]
-    if all(one.inverses for one in sets):
-        out.append(_term(product, file, INVERSE, _in_unit(product, missed)))
-    return out
-
-
-def _released(product: ProductInput, config: Config, base: Path, folder: Path) -> list[Calibration]:
+def _released(
+    product: ProductInput, block: ReleaseBlock, number: int, base: Path, folder: Path
+) -> list[Calibration]:
     """The files of a release, one set for each segment: of several periods of one, the first."""
-    block, filter = config.products.release, product.filter
-    assert block is not None
+    filter = product.filter
     solutions = {filter: product.solution}
-    entries = write_files(config, base, folder, solutions, product.tables)
+    entries = write_files(block, number, base, folder, solutions, product.tables)
     paths = {e["kind"]: folder / e["path"] for e in entries}
     before = read_d2im(paths["D2IMFILE"]) if "D2IMFILE" in paths else ()
     npol = read_lookup_file(paths["NPOLFILE"]) if "NPOLFILE" in paths else None

@@ -13,12 +13,12 @@ from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from bayesdist.app.products.file_positions import sky_of_header
 from bayesdist.app.products.made_files import ProductInput
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky.tangent import sky_of_plane
 from bayesdist.diagnose.residuals.sample import StarSample
 from bayesdist.limits import SKY_CLOSURE
+from bayesdist.products.formats.sip.positions import sky_of_header
 
 __all__ = ["SkyClosure", "sky_closure"]
 

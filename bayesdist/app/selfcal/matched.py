@@ -17,13 +17,12 @@ from bayesdist.app.selfcal.inputs import Inputs
 from bayesdist.app.selfcal.matches import matches_of
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
-from bayesdist.errors import InputError
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal.elimination import Mixture
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import DistortionModel
 
-__all__ = ["SelfcalMatched", "load_matched_selfcal", "selfcal_matched", "selfcal_matches"]
+__all__ = ["SelfcalMatched", "load_matched_selfcal", "selfcal_matched"]
 
 Float = NDArray[np.float64]
 
@@ -81,19 +80,6 @@ class SelfcalMatched(Matched):
         arrays["model"] = np.frombuffer(text.encode(), np.uint8)
         write_arrays(folder / DETECTIONS, "", arrays)
         super().save(folder)
-
-
-def selfcal_matches(matched: Matched) -> SelfcalMatched:
-    """Matches that are detections of a self-calibration.
-
-    Raises
-    ------
-    InputError
-        For others.
-    """
-    if not isinstance(matched, SelfcalMatched):
-        raise InputError("are no detections of a self-calibration", do="give such a run")
-    return matched
 
 
 def load_matched_selfcal(

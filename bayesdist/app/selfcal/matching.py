@@ -136,7 +136,7 @@ def exposure_table(found: SelfCalibration, inputs: Inputs) -> Table:
     """One row for each exposure: its detections, those in common with others, rms, and its frame.
 
     'overlapping' are detections that lie where other exposures look, 'common' those of them that
-    are of a common star, 'share_common' is that fraction; rms in pixels.
+    are of a common star, 'fraction_common' is that fraction; rms in pixels.
     """
     s, d = found.mode, found.detections
     p, model, E = s.problem, s.problem.model, len(d.exposure_names)
@@ -160,7 +160,7 @@ def exposure_table(found: SelfCalibration, inputs: Inputs) -> Table:
         "detections": total,
         "overlapping": overlap,
         "common": common,
-        "share_common": common / np.maximum(overlap, 1),
+        "fraction_common": common / np.maximum(overlap, 1),
         "rms": rms,
         "shift_u": [shift[0] for _, shift in frames],
         "shift_v": [shift[1] for _, shift in frames],
@@ -179,7 +179,7 @@ def refuse_unconnected(table: Table) -> None:
     InputError
         Naming it, and whether it lies half a turn from the others.
     """
-    share = np.asarray(table["share_common"], float)
+    share = np.asarray(table["fraction_common"], float)
     if len(share) < 3:  # of two nobody knows which one is wrong
         return
     usual = np.array([np.nanmedian(np.delete(share, k)) for k in range(len(share))])
@@ -223,7 +223,7 @@ def matching_facts(found: SelfCalibration, inputs: Inputs) -> dict[str, Any]:
         "n_ambiguous": friends.n_ambiguous,
         "n_doubled": friends.n_doubled,
         "n_chains": friends.n_chains,
-        "rounds": found.iterations,
+        "iterations": found.iterations,
         "match_radius": p.match_radius,
         "tangent_planes_pix": _moved(d, inputs.detections),
         "detections": {

@@ -14,6 +14,7 @@ from bayesdist.app.selfcal.gauge import fixed_by, gauge_table, gauge_words
 from bayesdist.app.selfcal.matched import SelfcalMatched
 from bayesdist.app.selfcal.matches import matches_of
 from bayesdist.app.tables.output import write_table
+from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matches import Matches
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal import Gauge, SelfCalibrationMode
@@ -48,6 +49,8 @@ class SelfCalibrated:
         From which the solution is made again.
     contradictions : tuple of str
         Where what is known beside the detections does not go with them, as sentences.
+    references : ReferenceCatalog or None
+        Stars that a catalogue has, too.
     """
 
     mode: SelfCalibrationMode
@@ -56,6 +59,7 @@ class SelfCalibrated:
     matches: Matches
     arrays: Mapping[str, NDArray[Any]]
     contradictions: tuple[str, ...] = ()
+    references: ReferenceCatalog | None = None
 
     @property
     def gauge_words(self) -> str:
@@ -127,4 +131,5 @@ def solved_of(
         matches_of(problem, places, matched.detections, inputs, matched.unused),
         arrays,
         tuple(known.contradictions(theta)),
+        inputs.catalog,
     )

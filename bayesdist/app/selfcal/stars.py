@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from bayesdist.app.assessment.checks import provenance_notes
 from bayesdist.app.kinds.fitted import required
 from bayesdist.app.results import Results
-from bayesdist.app.selfcal.matched import selfcal_matches
 from bayesdist.app.tables.output import write_table
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.storage.write import write_columns
@@ -41,7 +40,7 @@ def write_stars(results: Results) -> dict[str, Any]:
         For summary.json.
     """
     solved = required(results.fitted.solved, "solution of detections")
-    solution, references = solved.mode, selfcal_matches(results.matched).inputs.catalog
+    solution, references = solved.mode, solved.references
     correlated = results.diagnostics.correlated
     cov = None if correlated is None else correlated.covariance
     found = star_catalogue(solution, cov)

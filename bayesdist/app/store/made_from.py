@@ -8,7 +8,6 @@ from typing import Any
 
 from bayesdist.app.config import Config
 from bayesdist.app.store import Adjustable, Made, Stage, as_json, differences
-from bayesdist.app.store.named_files import files_of_products
 from bayesdist.version import __version__
 
 __all__ = [
@@ -29,7 +28,7 @@ STAGES = {
     "fit": Stage(),
     "sample": Stage(checkpoints=("chain-*.h5",)),
     "diagnose": Stage(),
-    "evaluate": Stage(),
+    "evaluate": Stage(revision=2),
     "export": Stage(),
     "report": Stage(),
 }
@@ -81,7 +80,7 @@ def made_from_of(
     solution, limits, later = settings_of(config)
     own = [as_json(vars(one)) for one in config.requirements()]
     later["requirement"] = facts.get("requirements", own)
-    of_products = {str(one) for one in files_of_products(config, Path(facts["base"]))}
+    of_products = {str(one) for one in config.files_of_products(Path(facts["base"]))}
     inputs = {k: v for k, v in facts["inputs"].items() if k not in of_products}
     if stage in ("match", "fit"):
         return solution, {"inputs": inputs}, *before.values()
@@ -102,6 +101,7 @@ def _of_diagnoses(later: Mapping[str, Any], own: list[Any], config: Config) -> d
         found["requirement"] = own  # the tightest limit is the tolerance of periods
     if config.holdout is not None:  # what is held out is predicted with all errors of a position
         found |= {key: later[key] for key in ("assess", "budget")}
+        found["useafter"] = config.products.useafter_years()  # which may be the epoch of assess
     return found
 
 

@@ -22,7 +22,7 @@ from bayesdist.version import __version__
 __all__ = ["SCHEMA", "Artefact", "FileMark", "Record", "as_json", "versions", "write_json"]
 
 SCHEMA = 2
-PACKAGES = ("arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
+PACKAGES = ("arviz-stats", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
 
 
 def as_json(value: Any) -> Any:
@@ -152,6 +152,13 @@ class Record:
             where=str(path),
             do="use that version, or choose another folder",
         )
+
+    def begins_file(self, name: str) -> bool:
+        """Note that the stage under way writes a file; False where that is known."""
+        if self.under_way is None or name in self.under_way["files"]:
+            return False
+        self.under_way["files"] = sorted([*self.under_way["files"], name])
+        return True
 
     def write(self, path: Path) -> None:
         """Replace run.json."""

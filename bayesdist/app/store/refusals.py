@@ -9,7 +9,6 @@ from typing import Any
 from bayesdist.app.config import Config, load_config, load_text, parse_config
 from bayesdist.app.store.keys import shown
 from bayesdist.app.store.made_from import changes, is_adjustable, with_seed
-from bayesdist.app.store.named_files import files_of_products, named_files
 from bayesdist.errors import InputError
 from bayesdist.files import is_leftover
 
@@ -24,7 +23,7 @@ __all__ = [
 
 def refuse_inside_input(folder: Path, config: Config, base: Path) -> None:
     """Refuse a run whose own Parquet files would become part of its input."""
-    named = named_files(config, base)
+    named = config.named_files(base)
     for path in named if isinstance(named, list) else [named]:
         if path.is_dir() and folder.resolve().is_relative_to(path.resolve()):
             raise InputError(
@@ -82,8 +81,8 @@ def refuse_another_solution(
                 where=str(path),
                 do="resume with the old value, or start again with --force",
             )
-    of_products = {str(one) for one in files_of_products(config, base.resolve())}
-    of_products |= {str(one) for one in files_of_products(known, Path(record["base"]))}
+    of_products = {str(one) for one in config.files_of_products(base.resolve())}
+    of_products |= {str(one) for one in known.files_of_products(Path(record["base"]))}
     refuse_other_inputs(record["inputs"], inputs, but=of_products)
 
 

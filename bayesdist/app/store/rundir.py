@@ -15,7 +15,6 @@ from bayesdist.app.config import (
 )
 from bayesdist.app.store import Made, Record, RunStore, as_json, versions
 from bayesdist.app.store.made_from import STAGES, changes, made_from_of, with_seed
-from bayesdist.app.store.named_files import files_of_products, named_files
 from bayesdist.app.store.refusals import (
     refuse_another_solution,
     refuse_edited,
@@ -330,5 +329,5 @@ class RunDirectory(RunStore):
 
 def _hashes(config: Config, base: Path) -> dict[str, str]:
     """SHA-256 of every file that the configuration names, by its absolute path."""
-    named, others = named_files(config, base.resolve()), files_of_products(config, base.resolve())
+    named, others = config.named_files(base.resolve()), config.files_of_products(base.resolve())
     return {str(f): sha256_of(f) for f in [*input_files(named), *others]}

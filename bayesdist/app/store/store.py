@@ -307,9 +307,7 @@ class RunStore:
                 return
             self._written.add(name)
             record = self.record
-            assert record.under_way is not None
-            if name not in record.under_way["files"]:
-                record.under_way["files"] = sorted([*record.under_way["files"], name])
+            if record.begins_file(name):
                 record.write(self.path / RECORD)
 
         self._making = stage

@@ -12,7 +12,6 @@ from bayesdist.app.summary.rows import (
     BudgetRow,
     CoverageRow,
     HoldoutTest,
-    HorizonRow,
     MapRow,
     MarginRow,
     MeanAndSd,
@@ -22,6 +21,7 @@ from bayesdist.app.summary.rows import (
     ProductRow,
     ScoreTestRow,
     StructureRow,
+    ValidityRow,
 )
 
 __all__ = ["Summary", "head_of", "schema_text"]
@@ -132,6 +132,13 @@ class Periods(Part):
     first_vs_last: dict[str, Any]
 
 
+class Verdict(Part):
+    """The worst of all checks, requirements and validity periods, in words."""
+
+    level: Literal["pass", "warn", "fail"]
+    headline: str
+
+
 class Summary(Part):
     """Content of summary.json: what the stages that have ended found."""
 
@@ -156,10 +163,11 @@ class Summary(Part):
     budget: list[BudgetRow] | None = None
     misfit: Misfit | None = None
     margins: list[MarginRow] | None = None
-    horizons: list[HorizonRow] | None = None
+    validity_periods: list[ValidityRow] | None = None
     warnings: list[str] | None = None
     products: list[ProductRow] | None = None
     figures: list[str] | None = None
+    verdict: Verdict | None = Field(None, description="headline of the report")
 
 
 def head_of(facts: Mapping[str, Any]) -> dict[str, Any]:

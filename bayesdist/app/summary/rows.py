@@ -10,7 +10,6 @@ __all__ = [
     "BudgetRow",
     "CoverageRow",
     "HoldoutTest",
-    "HorizonRow",
     "MapRow",
     "MarginRow",
     "MeanAndSd",
@@ -19,6 +18,7 @@ __all__ = [
     "ProductRow",
     "ScoreTestRow",
     "StructureRow",
+    "ValidityRow",
 ]
 
 Number = float | None  # null where it is not finite, or not known
@@ -43,7 +43,10 @@ class MapRow(Part):
     chip: int
     sigma_u_max: Number
     sigma_v_max: Number
-    radius_max: Number = Field(description="largest of the joint error ellipse")
+    sigma_max: Number = Field(None, description="largest per axis: rms of sigma_u and sigma_v")
+    ce68_max: Number = Field(None, description="largest radius of a circle that holds 68 %")
+    ce95_max: Number = Field(None, description="largest radius of a circle that holds 95 %")
+    radius_max: Number = Field(description="largest hypot(sigma_u, sigma_v)")
     position_of_max: list[float] = Field(description="x and y, pixels")
     radius_max_least_squares: Number
     radius_max_relative: Number = Field(None, description="of relative positions, with a gauge")
@@ -162,7 +165,7 @@ class MarginRow(Part):
     remedy: str | None
 
 
-class HorizonRow(Part):
+class ValidityRow(Part):
     """Until when a requirement is met."""
 
     name: str

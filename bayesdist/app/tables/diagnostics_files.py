@@ -103,6 +103,7 @@ def _load_catalogue(run: RunDirectory, fingerprint: str) -> StarCovariance | Non
 def _row(test: ScoreTest) -> dict[str, Any]:
     """A test as a row of summary.json."""
     row = asdict(test)
+    del row["held_by"]
     # JSON has no infinity: what no effect can show has no smallest size
     return row | {"smallest": test.smallest if np.isfinite(test.smallest) else None}
 

@@ -86,8 +86,8 @@ def save_margins(
 def load_evaluation(run: RunDirectory, fit: LinearFit, posterior: Posterior) -> Evaluation:
     """The evaluation of a fit and a posterior; InputError where there is none of just these."""
     again = f"run 'bayesdist stage evaluate {run.path}' again"
-    found = record_from_arrays(read_arrays(run / FILE, fingerprint_of(fit, posterior), do=again))
-    assert isinstance(found, Evaluation)
+    arrays = read_arrays(run / FILE, fingerprint_of(fit, posterior), do=again)
+    found: Evaluation = record_from_arrays(arrays)
     return found
 
 
@@ -118,8 +118,8 @@ def _write_margins(
     table = margin_table(margins, several=len(posterior.model.chips) > 1)
     table.meta = dict(head)
     write_table(table, run / "margins.ecsv")
-    _write_validity(run / "horizon.ecsv", validity)
-    run.summarise(margins=margin_rows(margins), horizons=validity_rows(validity))
+    _write_validity(run / "validity_periods.ecsv", validity)
+    run.summarise(margins=margin_rows(margins), validity_periods=validity_rows(validity))
 
 
 def _write_validity(path: Path, validity: Sequence[ValidityPeriod]) -> None:
@@ -166,6 +166,9 @@ def _map_summary(found: Evaluation) -> dict[str, Any]:
             "chip": m.chip,
             "sigma_u_max": m.sigma_u_max,
             "sigma_v_max": m.sigma_v_max,
+            "sigma_max": float(m.per_axis.max()),
+            "ce68_max": float(m.circular_error(0.68).max()),
+            "ce95_max": float(m.circular_error(0.95).max()),
             "radius_max": m.radius_max,
             "position_of_max": list(m.position_of_max),
             "radius_max_least_squares": least_squares.radius_max,
@@ -175,7 +178,10 @@ def _map_summary(found: Evaluation) -> dict[str, Any]:
     for chip, one in zip(chips, found.relative, strict=bool(found.relative)):
         chip["radius_max_relative"] = one.radius_max
     worst = max(chips, key=lambda c: c["radius_max"])
-    largest = ("sigma_u_max", "sigma_v_max", "radius_max_least_squares", "radius_max_relative")
+    largest = (
+        *("sigma_u_max", "sigma_v_max", "ce68_max", "ce95_max"),
+        *("radius_max_least_squares", "radius_max_relative"),
+    )
     return {
         "unit": found.maps[0].unit,
         "epoch": found.maps[0].epoch,

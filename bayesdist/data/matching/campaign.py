@@ -86,7 +86,7 @@ class CampaignMatches:
             rows[name] = [getattr(one, name) for one in self.reports]
         for reason in reasons:
             rows[reason] = [one.rejected.get(reason, 0) for one in self.reports]
-        for name in ("matched", "expected", "completeness", "false_rate", "false_share"):
+        for name in ("matched", "expected", "completeness", "false_rate", "false_fraction"):
             rows[name] = [getattr(one, name) for one in self.reports]
         for chip in chips:
             rows[f"chip {chip}"] = [one.per_chip.get(chip, 0) for one in self.reports]

@@ -108,11 +108,11 @@ def match_exposure(
     false_rate = _false_rate(pairs, rho, reference, _DISPLACEMENT * largest)
     # matched = true + rate (all - true)
     true = max((len(index) - false_rate * len(points)) / (1.0 - min(false_rate, 0.99)), 0.0)
-    false_share = float(np.clip(1.0 - true / len(index), 0.0, 1.0))
-    if radius is None and false_share > _MAX_FALSE_FRACTION:
+    false_fraction = float(np.clip(1.0 - true / len(index), 0.0, 1.0))
+    if radius is None and false_fraction > _MAX_FALSE_FRACTION:
         raise InputError(
-            f"of {len(index)} pairs with {catalog.source} {false_share:.0%} are there by chance: "
-            "they do not crowd near zero distance",
+            f"of {len(index)} pairs with {catalog.source} {false_fraction:.0%} are there by "
+            "chance: they do not crowd near zero distance",
             where=source,
             do="give a better known distortion, or a search radius",
         )
@@ -143,7 +143,7 @@ def match_exposure(
         expected=int(expected.sum()),
         completeness=matched / max(int(expected.sum()), 1),
         false_rate=false_rate,
-        false_share=false_share,
+        false_fraction=false_fraction,
         rotation=float(np.degrees(np.angle(turn)) % 360.0),
         scale=float(abs(turn)),
         offset=(float(centre[0]), float(centre[1])),

@@ -62,7 +62,7 @@ class ExposureReport:
         Part of `expected` that is matched.
     false_rate : float
         Probability that a detection without counterpart in the catalogue is matched by chance.
-    false_share : float
+    false_fraction : float
         Part of the matches that are expected to be false for that reason.
     rotation : float
         From the start's positions to the catalogue, degrees anticlockwise, in [0, 360).
@@ -91,7 +91,7 @@ class ExposureReport:
     expected: int
     completeness: float
     false_rate: float
-    false_share: float
+    false_fraction: float
     rotation: float
     scale: float
     offset: tuple[float, float]
@@ -214,7 +214,7 @@ def match_warnings(
     if len(reports) < _MIN_EXPOSURES:
         return out
     completeness = np.array([one.completeness for one in reports])
-    false = np.array([one.false_share for one in reports])
+    false = np.array([one.false_fraction for one in reports])
     factor = log.select(names=[one.exposure for one in reports])
     whole = np.array([not one.missing_chips and not one.astray for one in reports])
     scale = np.array(

@@ -16,8 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import Matches
-from bayesdist.diagnose.holdout.predictions import Prediction, groups_of, noise_of, predictions
-from bayesdist.diagnose.holdout.predictive import Predictive, scores_of
+from bayesdist.diagnose.holdout.predictive import (
+    Prediction,
+    Predictive,
+    groups_of,
+    noise_of,
+    predictions,
+    scores_of,
+)
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import RIGID, frame_names, nearest_frame
 

@@ -9,22 +9,28 @@ more is known: how exposures scatter, and which part of s is an error of the sta
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from bayesdist.data.matches import Matches
 from bayesdist.infer.catalogue.star_influence import StarInfluence
 from bayesdist.infer.posterior import Posterior
-from bayesdist.model import DistortionModel, LookupTable
+from bayesdist.infer.stars.stars import errors_of
+from bayesdist.model import DistortionModel, Groups, LookupTable
 
 __all__ = [
     "ExposureDeviations",
+    "Prediction",
     "Predictive",
     "Scores",
+    "groups_of",
     "marginals_of",
+    "noise_of",
+    "predictions",
     "predictive_of",
     "scores_of",
     "uniforms_of",
@@ -34,6 +40,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 NEVER = 1e-300
+AT_ONCE = 2**14  # stars
 SCALES = np.geomspace(0.5, 4.0, 13)  # of the errors, at which scores are taken
 
 
@@ -238,3 +245,54 @@ def _radial(first: Float, second: Float) -> Float:
     """Probability of a smaller sum of squares of the normal variables of two uniform ones."""
     z = ndtri(np.clip(np.stack([first, second]), 1e-300, 1 - 1e-16))
     return np.asarray(-np.expm1(-0.5 * (z**2).sum(axis=0)))
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Stars of one group, or some of them, against a model."""
+
+    index: Int  # rows (n,) of their table
+    residual: Float  # data minus prediction (n, 2)
+    columns: Int  # parameters (m,) that the prediction depends on
+    jacobian: Float  # derivatives (n, 2, m) of the prediction by these
+    frame: Float  # linear part (2, 2) of the exposure's frame
+
+
+def predictions(
+    model: DistortionModel, theta: Float, table: Matches, rows: Int, exposure: Int | int | None
+) -> Iterator[Prediction]:
+    """Iterator over some rows (n,) of a table, by chip, date and code of the exposure."""
+    groups = groups_of(model, table, rows, exposure)
+    effective = model.effective(theta, groups)
+    jacobians = model.effective_jacobian(theta, groups)
+    data = np.stack([table.u, table.v], axis=1)
+    for g, members in enumerate(groups.members()):
+        columns, d = jacobians[g]
+        basis = model.basis(model.chips[groups.chip[g]].number)
+        frame = np.asarray(model.frame(theta, int(groups.exposure[g]))[0])
+        for start in range(0, len(members), AT_ONCE):
+            index = rows[members[start : start + AT_ONCE]]
+            phi = basis.evaluate(table.x[index], table.y[index])
+            jacobian = np.einsum("nk,akm->nam", phi, d)
+            yield Prediction(index, data[index] - phi @ effective[g].T, columns, jacobian, frame)
+
+
+def groups_of(
+    model: DistortionModel, table: Matches, rows: Int, exposure: Int | int | None
+) -> Groups:
+    """Groups of some rows (n,) of a table, of exposures with these codes."""
+    return model.groups(
+        len(rows),
+        epoch=None if table.epoch is None else table.epoch[rows],
+        exposure=exposure,
+        chip=table.chip_number[rows],
+    )
+
+
+def noise_of(predictive: Predictive, table: Matches, index: Int) -> Float:
+    """uu, vv and uv (n, 3) of the errors of stars without those of the solution's parameters."""
+    var = np.stack(errors_of(table), axis=1)[index] ** 2 + predictive.jitter2
+    if predictive.local and not predictive.local_in_noise:
+        place = (table.x[index], table.y[index], table.chip_number[index])
+        var = var + predictive.local_variance(*place)[:, None]
+    return np.column_stack([var, np.zeros(len(var))])

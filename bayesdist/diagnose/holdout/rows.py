@@ -18,8 +18,11 @@ from numpy.typing import NDArray
 
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.frames import Frame, framed
-from bayesdist.diagnose.holdout.predictions import noise_of, predictions
-from bayesdist.diagnose.holdout.predictive import Predictive
+from bayesdist.diagnose.holdout.predictive import (
+    Predictive,
+    noise_of,
+    predictions,
+)
 
 __all__ = ["HeldRows", "predicted_rows"]
 

@@ -7,28 +7,30 @@ those of the mixture, whose covariances are carried through (the scores are the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betainc, erf
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from bayesdist.diagnose.holdout.bins import ALL, Partition
+from bayesdist.diagnose.holdout.frames import Frame
 from bayesdist.diagnose.holdout.grouped import ScaleSums
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.sums import LEVELS, PIT_BINS, STEP, TAILS, BinSums, HeldSums
 from bayesdist.diagnose.significance import clopper_pearson, hotelling_p
 from bayesdist.limits import HELD_OUT_DISTRIBUTION, HELD_OUT_RATIO, HELD_OUT_TAILS
 
-__all__ = ["AXIS", "AxisCoverage", "HeldTest", "all_tests", "axis_coverage"]
+__all__ = ["AXIS", "AxisCoverage", "HeldTest", "all_tests", "axis_coverage", "deviation_tests"]
 
 Float = NDArray[np.float64]
 
 AXIS = "axis"  # a part: the stars along one axis
 
 INTERVAL = 0.95  # of fractions
+MIN_INFORMATION = 0.5  # fraction of a deviation's prior variance that stars take off, to be tested
 MIN_STARS = 20  # of a bin that is judged by itself
 STARS_PER_PIT_BIN = 20
 SINGULAR = 0.05  # of a variance: what is left where frames have taken up nearly all
@@ -250,3 +252,42 @@ def _at_least(k: float, n: float, share: Float) -> Float:
 def _at_most(k: float, n: float, share: Float) -> Float:
     """Probability of k or fewer of n."""
     return np.asarray(1 - betainc(k + 1, n - k, share)) if k < n else np.ones_like(share)
+
+
+def deviation_tests(predictive: Predictive, frames: Mapping[str, Frame]) -> list[HeldTest]:
+    """Tests of each deviation of exposures that were held out whole, by the others' scatter.
+
+    Its scale and shears, and where its chips lie, are fitted to its own stars before these are
+    judged: what is wrong with them does not show in residuals.  With b and v the estimate of one
+    deviation and its variance by the stars alone, all others being as they scatter,
+
+        b ~ N(0, tau^2 + v + w)
+
+    with draws of tau, and w what the errors of the solution do to b.  The probability of a larger
+    one is the mean over the draws.  The `limit` of a test is the scatter.
+    """
+    known = predictive.deviations
+    if known is None:
+        return []
+    n = predictive.model.n_distortion
+    C, out = predictive.cov[:n, :n], []
+    for name, frame in frames.items():
+        taken = 1 - frame.precision * np.diag(frame.spent)
+        by_solution = frame.spent @ frame.shared
+        extra = np.einsum("qn,nm,qm->q", by_solution, C, by_solution)
+        for kind, tau in zip(known.kinds, known.tau.T, strict=True):
+            k = frame.names.index(kind)
+            if taken[k] < MIN_INFORMATION:
+                continue
+            # without what its own prior has said
+            b = frame.values[k] / taken[k]
+            v = frame.spent[k, k] / taken[k] + extra[k] / taken[k] ** 2
+            p = float(np.mean(2 * norm.sf(abs(b) / np.sqrt(tau**2 + v))))
+            where = f"the {kind.replace('_', ' ')} of exposure {name}, held out whole"
+            scatter = float(np.sqrt(np.mean(tau**2)))
+            out.append(
+                HeldTest(
+                    "deviation", "exposure", where, k, frame.n, float(b), 0.0, p, limit=scatter
+                )
+            )
+    return out

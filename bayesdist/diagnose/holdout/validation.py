@@ -10,11 +10,16 @@ from numpy.typing import NDArray
 
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.bins import Bin, partitions_of
-from bayesdist.diagnose.holdout.deviations import deviation_tests
 from bayesdist.diagnose.holdout.frames import frames_for
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.sums import held_sums
-from bayesdist.diagnose.holdout.tests import AxisCoverage, HeldTest, all_tests, axis_coverage
+from bayesdist.diagnose.holdout.tests import (
+    AxisCoverage,
+    HeldTest,
+    all_tests,
+    axis_coverage,
+    deviation_tests,
+)
 from bayesdist.diagnose.significance import holm, p_words
 from bayesdist.errors import InputError
 from bayesdist.limits import HELD_OUT, HELD_OUT_DOUBTFUL, HELD_OUT_UNUSUAL

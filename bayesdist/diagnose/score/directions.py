@@ -5,9 +5,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["independent_directions", "squares_of"]
+__all__ = ["beside_others", "independent_directions", "squares_of"]
 
 Float = NDArray[np.float64]
+
+
+def beside_others(information: Float, own: NDArray[np.bool_], directions: Float) -> Float:
+    """Directions (n, q) of the `own` regressors (n,), without what the others say of them.
+
+    `information` (n, n) is that of all, the parameters projected out; `directions` are combinations
+    of the own ones.
+    """
+    out = np.zeros((len(own), directions.shape[1]))
+    out[own] = directions
+    across = information[np.ix_(~own, own)] @ directions
+    out[~own] = -np.linalg.lstsq(information[np.ix_(~own, ~own)], across)[0]
+    return out
 
 
 def independent_directions(whole: Float, left: Float, least: float) -> Float:

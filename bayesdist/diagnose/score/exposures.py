@@ -20,18 +20,25 @@ from scipy.linalg import cho_solve
 
 from bayesdist.diagnose.clusters import add_over, sums_over
 from bayesdist.diagnose.score.directions import independent_directions, squares_of
-from bayesdist.diagnose.score.families import FAMILIES
 from bayesdist.diagnose.score.projection import Projection, weighted
-from bayesdist.diagnose.score.result import Outcome, outcome
+from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import Block
 from bayesdist.diagnose.significance import chi_square_of, hotelling_p
 from bayesdist.model.frames import LINEAR_MATRICES, frame_names
 
-__all__ = ["exposure_test"]
+__all__ = ["EXPOSURES", "exposure_test"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+EXPOSURES = Family(
+    "exposures",
+    "use a campaign, whose exposures have a hierarchy of deviations",
+    "exposures deviate from each other in linear terms that their frames do not fit",
+    "no deviations of single exposures are left in the residuals",
+    held_by="exposures",
+    denial="it is not single exposures that deviate",
+)
 STARS_PER_DIRECTION = 4  # of an exposure that is tested
 MAX_PRODUCTS = 1e10  # of scores: beyond, those of other exposures count by their mean
 INDEPENDENT = 0.02  # as for time: what the frames' curvature leaves is no deviation
@@ -136,7 +143,7 @@ def exposure_test(projection: Projection) -> Outcome | None:
     dof = n / stretch
     T = T / stretch
     square, noise = (float(values) for values in np.mean(squares, axis=0))
-    family = replace(FAMILIES["exposures"], remedy=_remedy(model.frames))
+    family = replace(EXPOSURES, remedy=_remedy(model.frames))
     return outcome(
         family,
         T,
@@ -151,7 +158,7 @@ def exposure_test(projection: Projection) -> Outcome | None:
 
 def _remedy(frames: str) -> str:
     """Remedy of deviations, as a clause, by the kind of the frames."""
-    hierarchy = FAMILIES["exposures"].remedy
+    hierarchy = EXPOSURES.remedy
     return hierarchy if frames == "affine" else f"set model.frames to 'affine', or {hierarchy}"
 
 

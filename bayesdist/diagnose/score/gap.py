@@ -25,9 +25,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bayesdist.diagnose.clusters import squares_over
-from bayesdist.diagnose.score.families import FAMILIES
 from bayesdist.diagnose.score.projection import Projection
-from bayesdist.diagnose.score.result import Outcome, outcome, smallest_pattern
+from bayesdist.diagnose.score.result import Family, Outcome, outcome, smallest_pattern
 from bayesdist.diagnose.score.sample import Block
 from bayesdist.model.frames import DEVIATIONS, LINEAR_MATRICES, RIGID, frame_names
 
@@ -36,6 +35,7 @@ __all__ = ["gap_test", "visit_codes"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+GAP = Family("gap", "", "", "no drift of the gap between the chips is left in the residuals")
 MIN_FREE = 3  # visits beyond those that the line takes
 MIN_STARS = 12  # of an exposure on a chip: six linear terms of both axes, and as many beside
 SHORTEST = 0.1  # years over which a drift is looked for
@@ -102,7 +102,7 @@ def gap_test(projection: Projection) -> Outcome | None:
     terms = "['u', 0, 0] and ['v', 0, 0]" if best.way < 2 else "['u', 0, 1] and ['v', 1, 0]"
     return outcome(
         replace(
-            FAMILIES["gap"],
+            GAP,
             remedy=f"add {terms} to model.tdd.terms",
             present=f"chip {name} drifts {_WAYS[best.way]} against chip {model.chips[0].name}, and "
             "the gap between them is taken to be constant",

@@ -21,15 +21,22 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bayesdist.diagnose.clusters import sums_over
-from bayesdist.diagnose.score.families import FAMILIES, Family
-from bayesdist.diagnose.score.result import Outcome, noncentrality, outcome
+from bayesdist.diagnose.score.result import Family, Outcome, noncentrality, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 
-__all__ = ["StarResiduals", "motion_outcome", "motion_test"]
+__all__ = ["MOTIONS", "StarResiduals", "motion_outcome", "motion_test"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+MOTIONS = Family(
+    "motions",
+    "give the catalogue proper motions, or larger errors of those that it has, or leave out the "
+    "stars that move",
+    "stars move between the dates of the exposures in ways that the catalogue does not have",
+    "no motions of the stars are left in the residuals",
+    explained_by="exposures",
+)
 MIN_DETECTIONS = 4  # of a star: of fewer nothing is left
 MIN_STARS = 100
 SHORTEST = 0.1  # years in which motions are looked for
@@ -69,7 +76,7 @@ def motion_test(sample: ScoredSample) -> Outcome | None:
         np.zeros(()),
         stated,
     )
-    return motion_outcome(residuals, sample.model.unit, FAMILIES["motions"])
+    return motion_outcome(residuals, sample.model.unit, MOTIONS)
 
 
 def motion_outcome(data: StarResiduals, unit: str, family: Family) -> Outcome | None:

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bayesdist.diagnose.clusters import squares_over
-from bayesdist.diagnose.score.families import FAMILIES, Family
-from bayesdist.diagnose.score.result import Outcome, outcome, smallest_pattern
+from bayesdist.diagnose.score.result import Family, Outcome, outcome, smallest_pattern
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.significance import hotelling_p
 from bayesdist.model.grid import cell_index
@@ -27,6 +26,35 @@ __all__ = ["noise_tests"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+BY_POSITION = Family(
+    "noise by position",
+    "give errors that go with position",
+    "the noise differs from cell to cell",
+    "the noise is described equally well from cell to cell",
+    held_by="noise",
+    explained_by="orders",
+)
+BY_MAGNITUDE = Family(
+    "noise by magnitude",
+    "give errors that go with magnitude, or finer ones if they do",
+    "the noise differs from bright to faint stars",
+    "the noise is described equally well from bright to faint stars",
+    held_by="noise",
+)
+BY_EXPOSURE = Family(
+    "noise by exposure",
+    "give each exposure errors of its own, or leave out exposures",
+    "the noise differs from exposure to exposure",
+    "the noise is described equally well from exposure to exposure",
+    held_by="noise",
+)
+BY_AXIS = Family(
+    "noise by axis",
+    "give errors sigma_u and sigma_v of their own",
+    "along the other axis, beside its errors",
+    "the noise is described equally well along u and v",
+    held_by="noise",
+)
 LARGEST_LEVERAGE = 0.5
 STARS_PER_PART = 40  # of a part of the data; smaller ones are joined
 STARS_PER_CELL = 60
@@ -74,12 +102,12 @@ def noise_tests(sample: ScoredSample) -> list[Outcome]:
         1.0 - float(leverage[:, rows].mean()),
         sample.model.unit,
     )
-    parts = {"position": _cells(sample, rows)}
+    parts = [(BY_POSITION, _cells(sample, rows))]
     if sample.mag is not None:
         n_stars = int(squares.star.max(initial=0)) + 1
-        parts["magnitude"] = _magnitudes(sample.mag[rows], n_stars)
-    parts["exposure"] = sample.exposure[rows]
-    out = [_by_part(squares, FAMILIES[f"noise by {name}"], code) for name, code in parts.items()]
+        parts.append((BY_MAGNITUDE, _magnitudes(sample.mag[rows], n_stars)))
+    parts.append((BY_EXPOSURE, sample.exposure[rows]))
+    out = [_by_part(squares, family, code) for family, code in parts]
     return [one for one in (*out, _by_axis(squares)) if one is not None]
 
 
@@ -180,10 +208,9 @@ def _by_axis(squares: _Squares) -> Outcome | None:
         * float(np.sqrt((d**2).sum() / squares.free))
         / (2 * ratio * squares.expected.sum())
     )
-    family = FAMILIES["noise by axis"]
     larger = "u" if scale[0] > scale[1] else "v"
     return outcome(
-        replace(family, present=f"the noise along {larger} is larger than {family.present}"),
+        replace(BY_AXIS, present=f"the noise along {larger} is larger than {BY_AXIS.present}"),
         T,
         1,
         float(n - 1),

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import i0e, i1e
 
-from bayesdist.diagnose.score.families import FAMILIES
-from bayesdist.diagnose.score.result import Outcome, outcome
+from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.model.grid import cell_index
 
@@ -17,6 +16,12 @@ __all__ = ["pattern_test"]
 
 Float = NDArray[np.float64]
 
+REPEATING = Family(
+    "repeating pattern",
+    "fit a look-up table with nodes closer than half the period",
+    "",
+    "no pattern repeats over the detector",
+)
 BINS = 256  # along each side of a chip: periods from a hundredth of it are seen
 PADDED = 2  # finer frequencies than the bins', so that none falls between
 SLOWEST = 1.5  # periods beyond the polynomial's own, below which it takes waves for terms
@@ -69,7 +74,7 @@ def pattern_test(sample: ScoredSample) -> Outcome | None:
         "pixels"
     )
     return outcome(
-        replace(FAMILIES["repeating pattern"], present=present),
+        replace(REPEATING, present=present),
         2 * power,
         2,
         None,

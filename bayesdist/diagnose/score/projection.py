@@ -67,14 +67,9 @@ class Projection:
         """Number of global parameters."""
         return self.sample.model.n_global
 
-    @property
-    def n_added(self) -> int:
-        """Number of functions that the tests add to those of the model."""
-        return len(self.functions.terms) - self.sample.model.n_terms
-
     def columns(self, function: Int, chip: int) -> Int:
         """Indices of the regressors of some functions on both axes of a chip."""
-        start = 2 * self.n_added * chip
+        start = 2 * self.functions.n_added * chip
         return np.ravel(start + 2 * (function[:, None] - self.sample.model.n_terms) + [0, 1])
 
     @cached_property
@@ -175,7 +170,7 @@ class Projection:
         """
         K, one = self.sample.model.n_terms, self.exposures.get(block.frame_exposure)
         own = None if one is None else self._following(one, which)
-        out = _added(block, self.n_added, K, which)
+        out = _added(block, self.functions.n_added, K, which)
         out[:, :K] -= self.moved(block, self.nuisance[:, which], own)
         return out
 

@@ -22,11 +22,14 @@ from scipy import stats
 from scipy.linalg import block_diag
 
 from bayesdist.diagnose.clusters import add_over
-from bayesdist.diagnose.score.directions import independent_directions, squares_of
-from bayesdist.diagnose.score.families import Family
+from bayesdist.diagnose.score.directions import (
+    beside_others,
+    independent_directions,
+    squares_of,
+)
 from bayesdist.diagnose.score.projection import LARGEST_LEVERAGE, Projection
-from bayesdist.diagnose.score.regressors import Regressors
-from bayesdist.diagnose.score.result import Outcome, outcome
+from bayesdist.diagnose.score.regressors import Regressors, one_of_each
+from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import Block
 from bayesdist.diagnose.significance import chi_square_of
 
@@ -46,12 +49,13 @@ MAX_CHIPS = 4  # that are tested together, with the covariance of all their scor
 
 def regressor_tests(projection: Projection) -> list[Outcome]:
     """Outcomes of all regressor tests that there are stars enough for."""
-    found: dict[str, list[_Part]] = {}
+    found: dict[Regressors, list[_Part]] = {}
     for chips in _chips_together(projection):
-        for name, part in _parts_of(projection, chips):
-            found.setdefault(name, []).append(part)
-    families = {one.family.name: one.family for one in projection.functions.regressors}
-    return [_outcome(projection, families[name], parts) for name, parts in found.items()]
+        for several, part in _parts_of(projection, chips):
+            found.setdefault(several, []).append(part)
+    return one_of_each(
+        (several, _outcome(projection, several.family, parts)) for several, parts in found.items()
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,13 +97,12 @@ def _outcome(projection: Projection, family: Family, parts: Sequence[_Part]) -> 
     )
 
 
-def _parts_of(projection: Projection, chips: list[int]) -> Iterator[tuple[str, _Part]]:
-    """Tests of all families on some chips, with the names of the families."""
+def _parts_of(projection: Projection, chips: list[int]) -> Iterator[tuple[Regressors, _Part]]:
+    """Tests of all regressors on some chips."""
     tried = []
     for several in projection.functions.regressors:
         columns = np.concatenate([projection.columns(several.every, chip) for chip in chips])
-        own = np.tile(np.repeat(several.own, 2), len(chips))
-        one = _Directions.of(projection, several, columns, own)
+        one = _Directions.of(projection, several, columns, len(chips))
         if one.q:
             tried.append(one)
     sums = _star_sums(projection, chips, tried)
@@ -115,7 +118,7 @@ def _parts_of(projection: Projection, chips: list[int]) -> Iterator[tuple[str, _
         square = np.repeat(projection.functions.mean_square[one.regressors.every], 2)
         Q = (one.basis.T * np.tile(square, len(chips)) / len(chips)) @ one.basis
         squares = squares_of(one.score, np.eye(one.q), V, Q)
-        yield one.regressors.family.name, _Part(T, p, one.q, dof_residual, *squares)
+        yield one.regressors, _Part(T, p, one.q, dof_residual, *squares)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,16 +137,15 @@ class _Directions:
 
     @classmethod
     def of(
-        cls, projection: Projection, several: Regressors, columns: Int, own: NDArray[np.bool_]
+        cls, projection: Projection, several: Regressors, columns: Int, n_chips: int
     ) -> _Directions:
-        """Directions of regressors of which the `own` columns are tested beside the others."""
+        """Directions of regressors on some chips, of these columns."""
+        own, directions = several.own(n_chips), several.directions(n_chips)
         S = projection.efficient_information(columns)
-        # each of the tested ones without what the others say of it
-        A = np.zeros((len(columns), own.sum()))
-        A[own] = np.eye(own.sum())
-        A[~own] = -np.linalg.lstsq(S[np.ix_(~own, ~own)], S[np.ix_(~own, own)])[0]
+        A = beside_others(S, own, directions)
         S = A.T @ S @ A
-        N = independent_directions(projection.whole_information(columns[own]), S, several.least)
+        whole = directions.T @ projection.whole_information(columns[own]) @ directions
+        N = independent_directions(whole, S, several.least)
         # eigenvectors: their information is diagonal
         basis = A @ (N / np.sqrt(np.einsum("nq,nm,mq->q", N, S, N, optimize=True)))
         return cls(several, columns, basis, basis.T @ projection.efficient_score[columns])

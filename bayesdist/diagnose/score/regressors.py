@@ -1,74 +1,55 @@
-"""Functions of the stars that a model may lack.
-
-They are terms of higher order, and terms that go with magnitude, colour and time.
-"""
+"""Functions of the detections by which questions are asked, one after the other, with indices."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
-from bayesdist.diagnose.score.families import FAMILIES, Family, order_family
+from bayesdist.diagnose.score.questions import Products, Question, questions
+from bayesdist.diagnose.score.result import Family, Outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.model.basis import polynomial_terms
-from bayesdist.model.timedep import TimeDependence
 
-__all__ = ["EDGES", "EDGES_ADJUSTED", "Factor", "Functions", "Regressors", "functions_for"]
+__all__ = ["Functions", "Regressors", "functions_for", "one_of_each"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-EDGES, EDGES_ADJUSTED = "edges", "edges adjusted for orders"
-LINEAR = 1  # order of the terms that go with magnitude, colour and time
-HIGHER = 2  # orders above the model's that are tested
-OUTSIDE = 0.5  # per cent of the values at either end that are moved to the others
-MIN_AT_EDGES = 200  # detections: some in each margin
-NEAR_EDGE = 0.05  # of half a side, over which what is at an edge falls off
-SHORTEST = 0.1  # years over which a drift is looked for
-# of the information of a direction, left by the parameters: below, it is theirs
-INDEPENDENT = 1e-6
-CONSTANT = 1e-9  # scatter of a factor, in magnitudes or of the time from -1 to 1
-OWN_OF_TIME = 0.02  # frames take up drifts but for what the curvature of the polynomial leaves
-
-
-@dataclass(frozen=True, eq=False)
-class Factor:
-    """Number of each detection that multiplies polynomial terms."""
-
-    values: Float  # (N,)
-    order: int  # of the terms, 0 included
-
-    @property
-    def n_terms(self) -> int:
-        """Number of products."""
-        return len(polynomial_terms(self.order))
+CONSTANT = 1e-9  # scatter of values, in magnitudes or of the time from -1 to 1
+SAYS_NOTHING = 0.2  # probability by chance above which an adjusted test has seen nothing
 
 
 @dataclass(frozen=True, eq=False)
 class Regressors:
-    """Functions that one test adds to the model, on both axes of every chip."""
+    """Directions that one test adds to the model on every chip: functions along its axes."""
 
     family: Family
-    functions: Int  # which `Functions`
-    # fraction of its information that a direction must keep when parameters are projected out
-    least: float = INDEPENDENT
+    functions: Int  # (f,) which `Functions`
+    # (2 f, q) of each direction: along both axes of the first function, of the second, ...
+    combination: Float
+    least: float  # as of `Question`
     # functions that the fit is given as well, so that they do not pass for these
-    adjusted_for: Int = field(default_factory=lambda: np.zeros(0, np.int64))
+    adjusted_for: Int
 
     @property
     def every(self) -> Int:
         """Indices of all of these functions, the tested ones first."""
         return np.concatenate([self.functions, self.adjusted_for])
 
-    @property
-    def own(self) -> NDArray[np.bool_]:
-        """Boolean mask of those that are tested."""
-        return np.arange(len(self.functions) + len(self.adjusted_for)) < len(self.functions)
+    def own(self, n_chips: int) -> NDArray[np.bool_]:
+        """Boolean mask of what is tested, along both axes of every function on some chips."""
+        mask = np.arange(len(self.every)) < len(self.functions)
+        return np.tile(np.repeat(mask, 2), n_chips)
+
+    def directions(self, n_chips: int) -> Float:
+        """Combinations of what is tested on some chips, each with a coefficient of its own."""
+        return np.asarray(np.kron(np.eye(n_chips), self.combination), float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,112 +57,111 @@ class Functions:
     """Functions of the detections: those of the model, and those that the tests add."""
 
     sample: ScoredSample
-    order: int  # highest total order of the polynomials
-    factors: tuple[Factor, ...]
+    products: tuple[Products, ...]  # without directions; the first are the model's own
     regressors: tuple[Regressors, ...]
 
     @cached_property
     def terms(self) -> tuple[tuple[int, int], ...]:
-        """Powers (i, j) of every function, by the polynomial and then by the factors."""
-        out = list(polynomial_terms(self.order))
-        for factor in self.factors:
-            out += polynomial_terms(factor.order)
-        return tuple(out)
+        """Powers (i, j) of every function."""
+        return tuple(term for one in self.products for term in one.terms)
+
+    @property
+    def n_added(self) -> int:
+        """Number of functions that the tests add to those of the model."""
+        return len(self.terms) - self.sample.model.n_terms
 
     @property
     def mean_square(self) -> Float:
         """Mean square of every function (L,) over the detector, and over the detections."""
         i, j = np.array(self.terms).T
-        sizes = [np.ones(len(polynomial_terms(self.order)))]
-        sizes += [np.full(one.n_terms, np.mean(one.values**2)) for one in self.factors]
+        sizes = [
+            np.full(len(one.terms), 1.0 if one.values is None else np.mean(one.values**2))
+            for one in self.products
+        ]
         return np.concatenate(sizes) / ((2 * i + 1) * (2 * j + 1))
 
     @cached_property
     def _tables(self) -> tuple[Float, Float]:
         """Legendre polynomials (order + 1, N) of both coordinates."""
         X, Y = self.sample.X, self.sample.Y
-        P, Q = (np.asarray(legendre.legvander(z, self.order).T, float) for z in (X, Y))
+        order = int(np.max(self.terms))
+        P, Q = (np.asarray(legendre.legvander(z, order).T, float) for z in (X, Y))
         return P, Q
 
     @cached_property
-    def _powers(self) -> tuple[Int, Int]:
-        i, j = np.array(polynomial_terms(self.order), np.int64).T
-        return i, j
+    def _distinct(self) -> tuple[Int, Int, list[Int]]:
+        """Powers of the distinct terms, those of the model first, and which each product has."""
+        index = {term: k for k, term in enumerate(dict.fromkeys(self.terms))}
+        i, j = np.array(list(index), np.int64).T
+        return i, j, [np.array([index[term] for term in one.terms]) for one in self.products]
 
     def polynomials(self, rows: slice) -> Float:
         """Values (K, n) of the model's own functions at some detections."""
         K = self.sample.model.n_terms
         P, Q = self._tables
-        i, j = self._powers
+        i, j, _ = self._distinct
         return np.asarray(P[i[:K], rows] * Q[j[:K], rows])
 
-    def at(self, rows: slice) -> Float:
+    def at(self, rows: slice | Int) -> Float:
         """Values (L, n) of all functions at some detections."""
-        P, Q = self._tables
-        i, j = self._powers
-        products = P[i, rows] * Q[j, rows]
-        parts = [products]
-        parts += [products[: one.n_terms] * one.values[rows] for one in self.factors]
-        return np.concatenate(parts)
+        i, j, which = self._distinct
+        P, Q = (table[:, rows] for table in self._tables)
+        distinct = P[i] * Q[j]
+        return np.concatenate(
+            [
+                distinct[terms] if one.values is None else distinct[terms] * one.values[rows]
+                for one, terms in zip(self.products, which, strict=True)
+            ]
+        )
 
 
-def functions_for(sample: ScoredSample) -> Functions:
-    """Functions that the data can be asked for."""
-    n = sample.model.order
-    regressors = [
-        Regressors(order_family(total, n), len(polynomial_terms(total - 1)) + np.arange(total + 1))
-        for total in range(n + 1, n + HIGHER + 1)
-    ]
-    orders = np.concatenate([one.functions for one in regressors])
-    factors: list[Factor] = []
-    start = len(polynomial_terms(n + HIGHER))
-    for name, several, least in _questions(sample):
-        if all(np.std(one.values) < CONSTANT for one in several):
+def functions_for(sample: ScoredSample, asked: Iterable[Question] | None = None) -> Functions:
+    """Functions of the questions, by default of all that a sample can be asked."""
+    products = [Products(polynomial_terms(sample.model.order))]
+    start = len(products[0].terms)
+    regressors: list[Regressors] = []
+    groups: dict[str, list[Int]] = {}
+    for one in questions(sample) if asked is None else asked:
+        if all(p.values is not None and np.std(p.values) < CONSTANT for p in one.products):
             continue
-        functions = start + np.arange(sum(one.n_terms for one in several))
-        factors += several
+        parts, combination = _along_axes(one.products, len(sample))
+        functions = start + np.arange(sum(len(part.terms) for part in parts))
+        products += parts
         start += len(functions)
-        regressors.append(Regressors(FAMILIES[name], functions, least))
-        if name == EDGES:
-            adjusted = replace(FAMILIES[EDGES], name=EDGES_ADJUSTED)
-            regressors.append(Regressors(adjusted, functions, least, orders))
-    return Functions(sample, n + HIGHER, tuple(factors), tuple(regressors))
+        groups.setdefault(one.family.group, []).append(functions)
+        none = np.zeros(0, np.int64)
+        regressors.append(Regressors(one.family, functions, combination, one.least, none))
+        if one.adjusted_for:
+            others = np.concatenate([none, *groups.get(one.adjusted_for, [])])
+            regressors.append(Regressors(one.family, functions, combination, one.least, others))
+    return Functions(sample, tuple(products), tuple(regressors))
 
 
-def _questions(sample: ScoredSample) -> Iterator[tuple[str, list[Factor], float]]:
-    """Iterator over tests by name: factors of their functions, and what a direction must keep."""
-    for name, values in (("magnitude", sample.mag), ("colour", sample.colour)):
-        if values is not None:
-            yield name, [Factor(_standing_out(values), LINEAR)], INDEPENDENT
-    if len(sample) >= MIN_AT_EDGES:
-        edges = [np.exp((s * Z - 1.0) / NEAR_EDGE) for Z in (sample.X, sample.Y) for s in (-1, 1)]
-        yield EDGES, [Factor(one - one.mean(), 0) for one in edges], INDEPENDENT
-    time, epoch = sample.model.time, sample.epoch
-    if epoch is None or np.ptp(epoch) <= SHORTEST:
-        return
-    half = (2 * epoch - epoch.min() - epoch.max()) / np.ptp(epoch)  # from -1 to 1
-    if sample.mag is not None:
-        values = _standing_out(sample.mag) * half
-        yield "magnitude in time", [Factor(values, LINEAR)], INDEPENDENT
-    yield "drift", [Factor(half - half.mean(), LINEAR)], OWN_OF_TIME
-    if time is not None and len(np.unique(epoch)) > 2:
-        order = max([LINEAR, *(i + j for _, i, j in time.terms)])
-        factor = Factor(_beyond_lines(half, time, epoch), order)
-        yield "curvature in time", [factor], OWN_OF_TIME
+def _along_axes(several: Iterable[Products], n_detections: int) -> tuple[list[Products], Float]:
+    """Products without directions, and how those with directions are combined (2 f, q) of them."""
+    parts: list[Products] = []
+    blocks: list[Float] = []
+    for one in several:
+        n = len(one.terms)
+        if one.direction is None:
+            parts.append(one)
+            blocks.append(np.eye(2 * n))
+            continue
+        values = np.ones(n_detections) if one.values is None else one.values
+        for along in one.direction:
+            parts.append(Products(one.terms, values * along))
+        blocks.append(np.concatenate([np.kron(np.eye(n), axis[:, None]) for axis in np.eye(2)]))
+    return parts, np.asarray(block_diag(*blocks))
 
 
-def _standing_out(values: Float) -> Float:
-    """Values about their mean; codes for what is missing are brought to the others."""
-    low, high = np.percentile(values, [OUTSIDE, 100 - OUTSIDE])
-    inside = np.clip(values, low, high)
-    return np.asarray(inside - inside.mean())
+def one_of_each(found: Iterable[tuple[Regressors, Outcome]]) -> list[Outcome]:
+    """Outcomes with one test of each question: the adjusted one, where that says nothing.
 
-
-def _beyond_lines(half: Float, time: TimeDependence, epoch: Float) -> Float:
-    """Square of time, without what a constant and the segments' own lines say of it."""
-    design = np.column_stack([np.ones(len(half)), time.weights(epoch)])
-    dates, of = np.unique(half, return_inverse=True)
-    first = np.unique(of, return_index=True)[1]
-    weight = np.sqrt(np.bincount(of))
-    found = np.linalg.lstsq(weight[:, None] * design[first], weight * dates**2)[0]
-    return half**2 - design @ found
+    Adjusted for others there is less to be seen of what is there by itself, but something.
+    """
+    pairs = [(len(several.adjusted_for) > 0, one) for several, one in found]
+    out = {one.name: one for adjusted, one in pairs if not adjusted}
+    for adjusted, one in pairs:
+        if adjusted and one.name in out and one.p_value > SAYS_NOTHING:
+            out[one.name] = one
+    return list(out.values())

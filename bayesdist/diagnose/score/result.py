@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Literal
 
 import numpy as np
 from scipy import special, stats
 
-from bayesdist.diagnose.score.families import Family
 from bayesdist.diagnose.significance import holm, p_words
 from bayesdist.limits import SCORE_TESTS
 
 __all__ = [
     "POWER",
+    "Family",
     "Outcome",
     "ScoreTest",
     "corrected",
@@ -23,7 +24,26 @@ __all__ = [
     "smallest_pattern",
 ]
 
+HeldBy = Literal["", "noise", "structure", "exposures", "curvature"]
+
 POWER = 0.9  # with which the smallest effect that is stated would have been found
+
+
+@dataclass(frozen=True)
+class Family:
+    """One thing that a model may lack, in words, and what else accounts for it."""
+
+    name: str
+    remedy: str  # what to do about it, as a clause
+    # subject and verb of the finding, where there is something and where there is not; where they
+    # depend on what was found, the test fills them in
+    present: str
+    absent: str
+    group: str = ""  # of families that others name together
+    # kind of correlated errors that hold what is found, so that the verdict stands
+    held_by: HeldBy = ""
+    explained_by: str = ""  # name or group of a finding that this one may come from
+    denial: str = ""  # clause that denies it, for findings that it may explain
 
 
 @dataclass(frozen=True)
@@ -55,6 +75,9 @@ class ScoreTest:
         What it means, as a sentence.
     significant : bool
         More than chance, corrected for the number of tests (Holm 1979, at `limits.SCORE_TESTS`).
+    held_by : str
+        Kind of correlated errors that hold what was found: 'noise', 'structure', 'exposures' or
+        'curvature'; empty where none do.
     """
 
     name: str
@@ -68,6 +91,7 @@ class ScoreTest:
     remedy: str
     finding: str
     significant: bool
+    held_by: HeldBy = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +139,7 @@ class Outcome:
             remedy=self.family.remedy,
             finding=finding,
             significant=significant,
+            held_by=self.family.held_by,
         )
 
 
@@ -143,14 +168,28 @@ def outcome(
 
 
 def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
-    """Tests with their verdicts, corrected for how many there are (Holm 1979)."""
+    """Tests with their verdicts, corrected for how many there are (Holm 1979).
+
+    Findings that others explain as well say so.
+    """
     n = len(outcomes)
+    outcomes = [_with_explanation(one, outcomes) for one in outcomes]
     significant = holm([one.p_value for one in outcomes]) <= SCORE_TESTS.value
     # what is alone has to pass the first step
     return tuple(
         one.judged(bool(found), SCORE_TESTS.value / n)
         for one, found in zip(outcomes, significant, strict=True)
     )
+
+
+def _with_explanation(one: Outcome, outcomes: Sequence[Outcome]) -> Outcome:
+    """Outcome that names the finding of another test that may explain it."""
+    if one.family.explained_by:
+        for other in outcomes:
+            names = (other.family.name, other.family.group)
+            if one.family.explained_by in names and other.p_value < SCORE_TESTS.value:
+                return one.unless(other.family.denial)
+    return one
 
 
 def noncentrality(level: float, dof: float, dof_residual: float | None = None) -> float:

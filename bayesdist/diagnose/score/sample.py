@@ -64,6 +64,14 @@ class ScoredSample:
     # chip, exposure (N,): codes into the model's chips, and into the exposures of the data
     chip: Int
     exposure: Int
+    # (N, 2, 2) linear part of the frame of each detection's exposure, from the axes of the detector
+    # to those of u and v
+    turn: Float
+    has_catalogue: bool = True  # not where the positions of stars were solved for
+    # position, offset (2, N): ideal position, and where the exposure points beside the others, in
+    # half sides of the detector along its axes; None where pointings are not solved for
+    position: Float | None = None
+    offset: Float | None = None
     blocks: tuple[Block, ...] = ()  # none where nothing is asked of the model's derivatives
     motion: Float | None = None  # (2, N) proper motions along u and v, in the unit of u, v per year
     motion_sigma: Float | None = None  # (2, N) their standard errors, where the table has them
@@ -78,6 +86,11 @@ class ScoredSample:
     def used(self) -> NDArray[np.bool_]:
         """Boolean mask (N,) of the detections that count: all but those that a fit rejects."""
         return np.any(self.curvature != 0, axis=0)
+
+    def along_detector(self, direction: Float) -> Float:
+        """Displacements (2, N) along the axes of the detector; (2,) or (2, N) along u and v."""
+        on_sky = np.broadcast_to(np.reshape(direction, (2, -1)), self.score.shape)
+        return np.asarray(np.linalg.solve(self.turn, on_sky.T[..., None])[..., 0].T)
 
     @cached_property
     def whole_score(self) -> Float:
@@ -117,6 +130,10 @@ def scored_sample(table: Matches, solution: Solution) -> ScoredSample:
     rows = by_exposure[order]
     columns = likelihood.scores(stars)
     codes = np.arange(len(rows)) if table.star is None else table.star[rows]
+    blocks = _blocks(stars, table.exposure[rows], likelihood.theta)
+    turn = np.empty((len(rows), 2, 2))
+    for block in blocks:
+        turn[block.rows] = block.frame
     return ScoredSample(
         model=solution.model,
         X=stars.X,
@@ -132,7 +149,8 @@ def scored_sample(table: Matches, solution: Solution) -> ScoredSample:
         star=np.unique(codes, return_inverse=True)[1],
         chip=np.repeat(stars.groups.chip, np.diff(stars.starts)),
         exposure=table.exposure[rows],
-        blocks=_blocks(stars, table.exposure[rows], likelihood.theta),
+        turn=turn,
+        blocks=blocks,
         motion=_both(table.pm_u, table.pm_v, rows),
         motion_sigma=_both(table.sigma_pm_u, table.sigma_pm_v, rows),
     )

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, special
 
-from bayesdist.diagnose.score.families import FAMILIES
-from bayesdist.diagnose.score.result import Outcome
+from bayesdist.diagnose.score.result import Family, Outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.significance import chi_square_of
 
@@ -26,6 +25,9 @@ __all__ = ["truncation_test"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+TRUNCATION = Family(
+    "truncation", "match again with a wider radius", "", "the residuals do not end abruptly"
+)
 MIN_STARS = 50
 LARGEST_LEVERAGE = 0.5
 MAX_FRACTION_BEYOND = 0.25  # of the expected number: with more, nothing ends at the match radius
@@ -160,7 +162,7 @@ def truncation_test(sample: ScoredSample, match_radius: float | None = None) -> 
         "degree of freedom) says nothing of the quoted errors"
     )
     return Outcome(
-        replace(FAMILIES["truncation"], present=present),
+        replace(TRUNCATION, present=present),
         chi_square_of(p_value, 1),
         1,
         None,

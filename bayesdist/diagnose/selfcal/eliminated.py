@@ -24,8 +24,7 @@ from scipy.sparse import csr_array
 from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.correlated.deviations import DeviationColumns
 from bayesdist.diagnose.correlated.functions import StructureFunctions
-from bayesdist.diagnose.selfcal.leverage import places_by_star
-from bayesdist.diagnose.selfcal.scores import DetectionScores
+from bayesdist.diagnose.selfcal.scores import DetectionScores, places_by_star
 from bayesdist.infer.selfcal.elimination import PlaceDerivatives
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem

@@ -22,7 +22,7 @@ from scipy.sparse import csr_array
 from scipy.stats import f as f_distribution
 
 from bayesdist.diagnose.residuals.misfit import Misfit, bin_means, partitions_for, worst_misfit
-from bayesdist.diagnose.selfcal.leverage import StarBlock, star_blocks
+from bayesdist.diagnose.selfcal.scores import StarBlock, star_blocks
 from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.basis import polynomial_terms

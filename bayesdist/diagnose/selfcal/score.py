@@ -1,39 +1,51 @@
 """Score tests of self-calibrations: what a model lacks, with the stars eliminated.
 
-As for matched stars (`diagnose.score.regressor_tests`), with the positions of stars among the
-parameters that are projected out, and with the scores of a star's detections added up.  What stars
-take up cannot be tested: directions in which known stars would say much more are left out.
+The questions are those to matched stars (`diagnose.score.questions`), with the positions of stars
+among the parameters that are projected out, and with the scores of a star's detections added up.
+What stars take up cannot be tested: directions in which known stars would say much more are left
+out.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.diagnose.correlated.deviations import deviation_columns
-from bayesdist.diagnose.score.directions import independent_directions, squares_of
-from bayesdist.diagnose.score.families import FAMILIES, Family, order_family
-from bayesdist.diagnose.score.motions import SHORTEST, StarResiduals, motion_outcome
+from bayesdist.diagnose.score.directions import (
+    beside_others,
+    independent_directions,
+    squares_of,
+)
+from bayesdist.diagnose.score.exposures import EXPOSURES
+from bayesdist.diagnose.score.motions import MOTIONS, SHORTEST, StarResiduals, motion_outcome
 from bayesdist.diagnose.score.noise import noise_tests
-from bayesdist.diagnose.score.result import Outcome, ScoreTest, corrected, outcome
+from bayesdist.diagnose.score.regressors import (
+    Functions,
+    Regressors,
+    functions_for,
+    one_of_each,
+)
+from bayesdist.diagnose.score.result import Family, Outcome, ScoreTest, corrected, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
-from bayesdist.diagnose.selfcal.columns import AddedColumns, pointing_terms
 from bayesdist.diagnose.selfcal.correlated import MAX_EXPOSURES
 from bayesdist.diagnose.selfcal.eliminated import (
+    Columns,
     absorbed_by_stars,
     add_products,
     even_stars,
     pieces,
     without_parameters,
 )
-from bayesdist.diagnose.selfcal.leverage import taken_by_stars
 from bayesdist.diagnose.selfcal.sandwich import star_scores
-from bayesdist.diagnose.selfcal.scores import scores_of_detections
+from bayesdist.diagnose.selfcal.scores import scores_of_detections, taken_by_stars
 from bayesdist.diagnose.significance import hotelling_p
 from bayesdist.infer.selfcal.elimination import memberships
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
+from bayesdist.infer.selfcal.problem import Problem
 
 __all__ = ["selfcal_score_tests"]
 
@@ -43,11 +55,42 @@ Int = NDArray[np.int64]
 MAX_DETECTIONS = 60_000  # that are looked at
 STARS_PER_DIRECTION = 2  # below, a covariance of the scores says nothing
 MIN_INFORMATION = 0.02  # of a direction, relative to that with known stars
-REMEDIES = {
-    "magnitude": "cut the faint stars, or correct the charge-transfer efficiency",
-    "exposures": "give selfcal.frames a scale where it has none, or leave out exposures",
-}
-OUTSIDE = 0.5  # per cent of the magnitudes at either end that are moved to the others
+UNDITHERED = 1e-3  # of half a side: offsets that say nothing
+EXPOSURES_OF_SELFCAL = replace(
+    EXPOSURES, remedy="give selfcal.frames a scale where it has none, or leave out exposures"
+)
+MOTIONS_OF_SELFCAL = replace(
+    MOTIONS,
+    remedy="set selfcal.motion to 'proper_motion'",
+    present="stars move between the dates of the exposures, and are taken to stand still",
+)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _AddedColumns(Columns):
+    """Functions of the questions on both axes of every chip, and deviations of exposures."""
+
+    added: Functions
+
+    def n_functions(self, chip: int) -> int:
+        """Number of functions along one axis."""
+        return self.added.n_added
+
+    def values(self, chip: int, rows: Int) -> Float:
+        """Values (n, n_functions) of these."""
+        return self.added.at(rows)[self.problem.model.n_terms :].T
+
+    def along_axes(self, functions: Int) -> Int:
+        """Columns of some functions: those of one chip after the other, along u and v in turn."""
+        n, chips = self.n_functions(0), np.arange(len(self.problem.model.chips))
+        first = functions - self.problem.model.n_terms
+        return np.ravel(2 * n * chips[:, None, None] + first[:, None] + [0, n])
+
+    @property
+    def of_exposures(self) -> Int:
+        """Columns of the deviations of exposures."""
+        n = 0 if self.deviations is None else self.deviations.n_of_exposures
+        return 2 * self.n_functions(0) * len(self.problem.model.chips) + np.arange(n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,38 +108,42 @@ class _Sums:
 
 
 def selfcal_score_tests(
-    solution: SelfCalibrationMode, *, mag: Float | None = None, epoch: Float | None = None
+    solution: SelfCalibrationMode,
+    *,
+    mag: Float | None = None,
+    colour: Float | None = None,
+    epoch: Float | None = None,
 ) -> tuple[ScoreTest, ...]:
     """Targeted tests of a self-calibration for what its model lacks, and for its noise.
 
-    A test is left out where the data cannot be asked.  `mag` and `epoch` (N,) are those of each
-    detection of its problem, the latter in decimal years.
+    A test is left out where the data cannot be asked.  `mag`, `colour` and `epoch` (N,) are those
+    of each detection of its problem, the last in decimal years.
     """
     whole = solution.problem
     some = even_stars(whole, MAX_DETECTIONS)
     rows = np.isin(whole.star, some)
     problem, model = whole.of_stars(some), whole.model
-    varied = None
-    if mag is not None and np.ptp(mag) > 0:
-        low, high = np.percentile(mag, [OUTSIDE, 100 - OUTSIDE])
-        inside = np.clip(mag, low, high)[rows]
-        varied = inside - inside.mean()
     counts = np.bincount(problem.groups.index, minlength=len(problem.groups)).astype(float)
     deviations = deviation_columns(
         model, solution.theta, problem.groups, counts, most=MAX_EXPOSURES
     )
-    pointed = pointing_terms(problem, solution.theta)
-    columns = AddedColumns(problem, solution.theta, {}, deviations, varied, pointed)
+    sample = _sample(solution, some, rows, mag=mag, colour=colour, epoch=epoch)
+    functions = functions_for(sample)
+    columns = _AddedColumns(problem, solution.theta, deviations=deviations, added=functions)
     sums = _summed(solution, columns, rows, solution.stars[some])
-    found = [_tested(sums, name, which, model.order) for name, which in columns.families()]
+    found = one_of_each(_regressor_tests(sums, columns, functions))
+    chosen = columns.of_exposures
+    each = np.eye(len(chosen))
+    deviating = _tested(sums, EXPOSURES_OF_SELFCAL, chosen, each, each)
+    moving = None
     if epoch is not None and whole.n_star == 2 and np.ptp(epoch) > SHORTEST:
-        found.append(_motions(solution, epoch))
-    found += noise_tests(_noise_sample(solution, some, rows, mag))
-    return corrected([one for one in found if one is not None])
+        moving = _motions(solution, epoch)
+    found += [one for one in (deviating, moving) if one is not None]
+    return corrected([*found, *noise_tests(sample)])
 
 
 def _summed(
-    solution: SelfCalibrationMode, columns: AddedColumns, rows: NDArray[np.bool_], stars: Float
+    solution: SelfCalibrationMode, columns: _AddedColumns, rows: NDArray[np.bool_], stars: Float
 ) -> _Sums:
     """Sums over some of the detections of a solution."""
     p, scores = columns.problem, scores_of_detections(solution).at(rows)
@@ -133,10 +180,38 @@ def _summed(
     )
 
 
-def _tested(sums: _Sums, name: str, which: Int, order: int) -> Outcome | None:
-    """Outcome of one test; None where the data cannot be asked."""
+def _regressor_tests(
+    sums: _Sums, columns: _AddedColumns, functions: Functions
+) -> Iterator[tuple[Regressors, Outcome]]:
+    """Tests of all regressors that there are stars enough for."""
+    n_chips = len(columns.problem.model.chips)
+    for one in functions.regressors:
+        which = columns.along_axes(one.every)
+        own, directions = one.own(n_chips), one.directions(n_chips)
+        left = beside_others(sums.information[np.ix_(which, which)], own, directions)
+        whole = np.zeros_like(left)
+        whole[own] = directions
+        found = _tested(sums, one.family, which, whole, left, max(MIN_INFORMATION, one.least))
+        if found is not None:
+            yield one, found
+
+
+def _tested(
+    sums: _Sums,
+    family: Family,
+    which: Int,
+    whole: Float,
+    left: Float,
+    least: float = MIN_INFORMATION,
+) -> Outcome | None:
+    """Outcome of one test; None where the data cannot be asked.
+
+    It is that of the directions `left` (n, m) of some columns, which are `whole` (n, m) before
+    anything is projected out and must keep `least` of their information.
+    """
     at = np.ix_(which, which)
-    N = independent_directions(sums.known[at], sums.information[at], MIN_INFORMATION)
+    known, information = whole.T @ sums.known[at] @ whole, left.T @ sums.information[at] @ left
+    N = left @ independent_directions(known, information, least)
     q, n = N.shape[1], sums.n_stars
     if q == 0 or n < STARS_PER_DIRECTION * q + 2:
         return None
@@ -144,7 +219,7 @@ def _tested(sums: _Sums, name: str, which: Int, order: int) -> Outcome | None:
     T = float(U @ np.linalg.solve(V, U))
     square, noise = squares_of(U, S, V, N.T @ sums.square[at] @ N)
     return outcome(
-        _family(name, order),
+        family,
         T,
         q,
         float(n - q),
@@ -155,27 +230,18 @@ def _tested(sums: _Sums, name: str, which: Int, order: int) -> Outcome | None:
     )
 
 
-def _family(name: str, order: int) -> Family:
-    """Words of a test, with what can be done in a self-calibration."""
-    if name.startswith("order "):
-        return order_family(int(name.removeprefix("order ")), order)
-    return replace(FAMILIES[name], remedy=REMEDIES.get(name, FAMILIES[name].remedy))
-
-
 def _motions(solution: SelfCalibrationMode, epoch: Float) -> Outcome | None:
     """Test for stars that move."""
     p, scores = solution.problem, scores_of_detections(solution)
-    family = replace(
-        FAMILIES["motions"],
-        remedy="set selfcal.motion to 'proper_motion'",
-        present="stars move between the dates of the exposures, and are taken to stand still",
-    )
     residuals = StarResiduals(p.star, epoch, scores.gradient, scores.curvature, p.priors.precision)
-    return motion_outcome(residuals, p.model.unit, family)
+    return motion_outcome(residuals, p.model.unit, MOTIONS_OF_SELFCAL)
 
 
-def _noise_sample(
-    solution: SelfCalibrationMode, some: Int, rows: NDArray[np.bool_], mag: Float | None
+def _sample(
+    solution: SelfCalibrationMode,
+    some: Int,
+    rows: NDArray[np.bool_],
+    **known: Float | None,
 ) -> ScoredSample:
     """Sample of detections along the axes of the detector, in the unit of u and v.
 
@@ -192,6 +258,9 @@ def _noise_sample(
     residual = np.linalg.solve(J, r)[:, :, 0] * pixel
     variance = (p.var + solution.mixture.jitter**2) * pixel**2
     taken = taken_by_stars(solution)[rows]
+    at_rows = {name: None if one is None else one[rows] for name, one in known.items()}
+    frames = [model.frame(theta, e) for e in range(len(model.exposures))]
+    position, offset = _pointings(p, theta, frames)
     return ScoredSample(
         model=model,
         X=p.X,
@@ -201,11 +270,37 @@ def _noise_sample(
         residual=np.asarray(residual.T, float),
         variance=np.stack([variance, variance]),
         inlier=memberships(whole, theta, solution.mixture, solution.stars)[rows],
-        mag=None if mag is None else mag[rows],
-        colour=None,
-        epoch=None,
+        mag=at_rows["mag"],
+        colour=at_rows["colour"],
+        epoch=at_rows["epoch"],
         star=p.star,
         chip=p.groups.chip[group],
         exposure=p.groups.exposure[group],
+        turn=np.stack([M for M, _ in frames])[p.groups.exposure[group]],
+        has_catalogue=False,
+        position=position,
+        offset=offset,
         leverage=np.stack([taken, taken]),
     )
+
+
+def _pointings(
+    problem: Problem, theta: Float, frames: Sequence[tuple[Float, Float]]
+) -> tuple[Float, Float | None]:
+    """Positions (2, N), and offsets (2, N) of the exposures, along the axes of the detector.
+
+    Lengths are in half sides of the detector; no offsets where nothing was dithered.
+    """
+    model = problem.model
+    exposure = problem.groups.exposure[problem.groups.index]
+    half = model.pixel_size(theta) * max(max(c.size) for c in model.chips) / 2
+    on_sky = problem.places(theta) - np.asarray(model.origin)
+    offsets, positions = np.zeros((len(problem), 2)), np.empty((len(problem), 2))
+    for e in np.unique(exposure):
+        here = exposure == e
+        M, shift = frames[e]
+        back = np.linalg.inv(M).T / half
+        offsets[here] = shift @ back
+        positions[here] = (on_sky[here] - shift) @ back
+    offsets -= offsets.mean(axis=0)  # of a mean the polynomials take care
+    return positions.T, None if np.abs(offsets).max() < UNDITHERED else offsets.T

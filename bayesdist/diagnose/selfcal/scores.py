@@ -1,22 +1,35 @@
-"""Scores of single detections by their sky positions in the model, at a solution."""
+"""Scores of single detections at a self-calibration, and how much of them their stars absorb."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.correlated.noise import MAX_BLOCKS, STARS_PER_BLOCK, block_ratios
-from bayesdist.diagnose.selfcal.leverage import taken_by_stars
-from bayesdist.infer.selfcal.elimination import memberships
+from bayesdist.infer.selfcal.calibrate import MOST_TAKEN
+from bayesdist.infer.selfcal.elimination import STARS, memberships
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.grid import cell_index
 
-__all__ = ["DetectionScores", "score_excess", "scores_of_detections"]
+__all__ = [
+    "DetectionScores",
+    "StarBlock",
+    "places_by_star",
+    "score_excess",
+    "scores_of_detections",
+    "star_blocks",
+    "taken_by_stars",
+]
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+LOOSE = 1e-9  # relative curvature below which a combination of a star's parameters is undetermined
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,3 +93,63 @@ def score_excess(solution: SelfCalibrationMode, scores: DetectionScores) -> Floa
 
 def _square(problem: Problem) -> Float:
     return np.asarray(problem.W[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class StarBlock:
+    """Some stars with their n detections, in pixels of the detector."""
+
+    rows: slice  # detections, in the order of the problem
+    star: Int  # which of these stars each detection (n,) belongs to
+    member: Float  # probability (n,) to belong to the star
+    weight: Float  # inverse variance (n,) of each axis, times that probability
+    residual: Float  # detection minus star (n, 2)
+    # L^-1 B (n, q, 2): B is the curvature of the log density by the star's parameters and the
+    # detection's pixels, L L^T that by the star's parameters alone
+    ties: Float
+
+
+def star_blocks(solution: SelfCalibrationMode) -> Iterator[StarBlock]:
+    """Iterator over the stars of a solution, some at a time, with their detections."""
+    p, theta, mixture = solution.problem, solution.theta, solution.mixture
+    members = memberships(p, theta, mixture, solution.stars)
+    weights = members / (p.var + mixture.jitter**2)
+    residuals = p.places(theta) - p.star_places(solution.stars)
+    for first in range(0, p.n_stars, STARS):
+        last = min(first + STARS, p.n_stars)
+        rows = slice(int(p.starts[first]), int(p.starts[last]))
+        to_pixels = np.linalg.inv(p.jacobians(theta, rows))
+        w, star = weights[rows], p.star[rows] - first
+        by_star = np.swapaxes(to_pixels @ places_by_star(p, rows), 1, 2)
+        curvature = w[:, None, None] * by_star @ np.swapaxes(by_star, 1, 2)
+        own = p.priors.precision[first:last] + sums_over(star, curvature, last - first)
+        roots = _inverse_roots(own)
+        residual = np.einsum("nij,nj->ni", to_pixels, residuals[rows])
+        ties = w[:, None, None] * (roots[star] @ by_star)
+        yield StarBlock(rows, star, members[rows], w, residual, ties)
+
+
+def taken_by_stars(solution: SelfCalibrationMode) -> Float:
+    """Fraction (N,) of each detection's variance that its star absorbs, at most `MOST_TAKEN`."""
+    out = np.empty(len(solution.problem))
+    for some in star_blocks(solution):
+        square = np.sum(some.ties**2, axis=(1, 2))
+        out[some.rows] = square / (2 * np.maximum(some.weight, np.finfo(float).tiny))
+    return np.minimum(out, MOST_TAKEN)
+
+
+def _inverse_roots(matrices: Float) -> Float:
+    """L^-1 of A = L L^T, (S, q, q); undetermined directions get some curvature."""
+    scale = np.sqrt(np.einsum("sqq->sq", matrices))
+    scaled = matrices / (scale[:, :, None] * scale[:, None, :])
+    scaled += LOOSE * np.eye(matrices.shape[1])
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(scaled)) / scale[:, None, :])
+
+
+def places_by_star(problem: Problem, rows: slice) -> Float:
+    """Derivatives (n, 2, q) of positions of detections by the parameters of their stars."""
+    n, q, unit = rows.stop - rows.start, problem.n_star, np.eye(2)
+    out = np.broadcast_to(unit, (n, 2, 2))
+    if q >= 4:
+        out = np.concatenate([out, problem.time[rows, None, None] * unit], axis=2)
+    return out if q < 5 else np.concatenate([out, problem.factor[rows, :, None]], axis=2)

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from bayesdist.diagnose.clusters import squares_over, sums_over
 from bayesdist.diagnose.tables.mean_square import MeanSquare
-from bayesdist.diagnose.tables.node_cells import NodeCells
 from bayesdist.errors import DegenerateError
 from bayesdist.model import Chip
 
@@ -80,7 +79,7 @@ def between_nodes(
     """
     used = (precision > 0).all(axis=1)
     stars = x[used], y[used], residual[used], precision[used], star[used], exposure[used]
-    fine, coarse = (_pairs(NodeCells.of(chip, step, parts), *stars) for parts in (FINE, COARSE))
+    fine, coarse = (_pairs(_NodeCells.of(chip, step, parts), *stars) for parts in (FINE, COARSE))
     n_pairs = round(float(fine.number.sum()) / 2)
     part = fine.cells.areas(chip)
     seen = ((fine.weight > 0) & (coarse.weight > 0)).all(axis=1) & (part > 0)
@@ -144,7 +143,7 @@ class _Axis:
 class _Pairs:
     """Sums over ordered pairs of different stars in different exposures of the same cell."""
 
-    cells: NodeCells
+    cells: _NodeCells
     by_cell: Float  # (cells, 2) weights
     # product, weight, spread (squares, 2): products and weights by square; variance of the former
     # as far as stars err by themselves
@@ -176,7 +175,7 @@ class _Pairs:
 
 
 def _pairs(
-    cells: NodeCells,
+    cells: _NodeCells,
     x: Float,
     y: Float,
     residual: Float,
@@ -197,3 +196,57 @@ def _pairs(
     squares = cells.squares()
     whole = sums_over(squares, sums)
     return _Pairs(cells, sums[:, 2:4], whole[:, :2], whole[:, 2:4], 2 * whole[:, 4:6], whole[:, 6])
+
+
+@dataclass(frozen=True)
+class _NodeCells:
+    """Cells that divide the squares between nodes."""
+
+    # pixel of the corner of the first cell: on the node before the first one of the table
+    origin: tuple[float, float]
+    side: tuple[float, float]
+    shape: tuple[int, int]  # cells along x and y
+    parts: int  # along a side of a square
+
+    @classmethod
+    def of(cls, chip: Chip, step: tuple[float, float], parts: int) -> _NodeCells:
+        """Cells of a chip, `parts` along each side of a square."""
+        squares = [int(np.ceil(n / s - 1e-9)) + 1 for n, s in zip(chip.size, step, strict=True)]
+        return cls(
+            ((1 - step[0]) / 2, (1 - step[1]) / 2),
+            (step[0] / parts, step[1] / parts),
+            (squares[0] * parts, squares[1] * parts),
+            parts,
+        )
+
+    @property
+    def number(self) -> int:
+        """Number of cells."""
+        return self.shape[0] * self.shape[1]
+
+    def of_pixels(self, x: Float, y: Float) -> Int:
+        """Cell of each pixel, shape (N,)."""
+        i, j = (
+            np.clip(((p - o) // s).astype(np.int64), 0, n - 1)
+            for p, o, s, n in zip((x, y), self.origin, self.side, self.shape, strict=True)
+        )
+        return j * self.shape[0] + i
+
+    def centres(self, cells: Int) -> tuple[Float, Float]:
+        """Pixels x and y of the centres of cells."""
+        j, i = np.divmod(cells, self.shape[0])
+        x, y = (o + (k + 0.5) * s for o, k, s in zip(self.origin, (i, j), self.side, strict=True))
+        return x, y
+
+    def areas(self, chip: Chip) -> Float:
+        """Fraction of each square that lies on the chip."""
+        shares = []
+        for o, s, n, size in zip(self.origin, self.side, self.shape, chip.size, strict=True):
+            edges = o + s * self.parts * np.arange(n // self.parts + 1)
+            shares.append(np.diff(np.clip(edges, 0.5, size + 0.5)) / (s * self.parts))
+        return np.outer(shares[1], shares[0]).ravel()
+
+    def squares(self) -> Int:
+        """Square (cells,) that each cell lies in."""
+        j, i = np.divmod(np.arange(self.number), self.shape[0])
+        return j // self.parts * (self.shape[0] // self.parts) + i // self.parts

@@ -41,7 +41,6 @@ from bayesdist.infer.catalogue.by_magnitude import (
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.linear import NO_REJECTION, LinearFit, fit_linear
 from bayesdist.infer.stars.likelihood import good_probability, log_densities
-from bayesdist.infer.stars.stars import errors_of
 from bayesdist.model import DistortionModel
 
 __all__ = ["ONE", "GroupedErrors", "grouped_errors"]
@@ -182,7 +181,7 @@ def grouped_errors(
 
 def _quoted(table: Matches) -> Float:
     """Quoted variances (2, N)."""
-    return np.stack(errors_of(table)) ** 2
+    return np.stack([table.column("sigma_u"), table.column("sigma_v")]) ** 2
 
 
 def _starting_state(table: Matches, fit: LinearFit, quoted: Float, outliers: bool) -> _State:

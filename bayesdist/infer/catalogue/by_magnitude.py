@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
 from bayesdist.data.matches import Matches
-from bayesdist.errors import InputError, required
+from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.magnitude_law import MagnitudeLaw
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.linear import DEFAULT_REJECTION, NO_REJECTION, LinearFit, Rejection, fit_linear
@@ -105,7 +105,7 @@ def _law(
     priors: GaussianPriors | None,
 ) -> MagnitudeErrors:
     """Law of the errors with magnitude of some stars."""
-    mag = required(stars.mag, "errors by magnitude need magnitudes")
+    mag = stars.column("mag")
     fit = fit_linear(stars.with_errors(1.0), model, rejection=rejection, priors=priors)
     residual = residuals_of(fit, stars)
     bins = estimate(mag, *residual, n_params=model.n_params)

@@ -58,15 +58,15 @@ def star_influence(
 
     The fit has no extra weight in the corners; `matches` are its own, with errors and star codes.
     """
-    assert matches.star is not None
+    code = matches.column("star")
     model, D = fit.model, fit.model.n_distortion
     n_levers = 1 if errors.motion is None else 2
     by = np.zeros((n_levers, 2, len(codes), D))
-    wanted = np.isin(matches.star, codes) & fit.uses(matches)
+    wanted = np.isin(code, codes) & fit.uses(matches)
     if not wanted.any():
         return StarInfluence(errors, codes, by)
     stars, order = prepare(model, matches.select(wanted))
-    star = matches.star[wanted][order]
+    star = code[wanted][order]
     epoch = None if matches.epoch is None else matches.epoch[wanted][order]
     levers = list(errors.levers(star, epoch))
     inverse = np.stack([1 / stars.var_u, 1 / stars.var_v])

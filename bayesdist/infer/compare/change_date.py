@@ -19,7 +19,6 @@ from scipy.linalg import null_space
 from scipy.stats import chi2 as chi_square
 
 from bayesdist.data.matches import Matches
-from bayesdist.errors import required
 from bayesdist.infer.compare.frame_fields import mean_squares, without
 from bayesdist.infer.compare.monitoring import Change, NewFit
 from bayesdist.infer.equations.normal import NormalEquations, mixture
@@ -83,8 +82,7 @@ def period_scores(
     held: dict[int, tuple[NormalEquations, float, float, int]] = {}
     constants = new.target.hyper.constants(new.psi[None, new.target.n_theta :])
     for table in matches.batches():
-        epoch = required(table.epoch, "matches need epochs", do="map column 'epoch'")
-        of_period = np.searchsorted(edges, epoch, side="right")
+        of_period = np.searchsorted(edges, table.column("epoch"), side="right")
         for b in np.unique(of_period):
             part = table.select(of_period == b)
             found = _sums(new, part, constants)
@@ -97,8 +95,7 @@ def period_scores(
 
 def _edges(matches: Matches, most: int) -> Float:
     """Dates at which a new period begins."""
-    some = matches.sample(1_000_000)
-    epoch = required(some.epoch, "matches need epochs", do="map column 'epoch'")
+    epoch = matches.sample(1_000_000).column("epoch")
     dates, counts = np.unique(epoch, return_counts=True)
     if len(dates) <= most:
         return dates[1:]
@@ -110,7 +107,7 @@ def _sums(
     new: NewFit, table: Matches, constants: Constants
 ) -> tuple[NormalEquations, float, float, int]:
     stars, _ = prepare(new.model, table)
-    epoch = required(table.epoch, "matches need epochs", do="map column 'epoch'")
+    epoch = table.column("epoch")
     equations = mixture(stars, new.theta, constants, True)
     return equations, float(epoch.min()), float(epoch.max()), len(table)
 

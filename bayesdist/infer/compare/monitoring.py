@@ -147,6 +147,7 @@ def fit_new(
     rejection: Rejection = DEFAULT_REJECTION,
     compute: Compute | None = None,
     scatter: Mapping[str, float] | None = None,
+    frames: str | None = None,
 ) -> NewFit:
     """Fit new matches independently of the release.
 
@@ -164,6 +165,8 @@ def fit_new(
     scatter : mapping of str to float, optional
         Standard deviations of a campaign's exposures, by the name of the parameter: 'scale', ...
         Required for such a release.
+    frames : str, optional
+        Kind of the frames of the new exposures; by default that of the release.
 
     Returns
     -------
@@ -178,6 +181,8 @@ def fit_new(
     """
     bare = without_frames(released)
     model = new_model(released.model, matches)
+    if frames is not None:
+        model = replace(model, frames=frames)
     scattering = np.zeros(model.n_frame)
     if scatter is not None:
         model = held_in_reference(matches, model, model.chips[0].number)

@@ -10,7 +10,7 @@ import numpy as np
 from astropy.time import Time
 
 from bayesdist.data import Matches
-from bayesdist.errors import InputError, required
+from bayesdist.errors import InputError
 
 __all__ = ["Periods", "check_periods", "mjd_periods", "sum_by_period"]
 
@@ -84,7 +84,7 @@ def sum_by_period(matches: Matches, periods: Periods, task: Callable[[Matches], 
     check_periods(periods)
     sums: dict[str, Any] = {}
     for table in matches.batches():
-        epoch = required(table.epoch, "matches need epochs", do="map column 'epoch'")
+        epoch = table.column("epoch")
         for name, (start, stop) in periods.items():
             inside = (epoch >= start) & (epoch < stop)
             if inside.any():

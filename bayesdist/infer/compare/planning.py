@@ -104,6 +104,8 @@ def with_information(solution: Solution, information: Float) -> Solution:
     root = scaled_cholesky(cov[:n, :n])
     inner = np.eye(n) + root.T @ information @ root
     after = root @ np.linalg.solve(inner, root.T)
-    follow = cov[:, :n] @ scaled_inverse(cov[:n, :n])
+    free = np.flatnonzero(np.diag(cov[:n, :n]) > 0)  # without those that a gauge fixes
+    follow = np.zeros((len(cov), n))
+    follow[:, free] = cov[:, free] @ scaled_inverse(cov[np.ix_(free, free)])
     changed = cov + follow @ (after - cov[:n, :n]) @ follow.T
     return solution.mapped(recolouring(cov, (changed + changed.T) / 2))

@@ -138,7 +138,6 @@ def fit_exposures(
     for code, rows in zip(codes, np.split(order, starts[1:]), strict=True):
         name = matches.exposure_names[code]
         table = matches.select(np.sort(rows))
-        assert table.epoch is not None
         try:
             _require_stars(table, alone)
             fit = fit_linear(table, alone, rejection=rejection)
@@ -150,7 +149,7 @@ def fit_exposures(
             continue
         view = reference_gauge(fit, chip)
         names.append(name)
-        epochs.append(float(np.median(table.epoch)))
+        epochs.append(float(np.median(table.column("epoch"))))
         views.append(view)
         terms.append(linear_terms(view))
     if not names:

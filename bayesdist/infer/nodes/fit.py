@@ -244,14 +244,13 @@ def _with_memberships(matches: Matches, mixture: ResidualMixture, jitter: Float)
 
     A star of probability p counts p times: its variance is divided by p.
     """
-    assert matches.sigma_u is not None
-    assert matches.sigma_v is not None
+    sigma_u, sigma_v = matches.column("sigma_u"), matches.column("sigma_v")
     likely = mixture.probability >= LIKELY
     p = np.maximum(mixture.probability, LIKELY)
     wide = matches.with_errors(
         (
-            np.sqrt((matches.sigma_u**2 + jitter**2) / p),
-            np.sqrt((matches.sigma_v**2 + jitter**2) / p),
+            np.sqrt((sigma_u**2 + jitter**2) / p),
+            np.sqrt((sigma_v**2 + jitter**2) / p),
         )
     )
     return wide.select(likely, reason="false match")

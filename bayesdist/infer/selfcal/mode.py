@@ -87,6 +87,24 @@ class SelfCalibrationMode:
         return out
 
     @property
+    def distortion_information(self) -> Float:
+        """Information (d, d) of the detections about polynomials and drift; zero for fixed ones.
+
+        Stars and frames are eliminated.
+        """
+        n, H = self.problem.model.n_distortion, self.expansion.curvature
+        own, frames = self.free[self.free < n], self.free[self.free >= n]
+        left = H[np.ix_(own, own)]
+        if frames.size:
+            local, cross = H[np.ix_(frames, frames)], H[np.ix_(own, frames)]
+            scale = 1.0 / np.sqrt(np.diag(local))
+            half = cross * scale
+            left = left - half @ np.linalg.solve(local * np.outer(scale, scale), half.T)
+        out = np.zeros((n, n))
+        out[np.ix_(own, own)] = (left + left.T) / 2
+        return out
+
+    @property
     def error(self) -> float:
         """Typical error of a detection on one axis, pixels."""
         return float(np.sqrt(np.median(self.problem.var) + self.mixture.jitter**2))

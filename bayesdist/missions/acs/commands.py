@@ -31,14 +31,15 @@ from bayesdist.app.commands.options import (
     help="Detector of ACS whose published numbers are compared.",
 )
 @click.option("--magnification", type=float, metavar="M", help="Magnification of the vectors.")
-def handbook(file: str, output: str, **options: Any) -> None:
+@click.pass_obj
+def handbook(line: str, file: str, output: str, **options: Any) -> None:
     """Draw figures and numbers as in the ACS handbook.
 
     FILE is an IDCTAB, a run, or any file that 'compare' takes.
     """
     from bayesdist.missions.acs.handbook.command import handbook as written
 
-    click.echo(written(file, output, **options))
+    click.echo(written(file, output, command=line, **options))
 
 
 @command()

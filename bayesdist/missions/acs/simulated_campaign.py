@@ -43,6 +43,8 @@ q_max = 0.1
 method = "field"             # or "binned", as ACS ISR 2015-06; or "none"
 
 [detector]
+mission = "HST"
+instrument = "ACS"
 scale_mas = 50.0
 
 [[chip]]

@@ -103,14 +103,15 @@ def bands(
     metavar="DEG",
     help="Rotation of the optical model, degrees.",
 )
-def bring_up(detections: str, reference: str, output: str, **options: Any) -> None:
+@click.pass_obj
+def bring_up(line: str, detections: str, reference: str, output: str, **options: Any) -> None:
     """Determine pairs and distortion from unmatched star lists.
 
     DETECTIONS and REFERENCE have columns x, y, sigma and frame, in pixels of the band.
     """
     from bayesdist.missions.wise.bring_up.command import bring_up_files
 
-    click.echo(bring_up_files(detections, reference, output, **options))
+    click.echo(bring_up_files(detections, reference, output, command=line, **options))
 
 
 @command()
@@ -222,7 +223,7 @@ rvb.add_command(rereference)
     help="Number of pairs in each band.",
 )
 @click.option(
-    "--false-share", type=float, default=0.03, metavar="F", help="Fraction of false matches."
+    "--false-fraction", type=float, default=0.03, metavar="F", help="Fraction of false matches."
 )
 @click.option("--partition-pattern", is_flag=True, help="Add a pattern of blocks to the residuals.")
 @click.option(

@@ -34,6 +34,7 @@ simulated = true
 columns = {{x="x", y="y", u="u", v="v", sigma_u="sigma_u", sigma_v="sigma_v", mag="mag"}}
 
 [detector]
+mission = "WISE"
 name = "{band}"
 size = [1016, 1016]
 scale_mas = 2750.0

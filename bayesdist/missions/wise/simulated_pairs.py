@@ -28,6 +28,7 @@ band = "{band}"
 columns = {{exposure = ""}}    # without the frames: one distortion serves all
 
 [detector]
+mission = "WISE"
 name = "{band}"
 size = [{columns:.0f}, {rows:.0f}]
 scale_mas = {scale_mas:.1f}
@@ -98,7 +99,7 @@ def simulate_sets(
     *,
     bands: Sequence[str] = ("W1", "W2", "W3", "W4"),
     pairs: int | None = None,
-    false_share: float = 0.03,
+    false_fraction: float = 0.03,
     partition_pattern: bool = False,
     seed: int = 1,
     force: bool = False,
@@ -106,7 +107,7 @@ def simulate_sets(
     """Full sets of bands in Parquet, and how to calibrate them.
 
     `output`: folder. `pairs`: of each band; by default those of section 4 of WSDC D-T033.
-    `false_share`: fraction of false matches. `partition_pattern`: blocks in the residuals. `force`:
+    `false_fraction`: of false matches. `partition_pattern`: blocks in the residuals. `force`:
     replace sets that are there. Returns the text to print. InputError for options that cannot be
     used, and a folder in use.
     """
@@ -118,7 +119,7 @@ def simulate_sets(
             band,
             pairs=pairs,
             seed=seed,
-            false_share=false_share,
+            false_fraction=false_fraction,
             partition=partition_pattern,
         )
         for band in bands

@@ -29,6 +29,7 @@ from bayesdist.report.sections.run import (  # noqa: F401
     provenance,
     residuals,
     status,
+    trends,
 )
 
 __all__ = ["REPORT"]

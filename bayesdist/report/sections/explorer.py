@@ -69,12 +69,12 @@ def budget_data(r: ReportInput) -> dict[str, Any]:
 
 @REPORT.data()
 def map_data(r: ReportInput) -> dict[str, Any]:
-    """Maps that a pointer reads: radial uncertainty and pixel area."""
+    """Maps that a pointer reads: uncertainty per axis and pixel area."""
     chips = r.chips
     layers = []
     for k, first in enumerate(chips[0].maps):
-        radii = [c.maps[k].radius for c in chips]
-        layers.append(_layer(f"Uncertainty, {first.kind}", r.unit, radii))
+        sigma = [c.maps[k].per_axis for c in chips]
+        layers.append(_layer(f"Uncertainty per axis, {first.kind}", r.unit, sigma))
     layers.append(_layer("Pixel area, relative", "", [c.area.area for c in chips], digits=7))
     return _common(r) | {"layers": layers}
 

@@ -134,16 +134,17 @@ class Budget {
       { name: "total", kind: "total", source: "", variance: [0, 1].map(a => joint[a] + add(others, a)) }];
   }
 
-  radial(chip, places, magnitude, name) {
+  /** Standard deviation of one axis, as the mean of the variances of both. */
+  perAxis(chip, places, magnitude, name) {
     if (name !== "total" && this.names.includes(name)) {
       const [u, v] = this.drawn(chip, name, this.form(chip, places));
-      return Math.sqrt(u + v);
+      return Math.sqrt((u + v) / 2);
     }
     const file = this.files(chip, places).find(p => p.name === name);
-    if (file) return Math.sqrt(file.variance[0] + file.variance[1]);
+    if (file) return Math.sqrt((file.variance[0] + file.variance[1]) / 2);
     const own = this.independent(chip, places, magnitude).filter(t => name === "total" || t.name === name);
     const joint = name === "total" ? this.drawn(chip, this.data.joint, this.form(chip, places)) : [0, 0];
-    return Math.sqrt(own.reduce((sum, t) => sum + t.variance[0] + t.variance[1], joint[0] + joint[1]));
+    return Math.sqrt(own.reduce((sum, t) => sum + t.variance[0] + t.variance[1], joint[0] + joint[1]) / 2);
   }
 }
 
@@ -190,12 +191,12 @@ function budgetToAsk() {
   const spoken = make("p", { class: "spoken", "aria-live": "polite" });
   const bar = make("div", { class: "stack", role: "img" });
   const rows = make("tbody");
-  const heads = ["Term", "u", "v", "Radial", "Share of variance"];
+  const heads = ["Term", "u", "v", "Per axis", "Share of variance"];
   const table = make("table", {}, make("thead", {}, make("tr", {}, ...heads.map((h, k) =>
     make("th", k > 0 ? { scope: "col", class: "n" } : { scope: "col" }, h)))), rows);
   panel.append(spoken, bar, make("div", { class: "tablebox" }, table));
   box.append(controls, make("div", { class: "explorer" }, mapbox, panel));
-  const maps = new ChipMaps(mapbox, data, { name: "Radial error", text: v => length(v, data), chosen: (k, x, y) => {
+  const maps = new ChipMaps(mapbox, data, { name: "Error per axis", text: v => length(v, data), chosen: (k, x, y) => {
     const second = state.mode === "two" && k === state.chip;
     state = { ...state, chip: k, mode: state.mode === "rms" ? "one" : state.mode, [second ? "b" : "a"]: [x, y] };
     if (state.mode === "two" && !second) state.b = inside(state.b);
@@ -229,7 +230,7 @@ function budgetToAsk() {
     rows.replaceChildren(...few.map(t => {
       const k = terms.indexOf(t), key = ["total", "product"].includes(t.kind) ? [] : [make("span", {
         class: t.kind === "shared" ? "key shared" : "key", style: t.kind === "shared" ? "" : `background:${tint(k)}` })];
-      const values = [...t.variance, t.variance[0] + t.variance[1]].map(v => make("td", { class: "n" }, signed(v)));
+      const values = [...t.variance, (t.variance[0] + t.variance[1]) / 2].map(v => make("td", { class: "n" }, signed(v)));
       return make("tr", t.kind === "total" ? { class: "total" } : {}, make("th", { scope: "row", title: [t.kind, t.source].filter(Boolean).join(", ") },
         ...key, t.name), ...values, make("td", { class: "n" },
           t.kind === "product" ? "in no total" : `${plain((100 * share(t)).toFixed(1))}${THIN}%`));
@@ -243,7 +244,7 @@ function budgetToAsk() {
     bar.setAttribute("aria-label", `Shares of the total variance: ${stacked.map(t => `${t.name} ${(100 * t.share).toFixed(0)} %`).join(", ")}`);
     const when = data.years ? `, epoch ${state.epoch.toFixed(2)}` : "";
     const star = state.magnitude === null ? "" : `, magnitude ${number(state.magnitude, 4)}`;
-    spoken.replaceChildren(`Total, ${where()}${when}${star}: `, make("b", { id: "budget-total" }, length(Math.sqrt(sum), data)));
+    spoken.replaceChildren(`Total, ${where()}${when}${star}: `, make("b", { id: "budget-total" }, length(Math.sqrt(sum / 2), data)), " per axis, 1 \u03c3");
     const label = (place, text) => ({ chip: state.chip, x: place[0], y: place[1], label: text });
     const marks = { rms: [], one: [label(state.a, "A")], two: [label(state.a, "A"), label(state.b, "B")] }[state.mode];
     const known = ["total", ...terms.slice(0, -1).filter(t => t.kind !== "shared").map(t => t.name)];
@@ -252,7 +253,7 @@ function budgetToAsk() {
     // two chips have no covariance here: of differences only the chip itself has a map
     const second = state.mode === "two" ? [state.a] : [];
     maps.draw((k, x, y) => second.length && k !== state.chip ? NaN
-      : budget.radial(k, [[x, y], ...second], state.magnitude, state.map), marks);
+      : budget.perAxis(k, [[x, y], ...second], state.magnitude, state.map), marks);
     Object.assign(mode, { value: state.mode }); Object.assign(map, { value: state.map });
     chip.value = state.chip;
     [[ax, ay, state.a], [bx, by, state.b]].forEach(([x, y, at]) => { [x.value, y.value] = at; });

@@ -205,8 +205,9 @@ function sortable(table) {
       const falling = head.getAttribute("aria-sort") === "ascending";
       heads.forEach(h => h.setAttribute("aria-sort", "none"));
       head.setAttribute("aria-sort", falling ? "descending" : "ascending");
-      const numeric = head.classList.contains("n");
-      const key = row => numeric ? worth(row.cells[column].textContent) : row.cells[column].textContent;
+      const numeric = head.classList.contains("n") || "key" in body.rows[0].cells[column].dataset;
+      const text = cell => cell.dataset.key ?? cell.textContent;
+      const key = row => numeric ? worth(text(row.cells[column])) : text(row.cells[column]);
       const order = (a, b) => numeric ? a - b : a.localeCompare(b, "en", { numeric: true });
       const rows = [...body.rows].map(row => ({ row, key: key(row), last: row.classList.contains("total") }));
       rows.sort((a, b) => {
@@ -219,9 +220,59 @@ function sortable(table) {
   });
 }
 
+/** Texts of a table's cells, row by row, with plain signs and spaces. */
+function textsOf(table) {
+  const tidy = cell => [...cell.childNodes].filter(n => !(n.classList && n.classList.contains("help")))
+    .map(n => n.textContent).join("").replaceAll(MINUS, "-").replace(/[\u202f\u00a0\s]+/g, " ").trim();
+  return [...table.rows].map(row => [...row.cells].map(tidy));
+}
+
+function csvOf(rows) {
+  const quoted = text => /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
+  return rows.map(row => row.map(quoted).join(",")).join("\r\n") + "\r\n";
+}
+
+const TEX = {
+  "\\": "\\textbackslash{}", "&": "\\&", "%": "\\%", "$": "\\$", "#": "\\#", "_": "\\_", "{": "\\{", "}": "\\}",
+  "~": "\\textasciitilde{}", "^": "\\textasciicircum{}", "\u00d7": "$\\times$", "\u00b1": "$\\pm$", "\u03c3": "$\\sigma$",
+  "\u03c7": "$\\chi$", "\u00b2": "$^2$", "\u00b5": "$\\mu$", "\u221e": "$\\infty$", "\u2013": "--", "\u2020": "\\dag{}",
+};
+function latexOf(rows, caption) {
+  const plainText = text => [...text.replace(/^-(?=[\d.])/, "\u0000")].map(c => c === "\u0000" ? "$-$" : TEX[c] ?? c).join("")
+    .replace(/[\u207b\u2070\u00b9\u00b3\u2074-\u2079]+/g, found => `$^{${[...found].map(c => c === "\u207b" ? "-" : SUPERSCRIPT.indexOf(c)).join("")}}$`);
+  const width = Math.max(...rows.map(row => row.length));
+  const lines = rows.map(row => row.length === 1 && width > 1
+    ? `\\multicolumn{${width}}{l}{${plainText(row[0])}}` : row.map(plainText).join(" & "));
+  return ["\\begin{table}", `\\caption{${plainText(caption)}}`, `\\begin{tabular}{${"l".repeat(width)}}`, "\\hline",
+    ...lines.map((line, k) => `${line} \\\\${k === 0 ? " \\hline" : ""}`), "\\hline", "\\end{tabular}", "\\end{table}", ""].join("\n");
+}
+
+function saved(text, name, type) {
+  const link = make("a", { download: name, href: URL.createObjectURL(new Blob([text], { type })) });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+}
+
+/** Below a table: its content as CSV and as LaTeX. */
+function downloads(table) {
+  const caption = table.caption ? textsOf({ rows: [{ cells: [table.caption] }] })[0][0] : "table";
+  const name = caption.toLowerCase().replace(/[^a-z0-9]+/g, "_").replace(/^_+|_+$/g, "").slice(0, 60) || "table";
+  const button = (label, act) => {
+    const one = make("button", { type: "button", "aria-label": `${caption} as ${label}` }, label);
+    one.addEventListener("click", act);
+    return one;
+  };
+  const box = make("p", { class: "get" },
+    button("CSV", () => saved(csvOf(textsOf(table)), `${name}.csv`, "text/csv")),
+    button("LaTeX", () => saved(latexOf(textsOf(table), caption), `${name}.tex`, "text/x-tex")));
+  (table.closest(".tablebox") || table).after(box);
+}
+
 document.addEventListener("DOMContentLoaded", () => {
   mapsToRead();
   budgetToAsk();
   for (const table of document.querySelectorAll("table.grid"))
     if (table.tHead && table.tBodies.length === 1 && table.tBodies[0].rows.length > 1) sortable(table);
+  for (const table of document.querySelectorAll("main .tablebox > table"))
+    if (table.caption) downloads(table);
 });

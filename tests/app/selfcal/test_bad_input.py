@@ -104,7 +104,7 @@ def test_an_exposure_turned_by_half_a_turn(tmp_path):
 def test_an_exposure_that_shares_hardly_a_star(roll, words):
     """Where the rest settles without it, it is named by what it has in common with the others."""
     rolls, shares = np.array([0.0, 0.1, roll, 0.0]), np.array([0.7, 0.8, 0.1, 0.75])
-    table = Table({"exposure": list("abcd"), "share_common": shares, "rotation": rolls})
+    table = Table({"exposure": list("abcd"), "fraction_common": shares, "rotation": rolls})
     with pytest.raises(InputError, match="exposure c ") as caught:
         refuse_unconnected(table)
     for word in words:

@@ -20,9 +20,10 @@ from bayesdist.app.selfcal.matching import match_dithers
 from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer import load_fit, load_posterior
+from bayesdist.infer.compare.planning import with_information
 from bayesdist.infer.selfcal import gauge_free
 from tests.app.selfcal.support import affine_left
-from tests.app.support import cli, good, one_sentence, snapshot, summary_of
+from tests.app.support import cli, good, one_sentence, snapshot, summary_of, write_config
 
 
 def _grid(n: int = 12) -> tuple[np.ndarray, np.ndarray]:
@@ -225,15 +226,57 @@ def test_other_commands(three_rolls, tmp_path):
     assert "total" in good("budget", run, "--at", 512, 512).out
     for arguments, word in (
         (("select-order", three_rolls.config), "[selfcal]"),
-        (("monitor", run, run), "self-calibration"),
+        (("monitor", run, run), "is a run"),
+        (("monitor", run, run / "stars.ecsv"), "self-calibration"),
         (("wise", "bands", run, "-o", tmp_path / "bands"), "self-calibration"),
-        (("plan", run), "self-calibration"),
+        (("plan", run), "has no requirements"),
+        (("plan", run, "--epochs", "2020"), "self-calibration"),
         (("release", run, "-o", tmp_path / "release"), "campaign"),
     ):
         result = cli(*arguments)
         assert result.code == 1, arguments
         one_sentence(result.err, word)
     assert "posterior of a distortion" in good("inspect", run).out
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.1])
+def test_new_matches_on_another_sky_test_the_release(bend, three_rolls, tmp_path):
+    """Exposures of a catalogue in any linear frame: a bend is found, and a frame is none."""
+    rng, n = np.random.default_rng(5), 900
+    x, y = rng.uniform(1, 1024, (2, n))
+    exposure = np.repeat([0, 1, 2], n // 3)
+    u, v = three_rolls.truth.model.predict(three_rolls.truth.theta, x, y, exposure=exposure).T
+    u = u + bend * ((x - 512) / 512) ** 2
+    frames = np.array([[[1.02, 0.3], [-0.25, 0.97]], [[-0.9, 0.1], [0.2, -1.0]], np.eye(2)])
+    u, v = np.einsum("nab,bn->an", frames[exposure], [u, v]) + 0.02 * rng.standard_normal((2, n))
+    names = np.array(["p", "q", "r"])[exposure]
+    sigma = np.full(n, 0.02)
+    columns = {"x": x, "y": y, "u": u, "v": v, "sigma_u": sigma, "sigma_v": sigma}
+    table = Table(columns | {"exposure": names})
+    for name in ("u", "v", "sigma_u", "sigma_v"):
+        table[name].unit = "pix"
+    table.write(tmp_path / "new.ecsv")
+    config = write_config(
+        tmp_path / "new.toml",
+        data={"matches": "new.ecsv"},
+        detector={"size": (1024, 1024)},
+        model={"order": 3, "reference_pixel": (512.0, 512.0)},
+    )
+    result = good("monitor", three_rolls.path, config)
+    assert ("no longer describes" in result.out) == (bend > 0)
+    assert "in 3 exposure(s); fitted to each and taken out: affine" in result.out
+
+
+def test_more_exposures_are_planned_as_these_are_dithered(three_rolls):
+    """Once more as many exposures halve the variance: as a limit by the root of 2 nearer asks."""
+    results = results_of(RunDirectory.open(three_rolls.path))
+    mode = results.fitted.solved.mode
+    n = mode.problem.model.n_distortion
+    more = with_information(mode.solution, mode.distortion_information)
+    before, after = (np.diag(one.cov)[:n] for one in (mode.solution, more))
+    free = before > 0
+    assert free.sum() > n / 2
+    np.testing.assert_allclose(after[free], before[free] / 2, rtol=1e-6)
 
 
 def test_requirements_are_judged(three_rolls, tmp_path):
@@ -243,3 +286,5 @@ def test_requirements_are_judged(three_rolls, tmp_path):
     good("requirements", tmp_path / "run", "--requirements", tmp_path / "req.toml")
     [margin] = summary_of(tmp_path / "run")["margins"]
     assert margin["verdict"] == "met"
+    planned = good("plan", tmp_path / "run").out
+    assert "dithered as these 8 are" in planned and "dithered like these: met as it is" in planned

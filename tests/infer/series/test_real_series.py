@@ -169,9 +169,9 @@ def test_decam_breaks_are_found(decam):
     assert level.significance[0] < -8
 
 
-def test_a_step_put_into_real_scatter_is_found(decam):
+def test_a_step_put_into_real_scatter_is_found(decam, full):
     """Of six times the CCD's own scatter, at a date that differs from CCD to CCD."""
-    for i, name in enumerate(("N4", "N14", "S2", "S21")):
+    for i, name in enumerate(("N4", "N14", "S2", "S21") if full else ("N4", "N14")):
         one = decam[name].only("e1")
         posterior = fit_series(one, TrendModel("constant"))
         size = 6 * posterior.scatter_sigma.mean()

@@ -156,7 +156,7 @@ def test_area_maps_say_how_well_they_are_known(idctab, tmp_path):
 def test_figures_and_numbers_of_a_table(idctab, tmp_path):
     result = good("hst", "handbook", idctab, "-o", tmp_path / "book")
     assert {p.name for p in (tmp_path / "book").iterdir()} == {
-        "non_linear.png", "pixel_area.png", "numbers.ecsv"
+        "handbook.json", "non_linear.png", "pixel_area.png", "numbers.ecsv"
     }  # fmt: skip
     assert "no residuals" in result.out
     numbers = Table.read(tmp_path / "book" / "numbers.ecsv")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -224,6 +225,7 @@ def test_the_command_gives_the_pairs_of_the_function(scene, ups, tmp_path, optic
                  "--corner-radius", RULE.corner, *start)  # fmt: skip
     up = ups["delivered" if optical else "nothing"]
     assert up.sentence in shown.out
+    assert json.loads((out / "bring_up.json").read_text())["verdict"] == up.sentence
     rounds = Table.read(out / "rounds.ecsv")
     assert rounds["n_believed"].tolist() == [one.n_believed for one in up.rounds]
     found = read_rvb(out / "pairs")

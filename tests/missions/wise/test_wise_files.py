@@ -40,7 +40,7 @@ def scaled_r2(one, chunk):
 @pytest.fixture(scope="module")
 def many():
     """W1 with many false matches."""
-    one = wise_set("W1", pairs=200_000, seed=4, false_share=0.2, partition=True)
+    one = wise_set("W1", pairs=200_000, seed=4, false_fraction=0.2, partition=True)
     return one, one.chunk(0)
 
 
@@ -101,10 +101,10 @@ def test_false_matches_depend_on_density_and_radius(many):
 
 @pytest.mark.parametrize("share", [0.001, 0.5, 0.9])
 def test_any_share_of_false_matches_is_met(share):
-    one = wise_set("W4", pairs=100_000, false_share=share)
+    one = wise_set("W4", pairs=100_000, false_fraction=share)
     n_false = int(one.chunk(0).false.sum())
     assert stats.binomtest(n_false, 100_000, share).pvalue > 1e-4
-    assert not wise_set("W4", pairs=1000, false_share=0.0).chunk(0).false.any()
+    assert not wise_set("W4", pairs=1000, false_fraction=0.0).chunk(0).false.any()
 
 
 def test_colour_favours_stars(many):
@@ -149,7 +149,7 @@ def test_the_pattern_has_the_report_s_size_and_nothing_for_the_polynomial(band, 
 
 def test_the_pattern_moves_the_positions_and_nothing_else(many):
     one, chunk = many
-    plain = wise_set("W1", pairs=200_000, seed=4, false_share=0.2).chunk(0)
+    plain = wise_set("W1", pairs=200_000, seed=4, false_fraction=0.2).chunk(0)
     for name in ("x", "y", "mag", "sigma", "colour", "false", "frame"):
         np.testing.assert_array_equal(getattr(chunk, name), getattr(plain, name))
     # what WISE measures is displaced along the pattern: corrected WISE less 2MASS gains it
@@ -160,7 +160,7 @@ def test_the_pattern_moves_the_positions_and_nothing_else(many):
 
 @pytest.mark.parametrize("band", WISE_BANDS)
 def test_a_fit_finds_the_published_coefficients(tmp_path, band):
-    one = wise_set(band, pairs=60_000, seed=6, false_share=0.0)
+    one = wise_set(band, pairs=60_000, seed=6, false_fraction=0.0)
     write_wise_set(one, tmp_path)
     matches = read_matches(tmp_path / band.lower(), columns=COLUMNS | {"exposure": ""})
     fit = fit_linear(matches, one.model, rejection=Rejection(1e9, 1e9))
@@ -171,7 +171,7 @@ def test_a_fit_finds_the_published_coefficients(tmp_path, band):
 
 def test_files_hold_the_chunks(tmp_path, monkeypatch):
     monkeypatch.setattr(sets, "CHUNK", 1000)
-    one = wise_set("W2", pairs=3500, seed=2, false_share=0.1)
+    one = wise_set("W2", pairs=3500, seed=2, false_fraction=0.1)
     n_false = write_wise_set(one, tmp_path)
     back = read_matches(tmp_path / "w2", columns=COLUMNS)
     chunks = [one.chunk(k) for k in range(4)]
@@ -227,7 +227,7 @@ def simulated(folder, **changes):
         "bands": ["W1", "W4"],
         "pairs": 2000,
         "seed": 1,
-        "false_share": 0.03,
+        "false_fraction": 0.03,
         "partition_pattern": True,
         "force": False,
     }
@@ -250,7 +250,7 @@ def test_what_cannot_be_simulated_is_refused(tmp_path):
         simulated(tmp_path, pairs=0)
     for share in (-0.1, 1.0, np.nan):
         with pytest.raises(InputError, match="fraction of false matches"):
-            simulated(tmp_path, false_share=share)
+            simulated(tmp_path, false_fraction=share)
     assert not list(tmp_path.iterdir())
     simulated(tmp_path, bands=["W4"])
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.*")}

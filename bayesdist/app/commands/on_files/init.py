@@ -69,14 +69,15 @@ target_rhat = 1.01
 grid = [33, {grid_y}]                 # points on x and y
 # epoch = 2006.5
 
-# Errors that the data cannot show: random | systematic.  No requirement is called met before one
-# of them is the reference catalogue's, of size 0 with its source where it has none.
-# [[budget]]
-# name = "reference catalogue"
-# kind = "systematic"
-# sigma_u = 0.02
-# sigma_v = 0.02
-# unit = "{unit}"
+# Errors that the data cannot show: random | systematic.  As long as both sizes here are 0 and no
+# source is given, the catalogue's error counts as not stated, and no requirement is called met.
+[[budget]]
+name = "reference catalogue"
+kind = "systematic"
+sigma_u = 0.0                   # FILL IN: error of the catalogue's positions over the whole field
+sigma_v = 0.0                   # FILL IN
+unit = "{unit}"
+# source = "published: ..."     # where the sizes are from; needed where they really are 0
 
 # [[requirement]]
 # name = "field-wide"
@@ -102,6 +103,9 @@ _DETECTOR = """\
 [detector]
 name = "{name}"
 size = [{nx}, {ny}]             # columns, rows; {how}
+# mission = ""                  # beside the name in the title of the report: mission,
+# instrument = ""               # instrument
+# filter = ""                   # and filter
 # scale_mas = 50.0              # size of a pixel, to state errors in mas beside pixels
 """
 

@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.app.commands.on_runs.judging import errors_of
+from bayesdist.app.commands.options import chip_of
 from bayesdist.app.results import open_results
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.budget.budget import TOTAL, ErrorBudget, place_budget
 from bayesdist.assess.terms.forms import PRODUCT
-from bayesdist.errors import InputError
-from bayesdist.model import DistortionModel
 
 __all__ = ["budget_at"]
 
@@ -35,7 +34,7 @@ def budget_at(
     """
     with open_results(RunDirectory.open(run)) as results:
         results.run.require("budget", ("fit", "sample"))
-        number_of = _chip(results.posterior.model, chip, str(run))
+        number_of = chip_of([one.number for one in results.posterior.model.chips], chip, str(run))
         errors = errors_of(results)
         x, y = zip(at, *to, strict=True)
         found = place_budget(
@@ -49,17 +48,6 @@ def budget_at(
         )
         mas = results.config.detector.scale_mas if found.unit == "pix" else None
         return _text(found, at, mas)
-
-
-def _chip(model: DistortionModel, chip: int | None, run: str) -> int:
-    chips = model.chips
-    if chip is None and len(chips) > 1:
-        raise InputError(
-            f"has {len(chips)} chips, and none is named",
-            where=run,
-            do=f"add --chip, one of {', '.join(str(c.number) for c in chips)}",
-        )
-    return chips[0].number if chip is None else chip
 
 
 def _text(found: ErrorBudget, at: tuple[float, float], scale_mas: float | None) -> str:

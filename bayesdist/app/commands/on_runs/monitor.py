@@ -45,7 +45,8 @@ def monitor(
 
     The matches that the run was made from are not needed any more.  `new` are matches, which are
     read as the run's were, or a configuration whose [data] says how; of a campaign another run of
-    which stage 'match' is done, or pairs as a run keeps them.
+    which stage 'match' is done, or pairs as a run keeps them; of a self-calibration a configuration
+    with [data], whose linear part is free in each exposure.
     """
     directory = RunDirectory(run)
     if not directory.is_initialized:
@@ -90,12 +91,6 @@ def _fitted(
         exposures = read_new_exposures(release, new)
         found = fit_exposures_of(release, exposures)
         return exposures.released, exposures.matches, found, exposures.left_out
-    if config.selfcal is not None:
-        raise InputError(
-            "is a run of a self-calibration, whose sky no new matches are on",
-            where=str(run.path),
-            do="calibrate the new exposures by themselves, and use 'bayesdist compare'",
-        )
     posterior = results_of(run).solution
     matches = _new_matches(run, config, new)
     found = fit_new(
@@ -103,28 +98,28 @@ def _fitted(
         matches,
         rejection=Rejection(config.fit.clip_chi2, config.fit.clip_abs),
         compute=config.resources(),
+        # new matches lie on a sky that a self-calibration has not seen
+        frames=None if config.selfcal is None else "affine",
     )
     return posterior, matches, found, ()
 
 
 def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
     """New matches with errors, read as those of the run or as their own configuration says."""
+    if not new.exists():
+        raise InputError("there is no such file", where=str(new), do="check the name")
     if new.suffix == ".toml":
         loaded, base = load_config(new)[0], new.parent
-        data, size = loaded.data, loaded.detector.size
-        if data is None:
+        size = loaded.detector.size
+        path: Path | list[Path]
+        if loaded.data is None:
             raise InputError(
                 "names no table of matches", where=str(new), do="give one in data.matches"
             )
-        names = data.matches
-        path: Any = base / names if isinstance(names, str) else [base / n for n in names]
+        data = loaded.data
+        path = data.paths(base)
     else:
-        # the date of the run's exposures is not that of new ones
-        own = config.data
-        data = None if own is None else own.model_copy(update={"epoch": None})
-        path, size = new, config.detector.size
-        if not new.exists():
-            raise InputError("there is no such file", where=str(new), do="check the name")
+        size, path = config.detector.size, new
         if (new / "run.json").exists():
             itself = new.resolve() == run.path.resolve()
             raise InputError(
@@ -132,7 +127,14 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
                 where=str(new),
                 do="give a file of new matches, or a configuration whose [data] names it",
             )
-    assert data is not None
+        if config.data is None:
+            raise InputError(
+                "is a table, and a self-calibration has not said how to read one",
+                where=str(new),
+                do="give a configuration whose [data] names it",
+            )
+        # the date of the run's exposures is not that of new ones
+        data = config.data.model_copy(update={"epoch": None})
     _refuse_the_same(run, path)
     matches = read_configured(path, data, size=size, chips=config.chip)
     if data.sigma != "by_magnitude":
@@ -147,7 +149,7 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
     return matches.with_errors(errors)
 
 
-def _refuse_the_same(run: RunDirectory, path: Any) -> None:
+def _refuse_the_same(run: RunDirectory, path: Path | list[Path]) -> None:
     """Refuse matches that the release was made from, under whatever name: they cannot test it."""
     seen = set(run.facts["inputs"].values())
     for file in input_files(path):

@@ -10,18 +10,25 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.commands.options import chip_of
 from bayesdist.app.config import Config, load_config
 from bayesdist.app.kinds.errors import QUOTED
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.stars import fit_stars, model_of, shards_of
 from bayesdist.app.results import Results, open_results
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.output import refuse_existing, write_table
+from bayesdist.data import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.files import atomic_path
+from bayesdist.infer import Shards
+from bayesdist.infer.compare.one_frame import in_one_frame
 from bayesdist.infer.compare.order import select_order
 from bayesdist.infer.compare.order_result import OrderSelection
 from bayesdist.infer.linear import Rejection
+from bayesdist.model import DistortionModel
 from bayesdist.model.basis import MAX_ORDER
 
 __all__ = ["order"]
@@ -32,14 +39,16 @@ def order(
     orders: Sequence[int] = (3, 9),
     *,
     output: str | Path | None = None,
+    chip: int | None = None,
     figure: str | Path | None = None,
     force: bool = False,
 ) -> str:
     """Orders from the lowest to the highest compared on the data of a configuration, as text.
 
-    Its own order, priors and extra weights do not matter.  `output` is an ECSV file for the table,
-    `figure` a PNG file.  Orders that the data do not determine are rows that say so, as long as two
-    lower ones can be compared.
+    Its own order, priors and extra weights do not matter; frames of exposures and drift are taken
+    out as a fit of the highest order has them.  `chip` is needed where there are several.
+    `output` is an ECSV file for the table, `figure` a PNG file.  Orders that the data do not
+    determine are rows that say so, as long as two lower ones can be compared.
     """
     targets = [Path(name) for name in (output, figure) if name is not None]
     for target in targets:
@@ -52,17 +61,19 @@ def order(
             do=f"give the lowest and the highest, between 1 and {MAX_ORDER}",
         )
     config, text = load_config(path)
-    if config.data is None:
-        kind = "campaign" if config.campaign is not None else "selfcal"
+    if config.selfcal is not None:
         raise InputError(
-            f"orders are compared on matched stars, and this is a [{kind}]",
+            "is a self-calibration, whose stars take up what an order too low leaves, so that no "
+            "star that is held out shows it",
             where=str(path),
-            do="give a configuration with [data]",
+            do="run it, and see whether the report asks for terms of a higher order",
         )
+    chips = [one.number for one in config.chips()]
+    number_of = chip_of(chips or [1], chip, str(path))
     with TemporaryDirectory() as nowhere:
         run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
         with open_results(run) as results:
-            found, failed = _selected(results, range(low, high + 1))
+            found, failed = _selected(results, range(low, high + 1), number_of if chips else None)
     if output is not None:
         write_table(_table(found, failed), Path(output))
     if figure is not None:
@@ -70,19 +81,15 @@ def order(
     return "\n\n".join([_text(found, failed), found.sentence])
 
 
-def _selected(results: Results, orders: Sequence[int]) -> tuple[OrderSelection, dict[int, str]]:
+def _selected(
+    results: Results, orders: Sequence[int], chip: int | None
+) -> tuple[OrderSelection, dict[int, str]]:
     """The comparison, and why the orders above those compared cannot be fitted."""
-    config = results.config
-    # names of priors may be those of other orders
-    free = config.model_copy(
-        update={"prior": [], "fit": config.fit.model_copy(update={"radial_weight": 1.0})}
-    )
     failed: dict[int, str] = {}
+    matched = results.kind.match(results.inputs, results.config, results.base)
     for top in sorted(orders, reverse=True):
-        highest = free.model.model_copy(update={"order": top})
-        wanted = free.model_copy(update={"model": highest})
         try:
-            return _compared(results, wanted, range(min(orders), top + 1)), failed
+            return _compared(results, matched, range(min(orders), top + 1), chip), failed
         except DegenerateError as error:
             if top <= min(orders) + 1:
                 raise
@@ -90,21 +97,36 @@ def _selected(results: Results, orders: Sequence[int]) -> tuple[OrderSelection, 
     raise AssertionError("the lowest two orders are compared or refused")
 
 
-def _compared(results: Results, config: Config, orders: Sequence[int]) -> OrderSelection:
+def _compared(
+    results: Results, matched: Matched, orders: Sequence[int], chip: int | None
+) -> OrderSelection:
     """The comparison of orders, by a configuration of the highest.
 
-    Errors by magnitude are those of the highest order: its residuals hold the least misfit.
+    Errors by magnitude, tables, frames and drift are those of a fit of that order: its residuals
+    hold the least misfit.
     """
-    matched, reader, errors = results.matched, results.reader, QUOTED
-    if config.data is not None and config.data.sigma == "by_magnitude":
-        errors = fit_stars(matched, config, reader=reader).errors
-    model = model_of(matched.stars, config)
-    return select_order(
-        shards_of(matched.stars, model, config, errors, reader),
-        model,
-        orders=orders,
-        rejection=Rejection(config.fit.clip_chi2, config.fit.clip_abs),
-    )
+    config, reader = results.config.of_order(max(orders)), results.reader
+    matched = matched.of_order(max(orders))
+    rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs)
+    stars: Matches | Shards
+    if _is_one_map(config):
+        errors = QUOTED
+        if config.data is not None and config.data.sigma == "by_magnitude":
+            errors = fit_stars(matched, config, reader=reader).errors
+        model = model_of(matched.stars, config)
+        stars = shards_of(matched.stars, model, config, errors, reader)
+    else:
+        data = FitData(matched, results.kind.fit(matched, config, results.base, reader), reader)
+        one = next(one for one in data.model.chips if chip in (None, one.number))
+        model = DistortionModel(max(orders), (one,), unit=data.model.unit)
+        stars = in_one_frame(data.fit, data.stars, one.number)
+    return select_order(stars, model, orders=orders, rejection=rejection)
+
+
+def _is_one_map(config: Config) -> bool:
+    """Boolean: all matches are on one chip, in one frame, at any date."""
+    single = len(config.chips()) < 2 and config.model.frames == "none" and config.time() is None
+    return single and config.data is not None
 
 
 def _rows(found: OrderSelection, failed: dict[int, str]) -> list[dict[str, Any]]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayesdist.app.commands.on_runs.judging import probability_met
 from bayesdist.app.results import Results, open_results
@@ -15,6 +16,7 @@ from bayesdist.assess.planning.exposures import Schedule, exposures_needed
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.planning import ExposureContent, exposure_content, exposure_information
+from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.solution import Solution
 
 __all__ = ["plan"]
@@ -30,11 +32,13 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
     """
     with open_results(RunDirectory.open(run)) as results:
         results.run.require("plan", ("fit", "sample", "diagnose", "evaluate"))
-        if results.config.selfcal is not None:
+        solved = results.fitted.solved
+        if solved is not None and epochs:
             raise InputError(
-                "is a run of a self-calibration, where an exposure is worth what it overlaps",
+                "is a run of a self-calibration, whose exposures count as those at hand with their "
+                "dates",
                 where=str(run),
-                do="plan with matched stars",
+                do="leave --epochs out",
             )
         requirements = judged_requirements(results.run)
         chosen = [r for r in requirements if name is None or r.name == name]
@@ -45,11 +49,28 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
                 where=str(run),
                 do=f"name one of {known}" if known else "judge some with 'bayesdist requirements'",
             )
-        content = _content(results)
-        lines = [f"An exposure is taken to hold {content.n_stars:.0f} matched stars as these do."]
-        for requirement in chosen:
-            lines += ["", *_lines(results, requirement, content, epochs)]
+        if solved is None:
+            content = _content(results)
+            lines = [
+                f"An exposure is taken to hold {content.n_stars:.0f} matched stars as these do."
+            ]
+            schedules = [_schedules(results, one, content, epochs) for one in chosen]
+        else:
+            lines, alike = _dithered_alike(solved.mode)
+            schedules = [[alike]] * len(chosen)
+        for requirement, several in zip(chosen, schedules, strict=True):
+            lines += ["", *_lines(results, requirement, several)]
         return "\n".join(lines)
+
+
+def _dithered_alike(mode: SelfCalibrationMode) -> tuple[list[str], Schedule]:
+    """What further exposures of a self-calibration are taken to be, in words and as a schedule.
+
+    An exposure by itself says nothing: as many as these, over other stars, say as much again.
+    """
+    n = len(mode.problem.model.exposures)
+    line = f"Exposures are taken to be dithered as these {n} are, over as many other stars."
+    return [line], Schedule("dithered like these", mode.distortion_information / n)
 
 
 def _content(results: Results) -> ExposureContent:
@@ -69,39 +90,34 @@ def _content(results: Results) -> ExposureContent:
     )
 
 
-def _lines(
-    results: Results,
-    requirement: Requirement,
-    content: ExposureContent,
-    epochs: Sequence[float],
-) -> list[str]:
-    solution, time = results.solution, results.posterior.model.time
-    schedules = []
-    if time is None:
-        schedules.append(Schedule("at any date", exposure_information(solution, content, None)))
-    else:
-        epoch, seen = results.epoch, results.diagnostics.sample.table.epoch
-        assert epoch is not None
-        assert seen is not None
-        wanted = requirement.epoch or (requirement.epochs or [epoch])[-1]
-        last = float(np.max(seen))
-        for date in dict.fromkeys([*epochs, wanted]):
-            schedules.append(
-                Schedule(f"at {date:.2f}", exposure_information(solution, content, date))
-            )
-        if wanted > last:
-            dates = np.linspace(last, wanted, LATER + 1)[1:]
-            spread = [exposure_information(solution, content, float(d)) for d in dates]
-            schedules.append(
-                Schedule(
-                    f"evenly from {last:.2f} to {wanted:.2f}", np.sum(spread, axis=0) / len(spread)
-                )
-            )
+def _schedules(
+    results: Results, requirement: Requirement, content: ExposureContent, epochs: Sequence[float]
+) -> list[Schedule]:
+    """Single exposures at dates that matter to a requirement, or at any."""
+    solution, epoch = results.solution, results.epoch
+
+    def worth(date: float | None) -> NDArray[np.float64]:
+        return exposure_information(solution, content, date)
+
+    if solution.model.time is None or epoch is None:
+        return [Schedule("at any date", worth(None))]
+    wanted = requirement.epoch or (requirement.epochs or [epoch])[-1]
+    last = float(np.max(results.diagnostics.sample.table.column("epoch")))
+    found = [Schedule(f"at {date:.2f}", worth(date)) for date in dict.fromkeys([*epochs, wanted])]
+    if wanted > last:
+        spread = [worth(float(date)) for date in np.linspace(last, wanted, LATER + 1)[1:]]
+        name = f"evenly from {last:.2f} to {wanted:.2f}"
+        found.append(Schedule(name, np.sum(spread, axis=0) / len(spread)))
+    return found
+
+
+def _lines(results: Results, requirement: Requirement, schedules: Sequence[Schedule]) -> list[str]:
+    """How many exposures of each schedule a requirement takes."""
 
     def met(candidate: Solution) -> float:
         return probability_met(results, requirement, candidate, DRAWS)
 
-    found = exposures_needed(solution, schedules, met, requirement.probability)
+    found = exposures_needed(results.solution, schedules, met, requirement.probability)
     return [f"{requirement.name} (probability {requirement.probability:g} asked for)"] + [
         f"  {need.sentence}" for need in found
     ]

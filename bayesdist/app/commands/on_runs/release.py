@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from bayesdist.app.assessment.error_terms import published_tables
+from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.exposures.filter_figures import draw_filters
 from bayesdist.app.exposures.filters import FilterComparison, compare_filters, comparison_table
 from bayesdist.app.exposures.release_files import write_files
@@ -54,7 +55,7 @@ def release_runs(
                     do="give one run for each filter",
                 )
             by_filter[filter] = results
-        _require_alike(by_filter)
+        block = _require_alike(by_filter)
         doubts = _doubts(by_filter, allowed=allow_unconverged)
         solutions = _solutions(by_filter)
         comparison, why_not = _compared(by_filter)
@@ -66,7 +67,7 @@ def release_runs(
             table.meta["drift"] = {"verdict": why_not}
         with record_folder(Path(output), "release.json", command) as (folder, record):
             tables = _tables(by_filter)
-            files = write_files(first.config, first.base, folder, solutions, tables, notes)
+            files = write_files(block, chip, first.base, folder, solutions, tables, notes)
             write_table(table, folder / "filters.ecsv")
             figures = draw_filters(
                 folder, {k: one.fitted for k, one in by_filter.items()}, solutions
@@ -96,9 +97,11 @@ def _opened(path: str | Path) -> Results:
 # -- whether the runs go together -----------------------------------------------------------------
 
 
-def _require_alike(by_filter: Mapping[str, Results]) -> None:
+def _require_alike(by_filter: Mapping[str, Results]) -> ReleaseBlock:
+    """What is released, as the first run says; InputError for runs that do not go together."""
     first, *others = by_filter.values()
-    if first.config.products.release is None:
+    block = first.config.products.release
+    if block is None:
         raise InputError(
             "has no [products.release], and the first run says what is released",
             where=str(first.run.path),
@@ -120,6 +123,7 @@ def _require_alike(by_filter: Mapping[str, Results]) -> None:
                 where=str(results.run.path),
                 do="name that run in tables.detector and run this filter again",
             )
+    return block
 
 
 def _structure(results: Results) -> dict[str, Any]:

@@ -31,14 +31,14 @@ def validate(run: str | Path, requirements: str | Path) -> tuple[str, bool]:
         directory.require("requirements", ("fit", "sample"))
         with _named_after(requirements, asked):
             margins = margins_of(results, asked)
-            horizons = validity_periods_of(results, asked)
+            periods = validity_periods_of(results, asked)
         fit, posterior, gauge = results.fit, results.posterior, results.gauge_words
         with directory.locked(), directory.judged_by(asked):
-            save_margins(directory, fit, posterior, gauge, margins, horizons)
+            save_margins(directory, fit, posterior, gauge, margins, periods)
         report = directory / "report.html"
         outdated = report.exists() and not directory.done("report")
     warnings = posterior.approximation, idle_dates(results.config, asked, str(requirements))
-    lines = [*_lines(margins), *(one.sentence for one in horizons)]
+    lines = [*_lines(margins), *(one.sentence for one in periods)]
     lines += [f"WARNING: {text}" for text in warnings if text]
     if outdated:
         lines.append(f"{report} shows earlier margins; renew it by 'bayesdist stage report {run}'")

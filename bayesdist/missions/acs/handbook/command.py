@@ -12,7 +12,7 @@ from bayesdist.app.commands.on_files.calibrations import calibration_at
 from bayesdist.app.results import open_results
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.tables.output import atomic_directory, write_table
+from bayesdist.app.tables.output import record_folder, write_table
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
 from bayesdist.missions.acs.handbook.numbers import detector_numbers
@@ -34,13 +34,15 @@ def handbook(
     scale: float | None = None,
     detector: str | None = None,
     magnification: float | None = None,
+    command: str = "",
 ) -> str:
     """Write the figures and the numbers of a calibration.
 
     `path`: as of `calibration_at`. `output`: new or empty folder. `filter`, `scale`: as of
     `calibration_at`. `epoch`: decimal years, for what depends on time. `detector`: WFC, HRC or SBC,
     whose printed numbers stand beside; that of an IDCTAB of ACS by default. `magnification`: of the
-    vectors. Returns the numbers. InputError for what cannot be read or written.
+    vectors. `command`: for the record. Returns the numbers. InputError for what cannot be read or
+    written.
     """
     # figures take seconds to import
     from bayesdist.missions.acs.handbook.figures import (
@@ -64,7 +66,7 @@ def handbook(
         detector = found.detector
     whole = WholeDetector(found.in_frame(epoch), pixel)
     title = _title(found, filter, epoch)
-    with atomic_directory(Path(output)) as folder:
+    with record_folder(Path(output), "handbook.json", command) as (folder, record):
         figures = {
             "non_linear": non_linear_figure(whole, title, magnification=magnification),
             "pixel_area": area_figure(whole, title),
@@ -77,6 +79,7 @@ def handbook(
         )
         save_figures(figures, folder)
         write_table(Table(rows), folder / "numbers.ecsv")
+        record |= {"calibration": found.name, "detector": detector, "figures": list(figures)}
     shown = [row | {"published": row["published"] or "-"} for row in rows]
     return f"{output}: {', '.join(figures)}{missing}\n{table_text(shown, 5)}"
 

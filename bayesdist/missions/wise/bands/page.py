@@ -20,12 +20,11 @@ def write_bands(folder: Path, inputs: BandsInput) -> list[str]:
 
     InputError when a file cannot be written.
     """
-    drawings = draw_all(BANDS, inputs)
-    save_drawings(drawings, folder / "figures")
+    drawings = draw_all(BANDS, inputs, pdf=True)
+    paths = save_drawings(drawings, folder / "figures")
     overview, *parts = parts_of(BANDS, inputs, drawings)
     page = template("bands.html.jinja", __package__)
     text = page.render(run=inputs, overview=overview, parts=parts)
     with atomic_path(folder / "bands.html") as temporary:
         temporary.write_text(text, encoding="utf-8")
-    drawn = [f"figures/{name}.{kind}" for kind in ("png", "pdf") for name in drawings]
-    return ["bands.html", *drawn]
+    return ["bands.html", *(f"figures/{path.name}" for path in paths)]

@@ -10,7 +10,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.screen import table_text
-from bayesdist.app.tables.output import atomic_directory, write_table
+from bayesdist.app.tables.output import record_folder, write_table
 from bayesdist.data.detections import Detections
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.files import read_table
@@ -49,6 +49,7 @@ def bring_up_files(
     order: int = 4,
     optical: str | Path | None = None,
     rotation: float = 0.0,
+    command: str = "",
 ) -> str:
     """Write the pairs that matching and fitting in turn arrive at, and a table of the rounds.
 
@@ -57,8 +58,9 @@ def bring_up_files(
     `output`: new folder: pairs/ for `format = "rvb"`, rounds.ecsv. `radius`, `corner_radius`:
     within which pairs are accepted, in the array's centre and in its corners; pixels. `order`: of
     the polynomial in the end. `optical`: SIP header or WISE meta-data to begin with; by default no
-    distortion. `rotation`: degrees by which that is turned, from x towards y. Returns the text to
-    print. InputError for what cannot be read or written, and as `bring_up`.
+    distortion. `rotation`: degrees by which that is turned, from x towards y. `command`: for the
+    record. Returns the text to print. InputError for what cannot be read or written, and as
+    `bring_up`.
     """
     band = band_name(band)
     array = WISE_ARRAYS[band]
@@ -68,9 +70,10 @@ def bring_up_files(
     up = bring_up(stars, others, model, start, acceptance=RadialLimit(radius, corner_radius))
     rows = [{"round": k, **asdict(one)} for k, one in enumerate(up.rounds, 1)]
     rows = [{name: row[name] for name in ("round", *_SHOWN)} for row in rows]
-    with atomic_directory(Path(output)) as folder:
+    with record_folder(Path(output), "bring_up.json", command) as (folder, record):
         write_rvb([_pairs(up, band)], folder / "pairs")
         write_table(Table(rows), folder / "rounds.ecsv")
+        record |= {"band": band, "order": order, "verdict": up.sentence}
     return f"{table_text(rows, 4)}\n{up.sentence}\n{output}/pairs: calibrate with format = 'rvb'"
 
 

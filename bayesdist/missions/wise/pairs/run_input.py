@@ -11,7 +11,6 @@ from typing import Any
 from bayesdist.app.config import Data
 from bayesdist.app.matches.reading import is_large
 from bayesdist.app.matches.sources import MatchSource
-from bayesdist.app.store.named_files import named_files
 from bayesdist.app.store.rundir import PAIRS, RunDirectory, part_files
 from bayesdist.data import Matches, open_matches, write_partitioned
 from bayesdist.errors import InputError
@@ -47,7 +46,7 @@ class RvbInput:
         band's.
         """
         data, size = self._settings
-        path = named_files(self.run.config, Path(self.run.facts["base"]))
+        path = self.run.config.named_files(Path(self.run.facts["base"]))
         options = _options(data, size)
         if not is_large(path):
             return load_rvb(path, data, size)

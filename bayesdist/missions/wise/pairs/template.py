@@ -41,6 +41,7 @@ _COLOUR = """\
 
 _DETECTOR = """\
 [detector]
+mission = "WISE"
 name = "{band}"
 size = [{nx:.0f}, {ny:.0f}]
 scale_mas = {scale:.0f}

@@ -131,7 +131,7 @@ def _write_truth(one: WiseSet, n_false: int, folder: Path) -> None:
         "pairs": one.pairs,
         "false_matches": n_false,
         "seed": one.seed,
-        "false_share": one.false_share,
+        "false_fraction": one.false_fraction,
         "unlisted_share": one.false_matches.unlisted,
         "partition_blocks": 0 if one.pattern is None else one.pattern.blocks,
         "model": one.model.to_dict(),

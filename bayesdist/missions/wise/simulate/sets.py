@@ -74,7 +74,7 @@ class WiseSet:
     band : str
     pairs : int
     seed : int
-    false_share : float
+    false_fraction : float
         Expected fraction of false matches.
     model : DistortionModel
     theta : ndarray, shape (30,)
@@ -88,7 +88,7 @@ class WiseSet:
     band: str
     pairs: int
     seed: int
-    false_share: float
+    false_fraction: float
     model: DistortionModel
     theta: Float
     survey: Survey
@@ -182,7 +182,7 @@ def wise_set(
     *,
     pairs: int | None = None,
     seed: int = 1,
-    false_share: float = 0.03,
+    false_fraction: float = 0.03,
     partition: bool = False,
 ) -> WiseSet:
     """Set of pairs of WISE detections and 2MASS stars.
@@ -194,7 +194,7 @@ def wise_set(
         By default as many as in section 4 of WSDC D-T033.
     seed : int, optional
         Bands do not depend on each other.
-    false_share : float, optional
+    false_fraction : float, optional
         Expected fraction of false matches among the pairs.
     partition : bool, optional
         True where the partition of the point-spread function shows in the residuals.
@@ -221,11 +221,11 @@ def wise_set(
         band=band,
         pairs=pairs,
         seed=seed,
-        false_share=false_share,
+        false_fraction=false_fraction,
         model=model,
         theta=theta,
         survey=frames,
-        false_matches=false_matches(frames, WISE_ARRAYS[band].scale, false_share),
+        false_matches=false_matches(frames, WISE_ARRAYS[band].scale, false_fraction),
         pattern=pattern,
     )
 

@@ -105,7 +105,7 @@ def false_matches(survey: Survey, scale: float, share: float) -> FalseMatches:
     if not 0.0 <= share < 1.0:
         raise InputError(
             f"the fraction of false matches is {share:g}",
-            where="false_share",
+            where="false_fraction",
             do="give one in [0, 1)",
         )
     density = survey.density * scale**2

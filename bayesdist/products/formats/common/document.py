@@ -16,7 +16,9 @@ from pydantic import BaseModel, ConfigDict
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
+from bayesdist.model import LookupTable
 from bayesdist.products.formats.common.content import Content, readable
+from bayesdist.products.formats.common.read_back import ReadBack
 
 __all__ = [
     "LEVELS",
@@ -112,6 +114,8 @@ class BuildOptions:
 
     epoch: float | None = None  # decimal years, for files that are valid at one date
     scale_arcsec: float | None = None  # arcseconds per pixel, where configured
+    # by which pixels are corrected before the polynomials, of the detector and of the filter
+    tables: tuple[LookupTable, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +154,10 @@ class Format:
         Of a format that can be built.
     build : callable, optional
         From a `Calibration`, its settings and `BuildOptions` to files.
+    read_back : callable, optional
+        From files that were built, and the calibration and options that they were built from, to
+        what they say of positions, one `ReadBack` for each row of the budget.  By default they are
+        read by `calibration`, and laid on the solution.
     """
 
     key: str
@@ -161,6 +169,9 @@ class Format:
     calibration: Callable[[Any, str, Choice], Calibration] | None = None
     settings: type[FormatSettings] | None = None
     build: Callable[[Calibration, Any, BuildOptions], tuple[Built, ...]] | None = None
+    read_back: Callable[[Sequence[Built], Calibration, BuildOptions], Sequence[ReadBack]] | None = (
+        None
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -16,6 +17,7 @@ from bayesdist.products.formats.common.document import (
     Format,
     FormatSettings,
 )
+from bayesdist.products.formats.common.read_back import ReadBack
 from bayesdist.products.formats.sip.calibration import sip_calibration
 from bayesdist.products.formats.sip.lint import lint_sip
 from bayesdist.products.formats.sip.read import holds_sip, sip_of
@@ -45,6 +47,15 @@ def _calibration(content: Content, name: str, choice: Choice) -> Calibration:
     return sip_calibration(sip_of(content), name, size=choice.size)
 
 
+def _read_back(
+    files: Sequence[Built], calibration: Calibration, options: BuildOptions
+) -> list[ReadBack]:
+    # no file that is read needs it
+    from bayesdist.products.formats.sip.positions import sip_read_back
+
+    return sip_read_back(files, calibration, options)
+
+
 def _build(
     calibration: Calibration, settings: Settings, options: BuildOptions
 ) -> tuple[Built, ...]:
@@ -70,5 +81,14 @@ def _build(
 
 
 FORMAT = Format(
-    "sip", "a SIP header", 1, _parse, describe_wcs, _lint, _calibration, Settings, _build
+    "sip",
+    "a SIP header",
+    1,
+    _parse,
+    describe_wcs,
+    _lint,
+    _calibration,
+    Settings,
+    _build,
+    _read_back,
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from bayesdist.calibration.calibration import Calibration
@@ -17,6 +18,7 @@ from bayesdist.products.formats.common.document import (
     FormatSettings,
     finding_lines,
 )
+from bayesdist.products.formats.common.read_back import ReadBack
 from bayesdist.products.formats.sip.header import SIP_ORDERS, worst_closure
 from bayesdist.products.formats.sip.text import coefficient_lines
 from bayesdist.products.formats.wise.build import wise_text
@@ -96,6 +98,21 @@ def _calibration(named: tuple[str, Bands], name: str, choice: Choice) -> Calibra
     return wise_calibration(named[1], name, choice.filter)
 
 
+def _read_back(
+    files: Sequence[Built], calibration: Calibration, options: BuildOptions
+) -> list[ReadBack]:
+    """Positions by the entries, with CD and zero point, which they lack, as they were made."""
+    # no file that is read needs it
+    from bayesdist.products.formats.sip.positions import headers_read_back
+
+    out = []
+    for one in files:
+        [band] = bands_of(Content(one.file_name, one.content))
+        headers = {calibration.numbers[0]: band.sip}
+        out.append(headers_read_back(one.file_name, headers, calibration, options, like=one.made))
+    return out
+
+
 def _build(calibration: Calibration, _: Settings, options: BuildOptions) -> tuple[Built, ...]:
     """WISE's form: all linear terms in A and B, and an inverse of equal order."""
     # no file that is read needs it
@@ -126,5 +143,14 @@ def _build(calibration: Calibration, _: Settings, options: BuildOptions) -> tupl
 
 
 FORMAT = Format(
-    "wise_meta", "WISE meta-data", 5, _parse, _describe, _lint, _calibration, Settings, _build
+    "wise_meta",
+    "WISE meta-data",
+    5,
+    _parse,
+    _describe,
+    _lint,
+    _calibration,
+    Settings,
+    _build,
+    _read_back,
 )

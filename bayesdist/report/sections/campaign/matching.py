@@ -59,7 +59,7 @@ def matching_table(r: ReportInput) -> TextTable:
         "Pairs": count(m["n_pairs"]),
         "Completeness": f"{percent(m['completeness']['median'])} at the median,"
         f" {percent(m['completeness']['least'])} at least",
-        "False pairs expected": percent(m["false_share"], 2),
+        "False pairs expected": percent(m["false_fraction"], 2),
         "Search radius": f"{number(low)} to {number(high)} {c.unit}",
     }
     return listing("Matching", pairs)
@@ -202,7 +202,7 @@ def matching(r: ReportInput) -> Plot:
     epoch = np.asarray(c.matching["epoch"], float)
     rows = (
         ("completeness [%]", 100 * np.asarray(c.matching["completeness"], float), "blue"),
-        ("false pairs [10⁻⁶]", 1e6 * np.asarray(c.matching["false_share"], float), "vermilion"),
+        ("false pairs [10⁻⁶]", 1e6 * np.asarray(c.matching["false_fraction"], float), "vermilion"),
         ("pairs", np.asarray(c.matching["matched"], float), "green"),
     )
     fig = new_figure(WIDTH, 4.2)
@@ -224,7 +224,7 @@ def matching(r: ReportInput) -> Plot:
         "Top: part of the catalogue's stars in the footprint and range of magnitudes that is"
         f" matched, {percent(completeness['median'])} at the median and"
         f" {percent(completeness['least'])} at least. Middle: fraction of pairs that is expected"
-        f" to be false, {number(m['false_share'], 2)} over all. Bottom: pairs,"
+        f" to be false, {number(m['false_fraction'], 2)} over all. Bottom: pairs,"
         f" {count(m['n_pairs'])} in {count(m['n_exposures'])} exposures. Search radii were"
         f" {number(m['radius'][0])} to {size_of(m['radius'][1], c.unit)}.",
         "Completeness, fraction of false pairs and number of pairs of each exposure against date.",

@@ -87,7 +87,7 @@ def _detections(found: SelfcalResults) -> TextTable:
             "Detections of a star, median and most": f"{number(s['per_star']['median'])}, "
             f"{count(s['per_star']['most'])}",
             "Ambiguous groups": count(s["n_ambiguous"]),
-            "Rounds of grouping and solving": count(s["rounds"]),
+            "Rounds of grouping and solving": count(s["iterations"]),
         },
     )
 
@@ -97,7 +97,7 @@ def _exposures(found: SelfcalResults, r: ReportInput) -> TextTable:
         (
             str(row["exposure"]),
             count(row["detections"]),
-            percent(float(row["share_common"])),
+            percent(float(row["fraction_common"])),
             number(float(row["rms"])),
             number(float(row["shift_u"]), 6),
             number(float(row["shift_v"]), 6),

@@ -11,8 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.patches import Patch
 
+from bayesdist.assess.circular import circular_error, per_axis
 from bayesdist.assess.terms.forms import PRODUCT
-from bayesdist.numbers import MISSING, display_scale, percent, with_mas
+from bayesdist.numbers import MISSING, display_scale, percent, size_of, with_mas
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.fields import Grid, scalar_map
@@ -73,26 +74,43 @@ def budget_table(r: ReportInput) -> TextTable:
             *((names[str(row["chip"])],) if r.several else ()),
             str(row["kind"]),
             AS_ABOVE if str(row.get("chip", "all")) != "all" else str(row["source"]) or MISSING,
-            *(r.marked(with_mas(float(row[k]), unit, mas)) for k in ("u", "v", "radial")),
+            *(r.marked(text) for text in _sizes(row, mas, unit)),
             _known_to(row),
         )
         for row in rows
     ]
     of_chip = ("Chip",) if r.several else ()
-    heads = ("Term", *of_chip, "Kind", "Source", "u", "v", "Radial", "Known to")
+    heads = ("Term", *of_chip, "Kind", "Source", "u", "v", "Per axis", "CE68", "CE95", "Known to")
     epoch = budget.epoch
     when = "" if epoch is None else f" at epoch {epoch:.2f}"
     return TextTable(
         f"Error budget{when}: rms over the detector, 1 σ",
         heads,
         tuple(out),
-        words=tuple(range(len(heads) - 4)),
+        words=tuple(range(len(heads) - 6)),
         leading=len(budget.rows()),  # rows of all chips together
-        stacked=(heads.index("Radial"),),
-        note="The parts of the model are correlated and enter the total jointly, by draws;"
-        " independent terms are added in quadrature. The total therefore need not be the root of"
-        f" the sum of squares.{_of_products(rows)} {gauge_of_new_exposure(r)}".rstrip(),
+        stacked=(heads.index("Per axis"),),
+        note="Per axis: rms of u and v; CE68, CE95: circles that hold 68 and 95 % of errors of that"
+        " size, if Gaussian. The parts of the model are correlated and enter the total jointly, by"
+        " draws; independent terms add in quadrature. The total therefore need not be the root"
+        f" of the sum of squares.{_of_products(rows)} {gauge_of_new_exposure(r)}".rstrip(),
     )
+
+
+def _sizes(row: Mapping[str, Any], mas: float | None, unit: str) -> tuple[str, ...]:
+    """Errors of u, of v, per axis (in mas as well), CE68 and CE95, of the rms over the detector."""
+    u, v = float(row["u"]), float(row["v"])
+    circles = (float(circular_error(u, v, 0.0, p)) for p in (0.68, 0.95))
+    return (
+        size_of(u, unit),
+        size_of(v, unit),
+        with_mas(_per_axis(row), unit, mas),
+        *(size_of(radius, unit) for radius in circles),
+    )
+
+
+def _per_axis(row: Mapping[str, Any]) -> float:
+    return float(per_axis(row["u"], row["v"]))
 
 
 def _known_to(row: Mapping[str, Any]) -> str:
@@ -114,7 +132,7 @@ def _of_products(rows: Sequence[Mapping[str, Any]]) -> str:
 
 @REPORT.figure("budget", needs=("budget",))
 def budget_terms(r: ReportInput) -> Plot:
-    """Bars of each term's radial rms over the detector, with its two axes marked.
+    """Bars of each term's rms per axis over the detector, with its two axes marked.
 
     Each of up to three chips has a panel next to that of the whole detector.
     """
@@ -123,7 +141,7 @@ def budget_terms(r: ReportInput) -> Plot:
     parts = {"all chips": rows}
     if 1 < len(budget.chips) <= _MOST_PANELS:
         parts |= {n: b.rows() for n, b in zip(r.mosaic.names, budget.chips, strict=True)}
-    largest = max(float(row["radial"]) for part in parts.values() for row in part)
+    largest = max(max(float(row["u"]), float(row["v"])) for part in parts.values() for row in part)
     scale = display_scale(budget.unit, largest)
     fig = new_figure(WIDTH, (1.1 if len(parts) == 1 else 1.3) + 0.34 * len(rows))
     axes = fig.subplots(1, len(parts), sharey=True, squeeze=False)[0]
@@ -138,31 +156,31 @@ def budget_terms(r: ReportInput) -> Plot:
     axes[0].invert_yaxis()
     present = {row["kind"] for row in rows if not is_total(row)}
     kinds = [k for k in _KIND_COLORS if k in present]
-    handles = [Patch(color=_KIND_COLORS[k], label=f"{k}, radial") for k in kinds]
-    handles.append(Patch(color=INK, label="total, radial"))
+    handles = [Patch(color=_KIND_COLORS[k], label=f"{k}, per axis") for k in kinds]
+    handles.append(Patch(color=INK, label="total, per axis"))
     for key, (marker, _) in _AXIS_MARKERS.items():
         handles += axes[0].plot([], [], marker, label=f"{key} alone", **_MARKER_STYLE)
     fig.legend(handles=handles, loc="outside upper left", ncols=len(handles))
     *terms, total = (row for row in rows if row["kind"] != PRODUCT)
-    top = max(terms, key=lambda row: row["radial"])
+    top = max(terms, key=_per_axis)
     return Plot(
         fig,
         "Error budget by term",
-        f"The largest term is {top['name']}, {r.length(top['radial'])}, of a total of"
-        f" {r.length(total['radial'])} (radial rms over the detector).",
+        f"The largest term is {top['name']}, {r.length(_per_axis(top))}, of a total of"
+        f" {r.length(_per_axis(total))} (rms over the detector, per axis).",
         f"Bars of the budget's terms; the largest is {top['name']}.",
     )
 
 
 def _bars(ax: Axes, rows: Sequence[Mapping[str, str | float]], factor: float) -> None:
     place = np.arange(len(rows))
-    radial = np.array([row["radial"] for row in rows], float) * factor
+    sizes = np.array([_per_axis(row) for row in rows]) * factor
     colors = [INK if is_total(row) else _KIND_COLORS.get(str(row["kind"]), OUTLINE) for row in rows]
-    ax.barh(place, radial, height=0.62, color=colors, zorder=2)
+    ax.barh(place, sizes, height=0.62, color=colors, zorder=2)
     for key, (marker, shift) in _AXIS_MARKERS.items():
         values = np.array([row[key] for row in rows], float) * factor
         ax.plot(values, place + shift, marker, **_MARKER_STYLE)
-    for k, value in enumerate(radial):
+    for k, value in enumerate(sizes):
         ax.annotate(f"{value:.3g}", (value, k), (5, 0), textcoords="offset points", va="center")
     ax.spines[["top", "right"]].set_visible(False)
     ax.tick_params(axis="y", length=0)

@@ -5,13 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.colors import LogNorm
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bayesdist.numbers import MISSING, count, display_scale, number
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
+from bayesdist.report.fields import Grid, scalar_map
+from bayesdist.report.panels import ChipPanels
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import INK, PALETTE, SEQUENTIAL, WIDTH, new_figure
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing, short_paths
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from bayesdist.data import MagnitudeErrors
 
 __all__ = [
+    "coverage",
     "data_tables",
     "residuals_by_magnitude",
 ]
@@ -143,6 +146,35 @@ def residuals_by_magnitude(r: ReportInput) -> Plot:
         "Residuals against magnitude",
         text,
         "Two density plots of the residuals in u and v against magnitude, widening to faint stars.",
+    )
+
+
+@REPORT.figure("data")
+def coverage(r: ReportInput) -> Plot:
+    """Map of the number of stars in each cell of the detector."""
+    grids = [Grid(c.binned.x, c.binned.y, np.asarray(c.binned.count, float)) for c in r.chips]
+    panels = ChipPanels(r.mosaic, colorbar=True)
+    panels.frame()
+    counts = np.concatenate([g.values.ravel() for g in grids])
+    rows = r.words.rows
+    scalar_map(
+        panels,
+        grids,
+        [
+            panels.title(k, f"{g.values.min():.0f} to {g.values.max():.0f} a cell")
+            for k, g in enumerate(grids)
+        ],
+        norm=Normalize(0.0, max(float(counts.max()), 1.0)),
+        label=f"{rows} per cell [count]",
+    )
+    empty = int((counts == 0).sum())
+    return Plot(
+        panels.figure,
+        "Coverage of the detector",
+        f"Number of {rows} that the {r.words.rejection} used in each cell: {count(empty)} of"
+        f" {count(counts.size)} cells are empty, and the median is {np.median(counts):.0f}. Where"
+        f" there are no {rows}, the solution is an extrapolation of the polynomial.",
+        f"Map of the number of {rows} per cell; {empty} of {counts.size} cells are empty.",
     )
 
 

@@ -35,6 +35,7 @@ __all__ = [
     "formal_uncertainty",
     "map_table",
     "pixel_area",
+    "pixel_scale",
     "uncertainty_radius",
 ]
 
@@ -47,7 +48,14 @@ def map_table(r: ReportInput) -> TextTable:
         for m in c.maps:
             cells = [
                 with_mas(v, m.unit, r.scale_mas)
-                for v in (m.sigma_u_max, m.sigma_v_max, m.radius_max, float(np.median(m.radius)))
+                for v in (
+                    m.sigma_u_max,
+                    m.sigma_v_max,
+                    float(m.per_axis.max()),
+                    float(np.median(m.per_axis)),
+                    float(m.circular_error(0.68).max()),
+                    float(m.circular_error(0.95).max()),
+                )
             ]
             cells.append("({:.0f}, {:.0f})".format(*m.position_of_max))
             if m is not c.formal_map:
@@ -63,13 +71,58 @@ def map_table(r: ReportInput) -> TextTable:
             "Chip, solution" if r.several else "Solution",
             "Largest σ u",
             "Largest σ v",
-            "Max radius",
-            "Median radius",
+            "Largest per axis",
+            "Median per axis",
+            "Largest CE68",
+            "Largest CE95",
             "At pixel",
         ),
         tuple(rows),
-        note=gauge_of_maps(r),
+        note="Per axis: rms of σ u and σ v. CE68, CE95: radii of the circles that hold 68 and 95 %."
+        f" {gauge_of_maps(r)}".rstrip(),
     )
+
+
+@REPORT.figure("maps", printed=True)
+def uncertainty_radius(r: ReportInput) -> Plot:
+    """Uncertainty per axis, rms of sigma_u and sigma_v, all maps in one colour scale."""
+    maps = [m for c in r.chips for m in c.maps]
+    scale = display_scale(r.unit, max(float(m.per_axis.max()) for m in maps))
+    grids = [Grid(m.x, m.y, m.per_axis * scale.factor, m.position_of_max) for m in maps]
+    panels = ChipPanels(r.mosaic, len(r.chips[0].maps), colorbar=True)
+    panels.frame()
+    kinds = [(k, m.kind) for k, c in enumerate(r.chips) for m in c.maps]
+    scalar_map(
+        panels,
+        grids,
+        [
+            panels.title(k, f"{kind}: {g.values.min():.3g} to {g.values.max():.3g}", ", ")
+            for (k, kind), g in zip(kinds, grids, strict=True)
+        ],
+        levels=contour_levels(np.concatenate([g.values.ravel() for g in grids])),
+        label=f"per axis (1 σ) [{scale.unit}]",
+    )
+    figure = panels.figure
+    text = (
+        "Uncertainty per axis, the rms of σ u and σ v, ringed where it is largest. The circle that"
+        " holds 68 % has 1.51 times this as its radius where both axes are alike, that of 95 %"
+        " 2.45 times."
+    )
+    if r.selfcal is not None:
+        text += (
+            " That of relative positions is the same in any gauge of shift, rotation and scale (and"
+            " skew, where all exposures have one roll angle); the other is that of the run's gauge."
+        )
+        return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")
+    pairs = [(c.formal_map, c.posterior_map) for c in r.chips]
+    ratios = [p.radius / f.radius for f, p in pairs if p is not None]
+    if ratios:
+        low, high = (number(float(end(ratios))) for end in (np.min, np.max))
+        text += (
+            f" The posterior's is {low} to {high} times the formal one;"
+            " above 1, least squares with rejection is too sure of itself."
+        )
+    return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")
 
 
 @REPORT.figure("maps", printed=True)
@@ -163,7 +216,9 @@ def formal_uncertainty(r: ReportInput) -> Plot:
     panels = ChipPanels(r.mosaic, len(r.chips[0].maps))
     panels.frame(M * widest + 0.02 * r.mosaic.longest_side)
     titles = [
-        panels.title(k, f"{m.kind}, max radius {size_of(m.radius_max, m.unit)}", ", ")
+        panels.title(
+            k, f"{m.kind}, largest {size_of(float(m.per_axis.max()), m.unit)} per axis", ", "
+        )
         for k, c in enumerate(r.chips)
         for m in c.maps
     ]
@@ -172,55 +227,17 @@ def formal_uncertainty(r: ReportInput) -> Plot:
         max(maps, key=lambda m: m.radius_max)
         for maps in zip(*(c.maps for c in r.chips), strict=True)
     ]
-    found = " and ".join(f"{r.length(m.radius_max)} ({m.kind})" for m in by_kind)
+    found = " and ".join(f"{r.length(float(m.per_axis.max()))} ({m.kind})" for m in by_kind)
     return Plot(
         panels.figure,
-        "Formal-uncertainty diagram",
+        "Uncertainty diagram",
         "From each position four vectors to all combinations of ±1 σ in u and v, enlarged as"
-        f" stated above the panels; the largest radius is {found}.",
-        f"Crosses of ±1 sigma over the detector; largest radius {found}.",
+        f" stated above the panels; the largest error per axis is {found}.",
+        f"Crosses of ±1 sigma over the detector; largest per axis {found}.",
     )
 
 
-@REPORT.figure("maps", printed=True)
-def uncertainty_radius(r: ReportInput) -> Plot:
-    """Radial uncertainty hypot(sigma_u, sigma_v), all maps in one colour scale."""
-    maps = [m for c in r.chips for m in c.maps]
-    scale = display_scale(r.unit, max(m.radius_max for m in maps))
-    grids = [Grid(m.x, m.y, m.radius * scale.factor, m.position_of_max) for m in maps]
-    panels = ChipPanels(r.mosaic, len(r.chips[0].maps), colorbar=True)
-    panels.frame()
-    kinds = [(k, m.kind) for k, c in enumerate(r.chips) for m in c.maps]
-    scalar_map(
-        panels,
-        grids,
-        [
-            panels.title(k, f"{kind}: {g.values.min():.3g} to {g.values.max():.3g}", ", ")
-            for (k, kind), g in zip(kinds, grids, strict=True)
-        ],
-        levels=contour_levels(np.concatenate([g.values.ravel() for g in grids])),
-        label=f"radius (1 σ) [{scale.unit}]",
-    )
-    figure = panels.figure
-    text = "Radial uncertainty hypot(σ u, σ v), its maximum ringed."
-    if r.selfcal is not None:
-        text += (
-            " That of relative positions is the same in any gauge of shift, rotation and scale (and"
-            " skew, where all exposures have one roll angle); the other is that of the run's gauge."
-        )
-        return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")
-    pairs = [(c.formal_map, c.posterior_map) for c in r.chips]
-    ratios = [p.radius / f.radius for f, p in pairs if p is not None]
-    if ratios:
-        low, high = (number(float(end(ratios))) for end in (np.min, np.max))
-        text += (
-            f" The posterior's is {low} to {high} times the formal one;"
-            " above 1, least squares with rejection is too sure of itself."
-        )
-    return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")
-
-
-@REPORT.figure("maps", printed=lambda r: r.campaign is None)
+@REPORT.figure("maps")
 def pixel_area(r: ReportInput) -> Plot:
     """Contours of the pixel area relative to that at the reference pixel, in percent.
 
@@ -262,4 +279,40 @@ def pixel_area(r: ReportInput) -> Plot:
         f" {high:.5f}, known to {number(sigma, 2)} at worst: flat-fielded"
         f" point-source photometry is to be multiplied by it.{between}",
         "Contour map of the relative pixel area.",
+    )
+
+
+@REPORT.figure("maps")
+def pixel_scale(r: ReportInput) -> Plot:
+    """Map of the pixel scale, the square root of the area of each pixel."""
+    areas = [c.area for c in r.chips]
+    in_pixels = r.unit == "pix" and r.scale_mas is None
+    factor = r.scale_mas or 1.0 if r.unit == "pix" else 1.0
+    values = [factor * np.sqrt(a.area * a.reference_area) for a in areas]
+    scale = display_scale("mas" if r.unit == "pix" else r.unit, max(float(v.max()) for v in values))
+    unit = "reference pix" if in_pixels else scale.unit
+    by = 1.0 if in_pixels else scale.factor
+    grids = [Grid(a.x, a.y, by * v) for a, v in zip(areas, values, strict=True)]
+    panels = ChipPanels(r.mosaic, colorbar=True)
+    panels.frame()
+    scalar_map(
+        panels,
+        grids,
+        [
+            panels.title(k, f"{g.values.min():.6g} to {g.values.max():.6g}")
+            for k, g in enumerate(grids)
+        ],
+        levels=contour_levels(np.concatenate([g.values.ravel() for g in grids])),
+        label=f"pixel scale [{unit}/pix]",
+        labelled=True,
+    )
+    low = min(float(g.values.min()) for g in grids)
+    high = max(float(g.values.max()) for g in grids)
+    return Plot(
+        panels.figure,
+        "Pixel scale",
+        f"Side of the square that has the area of the pixel, from {low:.6g} to {high:.6g} {unit}:"
+        " the geometric mean of the scales along both axes. With u and v in pixels it rests on the"
+        " size of a pixel that the configuration gives.",
+        f"Contour map of the pixel scale, from {low:.6g} to {high:.6g} {unit}.",
     )

@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "VERDICT_LEVELS",
-    "horizon",
     "margin_table",
     "margins",
     "rests_on_table",
+    "validity_period",
 ]
 
 Float = NDArray[np.float64]
@@ -182,13 +182,13 @@ def _statement(m: Margin) -> str:
     )
 
 
-@REPORT.figure("margins", needs=("horizons",), printed=True)
-def horizon(r: ReportInput) -> Plot:
+@REPORT.figure("margins", needs=("validity",), printed=True)
+def validity_period(r: ReportInput) -> Plot:
     """Probability of meeting each requirement against time, and when it becomes too low."""
-    horizons = r.horizons
-    fig = new_figure(WIDTH, 0.7 + 1.5 * len(horizons))
-    panels = fig.subplots(len(horizons), 1, sharex=True, squeeze=False)[:, 0]
-    for ax, one in zip(panels, horizons, strict=True):
+    periods = r.validity
+    fig = new_figure(WIDTH, 0.7 + 1.5 * len(periods))
+    panels = fig.subplots(len(periods), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, one in zip(panels, periods, strict=True):
         asked = one.requirement.probability
         ax.fill_between(one.epoch, one.low, one.high, color=CYCLE[0], alpha=0.25, lw=0)
         ax.plot(one.epoch, one.probability, color=CYCLE[0])
@@ -224,5 +224,5 @@ def horizon(r: ReportInput) -> Plot:
         " band is the 95 % interval of counting draws, red the date (with its interval) at which"
         " the probability falls below what is asked. It holds while the drift goes on as the model"
         " has it: a drift that bends is not in it.",
-        " ".join(f"{one.sentence}." for one in horizons),
+        " ".join(f"{one.sentence}." for one in periods),
     )

@@ -1,4 +1,4 @@
-"""Posterior: outliers, the most correlated coefficients, and the chains."""
+"""Posterior: outliers, correlations of coefficients, and ranks of the draws."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from bayesdist.infer.catalogue.added_errors import DECISIVE
@@ -26,7 +24,15 @@ from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.corners import Column, corner_figure
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import CYCLE, INK, WIDTH, legend_above, new_figure
+from bayesdist.report.style import (
+    COLORBAR,
+    CYCLE,
+    DIVERGING,
+    OUTLINE,
+    WIDTH,
+    legend_above,
+    new_figure,
+)
 from bayesdist.report.texttable import TextTable
 
 if TYPE_CHECKING:
@@ -34,19 +40,26 @@ if TYPE_CHECKING:
 
 __all__ = [
     "added_errors_table",
-    "coefficients_corner",
-    "correlated_parameters",
+    "correlation_matrix",
+    "correlations",
     "outlier_table",
     "outliers_corner",
+    "rank_counts",
+    "ranks",
     "slowest_parameters",
-    "traces",
 ]
 
 Float = NDArray[np.float64]
 
 _MIXTURE_LABELS = {"f": "f", "j": "j", "s_out": r"$s_\mathrm{out}$"}
 _MAX_POINTS = 20_000  # draws that enter a corner plot
-_TRACE_POINTS = 2_000  # draws that stand as points in a trace
+_NAMED = 25  # coefficients that have room for their names
+RANK_BINS = 20
+_INDEPENDENCE = (
+    "Independence sampling draws each proposal from a fixed approximation of the posterior,"
+    " whatever the current position, and accepts it by the ratio of true to approximate density:"
+    " draws are nearly independent, so that a few steps of many walkers are enough."
+)
 
 
 def _with_mixture(r: ReportInput) -> bool:
@@ -154,48 +167,48 @@ def outliers_corner(r: ReportInput) -> Plot:
 
 
 @REPORT.figure("coefficients", needs=("posterior",))
-def coefficients_corner(r: ReportInput) -> Plot:
-    """Corner plot of coefficients, as differences from least squares, with its Gaussian over it."""
-    posterior, fit = needed(r.posterior), r.fit
-    names = correlated_parameters(posterior)
-    index = [posterior.model.names.index(name) for name in names]
-    draws = _thinned(posterior.flat)[:, index] - fit.mean[index]
-    columns = [
-        Column(f"{broken_name(name)}\n− l. s.", posterior.model.units[k], draws[:, c])
-        for c, (name, k) in enumerate(zip(names, index, strict=True))
-    ]
-    sd = np.sqrt(np.diag(posterior.cov))
-    formal = np.sqrt(np.diag(fit.cov))
-    ratio = float(np.median(sd[formal > 0] / formal[formal > 0]))
+def correlations(r: ReportInput) -> Plot:
+    """Matrix of the correlations between coefficients, as a map of colours."""
+    posterior = needed(r.posterior)
+    names, matrix = correlation_matrix(posterior)
+    fig = new_figure(0.72 * WIDTH, 0.62 * WIDTH)
+    ax = fig.subplots()
+    image = ax.imshow(matrix, vmin=-1, vmax=1, cmap=DIVERGING, interpolation="nearest")
+    step = -(-len(names) // _NAMED)
+    ax.set_xticks(range(0, len(names), step), names[::step], rotation=90)
+    ax.set_yticks(range(0, len(names), step), names[::step])
+    ax.set_xlabel("coefficient [name]")
+    ax.set_ylabel("coefficient [name]")
+    fig.colorbar(image, ax=ax, label="correlation [no unit]", **COLORBAR)
+    upper = np.triu(np.abs(matrix), k=1)
+    i, j = np.unravel_index(int(upper.argmax()), upper.shape)
+    sd, formal = np.sqrt(np.diag(posterior.cov)), np.sqrt(np.diag(r.fit.cov))
+    ratio = number(float(np.median(sd[formal > 0] / formal[formal > 0])))
+    most = (
+        f"the strongest correlation is {number(float(matrix[i, j]), 2)}, of {names[i]} and"
+        f" {names[j]}"
+        if len(names) > 1
+        else "there is one coefficient alone"
+    )
     return Plot(
-        corner_figure(columns, formal=np.asarray(fit.cov)[np.ix_(index, index)]),
-        "Coefficients with the strongest correlations",
-        "Filled: posterior; lines: the formal Gaussian of least squares, whose estimate is the zero"
-        " of each axis. Where they agree, the quoted errors and the rejection did no harm. Over all"
-        f" parameters the posterior sd is {number(ratio)} times the formal σ (median).",
-        "Corner plot of the most correlated coefficients, posterior against least squares.",
+        fig,
+        "Correlations of the coefficients",
+        f"Correlations of the posterior; {most}. Coefficients that are strongly correlated must"
+        " not be quoted without their covariance, which posterior.nc and the products hold. Over"
+        f" all parameters the posterior's sd is {ratio} times the formal σ of least squares"
+        " (median).",
+        f"Matrix of correlations of {len(names)} coefficients; {most}.",
     )
 
 
-def correlated_parameters(posterior: Posterior, n: int = 5) -> tuple[str, ...]:
-    """Coefficients in the n strongest correlations of the posterior, in the model's order.
-
-    Polynomial and time-dependent terms only, without those that are held.
-    """
+def correlation_matrix(posterior: Posterior) -> tuple[list[str], Float]:
+    """Names, and correlations (n, n), of coefficients that are free and no exposure's frame."""
     moves = np.ptp(posterior.flat, axis=0) > 0
     kinds = [p.kind for p in posterior.model.parameters]
     chosen = [k for k, kind in enumerate(kinds) if kind != "frame" and moves[k]]
     cov = np.asarray(posterior.cov)[np.ix_(chosen, chosen)]
     sd = np.sqrt(np.diag(cov))
-    strength = np.triu(np.abs(cov / np.outer(sd, sd)), k=1)
-    picked: list[int] = []
-    for flat in np.argsort(-strength, axis=None, kind="stable"):
-        for k in divmod(int(flat), len(chosen)):
-            if k not in picked and len(picked) < n:
-                picked.append(k)
-        if len(picked) == min(n, len(chosen)):
-            break
-    return tuple(posterior.model.names[chosen[k]] for k in sorted(picked))
+    return [posterior.model.names[k] for k in chosen], cov / np.outer(sd, sd)
 
 
 def _mixture_draws(posterior: Posterior) -> list[tuple[str, str, Float]]:
@@ -214,43 +227,61 @@ def _thinned(draws: Float) -> Float:
 
 
 @REPORT.figure("coefficients", needs=("posterior",))
-def traces(r: ReportInput) -> Plot:
-    """Chains of the slowest parameters and of f, j, s_out, and their densities, by ensemble."""
+def ranks(r: ReportInput) -> Plot:
+    """Ranks of the draws of each ensemble among all, of the slowest parameters and f, j, s_out."""
     posterior = needed(r.posterior)
-    names = slowest_parameters(posterior, without=r.held)
-    rows: list[tuple[str, str, Float]] = []
-    for name in names:
-        k = posterior.model.names.index(name)
-        mean = float(posterior.mean[k])
-        rows.append(
-            (
-                broken_name(name) + ("\n" if len(name) > 6 else " ") + "− mean",
-                posterior.model.units[k],
-                posterior.theta[..., k] - mean,
-            )
-        )
-    rows += _mixture_draws(posterior)
-    fig = new_figure(WIDTH, 1.0 * len(rows) + 0.7)
-    axes = fig.subplots(
-        len(rows), 2, sharey="row", sharex="col", width_ratios=(4, 1), squeeze=False
-    )
-    for (trace, density), (label, unit, values) in zip(axes, rows, strict=True):
-        scale = display_scale(unit, values)
-        _trace_row(trace, density, _by_walker(values * scale.factor, posterior))
-        trace.set_ylabel(f"{label}\n[{scale.unit or 'no unit'}]", fontsize=7.5)
-        trace.yaxis.set_major_locator(MaxNLocator(4))
-    axes[-1, 0].set_xlabel("step after warm-up [count]")
-    axes[-1, 1].set_xlabel("density [relative]")
-    fig.align_ylabels(axes[:, 0])
-    legend_above(fig, axes[0, 0])
+    rows = [
+        (broken_name(name), posterior.theta[..., posterior.model.names.index(name)])
+        for name in slowest_parameters(posterior, without=r.held)
+    ]
+    rows += [(label, draws) for label, _, draws in _mixture_draws(posterior)]
+    columns = min(4, len(rows))
+    lines = -(-len(rows) // columns)
+    fig = new_figure(WIDTH, 0.5 + 1.5 * lines)
+    axes = fig.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).ravel()
+    for ax in axes[len(rows) :]:
+        ax.remove()
+    ensembles, draws = rows[0][1].shape
+    ess = dict(zip(posterior.convergence.names, posterior.convergence.ess_bulk, strict=True))
+    worst = min((v for v in ess.values() if np.isfinite(v)), default=float(ensembles * draws))
+    # a share of the draws of an ensemble that is 1 / bins, known from its effective draws
+    band = 2.0 * np.sqrt((1.0 - 1.0 / ensembles) * (RANK_BINS - 1) * ensembles / max(worst, 1.0))
+    edges, farthest = np.linspace(0.0, 1.0, RANK_BINS + 1), band
+    for ax, (label, values) in zip(axes, rows, strict=False):
+        ax.axhspan(1 - band, 1 + band, color=OUTLINE, alpha=0.25, lw=0)
+        for k, counts in enumerate(rank_counts(values, RANK_BINS)):
+            share = counts * RANK_BINS / draws
+            farthest = max(farthest, float(np.abs(share - 1).max()))
+            color = CYCLE[k % len(CYCLE)]
+            ax.stairs(share, edges, color=color, lw=1.1, baseline=None, label=f"ensemble {k + 1}")
+        ax.set_title(label.replace("\n", " "))
+    for ax in axes[: len(rows)]:
+        spec = ax.get_subplotspec()
+        if spec.colspan.start == 0:
+            ax.set_ylabel("draws / even share\n[no unit]")
+        if spec.rowspan.start == (len(rows) - 1 - spec.colspan.start) // columns:
+            ax.tick_params(labelbottom=True)
+            ax.set_xlabel("rank [fraction]")
+    axes[0].set_xlim(0, 1)
+    axes[0].set_ylim(max(0.0, 1 - 1.2 * farthest), 1 + 1.2 * farthest)
+    legend_above(fig, axes[0])
     return Plot(
         fig,
-        "Chains",
-        "The coefficients with the fewest effective draws, and the mixture's parameters. The"
-        " ensembles are independent: equal levels and equal densities are what convergence looks"
-        " like.",
-        "Traces of the slowest parameters and densities by ensemble.",
+        "Ranks of the draws",
+        "Ranks of the draws of each independent ensemble among those of all, for the coefficients"
+        " with the fewest effective draws and for the mixture's parameters. Ensembles that sample"
+        " one distribution have flat histograms, within the band of 2 σ. "
+        f"{_INDEPENDENCE}",
+        "Histograms of the ranks of the draws, by ensemble, which are flat where chains agree.",
     )
+
+
+def rank_counts(draws: Float, bins: int) -> NDArray[np.int64]:
+    """Numbers (ensembles, bins) of draws (ensembles, draws) in equal bins of their ranks."""
+    order = np.argsort(draws, axis=None, kind="stable")
+    which = np.empty(draws.size, np.int64)
+    which[order] = np.arange(draws.size) * bins // draws.size
+    return np.array([np.bincount(w, minlength=bins) for w in which.reshape(draws.shape)])
 
 
 def slowest_parameters(
@@ -262,42 +293,3 @@ def slowest_parameters(
     ess = np.array([known.get(name, np.inf) for name in names], float)
     order = np.argsort(np.where(np.isfinite(ess), ess, -np.inf), kind="stable")
     return tuple(names[k] for k in order if names[k] not in without)[:n]
-
-
-def _by_walker(values: Float, posterior: Posterior) -> Float:
-    """Draws (ensembles, walkers, steps) of an array (ensembles, draws), walker after walker."""
-    ensembles, draws = values.shape
-    walkers = posterior.sampler.walkers
-    # a posterior that was thinned while sampling has lost its order in time: show it as it is
-    return values.reshape(ensembles, walkers if draws % walkers == 0 else 1, -1)
-
-
-def _trace_row(trace: Axes, density: Axes, ensembles: Float) -> None:
-    low, high = np.quantile(ensembles, [0.0005, 0.9995])
-    pad = 0.1 * (high - low) or 1e-6 * max(abs(high), 1e-12)
-    edges = np.linspace(low - pad, high + pad, 41)
-    n_steps = ensembles.shape[-1]
-    step = max(1, n_steps * len(ensembles) // _TRACE_POINTS)
-    blocks = np.array_split(np.arange(n_steps), min(30, n_steps))
-    for k, walkers in enumerate(ensembles):
-        color = CYCLE[k % len(CYCLE)]
-        # one walker of each ensemble as points, the running median over all walkers as a line
-        trace.plot(
-            np.arange(0, n_steps, step),
-            walkers[0, ::step],
-            ".",
-            ms=1.0,
-            alpha=0.4,
-            color=color,
-            rasterized=True,
-            zorder=1,
-        )
-        middle = [np.median(walkers[:, b]) for b in blocks]
-        at = [float(b.mean()) for b in blocks]
-        trace.plot(at, middle, color=color, lw=1.2, label=f"ensemble {k + 1}", zorder=3)
-        counts, _ = np.histogram(walkers, edges)
-        density.stairs(counts / max(counts.max(), 1), edges, orientation="horizontal", color=color)
-    trace.set_xlim(0, max(n_steps - 1, 1))
-    trace.set_ylim(edges[0], edges[-1])
-    density.set_xlim(0, 1.1)
-    trace.axhline(float(np.mean(ensembles)), color=INK, lw=0.5, zorder=4)

@@ -110,7 +110,7 @@ def _mixture_curves(r: ReportInput) -> tuple[MixtureCurve, MixtureCurve]:
     return u, v
 
 
-@REPORT.figure("fit", printed=lambda r: r.campaign is None)
+@REPORT.figure("fit")
 def residual_histogram(r: ReportInput) -> Plot:
     """Histograms of the two axes: the core, and everything on a logarithmic scale of counts."""
     words = r.words

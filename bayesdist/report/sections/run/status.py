@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.checks import Check
+from bayesdist.assess.circular import per_axis
+from bayesdist.checks import LEVELS, Check, worst
 from bayesdist.numbers import number, rounded, with_mas
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.sections.run.margins import VERDICT_LEVELS
+from bayesdist.report.sections.run.validity import (
+    epoch_clause,
+    validity_checks,
+    validity_clause,
+)
 from bayesdist.report.texttable import TextTable, check_cells
 
 __all__ = [
@@ -20,7 +27,10 @@ __all__ = [
     "verdict",
 ]
 
-GROUPS = ("Held-out truth", "Campaign", "Sampling", "Fit")
+GROUPS = ("Held-out truth", "Campaign", "Sampling", "Fit", "Assumptions")
+_OWN_CLAUSE = ("Requirements", "Validity")  # of the headline
+_UNSAMPLED = "least squares only, no posterior was sampled"
+_NAMED = 2  # rows of the status table that the headline names
 
 
 @dataclass(frozen=True)
@@ -35,11 +45,13 @@ class Verdict:
 def status_checks(r: ReportInput) -> dict[str, tuple[Check, ...]]:
     """Criteria by subject; empty groups are left out.
 
-    Groups are 'Held-out truth', 'Campaign', 'Sampling', 'Fit', 'Requirements', 'Products'.
+    Groups are 'Held-out truth', 'Campaign', 'Sampling', 'Fit', 'Assumptions', 'Requirements',
+    'Validity', 'Products'.
     """
     groups = {
         **{name: tuple(c for c in r.checks if c.group == name and c.name) for name in GROUPS},
         "Requirements": _margin_checks(r),
+        "Validity": validity_checks(r),
         "Products": tuple(
             replace(c, name=f"{p.path}: {c.name}")
             for p in r.products
@@ -78,41 +90,59 @@ def _margin_checks(r: ReportInput) -> tuple[Check, ...]:
 
 
 def verdict(r: ReportInput) -> Verdict:
-    """Verdict on the run.
+    """Verdict on the run: the worst of all rows of the status table and of all warnings.
 
-    'fail' when the posterior is not converged, a requirement is missed or a product fails its
-    check; 'warn' when something is undecided or nothing was sampled.
+    The headline says what is worst first, for which epoch, and until when it holds.
     """
-    sentences = [_margin_sentence(r), _accuracy_sentence(r)]
-    failed = [f"{p.path} ({c.name})" for p in r.products for c in p.checks if c.level == "fail"]
-    if failed:
-        sentences.append(f"Products that fail their own check: {', '.join(failed)}.")
-    verdicts = {m.verdict for m in r.margins}
+    groups = status_checks(r)
+    sentences = [*(f"{text}." for text in r.warnings), _margin_sentence(r), _accuracy_sentence(r)]
     if r.provisional:
         reasons = r.posterior.convergence.reasons  # type: ignore[union-attr]
         sentences.insert(0, f"Why: {'; '.join(reasons) or 'no reason was recorded'}.")
         return Verdict("fail", "NOT CONVERGED: do not rely on these numbers", tuple(sentences))
+    clauses = [(worst(groups.get("Requirements", ())), _requirements_clause(r))]
+    own: tuple[str, ...] = _OWN_CLAUSE
     if r.posterior is None:
-        headline, level = "Least squares only: no posterior was sampled", "warn"
-    else:
-        headline, level = "The posterior is converged", "pass"
+        clauses.append(("warn", _UNSAMPLED))
+        own = (*own, "Sampling")
+    others = [c for name, rows in groups.items() if name not in own for c in rows]
+    for level, verb in (("fail", "fails"), ("warn", "warns")):
+        names = [c.name for c in others if c.level == level]
+        if names:
+            clauses.append((level, _rows_clause(names, verb)))
     if r.warnings:
-        sentences[:0] = [f"{text}." for text in r.warnings]
-        headline, level = f"{headline}, but read the warnings", _worse(level, "warn")
-    if "missed" in verdicts:
-        headline, level = f"{headline}; not every requirement is met", "fail"
-    elif "undecided" in verdicts:
-        headline, level = f"{headline}; not every requirement is decided", _worse(level, "warn")
-    elif verdicts:
-        headline = f"{headline}; every requirement is met"
-    if failed:
-        headline, level = f"{headline}; a product fails its check", "fail"
-    return Verdict(level, headline, tuple(sentences))
+        clauses.append(("warn", "read the warnings"))
+    clauses.append((worst(groups.get("Validity", ())), validity_clause(r)))
+    # the kind of solution first, then what is worst
+    clauses.sort(key=lambda one: (one[1] == _UNSAMPLED, LEVELS.index(one[0])), reverse=True)
+    level = max((level for level, _ in clauses), key=LEVELS.index)
+    headline = "; ".join(text for _, text in clauses)
+    return Verdict(level, headline[:1].upper() + headline[1:], tuple(sentences))
 
 
-def _worse(a: str, b: str) -> str:
-    order = ("pass", "warn", "fail")
-    return max(a, b, key=order.index)
+def _requirements_clause(r: ReportInput) -> str:
+    """Clause on the requirements that are met, and the epoch for which that is said."""
+    at, n = epoch_clause(r), len(r.margins)
+    if not n:
+        return (
+            f"no requirement was stated; errors are those{at}"
+            if at
+            else ("no requirement was stated")
+        )
+    counts = {v: sum(m.verdict == v for m in r.margins) for v in VERDICT_LEVELS}
+    if counts["met"] == n:
+        return f"every requirement is met{at}"
+    (first, k), *others = [(v, counts[v]) for v in ("missed", "undecided") if counts[v]]
+    of = f"{k} of {n} requirements {'is' if k == 1 else 'are'}" if n > 1 else "the requirement is"
+    return " and ".join([f"{of} {first}", *(f"{more} {v}" for v, more in others)]) + at
+
+
+def _rows_clause(names: Sequence[str], verb: str) -> str:
+    """Clause on the rows of the status table that fail or warn."""
+    if len(names) == 1:
+        return f"one criterion {verb} ({names[0]})"
+    shown = "; ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+    return f"{len(names)} criteria {verb[:-1]} ({shown})"
 
 
 def _margin_sentence(r: ReportInput) -> str:
@@ -130,29 +160,38 @@ def _margin_sentence(r: ReportInput) -> str:
 
 
 def _accuracy_sentence(r: ReportInput) -> str:
-    whose = "posterior" if r.posterior is not None else "formal"
+    whose = "posterior" if r.posterior is not None else "formal (least-squares)"
     if r.provisional:
         whose = f"provisional {whose}"
-    worst = max(r.chips, key=lambda c: c.best_map.radius_max)
+    worst = max(r.chips, key=lambda c: c.best_map.radius_max)  # where per-axis errors are largest
     best = worst.best_map
-    median = float(np.median(np.concatenate([c.best_map.radius.ravel() for c in r.chips])))
+    maps = [c.best_map for c in r.chips]
+    median = float(np.median(np.concatenate([m.per_axis.ravel() for m in maps])))
+    largest = with_mas(float(best.per_axis.max()), r.unit, r.scale_mas)
+    circles = " and ".join(
+        f"CE{p} {r.length(max(float(m.circular_error(p / 100).max()) for m in maps))}"
+        for p in (68, 95)
+    )
     text = (
-        f"The {whose} uncertainty of the distortion (radial, 1 σ) is"
-        f" {with_mas(median, r.unit, r.scale_mas)} at the median"
-        f" position and at most {with_mas(best.radius_max, r.unit, r.scale_mas)},"
-        f" at pixel {r.position(best.position_of_max, worst.chip.number)}"
-        f"{_with_shift(r)}"
+        f"The {whose} uncertainty of the distortion (per axis, 1 σ) is"
+        f" {with_mas(median, r.unit, r.scale_mas)} at the median position and at most {largest},"
+        f" at pixel {r.position(best.position_of_max, worst.chip.number)}{_with_shift(r)}"
+        f" ({circles} at most)"
     )
     if r.budget is None:
         return f"{text}."
-    total = r.budget.rows()[-1]["radial"]
-    with_budget = with_mas(total, r.budget.unit, r.scale_mas)
+    total = r.budget.rows()[-1]
+    per_axis_rms = float(per_axis(total["u"], total["v"]))
+    with_budget = with_mas(per_axis_rms, r.budget.unit, r.scale_mas)
     whom = (
         ""
         if r.campaign is None
         else " for a new exposure whose shift and rotation are fitted by whoever uses it"
     )
-    return f"{text}; with all terms of the budget the rms over the detector is {with_budget}{whom}."
+    return (
+        f"{text}; with all terms of the budget the rms over the detector is {with_budget} per"
+        f" axis{whom}."
+    )
 
 
 def _with_shift(r: ReportInput) -> str:

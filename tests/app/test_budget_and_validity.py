@@ -1,4 +1,4 @@
-"""Budget of a position, horizon and plan, through the command line, on pairs that drift."""
+"""Budget of a position, validity period and plan, through the command line, on pairs that drift."""
 
 import json
 import re
@@ -33,7 +33,7 @@ target_ess = 200
 epoch = 2008.0
 grid = [9, 5]
 draws = 2000
-horizon = 20.0
+years_ahead = 20.0
 [[budget]]
 name = "catalogue"
 kind = "random"
@@ -126,9 +126,9 @@ def test_the_budget_of_a_difference_leaves_out_what_both_share(run):
     assert near["coefficients"][0] < far["coefficients"][0]
 
 
-def test_the_horizon_is_said_written_and_drawn(run):
-    [row] = json.loads((run / "summary.json").read_text())["horizons"]
-    table = Table.read(run / "horizon.ecsv")
+def test_the_validity_period_is_said_written_and_drawn(run):
+    [row] = json.loads((run / "summary.json").read_text())["validity_periods"]
+    table = Table.read(run / "validity_periods.ecsv")
     assert len(table) == 40
     assert table["epoch"][0] == pytest.approx(2012.0) and table["epoch"][-1] == 2032.0
     below = np.flatnonzero(table["probability"] < 0.95)
@@ -137,7 +137,7 @@ def test_the_horizon_is_said_written_and_drawn(run):
     assert low <= row["date"] <= high
     assert row["interval"][0] <= row["date"] <= row["interval"][1]
     assert "recalibrate before" in row["sentence"]
-    assert (run / "figures" / "horizon.png").exists()
+    assert (run / "figures" / "validity_period.png").exists()
     text = (run / "report.html").read_text()
     assert row["sentence"] in text and "How long the requirements are met" in text
     # an independent judgement on both sides of the date

@@ -25,7 +25,7 @@ from bayesdist.missions.wise.assess.histograms import band_sums
 from bayesdist.missions.wise.published import RESIDUAL_SIGMAS, WISE_BANDS
 from bayesdist.missions.wise.simulate import wise_set
 
-from .support import matches_of, pairs_of
+from .calibrations import matches_of, pairs_of
 
 # the pattern of W3 is small beside its noise
 PAIRS = {"W1": 150_000, "W2": 150_000, "W3": 600_000, "W4": 150_000}
@@ -37,7 +37,9 @@ TERMS = 15
 
 def calibrated(band: str, partition: bool, bins: int = 31, pairs: int | None = None):
     """Set, pairs, fit and bins; without false matches, whose share of the noise no theory gives."""
-    one = wise_set(band, pairs=pairs or PAIRS[band], seed=8, false_share=0.0, partition=partition)
+    one = wise_set(
+        band, pairs=pairs or PAIRS[band], seed=8, false_fraction=0.0, partition=partition
+    )
     drawn = pairs_of(one)
     matches = matches_of(drawn)
     fit = fit_linear(matches, one.model, rejection=Rejection(1e9, None))

@@ -16,7 +16,7 @@ from bayesdist.missions.wise.simulate import wise_set
 from bayesdist.products import read_wise_meta, sip_from_solution, write_wise_meta
 from bayesdist.products.formats.common.coefficients import evaluate
 
-from .support import CLIP_ABS, matches_of, pairs_of
+from .calibrations import CLIP_ABS, matches_of, pairs_of
 
 # a longest vector is then known to 0.1 %; in W4 pairs are worst, and its vectors short
 PAIRS = {"W1": 400_000, "W2": 400_000, "W3": 400_000, "W4": 2_500_000}

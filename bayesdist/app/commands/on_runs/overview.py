@@ -1,0 +1,78 @@
+"""`bayesdist report`: one page for many runs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from bayesdist.app.config import config_of_record
+from bayesdist.app.report import title_of
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.summary import head_of
+from bayesdist.numbers import with_mas
+from bayesdist.report.overview import OverviewRow, write_overview
+
+__all__ = ["overview"]
+
+NO_VERDICT = "no verdict is recorded; 'bayesdist stage report' makes one"
+
+
+def overview(runs: Sequence[str | Path], output: str | Path) -> str:
+    """Text to print, once the page that compares runs by their summary.json is written.
+
+    InputError for a folder that holds no run.
+    """
+    rows = [_row(RunDirectory(run), Path(output)) for run in runs]
+    write_overview(output, rows)
+    worst = [row.name for row in rows if row.level == "fail"]
+    failed = f"; that of {', '.join(worst)} fails" if worst else ""
+    return f"{output}: verdicts of {len(rows)} run{'s' if len(rows) > 1 else ''}{failed}"
+
+
+def _row(run: RunDirectory, output: Path) -> OverviewRow:
+    if not run.is_initialized:
+        raise run.not_a_run_error()
+    summary, head = run.summary, head_of(run.facts)
+    config = config_of_record(run.facts["config"], str(run.path))
+    margins: list[Mapping[str, Any]] = summary.get("margins") or []
+    worst = min(margins, key=lambda row: row["margin_percent"], default=None)
+    until, is_open = _validity(summary.get("validity_periods") or [])
+    found, fit = summary.get("map"), summary.get("fit")
+    verdict = summary.get("verdict") or {"level": "note", "headline": NO_VERDICT}
+    return OverviewRow(
+        name=run.path.as_posix(),
+        link=_link(run / "report.html", output),
+        detector=title_of(config),
+        simulated=bool(head["simulated"]),
+        level=verdict["level"],
+        headline=verdict["headline"],
+        worst_margin=None if worst is None else worst["margin_percent"],
+        worst_requirement="" if worst is None else worst["name"],
+        valid_until=until,
+        open_ended=is_open,
+        epoch=None if found is None else found["epoch"],
+        uncertainty=""
+        if found is None or found.get("sigma_max") is None  # of an earlier version
+        else with_mas(found["sigma_max"], found["unit"], config.detector.scale_mas),
+        n_used=summary["data"]["n_used"] if summary.get("data") else None,
+        chi2_per_dof=fit["chi2"] / fit["dof"] if fit and fit["dof"] else None,
+        began=head["began"],
+    )
+
+
+def _validity(rows: Sequence[Mapping[str, Any]]) -> tuple[float | None, bool]:
+    """Date at which the first requirement fails; and whether that is a lower bound."""
+    dates = [row["date"] for row in rows if row["date"] is not None]
+    if dates:
+        return min(dates), False
+    return (min(row["until"] for row in rows), True) if rows else (None, False)
+
+
+def _link(report: Path, output: Path) -> str:
+    """Address of a report as seen from the page; empty where there is none."""
+    if not report.exists():
+        return ""
+    return quote(os.path.relpath(report.resolve(), output.resolve().parent))

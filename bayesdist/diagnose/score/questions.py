@@ -1,0 +1,182 @@
+"""Questions to the detections: functions that a model may lack, each with its words.
+
+This is the list for matched stars, campaigns and self-calibrations. How parameters and stars are
+projected out of the functions, the statistic, its p-value and the smallest effect that would have
+been found follow from them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.diagnose.score.result import Family
+from bayesdist.diagnose.score.sample import ScoredSample
+from bayesdist.model.basis import MAX_ORDER, polynomial_terms
+from bayesdist.model.timedep import TimeDependence
+
+__all__ = ["CONSTANT", "LINEAR", "Products", "Question", "questions"]
+
+Float = NDArray[np.float64]
+Terms = tuple[tuple[int, int], ...]
+
+CONSTANT, LINEAR = polynomial_terms(0), polynomial_terms(1)
+HIGHER = 2  # orders above the model's that are tested
+OUTSIDE = 0.5  # per cent of the values at either end that are moved to the others
+MIN_AT_EDGES = 200  # detections: some in each margin
+NEAR_EDGE = 0.05  # of half a side, over which what is at an edge falls off
+SHORTEST = 0.1  # years over which a drift is looked for
+# of the information of a direction, left by the parameters: below, it is theirs
+INDEPENDENT = 1e-6
+OWN_OF_TIME = 0.02  # frames take up drifts but for what the curvature of the polynomial leaves
+
+
+@dataclass(frozen=True, eq=False)
+class Products:
+    """Functions of the detections: polynomial terms times a number of each detection.
+
+    Each moves both axes of each chip freely, or only along a given direction.
+    """
+
+    terms: Terms  # powers (i, j) of Legendre polynomials over the chip
+    values: Float | None = None  # (N,) that multiply the terms; 1 by default
+    # (2,) or (2, N) displacement along the axes of the detector; those of the sky are turned by
+    # `ScoredSample.along_detector`
+    direction: Float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """What a model may lack: functions of the detections that are tested together."""
+
+    family: Family
+    products: tuple[Products, ...]
+    # fraction of its information that a direction must keep when parameters are projected out
+    least: float = INDEPENDENT
+    # group of families that are fitted as well in a second test, which counts where it sees nothing
+    adjusted_for: str = ""
+
+
+MAGNITUDE = Family(
+    "magnitude",
+    "add a magnitude term, cut the faint stars, or correct the charge-transfer efficiency",
+    "the residuals go with the magnitude of the stars",
+    "the residuals do not go with the magnitude of the stars",
+)
+COLOUR = Family(
+    "colour",
+    "add a colour term, or select a narrower range of colours",
+    "the residuals go with the colour of the stars",
+    "the residuals do not go with the colour of the stars",
+)
+POINTING = Family(
+    "pointing",
+    "give the true detector.scale_mas, by which tangent planes are taken to one",
+    "the distortion goes with where exposures point, as if a curved sky were taken as flat",
+    "the distortion does not go with where exposures point",
+)
+EDGES = Family(
+    "edges",
+    "leave out the margins of the detector, or fit a look-up table",
+    "the residuals rise towards the edges of the detector",
+    "the residuals do not rise towards the edges of the detector",
+)
+MAGNITUDE_IN_TIME = Family(
+    "magnitude in time",
+    "cut the faint stars, correct the charge-transfer efficiency, or leave out the late years",
+    "how the residuals go with the magnitude of the stars changes with time",
+    "how the residuals go with the magnitude of the stars does not change with time",
+)
+DRIFT = Family(
+    "drift",
+    "add time-dependent terms to model.tdd",
+    "linear terms drift with time, and the model's do not",
+    "no drift of the linear terms is left in the residuals",
+    explained_by="exposures",
+)
+CURVATURE = Family(
+    "curvature in time",
+    "give model.tdd a break, or shorter periods",
+    "the time dependence is not linear",
+    "no curvature of the time dependence is left in the residuals",
+    held_by="curvature",
+    explained_by="exposures",
+)
+
+
+def order_family(total: int, order: int) -> Family:
+    """Words of the test for terms of one total order, of a model that ends at another."""
+    return Family(
+        f"order {total}",
+        f"raise model.order to {total}" if total <= MAX_ORDER else "fit a look-up table",
+        f"the residuals hold terms of order {total}, and the model ends at order {order}",
+        f"no terms of order {total} are left in the residuals",
+        group="orders",
+        held_by="structure",
+        denial="it is not the missing order",
+    )
+
+
+def questions(sample: ScoredSample) -> Iterator[Question]:
+    """Iterator over what a sample can be asked; values that do not vary are left out later."""
+    order = sample.model.order
+    for total in range(order + 1, order + HIGHER + 1):
+        terms = polynomial_terms(total)[len(polynomial_terms(total - 1)) :]
+        yield Question(order_family(total, order), (Products(terms),))
+    if sample.mag is not None:
+        family = MAGNITUDE
+        if not sample.has_catalogue:  # whose model has no magnitude terms
+            remedy = "cut the faint stars, or correct the charge-transfer efficiency"
+            family = replace(MAGNITUDE, remedy=remedy)
+        yield Question(family, (Products(LINEAR, _standing_out(sample.mag)),))
+    if sample.offset is not None and sample.position is not None:
+        # to first order, what a curved sky makes of the tangent planes of exposures
+        p, q = sample.position
+        values = [square * along for square in (p * p, p * q, q * q) for along in sample.offset]
+        yield Question(POINTING, tuple(Products(CONSTANT, one) for one in values))
+    if not sample.has_catalogue:
+        return  # how often the others err where stars are solved for is not known
+    if sample.colour is not None:
+        yield Question(COLOUR, (Products(LINEAR, _standing_out(sample.colour)),))
+    if len(sample) >= MIN_AT_EDGES:
+        rising = [np.exp((s * Z - 1.0) / NEAR_EDGE) for Z in (sample.X, sample.Y) for s in (-1, 1)]
+        edges = tuple(Products(CONSTANT, one - one.mean()) for one in rising)
+        # a missing order rises towards the edges as well
+        yield Question(EDGES, edges, adjusted_for="orders")
+    yield from _of_time(sample)
+
+
+def _of_time(sample: ScoredSample) -> Iterator[Question]:
+    """Questions to detections of several dates."""
+    time, epoch = sample.model.time, sample.epoch
+    if epoch is None or np.ptp(epoch) <= SHORTEST:
+        return
+    half = (2 * epoch - epoch.min() - epoch.max()) / np.ptp(epoch)  # from -1 to 1
+    if sample.mag is not None:
+        values = _standing_out(sample.mag) * half
+        yield Question(MAGNITUDE_IN_TIME, (Products(LINEAR, values),))
+    yield Question(DRIFT, (Products(LINEAR, half - half.mean()),), OWN_OF_TIME)
+    if time is not None and len(np.unique(epoch)) > 2:
+        order = max([1, *(i + j for _, i, j in time.terms)])
+        products = Products(polynomial_terms(order), _beyond_lines(half, time, epoch))
+        yield Question(CURVATURE, (products,), OWN_OF_TIME)
+
+
+def _standing_out(values: Float) -> Float:
+    """Values about their mean; codes for what is missing are brought to the others."""
+    low, high = np.percentile(values, [OUTSIDE, 100 - OUTSIDE])
+    inside = np.clip(values, low, high)
+    return np.asarray(inside - inside.mean())
+
+
+def _beyond_lines(half: Float, time: TimeDependence, epoch: Float) -> Float:
+    """Square of time, without what a constant and the segments' own lines say of it."""
+    design = np.column_stack([np.ones(len(half)), time.weights(epoch)])
+    dates, of = np.unique(half, return_inverse=True)
+    first = np.unique(of, return_index=True)[1]
+    weight = np.sqrt(np.bincount(of))
+    found = np.linalg.lstsq(weight[:, None] * design[first], weight * dates**2)[0]
+    return half**2 - design @ found

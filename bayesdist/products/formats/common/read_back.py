@@ -1,0 +1,75 @@
+"""Positions by files as they were written, to be compared with the solution they were made from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.model import TimeDependence
+
+__all__ = ["Positions", "ReadBack", "by_calibrations"]
+
+Float = NDArray[np.float64]
+Positions = Callable[[Float, Float, int, float | None], Float]
+
+
+@dataclass(frozen=True, eq=False)
+class ReadBack:
+    """What a file says of pixels, by what its bytes hold.
+
+    Parameters
+    ----------
+    file : str
+        Name of the file, or of several that belong together.
+    forward : callable
+        Of pixels x and y (N,), the number of a chip and a date: positions (N, 2).
+    missed : callable or None
+        Of the same: where forward and back leads, less the pixel (N, 2); None for a file without
+        inverse.
+    own_axes : bool
+        Whether the file lies along axes of its own and counts in a unit of its own, so that shift,
+        rotation and scale are no errors of it.  Otherwise positions are along u, v and in their
+        unit.
+    """
+
+    file: str
+    forward: Positions
+    missed: Positions | None = None
+    own_axes: bool = False
+
+
+def by_calibrations(
+    file: str, sets: Sequence[Calibration], time: TimeDependence | None
+) -> ReadBack:
+    """Positions by the calibrations of a file, along axes of its own.
+
+    Parameters
+    ----------
+    file : str
+    sets : sequence of Calibration
+        One, or one for each segment of the drift.
+    time : TimeDependence or None
+        Of the solution that the file was made from.
+    """
+
+    def of(epoch: float | None) -> Calibration:
+        if time is None or epoch is None or len(sets) == 1:
+            return sets[0]
+        return sets[int(np.searchsorted(time.breaks, epoch, side="right"))]
+
+    def forward(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
+        # a table without drift would refuse a date
+        return of(epoch).forward(x, y, chip=chip, epoch=None if time is None else epoch)
+
+    def missed(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
+        one = of(epoch)
+        about_zero = one.at(origin="chip")[chip]  # at the reference date, for which the rows are
+        back = one.inverses[chip].pixels(*about_zero.at(x, y))
+        return np.stack([back[0] - x, back[1] - y], axis=-1)
+
+    inverses = all(one.inverses for one in sets)
+    return ReadBack(file, forward, missed if inverses else None, own_axes=True)

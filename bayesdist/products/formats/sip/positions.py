@@ -1,0 +1,103 @@
+"""Positions of pixels as the users of SIP headers get them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from astropy.io import fits
+from astropy.wcs import WCS, FITSFixedWarning
+from numpy.typing import NDArray
+
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.plane import ARCSEC
+from bayesdist.data.sky.tangent import tangent_plane
+from bayesdist.products.formats.common.content import Content
+from bayesdist.products.formats.common.document import BuildOptions, Built
+from bayesdist.products.formats.common.read_back import ReadBack
+from bayesdist.products.formats.sip.header import SipHeader
+from bayesdist.products.formats.sip.read import sip_of
+from bayesdist.products.formats.sip.write import sip_header
+
+__all__ = ["headers_read_back", "sip_positions", "sip_read_back", "sky_of_header"]
+
+Float = NDArray[np.float64]
+
+
+def sip_positions(
+    sip: SipHeader,
+    x: Float,
+    y: Float,
+    *,
+    unit: str,
+    scale_arcsec: float | None,
+    like: SipHeader | None = None,
+    tangent_point: tuple[float, float] | None = None,
+) -> Float:
+    """(u, v) of FITS 1-based pixels (N,) by the forward terms of a header, shape (N, 2).
+
+    `scale_arcsec` is that of a pixel as the header was made with, for u and v in pixels; CD and
+    zero point of `like` hold for a file that states neither; with a `tangent_point` (sky position
+    of u, v = 0) the way is over the sky, as astropy.wcs has it.
+    """
+    if tangent_point is not None:
+        plane = tangent_plane(*sky_of_header(sip_header(sip), x, y), tangent_point)
+        return np.stack(plane, axis=-1) / ARCSEC[unit]
+    stated = like or sip
+    in_unit = 3600.0 / (ARCSEC[unit] if unit != "pix" else scale_arcsec or 1.0)
+    offset = stated.offset or (0.0, 0.0)
+    return np.stack(sip.forward(x, y), axis=-1) @ (in_unit * stated.cd).T + offset
+
+
+def sky_of_header(header: fits.Header, x: Float, y: Float) -> tuple[Float, Float]:
+    """RA and Dec (N,) in degrees of pixels by a header, as astropy.wcs has them."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FITSFixedWarning)
+        ra, dec = WCS(header).all_pix2world(x, y, 1)
+    return np.asarray(ra), np.asarray(dec)
+
+
+def sip_read_back(
+    files: Sequence[Built], calibration: Calibration, options: BuildOptions
+) -> list[ReadBack]:
+    """Positions by headers of the chips, on the sky where the calibration's plane touches it."""
+    headers = {
+        one.chip: sip_of(Content(one.file_name, one.content))
+        for one in files
+        if one.chip is not None
+    }
+    names = ", ".join(one.file_name for one in files)
+    point = calibration.plane.point
+    return [headers_read_back(names, headers, calibration, options, tangent_point=point)]
+
+
+def headers_read_back(
+    file: str,
+    headers: Mapping[int, SipHeader],
+    calibration: Calibration,
+    options: BuildOptions,
+    *,
+    like: SipHeader | None = None,
+    tangent_point: tuple[float, float] | None = None,
+) -> ReadBack:
+    """Positions by headers, one for each chip; `like` and `tangent_point` as of `sip_positions`."""
+    unit = calibration.model.unit
+
+    def forward(x: Float, y: Float, chip: int, _: float | None) -> Float:
+        return sip_positions(
+            headers[chip],
+            x,
+            y,
+            unit=unit,
+            scale_arcsec=options.scale_arcsec,
+            like=like,
+            tangent_point=tangent_point,
+        )
+
+    def missed(x: Float, y: Float, chip: int, _: float | None) -> Float:
+        sip = headers[chip]
+        back_x, back_y = sip.inverse(*sip.forward(x, y))
+        return np.stack([back_x - x, back_y - y], axis=-1)
+
+    return ReadBack(file, forward, missed)

@@ -1,0 +1,111 @@
+"""Numbers of a figure as CSV: what its marks stand for, panel by panel."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PathCollection, PolyCollection
+from matplotlib.contour import ContourSet
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.patches import Rectangle, StepPatch
+from matplotlib.quiver import Quiver
+
+__all__ = ["numbers_of"]
+
+HEADS = ("panel", "mark", "label", "x", "y", "value", "value_2")
+MOST_ROWS = 20_000  # beyond them a figure is a picture of a table of its own
+Row = tuple[Any, ...]
+
+
+def numbers_of(figure: Figure) -> str:
+    """CSV of the marks of a figure in the units of its axes; at most `MOST_ROWS` rows.
+
+    Lines that begin with # name the panels and their axes. Arrows have their components as values,
+    segments their other end, cells and contours the value that their colour stands for.
+    """
+    out = io.StringIO()
+    panels = [ax for ax in figure.axes if ax.get_label() != "<colorbar>"]
+    for k, ax in enumerate(panels, start=1):
+        title = ax.get_title() or ax.get_title(loc="left")
+        words = (title, f"x: {ax.get_xlabel()}", f"y: {ax.get_ylabel()}")
+        out.write(f"# panel {k}: {'; '.join(' '.join(one.split()) for one in words if one)}\n")
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(HEADS)
+    for row in islice(_rows(panels), MOST_ROWS):
+        writer.writerow(row)
+    return out.getvalue()
+
+
+def _rows(panels: Sequence[Axes]) -> Iterator[Row]:
+    for k, ax in enumerate(panels, start=1):
+        for mark, label, rows in _marks(ax):
+            for row in rows:
+                yield (k, mark, label, *(f"{v:.6g}" for v in row))
+
+
+def _marks(ax: Axes) -> Iterator[tuple[str, str, Iterable[Sequence[float]]]]:
+    """Kind, label and numbers of each artist that stands for data."""
+    for line in ax.lines:
+        if line.get_transform() == ax.transData:
+            yield "line", _label(line), np.asarray(line.get_xydata(), float)
+    for one in ax.collections:
+        kind, rows = _of_collection(one)
+        yield kind, _label(one), rows
+    for image in ax.images:
+        yield "cell", _label(image), _cells(image)
+    for patch in ax.patches:
+        if isinstance(patch, StepPatch):
+            values, edges, _ = patch.get_data()
+            yield "bar", _label(patch), np.column_stack([edges[:-1], edges[1:], values])
+    for bars in ax.containers:
+        if bars and all(isinstance(one, Rectangle) for one in bars):
+            boxes = [one.get_bbox() for one in bars]
+            yield "bar", _label(bars), [(b.x1, (b.y0 + b.y1) / 2, b.width) for b in boxes]
+
+
+def _of_collection(one: Any) -> tuple[str, Iterable[Sequence[float]]]:
+    if isinstance(one, Quiver):
+        return "arrow", np.column_stack([one.XY, np.ravel(one.U), np.ravel(one.V)])
+    if isinstance(one, ContourSet):
+        if one.filled:
+            return "contour", ()
+        lines = zip(one.levels, one.get_paths(), strict=True)
+        return "contour", (
+            (*xy, level) for level, path in lines for xy in np.asarray(path.vertices)
+        )
+    if isinstance(one, LineCollection):
+        ends = (s for s in one.get_segments() if len(s) == 2)
+        return "segment", ((*first, *last) for first, last in ends)
+    if isinstance(one, PathCollection | PolyCollection):
+        at, values = np.asarray(one.get_offsets(), float), one.get_array()
+        if values is not None and len(np.ravel(values)) == len(at):
+            at = np.column_stack([at, np.ravel(values)])
+        return "point", at if len(at) > 1 else ()
+    return "other", ()
+
+
+def _cells(image: AxesImage) -> Iterator[Row]:
+    values: Any = np.ma.filled(np.ma.asarray(image.get_array(), float), np.nan)
+    if values.ndim != 2:
+        return
+    left, right, bottom, top = image.get_extent()
+    ny, nx = values.shape
+    x = left + (np.arange(nx) + 0.5) * (right - left) / nx
+    y = bottom + (np.arange(ny) + 0.5) * (top - bottom) / ny
+    if image.origin == "upper":
+        y = y[::-1]
+    for j, row in enumerate(values):
+        for i, value in enumerate(row):
+            yield x[i], y[j], value
+
+
+def _label(artist: Any) -> str:
+    text = str(artist.get_label() or "")
+    return "" if text.startswith("_") else " ".join(text.split())

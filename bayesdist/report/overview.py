@@ -1,0 +1,86 @@
+"""One page for many runs: status, worst margin and validity of each, in a table that sorts."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from bayesdist.checks import LEVELS
+from bayesdist.files import atomic_path
+from bayesdist.numbers import MISSING, count, number
+from bayesdist.report.page import template
+from bayesdist.report.texttable import Level
+
+__all__ = ["OverviewRow", "write_overview"]
+
+
+@dataclass(frozen=True)
+class OverviewRow:
+    """What the page says of one run; None where the run has not got so far."""
+
+    name: str  # folder of the run, as it was given
+    link: str  # to its report, relative to the page; empty where there is none
+    detector: str
+    simulated: bool
+    level: str  # 'pass', 'warn', 'fail', or 'note' where there is no verdict
+    headline: str
+    worst_margin: float | None  # percent of the limit
+    worst_requirement: str
+    valid_until: float | None  # decimal year
+    open_ended: bool  # the validity period lasts at least until then
+    epoch: float | None
+    uncertainty: str  # largest, per axis, with its unit
+    n_used: int | None
+    chi2_per_dof: float | None
+    began: str
+
+    @property
+    def key(self) -> int:
+        """Rank of the level: the worst one first."""
+        return -LEVELS.index(self.level)
+
+    @property
+    def status(self) -> Level:
+        """Level as a cell."""
+        return Level(self.level)
+
+    @property
+    def cells(self) -> tuple[tuple[str, bool], ...]:
+        """Texts of the cells behind the headline, and whether each is a number."""
+        margin = MISSING if self.worst_margin is None else f"{self.worst_margin:.0f}"
+        until = MISSING if self.valid_until is None else f"{self.valid_until:.1f}"
+        return (
+            (margin.replace("-", "−"), True),
+            (self.worst_requirement or MISSING, False),
+            (f"{until} or later" if self.open_ended else until, True),
+            (MISSING if self.epoch is None else f"{self.epoch:.2f}", True),
+            (self.uncertainty or MISSING, True),
+            (MISSING if self.n_used is None else count(self.n_used), True),
+            (number(self.chi2_per_dof), True),
+            (self.began[:10] or MISSING, False),
+        )
+
+
+HEADS = (
+    ("Worst margin [% of the limit]", True),
+    ("of requirement", False),
+    ("Valid until [yr]", True),
+    ("Judged at [yr]", True),
+    ("Largest uncertainty, per axis", True),
+    ("Used", True),
+    ("χ² / dof", True),
+    ("Began", False),
+)
+
+
+def write_overview(path: str | os.PathLike[str], rows: Sequence[OverviewRow]) -> None:
+    """Write the page; the worst runs stand first.
+
+    InputError when the file cannot be written.
+    """
+    ordered = sorted(rows, key=lambda row: row.key)
+    text = template("overview.html.jinja").render(rows=ordered, heads=HEADS)
+    with atomic_path(Path(path)) as temporary:
+        temporary.write_text(text, encoding="utf-8")

@@ -1,0 +1,77 @@
+"""Numbers of figures as CSV, and links to the documentation, in the page."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+from lxml import html as lxml_html
+
+from bayesdist.report.documentation import _PAGES, BASE, page_of
+from bayesdist.report.figure_numbers import numbers_of
+from bayesdist.report.sections import REPORT
+
+from .plots import drawings_of, plot_of
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+def rows_of(text: str) -> list[dict[str, str]]:
+    lines = [line for line in text.splitlines(keepends=True) if not line.startswith("#")]
+    return list(csv.DictReader(io.StringIO("".join(lines))))
+
+
+def test_numbers_are_those_that_are_drawn(converged):
+    figure = plot_of(converged, "chi_square_by_exposure").figure
+    drawn = figure.axes[0].lines[-1].get_xydata()
+    rows = [r for r in rows_of(numbers_of(figure)) if r["mark"] == "line"]
+    found = np.array([[float(r["x"]), float(r["y"])] for r in rows])
+    np.testing.assert_allclose(found[-len(drawn) :], drawn, rtol=1e-5)
+
+
+def test_cells_have_their_places_and_values(converged):
+    rows = rows_of(numbers_of(plot_of(converged, "coverage").figure))
+    binned = converged.chips[0].binned
+    assert sum(float(r["value"]) for r in rows) == binned.count.sum()
+    first = rows[0]
+    assert float(first["x"]) == binned.x[0] and float(first["y"]) == binned.y[0]
+    assert float(first["value"]) == binned.count[0, 0]
+
+
+def test_a_matrix_is_read_from_the_top(converged):
+    figure = plot_of(converged, "correlations").figure
+    values = figure.axes[0].images[0].get_array()
+    rows = {(float(r["x"]), float(r["y"])): float(r["value"]) for r in rows_of(numbers_of(figure))}
+    for i, j in ((0, 0), (3, 1), (0, 5)):
+        assert abs(rows[j, i] - values[i, j]) < 1e-5
+
+
+def test_numbers_are_in_the_page_and_what_they_hold_cannot_leave_them(converged):
+    from dataclasses import replace
+
+    from bayesdist.report.run_report import render_report
+
+    plot = plot_of(converged, "chi_square_by_exposure")
+    (drawing,) = drawings_of({"a": plot}).values()
+    evil = '"><script>alert(1)</script>'
+    drawings = {"chi_square_by_exposure": replace(drawing, numbers=evil)}
+    page = render_report(converged, drawings)
+    assert evil not in page
+    (link,) = lxml_html.fromstring(page).xpath("//a[@download]")
+    assert link.get("download") == "chi_square_by_exposure.csv"
+    assert base64.b64decode(link.get("href").partition("base64,")[2]).decode() == evil
+
+
+def test_each_section_has_a_page_that_exists():
+    for section in REPORT.sections:
+        assert section.name in _PAGES, section.name
+    for name, page in _PAGES.items():
+        file, _, anchor = page.partition("#")
+        text = (DOCS / file.replace(".html", ".md")).read_text("utf-8")
+        heads = [line.lstrip("# ").lower() for line in text.splitlines() if line.startswith("#")]
+        slugs = {"-".join("".join(c for c in h if c.isalnum() or c in " -").split()) for h in heads}
+        assert not anchor or anchor in slugs, name
+        assert page_of(name) == BASE + page

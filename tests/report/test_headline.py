@@ -1,0 +1,75 @@
+"""The headline is the worst row, names the epoch that it is of, and until when it holds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bayesdist.assess.checks import catalogue_checks
+from bayesdist.assess.requirements.validity import ValidityPeriod
+from bayesdist.checks import Check
+from bayesdist.report.sections.run.status import status_checks, verdict
+
+YEARS = np.linspace(2010.3, 2020.3, 41)
+
+
+def _met_only(run):
+    return replace(run, margins=tuple(m for m in run.margins if m.verdict == "met"))
+
+
+def _period(run, end: float) -> ValidityPeriod:
+    """Probability that falls from 1 to 0, and passes what is asked at `end`."""
+    asked = run.margins[0].requirement
+    p = np.clip(asked.probability + 0.3 * (end - YEARS), 0.0, 1.0)
+    return ValidityPeriod(asked, YEARS, p, p - 0.01, p + 0.01, np.ones_like(p))
+
+
+def test_a_row_that_warns_is_in_the_headline(converged):
+    good = _met_only(converged)
+    assert verdict(good).level == "pass"
+    row = Check("Fit", "Odd stars", "three", "none", "warn")
+    worse = verdict(replace(good, checks=(*good.checks, row)))
+    assert worse.level == "warn" and worse.headline.startswith("One criterion warns (Odd stars)")
+    failed = verdict(replace(good, checks=(*good.checks, row, replace(row, level="fail"))))
+    assert failed.level == "fail" and failed.headline.startswith("One criterion fails (Odd stars)")
+
+
+def test_the_headline_names_the_epoch_of_the_verdicts(converged):
+    assert {m.epoch for m in converged.margins} == {2010.3}
+    assert (
+        "every requirement is met at epoch 2010.30"
+        in verdict(_met_only(converged)).headline.lower()
+    )
+
+
+@pytest.mark.parametrize(
+    ("end", "began", "level", "words"),
+    [
+        (2015.3, "2012-07-01T00:00:00+00:00", "pass", "ends in 2015.3"),
+        (2015.3, "2016-07-01T00:00:00+00:00", "warn", "ended in 2015.3"),
+        (2030.0, "2012-07-01T00:00:00+00:00", "pass", "lasts at least until 2020.3"),
+        (2005.0, "2012-07-01T00:00:00+00:00", "warn", "has ended with the data"),
+    ],
+)
+def test_the_validity_period_counts_and_stands_in_the_status_table(
+    converged, end, began, level, words
+):
+    good = _met_only(converged)
+    run = replace(good, validity=(_period(good, end),), provenance={"created": began})
+    found = verdict(run)
+    assert found.level == level and words in found.headline
+    (row,) = status_checks(run)["Validity"]
+    assert row.level == level
+    if 2010.3 < end < 2020.3:
+        assert f"until {end:.1f}" in row.value
+
+
+def test_an_error_of_the_catalogue_that_is_not_stated_is_amber(converged):
+    good = _met_only(converged)
+    for stated, level in ((True, "pass"), (False, "warn")):
+        run = replace(good, checks=(*good.checks, *catalogue_checks(stated)))
+        (row,) = status_checks(run)["Assumptions"]
+        assert row.level == level == verdict(run).level
+    assert not list(catalogue_checks(None))

@@ -1,0 +1,51 @@
+"""Reports whose figures are made but not drawn.
+
+That takes most of the time of a small run.  Figures as they look are the subject of tests/report,
+and the demo draws them in a process of its own.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from unittest.mock import patch
+
+from PIL import Image
+
+
+@contextmanager
+def sketched() -> Iterator[None]:
+    """Context in which a speck stands for each figure of a report, and corner plots are empty."""
+    from matplotlib.figure import Figure
+
+    from bayesdist.report import drawing
+    from bayesdist.report.sections.run import posterior
+
+    with (
+        patch.object(drawing, "render", _sketch),
+        patch.object(posterior, "corner_figure", lambda *_, **__: Figure()),
+    ):
+        yield
+
+
+def _sketch(plot, *, pdf=False, svg=False):
+    """The words of a figure, and a speck in place of it."""
+    from bayesdist.report.drawing import Drawing
+
+    page = io.BytesIO()
+    Image.new("RGB", (4, 3), "white").save(page, format="png")
+    return Drawing(page.getvalue(), b"%PDF-1.7" if pdf else None, plot.title, plot.text, plot.alt)
+
+
+def main() -> int:
+    """Exit code of a command of bayesdist whose report is a sketch."""
+    from bayesdist.app.cli import main as command
+
+    with sketched():
+        return command(sys.argv[1:])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
