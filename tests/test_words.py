@@ -112,6 +112,11 @@ def test_help_texts_use_the_words_of_the_field():
     assert [f"{name}: {hit}" for name, text in found for hit in hits(text)] == []
 
 
+@pytest.mark.parametrize("name", bayesdist.__all__)
+def test_docstrings_of_the_public_names_use_the_words_of_the_field(name):
+    assert hits(getattr(bayesdist, name).__doc__ or "") == []
+
+
 @pytest.mark.parametrize("room", sorted(p.name for p in PACKAGE.iterdir() if p.is_dir()), ids=str)
 def test_messages_and_captions_use_the_words_of_the_field(room):
     found = [

@@ -185,7 +185,7 @@ def test_chips_have_places_all_or_none(tmp_path):
         file.write_text(start[0] + chips + start[1] + start[2], encoding="utf-8")
 
     write("", "place = [600, 0]")
-    refused(tmp_path, "plan-dither", file, words=["some [[chip]] blocks have a place"])
+    refused(tmp_path, "plan-dither", file, words=["some [[chip]] blocks have the key place"])
     write("place = [0, 0]", "place = [600, 0]")
     camera = load_plan(file).camera()
     assert camera.side == pytest.approx(512, abs=1)

@@ -66,7 +66,7 @@ class Margin:
     rests_on : tuple of str
         What the verdict takes for granted or has measured, as clauses.
     remedy : RequiredReduction or None
-        The term that would have to shrink, and how far, for the requirement to be met; None where
+        The term that must be reduced, and to what level, for the requirement to be met; None where
         it is met, and where there is doubt about all numbers.
 
     Examples

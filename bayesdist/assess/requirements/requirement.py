@@ -48,7 +48,7 @@ class Requirement:
         First and last epoch of a range, in place of `epoch`: the limit must hold throughout.
     relative : bool
         Whether the error is that of the difference of two positions in one image, over all pairs of
-        places, in place of that of a position.
+        positions, in place of that of one position.
     separation : float, optional
         Pairs on one chip that are not farther apart than so many pixels; for relative errors.
     magnitude : float, optional

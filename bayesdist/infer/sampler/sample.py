@@ -85,7 +85,7 @@ def sample(
         With 'certified': exact evaluations accept or reject the surrogate's draws always
         ('always'), never ('never'), or where that is affordable ('auto'); see `certified`.
     folder : path, optional
-        For checkpoints.  Blocks found there are read instead of run, so that a killed run is
+        For checkpoints.  Blocks found there are read instead of run, so that an interrupted run is
         resumed bit for bit.
     progress : callable, optional
         Called with (steps made, `max_steps`).

@@ -55,7 +55,7 @@ def time_tables(r: ReportInput) -> Iterator[TextTable]:
     if found.get("verdicts"):
         rows_of = tuple((v["term"], v["claim"], v["text"]) for v in found["verdicts"])
         yield TextTable(
-            "Which course each term takes, by held-out exposures",
+            "Time dependence of each term, selected by held-out exposures",
             ("Term", "Claim", "Why"),
             rows_of,
             words=(0, 1, 2),

@@ -109,7 +109,7 @@ def overlap(r: ReportInput) -> Plot:
     text += f" Pixels of {t.pixel_mas:g} mas; both panels have one scale."
     return Plot(
         panels.figure,
-        "Two exposures laid on each other",
+        "Alignment of two exposures",
         text,
         "Residual vectors between two exposures, with a pattern on the left and little on the"
         f" right: rms {size_of(old)} and {size_of(new)}.",

@@ -105,7 +105,7 @@ def rests_on_table(r: ReportInput) -> TextTable | None:
     rows = tuple(
         (clause, "all" if len(of) == every else ", ".join(of)) for clause, of in clauses.items()
     )
-    return TextTable("What the verdicts rest on", ("", "Requirements"), rows, words=(0, 1))
+    return TextTable("Basis of the verdicts", ("", "Requirements"), rows, words=(0, 1))
 
 
 @REPORT.figure("margins", needs=("margins",), printed=True)
