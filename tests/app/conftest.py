@@ -62,4 +62,4 @@ def finished(sketched, tmp_path_factory) -> Finished:
 @pytest.fixture
 def no_report(monkeypatch):
     """Runs without the figures, which take seconds and are not the subject here."""
-    monkeypatch.setattr("bayesdist.app.run.report", lambda results: [])
+    monkeypatch.setattr("bayesdist.app.run.report", lambda results, pdf: [])

@@ -84,7 +84,7 @@ def _assert_same_draws(a: Path, b: Path) -> None:
 @pytest.fixture(scope="module")
 def undisturbed(job, tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bayesdist.app.run.report", lambda results: [])
+        patch.setattr("bayesdist.app.run.report", lambda results, pdf: [])
         return run(job, tmp_path_factory.mktemp("undisturbed") / "run")
 
 

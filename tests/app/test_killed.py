@@ -81,7 +81,7 @@ class Forked:
 def _without_figures(arguments: list[str]) -> None:
     from bayesdist.app import run
 
-    run.report = lambda results: []
+    run.report = lambda results, pdf: []
     sys.exit(main(arguments))
 
 
