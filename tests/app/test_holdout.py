@@ -69,7 +69,7 @@ def test_verdict_and_tests_are_written_and_shown(run):
     html = (run[1] / "report.html").read_text(encoding="utf-8")
     assert "Coverage of the held-out stars" in html
     status = html.index("Held-out truth")
-    assert status < html.index(">Sampling<") and 'id="holdout"' in html
+    assert status < html.index(">Sampling ") and 'id="holdout"' in html
     assert (run[1] / "figures" / "holdout.png").exists()
     assert summary_of(run[1])["margins"][0]["verdict"] == "met"
 

@@ -29,7 +29,7 @@ Float = NDArray[np.float64]
 
 STRUCTURE = "unmodelled structure"
 STRUCTURE_IN_FIT = "unmodelled structure in coefficients"
-DEVIATIONS = "exposure-to-exposure variation"
+DEVIATIONS = "unmodelled exposure-to-exposure variation"
 SOURCE = f"{MEASURED}, with a prior on its size"
 
 
