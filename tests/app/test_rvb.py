@@ -134,7 +134,8 @@ def test_init_recognises_pairs(tmp_path, suffix):
     assert "W1 (300), W4 (600)" in text and "# colour = " in text
     found = tomllib.loads(text)
     assert (found["data"]["format"], found["data"]["band"]) == ("rvb", "W4")
-    assert found["detector"] == {"name": "W4", "size": [508, 508], "scale_mas": 5500}
+    detector = {"mission": "WISE", "name": "W4", "size": [508, 508], "scale_mas": 5500}
+    assert found["detector"] == detector
     assert "600 of 600 rows" in good("check", config).out
     # what is commented out is as it should be
     config.write_text(

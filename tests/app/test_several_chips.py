@@ -354,7 +354,7 @@ def test_the_report_shows_both_chips(run):
         assert words in page, words
     assert json.loads((run / "run.json").read_text())["config"]["chip"][1]["reference"] is True
     figures = {p.name for p in (run / "figures").iterdir()}
-    assert figures == set(summary_of(run)["figures"]) and len(figures) >= 22
+    assert figures == set(summary_of(run)["figures"]) and len(figures) >= 20
 
 
 # -- chips that only one side knows ---------------------------------------------------------------

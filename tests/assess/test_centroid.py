@@ -37,5 +37,5 @@ def test_without_magnitudes_nothing_is_said():
 
 
 def test_errors_that_are_larger_than_the_residuals_cannot_be_in_them():
-    with pytest.raises(InputError, match="said to be in residuals that scatter by"):
+    with pytest.raises(InputError, match="declared part of residuals that scatter by"):
         centroid_errors(centroid_scatter(sample()), [("catalogue", 0.3, 0.3)])
