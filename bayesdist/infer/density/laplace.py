@@ -22,6 +22,7 @@ __all__ = ["Conditional", "Node", "conditional_mode", "expected_mode", "starting
 Float = NDArray[np.float64]
 
 MAX_STEPS = 60
+UNSEEN = 1e-8  # decrement that rounding of the log density may hide: the step is taken unseen
 ON_A_RIDGE = 1e-2  # decrement at which a search stops where the curvature had to be made positive
 
 
@@ -90,6 +91,9 @@ def conditional_mode(
                     break
             length /= 2
         if not moved:
+            if decrement < UNSEEN and not mended and split.contains(y + step):
+                y = y + step
+                break
             if decrement < 1e-3:
                 break  # rounding limits the gain: this is the mode
             raise DegenerateError(
