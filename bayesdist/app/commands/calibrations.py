@@ -11,6 +11,7 @@ from bayesdist.app.commands.options import (
     epoch,
     filter_name,
     force,
+    image_size,
     new_folder,
     pixel_scale,
 )
@@ -31,6 +32,7 @@ def inspect(file: str) -> None:
 @filter_name
 @epoch
 @pixel_scale
+@image_size
 @click.option("-o", "--output", required=True, metavar="OUT", help="An .ecsv, .csv or .fits file.")
 @click.option("--inverse", is_flag=True, help="Back to pixels.")
 @click.option(
@@ -73,6 +75,7 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
 @click.option("--chip", type=int, metavar="N", show_default="all common chips")
 @click.option("--filter", metavar="F", help="Of IDCTABs, or WISE band; F:G for A and B.")
 @epoch
+@image_size
 @click.option("--keep-linear", is_flag=True, help="Leave shift, rotation and scale in.")
 @click.option("--grid", type=int, nargs=2, default=(33, 17), metavar="NX NY")
 @click.pass_obj

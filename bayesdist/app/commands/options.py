@@ -17,6 +17,7 @@ __all__ = [
     "epoch",
     "filter_name",
     "force",
+    "image_size",
     "new_folder",
     "pixel_scale",
     "seed",
@@ -89,3 +90,6 @@ seed = click.option("--seed", type=click.IntRange(min=0), default=1, metavar="N"
 epoch = click.option("--epoch", type=float, metavar="T", help="Decimal years, for what drifts.")
 filter_name = click.option("--filter", metavar="F", help="Of an IDCTAB, or a WISE band.")
 pixel_scale = click.option("--scale", type=float, metavar="S", help="Of a corrected pixel.")
+image_size = click.option(
+    "--size", nargs=2, type=float, metavar="NX NY", help="Pixels, for a file that does not say."
+)
