@@ -250,6 +250,20 @@ class Calibration:
         )
         return replace(self, solution=made.solution, reference_date=None, undated="", inverses={})
 
+    def only(self, number: int, epoch: float | None = None) -> Calibration:
+        """This calibration at a date, of one of its chips alone."""
+        one = self.chip(number, epoch, origin="stated")
+        made = calibration_of_maps({number: one}, self.name, cov=one.cov, errors=self.errors)
+        return replace(
+            self,
+            solution=made.solution,
+            reference_date=None,
+            undated="",
+            before=tuple(t for t in self.before if t.chip == number),
+            after=tuple(t for t in self.after if t.chip == number),
+            inverses={k: v for k, v in self.inverses.items() if k == number},
+        )
+
     # -- scale ------------------------------------------------------------------------------------
 
     def pixel(self, epoch: float | None = None) -> tuple[float, str]:

@@ -236,7 +236,7 @@ class ChipMap:
         basis = PolynomialBasis(order, self.basis.size, self.basis.reference_pixel)
         x, y = _even_grid(basis.size)
         design, wanted = basis.evaluate(x, y), self.at(x, y)
-        coefficients = np.linalg.lstsq(design, wanted.T, rcond=None)[0].T
+        coefficients = np.asarray(np.linalg.lstsq(design, wanted.T, rcond=None)[0].T, float)
         left = np.hypot(*(design @ coefficients.T - wanted.T).T)
         left /= np.sqrt(abs(np.linalg.det(self.linear)))
         cov, K = None, self.basis.n_terms

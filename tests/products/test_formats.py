@@ -30,13 +30,16 @@ from tests.app.support import good
 from .support import StandIn, some_solution, wfc_model
 
 SETTINGS = {
+    "ast": {},
+    "cpdis": {},
     "idctab": {"instrument": "WFC3", "detector": "IR"},
     "sip": {},
+    "stdgdc": {},
     "tpv": {},
     "wise_meta": {},
 }
 # errors that a file has by itself; what more there is stands in a file beside it
-ALONE = {"idctab": "covariance", "tpv": "none"}
+ALONE = {"ast": "none", "tpv": "none"} | dict.fromkeys(("cpdis", "idctab", "stdgdc"), "covariance")
 OPTIONS = BuildOptions(scale_arcsec=0.13)
 
 

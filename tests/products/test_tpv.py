@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import astropy.wcs
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -214,6 +215,17 @@ def test_fits_headers_and_old_scamp_headers_are_read(tmp_path):
     same = registry.read_calibration(old, size=(32.0, 64.0))
     assert_allclose(same.solution.mean, image.solution.mean)
     assert "as SCAMP wrote it before" in str(registry.lint(old))
+
+
+def test_a_real_header_is_read_as_astropy_reads_it():
+    """One of a mosaic, among the tests of astropy; CRPIX is twice its width off the chip."""
+    path = Path(astropy.wcs.__file__).parent / "tests" / "data" / "tpvonly.hdr"
+    found = registry.read_calibration(path)
+    assert found.model.order == 4 and found.model.chips[0].size == (2048.0, 4096.0)
+    [head] = read_tpv(path).heads
+    x, y = random_pixels(found.model.chips[0].size, 2000)
+    assert apart_mas(sky_of(found, x, y), sky_by("astropy.wcs", head.header, x, y)) < 1e-3
+    assert not registry.lint(path)
 
 
 FAULTS = {

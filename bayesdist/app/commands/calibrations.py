@@ -69,6 +69,34 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
 
 
 @command()
+@click.argument("file", metavar="FILE")
+@click.option("--to", required=True, metavar="FORMAT", help="As the table of [products].")
+@click.option("-o", "--output", metavar="OUT", help="A folder, or the file where there is one.")
+@click.option(
+    "--option",
+    "options",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Of the format, as in its table of [products].",
+)
+@click.option("--order", type=int, metavar="N", help="Of the polynomial, if another is wanted.")
+@click.option("--chip", type=int, metavar="N", help="This one alone.")
+@filter_name
+@epoch
+@click.option("--scale", type=float, metavar="S", help="Arcseconds in a pixel.")
+@image_size
+@force
+def convert(file: str, to: str, output: str | None, **options: Any) -> None:
+    """A calibration in another format, and what is lost by it.
+
+    FILE is a run, or a file of any format that holds a calibration.
+    """
+    from bayesdist.app.commands.on_files.convert import convert as converted
+
+    click.echo(converted(file, to, output, **options))
+
+
+@command()
 @click.argument("a", metavar="A")
 @click.argument("b", metavar="B")
 @click.option("-o", "--output", metavar="DIR", help="A new folder for tables and figure.")
@@ -84,7 +112,7 @@ def compare(
 ) -> None:
     """How two calibrations differ, and how significantly.
 
-    A and B are each a run, a posterior, a fit, an IDCTAB, a SIP header or WISE meta-data.
+    A and B are each a run, a posterior, a fit, or a file of any format that holds a calibration.
     """
     from bayesdist.app.commands.on_runs.compare import compare_files
 

@@ -30,7 +30,7 @@ from bayesdist.model import corrected
 from bayesdist.model.grid import grid_pixels, mesh
 from bayesdist.products import SipHeader, read_d2im, read_lookup_file
 from bayesdist.products.formats.common.content import Content
-from bayesdist.products.formats.common.document import Built
+from bayesdist.products.formats.common.document import PARAMETERS, Built, Choice
 from bayesdist.products.formats.sip.read import sip_of
 from bayesdist.products.formats.wise.meta import bands_of
 from bayesdist.products.registry import read_calibration, recognized
@@ -43,6 +43,7 @@ Float = NDArray[np.float64]
 Positions = Callable[[Float, Float, int, float | None], Float]
 
 FORWARD, INVERSE = "forward", "inverse"
+_LAID = ("ast", "cpdis", "stdgdc", "tpv")  # formats whose files are read as others read them
 GRID = (33, 33)  # points over which files are laid on the solution
 ROUNDING = 1e-9  # of a pixel
 SKY_ROUNDING = 2e-9  # arcsec: what double precision leaves of an RA of 360 degrees, and back
@@ -62,6 +63,9 @@ def product_terms(product: ProductInput, config: Config, base: Path) -> tuple[Kn
     for one in made.get("idctab", ()):
         of_file = recognized(_content(one)).calibration()
         out += _idctab_terms(product, one.file_name, [of_file])
+    for key in _LAID:
+        if files := [one for one in made.get(key, ()) if one.kind != PARAMETERS]:
+            out.append(_laid_term(product, files))
     for one in made.get("wise_meta", ()):
         [band] = bands_of(_content(one))
         chip = product.solution.model.chips[0].number
@@ -138,6 +142,20 @@ def _idctab_terms(product: ProductInput, file: str, sets: Sequence[Calibration])
     if all(one.inverses for one in sets):
         out.append(_term(product, file, INVERSE, _in_unit(product, missed)))
     return out
+
+
+def _laid_term(product: ProductInput, files: Sequence[Built]) -> Known:
+    """Forward term of one file, or of one for each chip, as other programs read them."""
+    by_chip: dict[int, Calibration] = {}
+    for one in files:
+        found = recognized(_content(one)).calibration(Choice(as_used=True))
+        by_chip |= dict.fromkeys(found.numbers if one.chip is None else (one.chip,), found)
+
+    def place(x: Float, y: Float, chip: int, _: float | None) -> Float:
+        return by_chip[chip].forward(x, y, chip=chip)
+
+    name = ", ".join(one.file_name for one in files)
+    return _term(product, name, FORWARD, _Laid(product, place, scaled=True))
 
 
 def _released(product: ProductInput, config: Config, base: Path, folder: Path) -> list[Calibration]:

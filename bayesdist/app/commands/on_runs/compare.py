@@ -45,8 +45,8 @@ def compare_files(
     `a` and `b` are each a run directory, posterior.nc, fit.nc, or a file that holds a calibration,
     of any format.  All chips that both have are compared by default, each by itself.  `filter` is
     of IDCTABs, or the band of WISE meta-data; two, joined by a colon, are for A and B.  `epoch` is
-    in decimal years; `keep` leaves shift, rotation and scale in the difference; `grid` are points on
-    x and y; `size` is of files that do not say.
+    in decimal years; `keep` leaves shift, rotation and scale in the difference; `grid` are points
+    on x and y; `size` is of files that do not say.
     """
     first, _, second = (filter or "").partition(":")
     both = _read((Path(a), Path(b)), (first or None, second or first or None), size)

@@ -20,6 +20,7 @@ from bayesdist.products.formats.common.content import Content, readable
 
 __all__ = [
     "LEVELS",
+    "PARAMETERS",
     "BuildOptions",
     "Built",
     "Choice",
@@ -34,6 +35,7 @@ __all__ = [
 ]
 
 LEVELS = ("error", "warning", "note")
+PARAMETERS = "parameters"  # kind of a file that stands beside another, with its covariance
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,7 @@ class Choice:
     # as in "W2"
     filter: str | None = None
     size: tuple[float, float] | None = None  # columns and rows, for a header that lacks them
+    as_used: bool = False  # as other programs have it: without the parameters that stand beside it
 
 
 class FormatSettings(BaseModel):

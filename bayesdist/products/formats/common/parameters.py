@@ -34,11 +34,13 @@ __all__ = [
     "parameters_hdu",
     "stored_calibration",
     "stored_in",
+    "with_parameters",
 ]
 
 Float = NDArray[np.float64]
 
 EXTENSION = "BDPARAM"
+AGREE = 1e-6  # pixels by which numbers that were printed may differ from the parameters
 _GRID = 33  # points of each axis over which two calibrations are compared
 _PLANES = ("free", "sky", "detector", "aperture")
 _ERRORS = ("covariance", "sigma", "none")
@@ -172,3 +174,18 @@ def agreeing(stored: Calibration, read: Calibration, pixels: float) -> Calibrati
             do="keep together what was written together",
         )
     return replace(stored, name=read.name, before=read.before, after=read.after, notes=read.notes)
+
+
+def with_parameters(found: Calibration, content: Content | None, named: str) -> Calibration:
+    """Calibration with the parameters that a content holds, after a check that the two agree.
+
+    `named` is the file in which they should be: without it a note says that they are not here.
+    FormatError where they are others.
+    """
+    hdu = None if content is None else stored_in(content)
+    if hdu is not None:
+        return agreeing(stored_calibration(hdu, found.name), found, AGREE)
+    if not named:
+        return found
+    note = f"its covariance is in {named}, which is not here"
+    return replace(found, notes=(*found.notes, note))

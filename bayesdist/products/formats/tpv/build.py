@@ -83,7 +83,8 @@ def _head(
     require_regular(poly.linear, number)
     cd = poly.linear * arcsec / 3600.0
     values = poly.values * arcsec / 3600.0
-    in_plane = values @ substitution(one.basis.order, np.linalg.inv(cd)).T
+    back = np.asarray(np.linalg.inv(cd), float)
+    in_plane = np.asarray(values @ substitution(one.basis.order, back).T, float)
     in_plane[:, 1:3] = np.eye(2)  # by the choice of CD, but for rounding
     pv = [pv_values_of(axis, poly.terms, in_plane[axis]) for axis in (0, 1)]
     size = (int(one.basis.size[0]), int(one.basis.size[1]))

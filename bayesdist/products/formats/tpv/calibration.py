@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,8 +11,7 @@ from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model.basis import MAX_ORDER
-from bayesdist.products.formats.common.content import Content
-from bayesdist.products.formats.common.parameters import agreeing, stored_calibration, stored_in
+from bayesdist.products.formats.common.parameters import with_parameters
 from bayesdist.products.formats.sip.calibration import MissingSize
 from bayesdist.products.formats.tpv.head import TpvFile, TpvHead
 
@@ -22,16 +19,20 @@ __all__ = ["tpv_calibration"]
 
 Float = NDArray[np.float64]
 
-AGREE = 1e-6  # pixels by which a header may differ from the parameters beside it
 _EXACT = 1e-9  # pixels: below it a map is the polynomial that it was taken for
 
 
 def tpv_calibration(
-    file: TpvFile, name: str, *, size: tuple[float, float] | None = None
+    file: TpvFile,
+    name: str,
+    *,
+    size: tuple[float, float] | None = None,
+    as_used: bool = False,
 ) -> Calibration:
     """Calibration of the headers, with the covariance of the file beside them where it is there.
 
-    `size` is columns and rows, for headers without them (else MissingSize).  Powers of r are no
+    `size` is columns and rows, for headers without them (else MissingSize); with `as_used` nothing
+    but the headers counts.  Powers of r are no
     polynomials: a note says how well they are followed.  FormatError for headers without PV1_1 or
     PV2_1, or about several points of the sky; and where the parameters beside them are others.
     """
@@ -54,19 +55,10 @@ def tpv_calibration(
     found = calibration_of_maps(
         maps, name, plane=plane, numbered=all(h.numbered for h in file.heads), notes=tuple(notes)
     )
-    beside = _beside(file)
-    hdu = None if beside is None else stored_in(beside)
-    if hdu is not None:
-        return agreeing(stored_calibration(hdu, name), found, AGREE)
-    if file.side_file:
-        note = f"its covariance is in {file.side_file}, which is not here"
-        return replace(found, notes=(*found.notes, note))
-    return found
-
-
-def _beside(file: TpvFile) -> Content | None:
-    """File that has the covariance: the one that is named, or a FITS file itself."""
-    return file.content if file.content.is_fits else file.content.beside(file.side_file)
+    if as_used:
+        return found
+    beside = file.content if file.content.is_fits else file.content.beside(file.side_file)
+    return with_parameters(found, beside, file.side_file)
 
 
 def _check(file: TpvFile, name: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import (
+    PARAMETERS,
     BuildOptions,
     Built,
     Choice,
@@ -49,7 +50,7 @@ def _describe(file: TpvFile) -> list[str]:
 
 
 def _calibration(file: TpvFile, name: str, choice: Choice) -> Calibration:
-    return tpv_calibration(file, name, size=choice.size)
+    return tpv_calibration(file, name, size=choice.size, as_used=choice.as_used)
 
 
 def _build(
@@ -67,7 +68,7 @@ def _build(
     )
     cards = [card.rstrip() for head in heads for card in tpv_cards(head, SIDE)]
     return (
-        Built(SIDE, "parameters", parameters_content(calibration, options.epoch), calibration),
+        Built(SIDE, PARAMETERS, parameters_content(calibration, options.epoch), calibration),
         Built(NAME, "TPV", ("\n".join(cards) + "\n").encode("ascii"), heads),
     )
 
