@@ -10,6 +10,7 @@ import pytest
 from astropy.io import fits
 from numpy.testing import assert_allclose
 
+from bayesdist.calibration.area import pixel_areas
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import FormatError, InputError
@@ -130,6 +131,17 @@ def test_the_magnitude_is_that_of_the_area(tmp_path):
     yy, yx = np.gradient(file.table("YGC"))
     area = (xx * yy - xy * yx)[20, 30]
     assert file.table("MGC")[20, 30] == pytest.approx(-2.5 * np.log10(area), abs=1e-4)
+
+
+def test_areas_are_those_of_the_tables(tmp_path):
+    """Of the five tables alone, whose polynomial is the identity: the file's own magnitudes."""
+    path = plain(write(tmp_path, some_calibration(strength=1.5), "double"))
+    one = registry.read_calibration(path).in_frame()[1]
+    inside = slice(1, -1)  # at the edge a table ends at the centre of the pixel
+    area, _ = pixel_areas(one, np.arange(2.0, 150), np.arange(2.0, 100))
+    theirs = 10 ** (-0.4 * read_stdgdc(path).table("MGC")[inside, inside])
+    assert_allclose(area, theirs, rtol=2e-4)
+    assert np.ptp(area) > 0.05
 
 
 def test_look_up_tables_go_into_the_file(tmp_path):
