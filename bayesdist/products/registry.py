@@ -29,6 +29,7 @@ __all__ = [
     "all_formats",
     "build",
     "describe",
+    "format_of",
     "lint",
     "open_document",
     "product_settings",
@@ -106,6 +107,17 @@ def product_settings() -> dict[str, type[FormatSettings]]:
     return {one.key: one.settings for one in all_formats() if one.settings is not None}
 
 
+def format_of(key: str) -> Format:
+    """Format of a key that can be built; InputError where there is none."""
+    for one in all_formats():
+        if one.key == key and one.build is not None:
+            return one
+    raise InputError(
+        f"there is no format {key!r} that can be built",
+        do=f"choose one of {', '.join(product_settings())}",
+    )
+
+
 def build(
     key: str,
     calibration: Calibration,
@@ -113,10 +125,6 @@ def build(
     options: BuildOptions = BuildOptions(),  # noqa: B008
 ) -> tuple[Built, ...]:
     """Files of a format, built and not written; values that the format cannot hold are refused."""
-    for one in all_formats():
-        if one.key == key and one.build is not None:
-            return one.build(calibration, settings, options)
-    raise InputError(
-        f"there is no format {key!r} that can be built",
-        do=f"choose one of {', '.join(product_settings())}",
-    )
+    one = format_of(key)
+    assert one.build is not None
+    return one.build(calibration, settings, options)

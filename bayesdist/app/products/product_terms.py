@@ -43,7 +43,7 @@ Float = NDArray[np.float64]
 Positions = Callable[[Float, Float, int, float | None], Float]
 
 FORWARD, INVERSE = "forward", "inverse"
-_LAID = ("ast", "cpdis", "stdgdc", "tpv")  # formats whose files are read as others read them
+_OF_THEIR_OWN = ("sip", "idctab", "wise_meta")  # formats that are compared in a way of their own
 GRID = (33, 33)  # points over which files are laid on the solution
 ROUNDING = 1e-9  # of a pixel
 SKY_ROUNDING = 2e-9  # arcsec: what double precision leaves of an RA of 360 degrees, and back
@@ -63,9 +63,9 @@ def product_terms(product: ProductInput, config: Config, base: Path) -> tuple[Kn
     for one in made.get("idctab", ()):
         of_file = recognized(_content(one)).calibration()
         out += _idctab_terms(product, one.file_name, [of_file])
-    for key in _LAID:
-        if files := [one for one in made.get(key, ()) if one.kind != PARAMETERS]:
-            out.append(_laid_term(product, files))
+    for key, files in made.items():
+        if key not in _OF_THEIR_OWN:
+            out.append(_laid_term(product, [one for one in files if one.kind != PARAMETERS]))
     for one in made.get("wise_meta", ()):
         [band] = bands_of(_content(one))
         chip = product.solution.model.chips[0].number

@@ -21,16 +21,19 @@ from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky.tangent import sky_of_plane
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
-from bayesdist.products.formats.common.document import BuildOptions, Built, Choice, FormatSettings
-from bayesdist.products.registry import build, open_document, product_settings
+from bayesdist.products.formats.common.document import (
+    BuildOptions,
+    Built,
+    Choice,
+    Format,
+    FormatSettings,
+)
+from bayesdist.products.registry import build, format_of, open_document, product_settings
 
 __all__ = ["convert"]
 
 Float = NDArray[np.float64]
 
-# Formats that hold look-up tables, and the highest orders of those that do not hold nine.
-_WITH_TABLES = ("stdgdc", "cpdis")
-_HIGHEST = {"tpv": 7}
 _GRID = 65  # points of each axis over which the loss is measured
 _ROUNDING = 1e-6  # pixels: what is less is called none
 
@@ -59,19 +62,14 @@ def convert(
     What is to be printed is returned.  InputError for what the format cannot hold, or files that
     are there without `force`.
     """
-    known = product_settings()
-    if to not in known:
-        raise InputError(
-            f"there is no format {to!r} that can be written", where="--to",
-            do=f"choose one of {', '.join(sorted(known))}",
-        )  # fmt: skip
-    settings = _settings(to, known[to], options)
+    target = format_of(to)
+    settings = _settings(to, product_settings()[to], options)
     found = calibration_at(path, filter=filter, size=size)
     source = found if chip is None else found.only(chip, epoch)
     at = None
     if source.model.time is not None:
         at = source.reference_date if epoch is None else epoch
-    made, notes = _representable(source, to, order, at)
+    made, notes = _representable(source, target, order, at)
     if scale is not None and not (np.isfinite(scale) and scale > 0):
         raise InputError(f"the scale is {scale}", where="--scale", do="give a positive number")
     built = build(to, made, settings, BuildOptions(at, scale))
@@ -107,16 +105,19 @@ def _settings(to: str, kind: type[FormatSettings], options: Sequence[str]) -> Fo
 
 
 def _representable(
-    source: Calibration, to: str, order: int | None, epoch: float | None
+    source: Calibration, to: Format, order: int | None, epoch: float | None
 ) -> tuple[Calibration, list[str]]:
     """Calibration that the format can hold as polynomials go, and what was done for it."""
     tables = bool(source.before or source.after)
-    highest = _HIGHEST.get(to, 9)
-    if order is None and (not tables or to in _WITH_TABLES):
+    if order is None and (not tables or to.holds_tables):
         return source, []
-    wanted = order if order is not None else highest
-    if not 1 <= wanted <= 9:
-        raise InputError(f"the order is {wanted}", where="--order", do="choose one from 1 to 9")
+    wanted = to.highest_order if order is None else order
+    if not 1 <= wanted <= to.highest_order:
+        raise InputError(
+            f"the order is {wanted}",
+            where="--order",
+            do=f"choose one from 1 to {to.highest_order} for {to.title}",
+        )
     kept = source.with_tables(source.at(epoch, origin="stated"))
     maps, worst, rms = {}, 0.0, 0.0
     for number, one in kept.items():

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
+from bayesdist.model.basis import MAX_ORDER
 from bayesdist.products.formats.common.content import Content, readable
 
 __all__ = [
@@ -153,6 +154,10 @@ class Format:
         Of a format that can be built.
     build : callable, optional
         From a `Calibration`, its settings and `BuildOptions` to files.
+    highest_order : int
+        Of the polynomials that can be built.
+    holds_tables : bool
+        True where what is built has the look-up tables of the calibration.
     """
 
     key: str
@@ -164,6 +169,8 @@ class Format:
     calibration: Callable[[Any, str, Choice], Calibration] | None = None
     settings: type[FormatSettings] | None = None
     build: Callable[[Calibration, Any, BuildOptions], tuple[Built, ...]] | None = None
+    highest_order: int = MAX_ORDER
+    holds_tables: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -66,5 +66,5 @@ def _build(
 
 FORMAT = Format(
     "cpdis", "an image with CPDIS look-up tables", 33, cpdis_of, _describe, lint_cpdis,
-    _calibration, Settings, _build,
+    _calibration, Settings, _build, holds_tables=True,
 )  # fmt: skip

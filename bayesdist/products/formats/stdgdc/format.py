@@ -71,13 +71,6 @@ def _build(
 
 
 FORMAT = Format(
-    "stdgdc",
-    "an STDGDC file",
-    32,
-    stdgdc_of,
-    _describe,
-    lint_stdgdc,
-    _calibration,
-    Settings,
-    _build,
-)
+    "stdgdc", "an STDGDC file", 32, stdgdc_of, _describe, lint_stdgdc, _calibration,
+    Settings, _build, holds_tables=True,
+)  # fmt: skip

@@ -17,6 +17,7 @@ from bayesdist.products.formats.common.parameters import parameters_content
 from bayesdist.products.formats.tpv.calibration import tpv_calibration
 from bayesdist.products.formats.tpv.head import TpvFile, tpv_of
 from bayesdist.products.formats.tpv.lint import lint_tpv
+from bayesdist.products.formats.tpv.pv import HIGHEST
 from bayesdist.products.formats.wcs.format import describe as describe_wcs
 
 __all__ = ["FORMAT", "Settings"]
@@ -74,5 +75,6 @@ def _build(
 
 
 FORMAT = Format(
-    "tpv", "TPV headers", 31, tpv_of, _describe, lint_tpv, _calibration, Settings, _build
-)
+    "tpv", "TPV headers", 31, tpv_of, _describe, lint_tpv, _calibration, Settings, _build,
+    highest_order=HIGHEST,
+)  # fmt: skip

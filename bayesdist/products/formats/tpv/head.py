@@ -115,19 +115,18 @@ def holds_tpv(header: fits.Header) -> bool:
 
 def _headers(content: Content) -> list[fits.Header]:
     """Headers of a FITS file, or of a text file whose headers end with END each."""
-    if content.is_fits or "CTYPE1" not in content.text:
+    lines = content.text.splitlines()
+    if content.is_fits or len(lines) < 2 or "CTYPE1" not in content.text:
         return [hdu.header for hdu in content.hdus]
     out, cards = [], list[str]()
-    for line in [*content.text.splitlines(), "END"]:
+    for line in [*lines, "END"]:
         if line.strip() != "END":
             cards.append(line.encode("ascii", "replace").decode())  # of comments in Latin-1
         elif any(cards):
             with readable(content.name):
                 out.append(fits.Header.fromstring("\n".join(cards), sep="\n"))
             cards = []
-    return out if len(out) > 1 or "\n" in content.text.strip() else [
-        hdu.header for hdu in content.hdus
-    ]  # fmt: skip
+    return out
 
 
 def _head(header: fits.Header, place: int, where: str) -> TpvHead:
