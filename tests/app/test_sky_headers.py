@@ -21,7 +21,7 @@ from astropy.wcs.utils import fit_wcs_from_points
 
 from bayesdist.products import read_calibration
 from bayesdist.products.formats.tpv.head import read_tpv
-from tests.app.support import EXACT, begin_stagewise, summary_of, write_config, write_job
+from tests.app.support import EXACT, begin_stagewise, good, summary_of, write_config, write_job
 
 SIZE = (2000, 1500)
 PIXEL = 0.4  # arcsec
@@ -126,6 +126,8 @@ def test_headers_of_other_kinds_are_on_the_sky_of_the_truth(tmp_path, rng) -> No
     assert not any(p["findings"] for p in entries.values())
     assert entries["tpv.head"]["forward_rms"] == entries["ast.txt"]["forward_rms"] == 0.0
     assert 1e-7 < entries["cpdis.fits"]["forward_rms"] < PIXEL * entries["cpdis.fits"]["tables_pix"]
+    good("convert", run, "--to", "tpv", "-o", tmp_path / "same")
+    assert (tmp_path / "same" / "tpv.head").read_text() == (run / "tpv.head").read_text()
     back = read_calibration(run / "tpv.head")
     assert back.errors == "covariance" and back.plane.kind == "sky"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,7 +18,7 @@ from bayesdist.app.screen import number as digits
 from bayesdist.app.tables.output import refuse_existing
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.inverse import detector_grid
-from bayesdist.calibration.plane import ARCSEC
+from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.data.sky.tangent import sky_of_plane
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
@@ -64,7 +65,7 @@ def convert(
     """
     target = format_of(to)
     settings = _settings(to, product_settings()[to], options)
-    found = calibration_at(path, filter=filter, size=size)
+    found = _on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
     source = found if chip is None else found.only(chip, epoch)
     at = None
     if source.model.time is not None:
@@ -80,6 +81,18 @@ def convert(
     used = _read_back(places, filter, made.model.chips[0].size, as_used=True)
     lines += [f"  {line}" for line in _losses(source, back, used, at, scale)]
     return "\n".join(lines)
+
+
+def _on_the_sky(path: Path, found: Calibration) -> Calibration:
+    """Calibration of a run about the point where its stars touch the sky, where they do."""
+    home = path if path.is_dir() else path.parent
+    summary = home / "summary.json"
+    if found.plane.kind != "free" or not (home / "run.json").exists() or not summary.exists():
+        return found
+    point = json.loads(summary.read_text(encoding="utf-8"))["data"].get("tangent_point")
+    if point is None:
+        return found
+    return replace(found, plane=Plane("sky", point=(float(point[0]), float(point[1]))))
 
 
 def _settings(to: str, kind: type[FormatSettings], options: Sequence[str]) -> FormatSettings:
@@ -217,7 +230,7 @@ def _losses(
     if source.plane.kind == "sky" and all(one.plane.kind != "sky" for one in back):
         lines.append("lost: where the plane touches the sky")
     worst, rms, frame = _difference(source, used, epoch)
-    mas = _mas_per_pixel(source, scale)
+    mas = _mas_per_pixel(source, scale, epoch)
     text = f"{digits(worst, 3)} pix at worst"
     if mas is not None:
         text += f" ({digits(worst * mas, 3)} mas)"
@@ -300,7 +313,7 @@ def _after_similarity(a: Float, b: Float) -> Float:
     return min(found, key=lambda far: float(far.max()))
 
 
-def _mas_per_pixel(source: Calibration, scale: float | None) -> float | None:
+def _mas_per_pixel(source: Calibration, scale: float | None, epoch: float | None) -> float | None:
     if source.unit == "pix":
         return None if scale is None else 1e3 * scale
-    return 1e3 * ARCSEC[source.unit] * source.pixel()[0] if source.model.time is None else None
+    return 1e3 * ARCSEC[source.unit] * source.pixel(epoch)[0]
