@@ -17,11 +17,13 @@ from pydantic import BaseModel, ConfigDict
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
 from bayesdist.model import LookupTable
+from bayesdist.model.basis import MAX_ORDER
 from bayesdist.products.formats.common.content import Content, readable
 from bayesdist.products.formats.common.read_back import ReadBack
 
 __all__ = [
     "LEVELS",
+    "PARAMETERS",
     "BuildOptions",
     "Built",
     "Choice",
@@ -36,6 +38,7 @@ __all__ = [
 ]
 
 LEVELS = ("error", "warning", "note")
+PARAMETERS = "parameters"  # kind of a file that stands beside another, with its covariance
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,7 @@ class Choice:
     # as in "W2"
     filter: str | None = None
     size: tuple[float, float] | None = None  # columns and rows, for a header that lacks them
+    as_used: bool = False  # as other programs have it: without the parameters that stand beside it
 
 
 class FormatSettings(BaseModel):
@@ -158,6 +162,10 @@ class Format:
         From files that were built, and the calibration and options that they were built from, to
         what they say of positions, one `ReadBack` for each row of the budget.  By default they are
         read by `calibration`, and laid on the solution.
+    highest_order : int
+        Of the polynomials that can be built.
+    holds_tables : bool
+        True where what is built has the look-up tables of the calibration.
     """
 
     key: str
@@ -172,6 +180,8 @@ class Format:
     read_back: Callable[[Sequence[Built], Calibration, BuildOptions], Sequence[ReadBack]] | None = (
         None
     )
+    highest_order: int = MAX_ORDER
+    holds_tables: bool = False
 
 
 @dataclass(frozen=True, eq=False)
