@@ -29,9 +29,7 @@ def pysiaf_offline() -> Any:
     return pysiaf
 
 
-def aperture_of(
-    path: Path | None, v2: float = 0.0, v3: float = 0.0, angle: float = 0.0
-) -> Any:
+def aperture_of(path: Path | None, v2: float = 0.0, v3: float = 0.0, angle: float = 0.0) -> Any:
     """Aperture of a JWST imager of 2048 x 2048 pixels, with the coefficients of a table."""
     pysiaf = pysiaf_offline()
     aperture = pysiaf.JwstAperture()

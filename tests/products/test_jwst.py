@@ -81,7 +81,7 @@ def test_a_file_that_was_read_is_built_again_without_its_position(plain):
     settings = {k: v for k, v in SETTINGS.items() if k not in ("v2ref", "v3ref", "v3idlyangle")}
     [again] = files("jwst", read(built).calibration(), settings)
     same_calibration(calibration, read(again).calibration())
-    with pytest.raises(InputError, match="v2ref and v3ref and v3idlyangle of .* are not known"):
+    with pytest.raises(InputError, match="v2ref and v3ref and v3idlyangle of"):
         files("jwst", calibration, settings)
 
 
@@ -171,12 +171,13 @@ def test_the_data_model_and_gwcs_map_pixels_as_we_do(which, request, tmp_path):
     same_calibration(calibration, again)
 
 
-def test_the_pipeline_assigns_our_solution_to_an_image(plain, tmp_path):
+@pytest.mark.parametrize("which", ["plain", "tabulated"])
+def test_the_pipeline_assigns_our_solution_to_an_image(which, request, tmp_path):
     """assign_wcs of an image of NIRISS, with the file alone and no CRDS."""
-    assign_wcs = pytest.importorskip("jwst.assign_wcs")
+    assign_wcs = pytest.importorskip("jwst.assign_wcs.assign_wcs")
     from stdatamodels.jwst.datamodels import ImageModel
 
-    calibration, built = plain
+    calibration, built = request.getfixturevalue(which)
     path = tmp_path / built.file_name
     path.write_bytes(built.content)
     image = ImageModel((2048, 2048))
@@ -274,6 +275,7 @@ def test_a_file_of_the_data_model_is_read(tmp_path):
         ("inverse", "error", "inverse", "is missing"),
         ("order", "error", "inverse", "order of coefficients: powers of x and y are exchanged"),
         ("forward order", "error", "model", "order of coefficients: powers of x and y"),
+        ("all orders", "error", "model", "order of coefficients: powers of x and y"),
         ("coefficient", "error", "inverse", "misses the inverse of the model"),
         ("parity", "error", "parity", "mirror image"),
         ("degrees", "error", "scale", "the transform gives degrees"),
@@ -294,14 +296,12 @@ def test_faults_are_found(plain, fault, level, where, message):
     if fault == "inverse":
         tree["model"] = model.copy()
         del tree["model"].inverse
-    elif fault in ("order", "forward order"):
+    elif fault == "order":
         tree["model"] = model.copy()
-        one = swapped(back if fault == "order" else model)
-        if fault == "order":
-            tree["model"].inverse = one
-        else:
-            one.inverse = back
-            tree["model"] = one
+        tree["model"].inverse = swapped(back)
+    elif fault in ("forward order", "all orders"):
+        tree["model"] = swapped(model, 2 if fault == "forward order" else 1)
+        tree["model"].inverse = back
     elif fault == "coefficient":
         back = back.copy()
         polynomial(back).c2_0 = polynomial(back).c2_0.value + 3e-6
@@ -329,9 +329,9 @@ def test_faults_are_found(plain, fault, level, where, message):
         record["covariance"] = np.eye(3)
     assert instrument["name"] == "NIRISS"
     found = with_tree(tree).lint()
-    assert any(
-        f.level == level and f.where == where and message in f.message for f in found
-    ), [str(f) for f in found]
+    assert any(f.level == level and f.where == where and message in f.message for f in found), [
+        str(f) for f in found
+    ]
 
 
 def polynomial(model):
@@ -339,15 +339,15 @@ def polynomial(model):
     return next(m for m in model if isinstance(m, models.Polynomial2D))
 
 
-def swapped(model):
-    """A transform whose polynomials above the linear terms have x and y exchanged."""
+def swapped(model, lowest=2):
+    """A transform whose polynomials have x and y exchanged, by default above the linear terms."""
     out = model.copy()
     for one in out:
         if isinstance(one, models.Polynomial2D):
             values = dict(zip(one.param_names, np.array(one.parameters), strict=True))
             for name in one.param_names:
                 i, j = name[1:].split("_")
-                if int(i) + int(j) > 1:
+                if int(i) + int(j) >= lowest:
                     setattr(one, name, values[f"c{j}_{i}"])
     return out
 
@@ -392,7 +392,7 @@ def test_another_asdf_file_is_refused_in_a_sentence(tree, message):
 def test_a_truncated_file_is_refused_in_a_sentence(plain):
     raw = plain[1].content
     for n in (7, 100, len(raw) // 2, len(raw) - 200):
-        with pytest.raises(FormatError, match="is an ASDF file that cannot be read: .*fetch"):
+        with pytest.raises(FormatError, match="is an ASDF file that cannot be read"):
             registry.recognized(Content("cut.asdf", raw[:n]))
 
 

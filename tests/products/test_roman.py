@@ -125,6 +125,7 @@ def test_the_pipeline_assigns_our_solution_to_an_image(which, request, tmp_path)
     path = tmp_path / built.file_name
     path.write_bytes(built.content)
     image = datamodels.ImageModel.create_fake_data(shape=(4088, 4088))
+    image.meta["cal_step"] = {"assign_wcs": "INCOMPLETE"}
     info = image.meta.wcsinfo
     info.v2_ref, info.v3_ref, info.vparity, info.v3yangle = V2REF, V3REF, -1, ANGLE
     info.ra_ref, info.dec_ref, info.roll_ref = 270.0, 66.0, 20.0
@@ -226,12 +227,10 @@ def test_faults_are_found(changed, fault, level, where, message):
         node["meta"]["reftype"] = "distortion"
     elif fault == "optical element":
         node["meta"]["instrument"] = {"name": "WFI", "detector": "WFI07"}
-    if fault in ("reftype", "optical element", "order"):
-        pytest.importorskip("asdf")
     found = loosely(document)
-    assert any(
-        f.level == level and f.where == where and message in f.message for f in found
-    ), [str(f) for f in found]
+    assert any(f.level == level and f.where == where and message in f.message for f in found), [
+        str(f) for f in found
+    ]
 
 
 def loosely(document):
@@ -253,7 +252,7 @@ def loosely(document):
     ("tree", "message"),
     [
         ({"roman": {"meta": {"a": 1}}}, f"holds meta under roman, and not meta and {KEY}"),
-        ({"roman": {"meta": {}, "data": [1]}}, "holds meta, data under roman"),
+        ({"roman": {"meta": {}, "data": [1]}}, "holds data, meta under roman"),
         ({"roman": {"meta": {}, KEY: "x"}}, f"{KEY} holds no model"),
         ({"roman": {"meta": {}, KEY: models.Identity(3)}}, "takes 3 coordinates to 3"),
     ],

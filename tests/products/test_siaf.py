@@ -158,7 +158,7 @@ def source_tables() -> list[Path]:
 
 
 def test_tables_of_the_observatory_are_sound():
-    """All of pysiaf: index order, parity and inverse are right; inverses of order 4 are not good."""
+    """All of pysiaf: index order, parity and inverse are right, those of order 4 to 0.2 px."""
     pytest.importorskip("pysiaf")
     paths = source_tables()
     assert len(paths) > 20
@@ -307,8 +307,9 @@ def test_broken_tables_are_refused_in_a_sentence(text, message):
 def test_an_unknown_aperture_needs_a_size(calibration):
     _, table = files("siaf", calibration, {"aperture": "MADE_UP"})
     text = "\n".join(
-        line for line in table.content.decode().splitlines() if not line.startswith("# XSci")
-        and not line.startswith("# YSci")
+        line
+        for line in table.content.decode().splitlines()
+        if not line.startswith("# XSci") and not line.startswith("# YSci")
     )
     document = registry.recognized(Content("table.txt", text.encode()))
     assert "size of the detector is not known" in document.describe()

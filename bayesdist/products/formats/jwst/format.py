@@ -48,7 +48,7 @@ def _parse(content: Content) -> DistortionFile | None:
     if "roman" in tree:
         return None
     if "model" not in tree or not isinstance(tree.get("meta"), Mapping):
-        named = ", ".join(key for key in tree if key not in ("asdf_library", "history"))
+        named = ", ".join(sorted(set(tree) - {"asdf_library", "history"}))
         raise FormatError(
             f"is an ASDF file that holds {named or 'nothing'}, and not model and meta, as JWST's "
             "distortion has, or roman",

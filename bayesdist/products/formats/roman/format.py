@@ -44,7 +44,7 @@ def _parse(content: Content) -> DistortionFile | None:
 
     tree = tree_of(content).get("roman")
     if not isinstance(tree, Mapping) or KEY not in tree or "meta" not in tree:
-        held = ", ".join(tree) if isinstance(tree, Mapping) else "nothing"
+        held = ", ".join(sorted(tree)) if isinstance(tree, Mapping) else "nothing"
         raise FormatError(
             f"holds {held or 'nothing'} under roman, and not meta and {KEY}",
             where=content.name,

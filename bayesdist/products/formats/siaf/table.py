@@ -121,7 +121,7 @@ class SiafTable:
             return None
         for axis, power in enumerate(((1, 0), (0, 1))):
             terms[axis][power] = terms[axis].get(power, 0.0) - 1.0
-        return ExplicitInverse(self.reference_pixel(self.size), *terms)
+        return ExplicitInverse(self.reference_pixel(self.size), terms[0], terms[1])
 
     def closure(self) -> float | None:
         """Largest distance of pixels from where Sci2Idl and Idl2Sci take them; None if unknown."""

@@ -122,13 +122,18 @@ def _inverse(file: DistortionFile) -> Iterator[Finding]:
 
 def _exchanged(model: Model, back: Model, x: Float, y: Float, closure: float) -> str:
     """Part in which powers are exchanged, where that alone makes forward and back agree."""
-    left = {
-        "inverse": closure_of(model, exchanged(back), x, y),
-        "model": closure_of(exchanged(model), back, x, y),
-    }
-    # where both are exchanged they nearly agree again: the better one of the two is right
-    best = min(left, key=lambda where: np.nan_to_num(left[where], nan=np.inf))
-    return best if left[best] < closure / 10 else ""
+    # where both are exchanged they nearly agree again: the better one is right
+    left = closure / 10
+    blamed = ""
+    for lowest in (1, 2):
+        for where, one, two in (
+            ("inverse", model, exchanged(back, lowest)),
+            ("model", exchanged(model, lowest), back),
+        ):
+            one_left = closure_of(one, two, x, y)
+            if one_left < left:
+                left, blamed = one_left, where
+    return blamed
 
 
 def _repeated(model: Model) -> Iterator[Finding]:

@@ -201,13 +201,17 @@ def order_of(model: Model) -> int | None:
     return 1 if isinstance(model, (*_AFFINE, models.Const1D)) else None
 
 
-def exchanged(model: Model) -> Model:
-    """Copy of a transform in which powers of x and y are exchanged in all its polynomials."""
+def exchanged(model: Model, lowest: int = 1) -> Model:
+    """Copy of a transform in which powers of x and y are exchanged in its polynomials.
+
+    From the total order `lowest` on; polynomials of order 1, which turn, are left as they are.
+    """
     out = model.copy()
     for one in leaves(out):
         if isinstance(one, models.Polynomial2D) and one.degree > 1:
             values = dict(zip(one.param_names, one.parameters.copy(), strict=True))
             for name in one.param_names:
-                i, j = name[1:].split("_")
-                setattr(one, name, values[f"c{j}_{i}"])
+                i, j = map(int, name[1:].split("_"))
+                if i + j >= lowest:
+                    setattr(one, name, values[f"c{j}_{i}"])
     return out
