@@ -76,6 +76,13 @@ def test_the_tutorial_in_python_runs(tmp_path, monkeypatch):
     assert namespace["margin"].verdict == "met" and Path("w2.hdr").is_file()
 
 
+@pytest.mark.parametrize("page", ["jwst.md", "roman.md"])
+def test_the_pages_of_the_pipelines_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_page(DOCS / page)
+    assert list(tmp_path.glob("**/*_distortion.asdf"))
+
+
 @pytest.mark.slow
 def test_the_hst1pass_tutorial_runs_on_real_lists(tmp_path, monkeypatch, data_dir, full):
     if not full:
@@ -99,7 +106,7 @@ def test_every_block_that_could_run_is_run():
     """Pages with blocks of console or Python are those that tests above go through."""
     run = {p.name for p in DOCS.glob("*.md") if {"console", "python"} & {b for b, _ in blocks(p)}}
     tutorials = {p.name for p in DOCS.glob("tutorial_*.md")}
-    assert run == {*tutorials, "posterior_file.md", "new_instrument.md"}
+    assert run == {*tutorials, "posterior_file.md", "new_instrument.md", "jwst.md", "roman.md"}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())

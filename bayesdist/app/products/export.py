@@ -54,7 +54,8 @@ def export_files(
             findings = [f"{f.level}: {f.where}: {f.message}" for f in lint(path)]
             if built.chip is not None:
                 entry["chip"] = built.chip
-                sky = None if stars is None else sky_closure(product, stars, path, built.chip)
+                on_sky = stars is not None and built.kind == "SIP"
+                sky = sky_closure(product, stars, path, built.chip) if on_sky else None
                 if sky is not None:
                     entry["sky"] = sky.summary
                     log.log(sky.level, "export: %s: %s", path.name, sky.sentence)
