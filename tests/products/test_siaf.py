@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -188,7 +189,9 @@ def test_deliveries_have_the_linear_terms_of_the_tables(data_dir):
     """The newest of 39 deliveries against pysiaf's own tables: four coefficients of an aperture."""
     pytest.importorskip("pysiaf")
     with open(data_dir / "siaf" / "jwst_siaf_history.csv", newline="") as file:
-        newest = {row["aperture"]: row for row in csv.DictReader(file)}
+        rows = [row for row in csv.DictReader(file) if re.fullmatch(r"PRDOPSSOC-\d+", row["prd"])]
+    # those with a letter are of other series, before launch
+    newest = {row["aperture"]: row for row in sorted(rows, key=lambda row: row["prd"])}
     compared = 0
     for path in source_tables():
         table = registry.open_document(path).holds
