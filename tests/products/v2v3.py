@@ -61,7 +61,8 @@ def read(built: Built) -> Any:
 
 def tree_of(built: Built) -> dict[str, Any]:
     """Tree of an ASDF file, by asdf alone."""
-    with asdf.open(io.BytesIO(built.content), lazy_load=False, memmap=False) as file:
+    options = {"lazy_load": False, "memmap": False, "ignore_unrecognized_tag": True}
+    with asdf.open(io.BytesIO(built.content), **options) as file:
         return dict(file.tree)
 
 
