@@ -77,6 +77,28 @@ def test_a_calibration_goes_into_every_format(tmp_path, to, name, limit):
         assert_allclose(back.solution.cov, on_sky(4).solution.cov, atol=0)
 
 
+def test_a_calibration_goes_into_files_of_pipelines(tmp_path):
+    """With its covariance, and without the point of the sky where V2, V3 are stated."""
+    path = write(tmp_path, "tpv", on_sky(4))
+    placed = {
+        "useafter": "2022-07-01T00:00:00", "pedigree": "GROUND", "author": "nobody",
+        "v2ref": -453.4, "v3ref": -373.8, "v3idlyangle": 4.8, "parity": -1,
+    }  # fmt: skip
+    for to, settings in (
+        ("jwst", placed | {"instrument": "MIRI", "detector": "MIRIMAGE"}),
+        ("roman", placed | {"optical_element": "F158", "detector": "WFI04"}),
+        ("siaf", {"aperture": "MADE_UP"}),
+    ):
+        options = [part for k, v in settings.items() for part in ("--option", f"{k}={v}")]
+        out = good("convert", path, "--to", to, "-o", tmp_path / to, *options).out
+        assert said(out) < 1e-6
+        # the side file of a SIAF table has the plane as it was
+        lost = [] if to == "siaf" else ["where the plane touches the sky"]
+        assert re.findall("lost: (.*)", out) == lost
+        [name] = [p for p in (tmp_path / to).iterdir() if p.suffix in {".asdf", ".txt"}]
+        assert_allclose(registry.read_calibration(name).solution.cov, on_sky(4).solution.cov)
+
+
 def test_the_loss_of_a_lower_order_is_as_measured_by_hand(tmp_path):
     """Over the same grid, from the files; in mas by the size of the pixel."""
     path = write(tmp_path, "tpv", on_sky(5))

@@ -230,3 +230,36 @@ def test_files_that_others_read_are_measured_as_others_read_them():
     assert off["tpv.head"] < 1e-7 and off["ast.txt"] < 1e-7
     [built] = made_files(product, SimpleNamespace(products=products))["cpdis"]
     assert 0.3 * built.summary["tables_pix"] < off["cpdis.fits"] < 1.1 * built.summary["tables_pix"]
+
+
+PLACED = {
+    "useafter": "2022-07-01T00:00:00", "pedigree": "GROUND", "author": "nobody",
+    "v2ref": -453.4, "v3ref": -373.8, "v3idlyangle": 4.8,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("key", "settings", "size"),
+    [
+        ("jwst", {**PLACED, "instrument": "MIRI", "detector": "MIRIMAGE"}, (1032.0, 1024.0)),
+        ("roman", {**PLACED, "detector": "WFI04", "optical_element": "F158"}, (4088.0, 4088.0)),
+        ("siaf", {"aperture": "MADE_UP"}, (1200.0, 900.0)),
+    ],
+)
+def test_files_of_pipelines_are_right_forward_and_miss_by_their_inverse(key, settings, size):
+    """Forward to rounding, along axes of their own; back as far as the file states."""
+    reference = ((size[0] + 1) / 2, (size[1] + 1) / 2)
+    solution = some_solution(4, unit="arcsec", pixel=0.11, size=size, reference_pixel=reference)
+    product = ProductInput(solution, "made up")
+    asked = {key: product_settings()[key](**settings)}
+    config = SimpleNamespace(products=SimpleNamespace(release=None, asked=lambda: asked))
+    forward, inverse = product_terms(product, config, None)
+    *_, built = made_files(product, config)[key]
+    assert [forward.row.name, inverse.row.name] == [
+        f"{built.file_name}, forward", f"{built.file_name}, inverse"
+    ]  # fmt: skip
+    x, y = random_pixels(size, 5000)
+    there, back = (np.hypot(*one.shift(x, y, 1, None).T).max() / 0.11 for one in (forward, inverse))
+    assert there < 1e-7
+    stated = built.summary["closure_pix"]
+    assert 0.3 * stated < back < 1.2 * stated

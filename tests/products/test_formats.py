@@ -29,6 +29,10 @@ from tests.app.support import good
 
 from .support import StandIn, some_solution, wfc_model
 
+IN_V2V3 = {
+    "useafter": "2022-07-01T00:00:00", "pedigree": "GROUND", "author": "nobody",
+    "v2ref": -453.4, "v3ref": -373.8, "v3idlyangle": 4.8,
+}  # fmt: skip
 SETTINGS = {
     "ast": {},
     "cpdis": {},
@@ -37,18 +41,25 @@ SETTINGS = {
     "stdgdc": {},
     "tpv": {},
     "wise_meta": {},
+    "jwst": IN_V2V3 | {"instrument": "MIRI", "detector": "MIRIMAGE"},
+    "roman": IN_V2V3 | {"detector": "WFI04", "optical_element": "F158"},
+    "siaf": {"aperture": "MADE_UP"},
 }
 # errors that a file has by itself; what more there is stands in a file beside it
-ALONE = {"ast": "none", "tpv": "none"} | dict.fromkeys(("cpdis", "idctab", "stdgdc"), "covariance")
-OPTIONS = BuildOptions(scale_arcsec=0.13)
+HOLD_COVARIANCE = ("cpdis", "idctab", "jwst", "roman", "stdgdc")
+ALONE = dict.fromkeys(("ast", "siaf", "tpv"), "none") | dict.fromkeys(HOLD_COVARIANCE, "covariance")
+SCALE = 0.13
+OPTIONS = BuildOptions(scale_arcsec=SCALE)
+SIZES = {"wise_meta": (1016.0, 1016.0), "jwst": (1032.0, 1024.0), "roman": (4088.0, 4088.0)}
 
 
 def calibration_for(key: str) -> Calibration:
     """One chip in pixels, as the format can hold it."""
-    if key == "wise_meta":
-        size, reference = (1016.0, 1016.0), (508.5, 508.5)
+    if key in SIZES:
+        size = SIZES[key]
+        reference = ((size[0] + 1) / 2, (size[1] + 1) / 2)
         solution = some_solution(4, size=size, reference_pixel=reference)
-        return calibration_of(solution, "made up", detector="W1")
+        return calibration_of(solution, "made up", detector="W1" if key == "wise_meta" else "")
     return calibration_of(some_solution(4), "made up")
 
 
@@ -83,7 +94,7 @@ def test_a_built_file_holds_the_calibration(key):
     """Its distortion by Legendre coefficients without the linear terms, and its errors."""
     ours = calibration_for(key).chip(origin="stated")
     theirs = registry.recognized(content_of(built(key))).calibration().chip(origin="stated")
-    scale = 0.13 if theirs.unit == "arcsec" else 1.0
+    scale = SCALE if theirs.unit == "arcsec" else 1.0
     # seven digits of WISE's entries, the constants aside, which lie in other places
     digits = 1e-6 if key == "wise_meta" else 1e-11
     largest = np.abs(ours.coefficients).max()

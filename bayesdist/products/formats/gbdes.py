@@ -24,8 +24,13 @@ from bayesdist.errors import FormatError, InputError
 from bayesdist.model import polynomial_terms
 from bayesdist.model.basis import MAX_ORDER, PolynomialBasis
 from bayesdist.products.formats.common.content import Content
-from bayesdist.products.formats.common.document import Choice, Finding, Format, finding_lines
-from bayesdist.products.formats.sip.calibration import MissingSizeError
+from bayesdist.products.formats.common.document import (
+    Choice,
+    Finding,
+    Format,
+    MissingSizeError,
+    finding_lines,
+)
 
 __all__ = ["FORMAT", "GbdesParameters"]
 

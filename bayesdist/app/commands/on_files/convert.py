@@ -6,6 +6,7 @@ import json
 import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import date, time
 from pathlib import Path
 from typing import Any
 
@@ -104,9 +105,11 @@ def _settings(to: str, kind: type[FormatSettings], options: Sequence[str]) -> Fo
         if not mark or not key.strip():
             raise InputError(f"{text!r} is not KEY=VALUE", where="--option", do="write it so")
         try:
-            values[key.strip()] = tomllib.loads(f"x = {value}")["x"]
+            found = tomllib.loads(f"x = {value}")["x"]
         except tomllib.TOMLDecodeError:
-            values[key.strip()] = value.strip()
+            found = value.strip()
+        # settings have dates as text
+        values[key.strip()] = value.strip() if isinstance(found, (date, time)) else found
     try:
         return kind(**values)
     except ValidationError as error:

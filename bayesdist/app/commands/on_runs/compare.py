@@ -20,7 +20,7 @@ from bayesdist.assess.comparison.gap import (
 from bayesdist.assess.comparison.sentences import comparison_lines, gap_lines, gap_verdict, verdict
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
-from bayesdist.products.formats.sip.calibration import MissingSizeError
+from bayesdist.products.formats.common.document import MissingSizeError
 
 __all__ = ["compare_files"]
 

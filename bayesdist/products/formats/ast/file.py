@@ -20,8 +20,8 @@ from bayesdist.model.basis import MAX_ORDER
 from bayesdist.products.formats.ast.dump import parse_dump
 from bayesdist.products.formats.ast.mapping import Step, steps_of
 from bayesdist.products.formats.common.content import Content
+from bayesdist.products.formats.common.document import MissingSizeError
 from bayesdist.products.formats.common.parameters import with_parameters
-from bayesdist.products.formats.sip.calibration import MissingSizeError
 
 __all__ = ["AstFile", "ast_calibration", "ast_of"]
 

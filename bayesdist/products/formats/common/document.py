@@ -31,6 +31,7 @@ __all__ = [
     "Finding",
     "Format",
     "FormatSettings",
+    "MissingSizeError",
     "finding_lines",
     "identity_lines",
     "missing_identity",
@@ -85,6 +86,10 @@ def finding_lines(findings: Sequence[Finding]) -> list[str]:
         return ["Findings: none"]
     ordered = sorted(findings, key=lambda f: LEVELS.index(f.level))
     return ["Findings:", *(f"  {finding}" for finding in ordered)]
+
+
+class MissingSizeError(InputError):
+    """Error of a file that does not state the size of its image."""
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,9 @@ from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import LookupTable
 from bayesdist.products.formats.common.content import Content, Hdu
+from bayesdist.products.formats.common.document import MissingSizeError
 from bayesdist.products.formats.common.parameters import stored_calibration, stored_in
 from bayesdist.products.formats.lookup.plane import Plane as TablePlane
-from bayesdist.products.formats.sip.calibration import MissingSizeError
 from bayesdist.products.formats.sip.read import cd_matrix, image_size
 
 __all__ = ["ERRORS", "TABLES", "CpdisFile", "CpdisImage", "cpdis_calibration", "cpdis_of"]

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from bayesdist.errors import FormatError
-from bayesdist.products.formats.common.document import Finding
+from bayesdist.products.formats.common.document import Finding, MissingSizeError
 from bayesdist.products.formats.cpdis.file import (
     ERRORS,
     TABLES,
@@ -16,7 +16,6 @@ from bayesdist.products.formats.cpdis.file import (
     cpdis_calibration,
 )
 from bayesdist.products.formats.lookup.plane import Plane
-from bayesdist.products.formats.sip.calibration import MissingSizeError
 
 __all__ = ["lint_cpdis"]
 

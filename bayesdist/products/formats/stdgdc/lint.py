@@ -43,7 +43,9 @@ def _extensions(file: StdGdc) -> Iterator[Finding]:
     names = [hdu.name for hdu in file.content.hdus[1:6]]
     if not file.missing and tuple(names) != EXTENSIONS:
         yield Finding(
-            "error", ", ".join(names), "extensions are read by their place: XGC, YGC, MGC, XCG, YCG"
+            "error",
+            ", ".join(names),
+            "extensions are read by their position: XGC, YGC, MGC, XCG, YCG",
         )
     if not _readable(file):
         yield Finding("error", "XGC, YGC", "are no pair of tables of one shape")

@@ -11,8 +11,8 @@ from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model.basis import MAX_ORDER
+from bayesdist.products.formats.common.document import MissingSizeError
 from bayesdist.products.formats.common.parameters import with_parameters
-from bayesdist.products.formats.sip.calibration import MissingSizeError
 from bayesdist.products.formats.tpv.head import TpvFile, TpvHead
 
 __all__ = ["tpv_calibration"]
@@ -32,8 +32,9 @@ def tpv_calibration(
     """Calibration of the headers, with the covariance of the file beside them where it is there.
 
     `size` is columns and rows, for headers without them (else MissingSizeError);
-    with `as_used` nothing but the headers counts.  Powers of r are no polynomials: a note says how well they are followed.  FormatError for headers without PV1_1 or
-    PV2_1, or about several points of the sky; and where the parameters beside them are others.
+    with `as_used` nothing but the headers counts.  Powers of r are no polynomials: a note says how
+    well they are followed.  FormatError for headers without PV1_1 or PV2_1, or about several points
+    of the sky; and where the parameters beside them are others.
     """
     _check(file, name)
     maps, notes = {}, list[str]()
