@@ -48,7 +48,7 @@ SETTINGS = {
 # errors that a file has by itself; what more there is stands in a file beside it
 HOLD_COVARIANCE = ("cpdis", "idctab", "jwst", "roman", "stdgdc")
 ALONE = dict.fromkeys(("ast", "siaf", "tpv"), "none") | dict.fromkeys(HOLD_COVARIANCE, "covariance")
-SCALE = 0.13
+SCALE = 0.11
 OPTIONS = BuildOptions(scale_arcsec=SCALE)
 SIZES = {"wise_meta": (1016.0, 1016.0), "jwst": (1032.0, 1024.0), "roman": (4088.0, 4088.0)}
 
