@@ -85,6 +85,19 @@ def test_the_tutorial_in_python_runs(tmp_path, monkeypatch):
     assert namespace["margin"].verdict == "met" and Path("w2.hdr").is_file()
 
 
+def test_the_page_on_ground_based_cameras_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_page(DOCS / "ground_based.md")
+    assert Path("tpv/tpv.head").is_file() and "sigma_x_out" in Path("with_errors.ecsv").read_text()
+
+
+@pytest.mark.parametrize("page", ["jwst.md", "roman.md"])
+def test_the_pages_of_the_pipelines_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_page(DOCS / page)
+    assert list(tmp_path.glob("**/*_distortion.asdf"))
+
+
 @pytest.mark.slow
 def test_the_hst1pass_tutorial_runs_on_real_lists(tmp_path, monkeypatch, data_dir, full):
     if not full:
@@ -108,7 +121,8 @@ def test_every_block_that_could_run_is_run():
     """Pages with blocks of console or Python are those that tests above go through."""
     run = {p.name for p in DOCS.glob("*.md") if {"console", "python"} & {b for b, _ in blocks(p)}}
     tutorials = {p.name for p in DOCS.glob("tutorial_*.md")}
-    assert run == {*tutorials, "posterior_file.md", "new_instrument.md"}
+    others = {"posterior_file.md", "new_instrument.md", "ground_based.md", "jwst.md", "roman.md"}
+    assert run == tutorials | others
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())

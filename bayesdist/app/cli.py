@@ -31,6 +31,7 @@ CORE = {
     "compare": f"{COMMANDS}.calibrations:compare",
     "inspect": f"{COMMANDS}.calibrations:inspect",
     "apply": f"{COMMANDS}.calibrations:apply",
+    "convert": f"{COMMANDS}.calibrations:convert",
     "release": f"{COMMANDS}.calibrations:release",
 }
 RENAMED = {

@@ -150,8 +150,9 @@ def _product_checks(product: dict[str, Any]) -> tuple[Check, ...]:
     out = []
     if product.get("closure_pix") is not None:
         out.append(Check("Products", "worst closure of the inverse (pix)", product["closure_pix"]))
-        out.append(Check("Products", "A_DMAX (pix)", product["a_dmax"]))
-        out.append(Check("Products", "B_DMAX (pix)", product["b_dmax"]))
+    for key, name in (("a_dmax", "A_DMAX (pix)"), ("b_dmax", "B_DMAX (pix)")):
+        if product.get(key) is not None:
+            out.append(Check("Products", name, product[key]))
     if product.get("sky"):
         sky = product["sky"]
         name = f"rms distance from RA, Dec of {sky['n']} stars (arcsec)"

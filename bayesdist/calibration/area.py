@@ -42,7 +42,8 @@ def pixel_areas(chip: ChipMap, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float
 
     In the unit of the map squared; None in place of the deviations where the map has no errors.
     The determinant is a polynomial of order 2 (n - 1) and its variance one of 4 (n - 1), so that
-    both follow exactly from as few nodes as such polynomials need.
+    both follow exactly from as few nodes as such polynomials need.  With look-up tables the areas
+    are those of the quadrilaterals that the corners make, and the deviations of the polynomial's.
     """
     basis = chip.basis
     nodes, weights = legendre.leggauss(4 * (basis.order - 1) + 1)
@@ -53,10 +54,23 @@ def pixel_areas(chip: ChipMap, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float
     )
     at = basis.scaled(x, y)
     area = np.abs(_through_nodes(det, nodes, weights, *at))
+    if chip.before or chip.after:
+        area = _quadrilaterals(chip, np.asarray(x, float), np.asarray(y, float))
     if chip.cov is None:
         return area, None
     variance = np.einsum("nk,nk->n", d @ chip.cov, d)
     return area, np.sqrt(np.maximum(_through_nodes(variance, nodes, weights, *at), 0.0))
+
+
+def _quadrilaterals(chip: ChipMap, x: Float, y: Float) -> Float:
+    """Areas (ny, nx) of the images of pixels, by their corners: half the product of diagonals."""
+    X, Y = np.meshgrid(x, y)
+    corners = [
+        chip.at((X + dx).ravel(), (Y + dy).ravel())
+        for dx, dy in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))
+    ]
+    a, b = corners[2] - corners[0], corners[3] - corners[1]
+    return np.abs(a[0] * b[1] - a[1] * b[0]).reshape(X.shape) / 2
 
 
 def _through_nodes(values: Float, nodes: Float, weights: Float, X: Float, Y: Float) -> Float:

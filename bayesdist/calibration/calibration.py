@@ -8,7 +8,7 @@ inverses, its validity period.  One calibration is of one filter.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +20,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer.solution import Solution
 from bayesdist.infer.transforms import without_frames
 from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence, corrected
+from bayesdist.model.basis import MAX_ORDER
 
 __all__ = [
     "Calibration",
@@ -109,12 +110,42 @@ class Calibration:
         return out
 
     def in_frame(self, epoch: float | None = None) -> dict[int, ChipMap]:
-        """Polynomials for an output frame: from the reference chip's zero point in a free plane."""
-        return self.at(epoch, origin="reference" if self.plane.kind == "free" else "stated")
+        """Maps for an output frame: from the reference chip's zero point in a free plane."""
+        origin = "reference" if self.plane.kind == "free" else "stated"
+        return self.with_tables(self.at(epoch, origin=origin))
 
     def by_chip(self, epoch: float | None = None) -> dict[int, ChipMap]:
-        """Polynomials for chips one by one: in an aperture each about its own zero point."""
-        return self.at(epoch, origin="chip" if self.plane.kind == "aperture" else "stated")
+        """Polynomials for chips one by one: in an aperture each about its own zero point.
+
+        Look-up tables are followed by a polynomial of the highest order, and a note says how well.
+        """
+        maps = self.at(epoch, origin="chip" if self.plane.kind == "aperture" else "stated")
+        if not self.before and not self.after:
+            return maps
+        out = {}
+        for number, one in self.with_tables(maps).items():
+            made, worst, rms = one.polynomial(MAX_ORDER)
+            note = (
+                f"its look-up tables are followed by a polynomial of order {MAX_ORDER}, "
+                f"{worst:.2g} pix off at worst, {rms:.2g} rms"
+            )
+            out[number] = replace(made, notes=(*one.notes, note))
+        return out
+
+    def with_tables(self, maps: Mapping[int, ChipMap]) -> dict[int, ChipMap]:
+        """These maps of chips, with the look-up tables of the calibration."""
+        return {
+            number: replace(
+                one,
+                before=tuple(
+                    t
+                    for t in sorted(self.before, key=lambda table: table.filter != "")
+                    if t.chip == number and t.filter in ("", self.filter)
+                ),
+                after=tuple(t for t in self.after if t.chip == number),
+            )
+            for number, one in maps.items()
+        }
 
     def chip(
         self, number: int | None = None, epoch: float | None = None, *, origin: str = "reference"
@@ -206,6 +237,32 @@ class Calibration:
                 "depends on time and no date is given", where=self.name, do="give --epoch"
             )
         return self.reference_date if epoch is None else epoch
+
+    def at_date(self, epoch: float | None = None) -> Calibration:
+        """This calibration without dependence on time, its covariance that at the date."""
+        if self.model.time is None:
+            return self
+        made = calibration_of_maps(
+            self.at(epoch, origin="stated"),
+            self.name,
+            cov=self.joint_covariance(self.numbers, epoch, origin="stated"),
+            errors=self.errors,
+        )
+        return replace(self, solution=made.solution, reference_date=None, undated="", inverses={})
+
+    def only(self, number: int, epoch: float | None = None) -> Calibration:
+        """This calibration at a date, of one of its chips alone."""
+        one = self.chip(number, epoch, origin="stated")
+        made = calibration_of_maps({number: one}, self.name, cov=one.cov, errors=self.errors)
+        return replace(
+            self,
+            solution=made.solution,
+            reference_date=None,
+            undated="",
+            before=tuple(t for t in self.before if t.chip == number),
+            after=tuple(t for t in self.after if t.chip == number),
+            inverses={k: v for k, v in self.inverses.items() if k == number},
+        )
 
     # -- scale ------------------------------------------------------------------------------------
 

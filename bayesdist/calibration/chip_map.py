@@ -1,7 +1,8 @@
 """One chip at one date: a polynomial from pixels to (u, v), with its covariance.
 
 Fits, posteriors and files of every format are reduced to this, so that any two can be compared,
-applied, inverted.
+applied, inverted.  Look-up tables are those of pixels before the polynomial and of positions after
+it, which are evaluated at the corrected pixel; they have no part in the covariance.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
 from bayesdist.infer.solution import Solution
-from bayesdist.model import Chip, PolynomialBasis
+from bayesdist.model import Chip, LookupTable, PolynomialBasis
 from bayesdist.model.basis import point_blocks
 
 __all__ = ["ChipMap", "Monomials", "fitted_map", "position_moments", "sampling_of"]
@@ -23,6 +24,7 @@ Float = NDArray[np.float64]
 
 # Newton's method has converged when a step is this short in pixels, which rounding allows.
 STEP, MAX_STEPS = 1e-9, 30
+_FIT_NODES = 129  # points of each axis over which a map is followed by a polynomial
 SINGULAR = 1e-12  # of the largest slope squared: below that a linear part has no inverse
 
 
@@ -68,6 +70,8 @@ class ChipMap:
     chip: int | None = None  # None where the source numbers no chips
     epoch: float | None = None  # decimal years
     notes: tuple[str, ...] = ()  # notes for the reader
+    before: tuple[LookupTable, ...] = ()  # in pixels, one after the other, before the polynomial
+    after: tuple[LookupTable, ...] = ()  # in the unit of u and v, added to the polynomial
 
     def __post_init__(self) -> None:
         known = [self.coefficients] if self.cov is None else [self.coefficients, self.cov]
@@ -90,7 +94,10 @@ class ChipMap:
         x, y = np.atleast_1d(np.asarray(x, float)), np.atleast_1d(np.asarray(y, float))
         out = np.empty((2, x.size))
         for rows in point_blocks(x.size):
-            out[:, rows] = self.coefficients @ self.basis.evaluate(x[rows], y[rows]).T
+            px, py = self._corrected(x[rows], y[rows])
+            out[:, rows] = self.coefficients @ self.basis.evaluate(px, py).T
+            for table in self.after:
+                out[:, rows] += _shift(table, px, py)
         return out
 
     def slope(self, x: ArrayLike, y: ArrayLike) -> Float:
@@ -106,6 +113,7 @@ class ChipMap:
         if self.cov is None:
             return None
         K = self.basis.n_terms
+        x, y = self._corrected(x, y)
         uu, vv, uv = position_moments(self.cov.reshape(2, K, 2, K), self.basis, x, y)
         out = np.empty((x.size, 2, 2))
         out[:, 0, 0], out[:, 1, 1], out[:, 0, 1], out[:, 1, 0] = uu, vv, uv, uv
@@ -162,10 +170,25 @@ class ChipMap:
 
     def _values_and_slopes(self, pixels: Float) -> tuple[Float, Float]:
         """Values (2, N) and derivatives (N, 2, 2) by the pixel."""
+        inner = np.eye(2)
+        for table in self.before:
+            inner = _slope(table, *pixels) @ inner
+            pixels = pixels + _shift(table, *pixels)
         phi = self.basis.evaluate(*pixels)
         by_x, by_y = self.basis.derivatives
-        along = [phi @ (by @ self.coefficients.T) for by in (by_x, by_y)]
-        return (phi @ self.coefficients.T).T, np.stack(along, axis=-1)
+        slope = np.stack([phi @ (by @ self.coefficients.T) for by in (by_x, by_y)], axis=-1)
+        value = (phi @ self.coefficients.T).T
+        for table in self.after:
+            value = value + _shift(table, *pixels)
+            slope = slope + _slope(table, *pixels) - np.eye(2)
+        return value, slope @ inner if self.before else slope
+
+    def _corrected(self, x: Float, y: Float) -> tuple[Float, Float]:
+        """Pixels after the tables before the polynomial."""
+        for table in self.before:
+            dx, dy = _shift(table, x, y)
+            x, y = x + dx, y + dy
+        return x, y
 
     def monomials(self) -> Monomials:
         """Map in powers of offsets from the reference pixel."""
@@ -190,13 +213,62 @@ class ChipMap:
     def transformed(self, linear: ArrayLike, shift: ArrayLike = (0.0, 0.0)) -> ChipMap:
         """Map to linear (u, v) + shift, both taken as exact."""
         L = np.asarray(linear, float)
+        after = tuple(
+            replace(t, values=np.einsum("ab,byx->ayx", L, t.values), sigma=None) for t in self.after
+        )
         coefficients = L @ self.coefficients
         coefficients[:, 0] += np.asarray(shift, float)  # the first basis function is 1
         cov = None
         if self.cov is not None:
             by = np.kron(L, np.eye(self.basis.n_terms))
             cov = by @ self.cov @ by.T
-        return replace(self, coefficients=coefficients, cov=cov)
+        return replace(self, coefficients=coefficients, cov=cov, after=after)
+
+    def polynomial(self, order: int) -> tuple[ChipMap, float, float]:
+        """Map without tables, of an order, and how far it is off: largest and rms, pixels.
+
+        The polynomial is fitted over the detector; where there are no tables and the order is not
+        below that of the map, the map stays as it is.  The errors are those of the terms that both
+        have.
+        """
+        if not self.before and not self.after and order >= self.basis.order:
+            return self, 0.0, 0.0
+        basis = PolynomialBasis(order, self.basis.size, self.basis.reference_pixel)
+        x, y = _even_grid(basis.size)
+        design, wanted = basis.evaluate(x, y), self.at(x, y)
+        coefficients = np.asarray(np.linalg.lstsq(design, wanted.T, rcond=None)[0].T, float)
+        left = np.hypot(*(design @ coefficients.T - wanted.T).T)
+        left /= np.sqrt(abs(np.linalg.det(self.linear)))
+        cov, K = None, self.basis.n_terms
+        if self.cov is not None:
+            same = min(K, basis.n_terms)
+            both = np.zeros((2, basis.n_terms, 2, basis.n_terms))
+            both[:, :same, :, :same] = self.cov.reshape(2, K, 2, K)[:, :same, :, :same]
+            cov = both.reshape(2 * basis.n_terms, -1)
+        made = replace(self, basis=basis, coefficients=coefficients, cov=cov, before=(), after=())
+        return made, float(left.max()), float(np.sqrt(np.mean(left**2)))
+
+
+def _shift(table: LookupTable, x: Float, y: Float) -> Float:
+    """Values (2, N) of a table; NaN where a pixel is."""
+    known = np.isfinite(x) & np.isfinite(y)
+    out = np.full((2, x.size), np.nan)
+    out[:, known] = table.evaluate(x[known], y[known]).T
+    return out
+
+
+def _slope(table: LookupTable, x: Float, y: Float) -> Float:
+    """Derivatives (N, 2, 2) of the corrected pixel by the pixel; NaN where a pixel is."""
+    known = np.isfinite(x) & np.isfinite(y)
+    out = np.full((x.size, 2, 2), np.nan)
+    out[known] = table.gradient(x[known], y[known])
+    return out
+
+
+def _even_grid(size: tuple[float, float]) -> tuple[Float, Float]:
+    """Points (N,) over a detector, denser than any table that a polynomial could follow."""
+    x, y = np.meshgrid(*(np.linspace(0.5, n + 0.5, _FIT_NODES) for n in size))
+    return x.ravel(), y.ravel()
 
 
 def sampling_of(solution: Solution) -> tuple[float, tuple[str, ...]]:

@@ -73,5 +73,18 @@ class Plane:
     kind: str = "free"
     point: tuple[float, float] | None = None  # RA and Dec of (u, v) = 0, degrees
     v2v3: tuple[float, float] | None = None  # of (u, v) = 0, arcsec
+    v3_angle: float | None = None  # degrees from +V3 to +v, positive towards +V2: V3IdlYAngle
+    parity: int | None = None  # -1 where u runs against V2 at an angle of zero: VIdlParity
     orientation: Orientation | None = None  # calibrations with one have its error in common
     note: str = ""  # for the reader
+
+    @property
+    def to_v2v3(self) -> Float | None:
+        """Matrix (2, 2) from (u, v) [arcsec] to offsets in V2, V3; None where it is not known.
+
+        In the plane approximation, as distortion reference files have it.
+        """
+        if self.v3_angle is None or self.parity is None:
+            return None
+        c, s = np.cos(np.radians(self.v3_angle)), np.sin(np.radians(self.v3_angle))
+        return np.array([[self.parity * c, s], [-self.parity * s, c]])

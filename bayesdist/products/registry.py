@@ -17,6 +17,7 @@ from bayesdist.errors import InputError
 from bayesdist.products import formats
 from bayesdist.products.formats.common.content import Content, read_content, readable
 from bayesdist.products.formats.common.document import (
+    PARAMETERS,
     BuildOptions,
     Built,
     Choice,
@@ -25,12 +26,13 @@ from bayesdist.products.formats.common.document import (
     Format,
     FormatSettings,
 )
-from bayesdist.products.formats.common.read_back import ReadBack, by_calibrations
+from bayesdist.products.formats.common.read_back import ReadBack, by_calibrations, of_chips
 
 __all__ = [
     "all_formats",
     "build",
     "describe",
+    "format_of",
     "lint",
     "open_document",
     "product_settings",
@@ -109,6 +111,17 @@ def product_settings() -> dict[str, type[FormatSettings]]:
     return {one.key: one.settings for one in all_formats() if one.settings is not None}
 
 
+def format_of(key: str) -> Format:
+    """Format of a key that can be built; InputError where there is none."""
+    for one in all_formats():
+        if one.key == key and one.build is not None:
+            return one
+    raise InputError(
+        f"there is no format {key!r} that can be built",
+        do=f"choose one of {', '.join(product_settings())}",
+    )
+
+
 def build(
     key: str,
     calibration: Calibration,
@@ -116,27 +129,29 @@ def build(
     options: BuildOptions = BuildOptions(),  # noqa: B008
 ) -> tuple[Built, ...]:
     """Files of a format, built and not written; values that the format cannot hold are refused."""
-    for one in all_formats():
-        if one.key == key and one.build is not None:
-            return one.build(calibration, settings, options)
-    raise InputError(
-        f"there is no format {key!r} that can be built",
-        do=f"choose one of {', '.join(product_settings())}",
-    )
+    one = format_of(key)
+    assert one.build is not None
+    return one.build(calibration, settings, options)
 
 
 def read_back(
     key: str, files: Sequence[Built], calibration: Calibration, options: BuildOptions
 ) -> Sequence[ReadBack]:
-    """What files of a format say of positions; they were built of a calibration with options."""
-    found = next(one.read_back for one in all_formats() if one.key == key)
+    """What files of a format say of positions; they were built of a calibration with options.
+
+    By default files are read as other programs have them, without those that stand beside them for
+    their covariance; several files, each of one chip, are one.
+    """
+    found = format_of(key).read_back
     if found is not None:
         return found(files, calibration, options)
-    return [
-        by_calibrations(
-            one.file_name,
-            [recognized(Content(one.file_name, one.content)).calibration()],
-            calibration.model.time,
-        )
-        for one in files
-    ]
+    parts: dict[int, ReadBack] = {}
+    for one in files:
+        if one.kind == PARAMETERS:
+            continue
+        document = recognized(Content(one.file_name, one.content))
+        used = document.calibration(Choice(as_used=True))
+        chips = used.numbers if one.chip is None else (one.chip,)
+        part = by_calibrations(one.file_name, [used], calibration.model.time)
+        parts |= dict.fromkeys(chips, part)
+    return [of_chips(parts)]

@@ -10,7 +10,7 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
 
-from bayesdist.app.products.made_files import ProductInput
+from bayesdist.app.products.made_files import ProductInput, made_files
 from bayesdist.app.products.product_terms import _Laid, product_terms
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
@@ -18,10 +18,13 @@ from bayesdist.calibration.calibration import GaussianSolution
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import read_wise_meta, sip_from_solution, write_wise_meta
 from bayesdist.products.formats.sip.positions import sip_positions
+from bayesdist.products.registry import product_settings
 from tests.app.support import good, summary_of
+from tests.products.support import random_pixels, some_solution
 
 SIZE, GRID, REFERENCE = (512, 256), (9, 5), (256.0, 128.0)
 DRIFT = 2e-5
+FILES_OF_OTHERS = ("tpv.head", "ast.txt", "cpdis.fits")
 
 CONFIG = """
 [data]
@@ -209,3 +212,54 @@ def test_digits_of_wise_entries_are_what_is_left(tmp_path):
         off = np.abs(printed - true)[:, axis]
         assert (off <= bound + 1e-9).all()
         assert off.max() > 10 * np.abs(exact - true).max()  # the digits show
+
+
+def test_files_that_others_read_are_measured_as_others_read_them():
+    """A TPV header and an AST mapping to rounding; tables by what lies between their nodes."""
+    solution = some_solution(3, unit="arcsec", pixel=0.26, angle=0.4, flip=True)
+    product = ProductInput(solution, "made up", tangent_point=(150.1, 2.2))
+    known = product_settings()
+    asked = {"tpv": known["tpv"](), "ast": known["ast"](), "cpdis": known["cpdis"](step=64.0)}
+    products = SimpleNamespace(release=None, asked=lambda: asked)
+    terms = product_terms(product, SimpleNamespace(products=products), None)
+    assert {t.row.name for t in terms} == {f"{n}, forward" for n in FILES_OF_OTHERS}
+    x, y = random_pixels((1200.0, 900.0), 5000)
+    off = {
+        t.row.name.split(",")[0]: np.hypot(*t.shift(x, y, 1, None).T).max() / 0.26 for t in terms
+    }
+    assert off["tpv.head"] < 1e-7 and off["ast.txt"] < 1e-7
+    [built] = made_files(product, SimpleNamespace(products=products))["cpdis"]
+    assert 0.3 * built.summary["tables_pix"] < off["cpdis.fits"] < 1.1 * built.summary["tables_pix"]
+
+
+PLACED = {
+    "useafter": "2022-07-01T00:00:00", "pedigree": "GROUND", "author": "nobody",
+    "v2ref": -453.4, "v3ref": -373.8, "v3idlyangle": 4.8,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("key", "settings", "size"),
+    [
+        ("jwst", {**PLACED, "instrument": "MIRI", "detector": "MIRIMAGE"}, (1032.0, 1024.0)),
+        ("roman", {**PLACED, "detector": "WFI04", "optical_element": "F158"}, (4088.0, 4088.0)),
+        ("siaf", {"aperture": "MADE_UP"}, (1200.0, 900.0)),
+    ],
+)
+def test_files_of_pipelines_are_right_forward_and_miss_by_their_inverse(key, settings, size):
+    """Forward to rounding, along axes of their own; back as far as the file states."""
+    reference = ((size[0] + 1) / 2, (size[1] + 1) / 2)
+    solution = some_solution(4, unit="arcsec", pixel=0.11, size=size, reference_pixel=reference)
+    product = ProductInput(solution, "made up")
+    asked = {key: product_settings()[key](**settings)}
+    config = SimpleNamespace(products=SimpleNamespace(release=None, asked=lambda: asked))
+    forward, inverse = product_terms(product, config, None)
+    *_, built = made_files(product, config)[key]
+    assert [forward.row.name, inverse.row.name] == [
+        f"{built.file_name}, forward", f"{built.file_name}, inverse"
+    ]  # fmt: skip
+    x, y = random_pixels(size, 5000)
+    there, back = (np.hypot(*one.shift(x, y, 1, None).T).max() / 0.11 for one in (forward, inverse))
+    assert there < 1e-7
+    stated = built.summary["closure_pix"]
+    assert 0.3 * stated < back < 1.2 * stated

@@ -19,7 +19,9 @@ from astropy.table import Table, vstack
 from astropy.wcs import WCS, FITSFixedWarning, Sip
 from astropy.wcs.utils import fit_wcs_from_points
 
-from tests.app.support import EXACT, begin_stagewise, summary_of, write_config, write_job
+from bayesdist.products import read_calibration
+from bayesdist.products.formats.tpv.head import read_tpv
+from tests.app.support import EXACT, begin_stagewise, good, summary_of, write_config, write_job
 
 SIZE = (2000, 1500)
 PIXEL = 0.4  # arcsec
@@ -102,6 +104,32 @@ def test_positions_are_those_of_the_truth(crval, parity, tmp_path, rng) -> None:
     assert not [f for f in product["findings"] if not f.startswith("note")]
     # as the budget has it, the file is the solution
     assert product["forward_rms"] < 1e-4 * PIXEL
+
+
+def test_headers_of_other_kinds_are_on_the_sky_of_the_truth(tmp_path, rng) -> None:
+    """TPV and CPDIS by astropy.wcs; each has its own error, and the total with it."""
+    truth = camera((83.8, -5.4), -1)
+    run = made(tmp_path, truth, rng, products={"tpv": {}, "ast": {}, "cpdis": {"step": 50.0}})
+    x, y = rng.uniform(0.5, np.array(SIZE) + 0.5, (1000, 2)).T
+    true = SkyCoord(*truth.all_pix2world(x, y, 1), unit="deg")
+    [head] = read_tpv(run / "tpv.head").heads
+    with fits.open(run / "cpdis.fits") as hdus, warnings.catch_warnings():
+        warnings.simplefilter("ignore", FITSFixedWarning)
+        by_file = {"tpv": WCS(head.header), "cpdis": WCS(hdus["SCI"].header, hdus)}
+    for wcs in by_file.values():
+        apart = SkyCoord(*wcs.all_pix2world(x, y, 1), unit="deg").separation(true).arcsec
+        assert np.sqrt(np.mean(apart**2)) < 2 * NOISE * np.sqrt(20 / N)
+    entries = {p["path"]: p for p in summary_of(run)["products"]}
+    assert set(entries) == {
+        "tpv.head", "tpv_parameters.fits", "ast.txt", "ast_parameters.fits", "cpdis.fits"
+    }  # fmt: skip
+    assert not any(p["findings"] for p in entries.values())
+    assert entries["tpv.head"]["forward_rms"] == entries["ast.txt"]["forward_rms"] == 0.0
+    assert 1e-7 < entries["cpdis.fits"]["forward_rms"] < PIXEL * entries["cpdis.fits"]["tables_pix"]
+    good("convert", run, "--to", "tpv", "-o", tmp_path / "same")
+    assert (tmp_path / "same" / "tpv.head").read_text() == (run / "tpv.head").read_text()
+    back = read_calibration(run / "tpv.head")
+    assert back.errors == "covariance" and back.plane.kind == "sky"
 
 
 def test_a_given_crval_keeps_the_sky_right(tmp_path, rng) -> None:

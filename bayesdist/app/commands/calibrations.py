@@ -11,6 +11,7 @@ from bayesdist.app.commands.options import (
     epoch,
     filter_name,
     force,
+    image_size,
     new_folder,
     pixel_scale,
 )
@@ -31,6 +32,7 @@ def inspect(file: str) -> None:
 @filter_name
 @epoch
 @pixel_scale
+@image_size
 @click.option("-o", "--output", required=True, metavar="OUT", help="An .ecsv, .csv or .fits file.")
 @click.option("--inverse", is_flag=True, help="Transform back to pixels.")
 @click.option(
@@ -67,12 +69,43 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
 
 
 @command()
+@click.argument("file", metavar="FILE")
+@click.option("--to", required=True, metavar="FORMAT", help="Format to write, a key of [products].")
+@click.option("-o", "--output", metavar="OUT", help="Folder, or file where one is made.")
+@click.option(
+    "--option",
+    "options",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Setting of the format, as in [products].",
+)
+@click.option(
+    "--order", type=int, metavar="N", help="Order of the polynomial, where another is wanted."
+)
+@click.option("--chip", type=int, metavar="N", help="Number of the only chip to convert.")
+@filter_name
+@epoch
+@click.option("--scale", type=float, metavar="S", help="Size of a pixel, arcsec.")
+@image_size
+@force
+def convert(file: str, to: str, output: str | None, **options: Any) -> None:
+    """Write a calibration in another format, and report what is lost.
+
+    FILE is a run, or a file of any format that holds a calibration.
+    """
+    from bayesdist.app.commands.on_files.convert import convert as converted
+
+    click.echo(converted(file, to, output, **options))
+
+
+@command()
 @click.argument("a", metavar="A")
 @click.argument("b", metavar="B")
 @click.option("-o", "--output", metavar="DIR", help="Folder to create for tables and figure.")
 @click.option("--chip", type=int, metavar="N", show_default="all common chips")
 @click.option("--filter", metavar="F", help="Filter of IDCTABs, or WISE band; F:G for A and B.")
 @epoch
+@image_size
 @click.option("--keep-linear", is_flag=True, help="Do not remove shift, rotation and scale.")
 @click.option("--grid", type=int, nargs=2, default=(33, 17), metavar="NX NY")
 @click.pass_obj
@@ -81,7 +114,7 @@ def compare(
 ) -> None:
     """Compare two calibrations: differences and their significance.
 
-    A and B are each a run, a posterior, a fit, an IDCTAB, a SIP header or WISE meta-data.
+    A and B are each a run, a posterior, a fit, or a file of any format that holds a calibration.
     """
     from bayesdist.app.commands.on_runs.compare import compare_files
 

@@ -18,6 +18,7 @@ __all__ = [
     "epoch",
     "filter_name",
     "force",
+    "image_size",
     "new_folder",
     "pixel_scale",
     "seed",
@@ -95,6 +96,13 @@ epoch = click.option(
 filter_name = click.option("--filter", metavar="F", help="Filter of an IDCTAB, or WISE band.")
 pixel_scale = click.option(
     "--scale", type=float, metavar="S", help="Size of a corrected pixel, arcsec."
+)
+image_size = click.option(
+    "--size",
+    nargs=2,
+    type=float,
+    metavar="NX NY",
+    help="Size of the image in pixels, for a file that does not state it.",
 )
 
 

@@ -56,7 +56,9 @@ def export_files(
             findings = [f"{f.level}: {f.where}: {f.message}" for f in lint(path)]
             if built.chip is not None:
                 entry["chip"] = built.chip
-                sky = None if stars is None else sky_closure(product, stars, path, built.chip)
+                sky = None
+                if stars is not None and built.kind == "SIP":
+                    sky = sky_closure(product, stars, path, built.chip)
                 if sky is not None:
                     entry["sky"] = sky.summary
                     log.log(sky.level, "export: %s: %s", path.name, sky.sentence)

@@ -50,6 +50,7 @@ def apply_to_table(
     filter: str | None = None,
     epoch: float | None = None,
     scale: float | None = None,
+    size: tuple[float, float] | None = None,
     origin: Sequence[float] | None = None,
     vafactor: float = 1.0,
     image: str | Path | None = None,
@@ -62,13 +63,13 @@ def apply_to_table(
     Positions are in `columns`, by default x, y (back: x_out, y_out), and the chip's number in a
     column chip unless `chip` gives it.  `method` is one of METHODS: Newton's method on the forward
     polynomials, a polynomial fitted here, of an `order`, or the INVERSE rows of an IDCTAB; `epoch`
-    is in decimal years; `origin` is the output pixel of the zero point, (0, 0) by default.  Filter
-    and scale are as of `calibration_at`; image, ltv and corner as of `images_of`.  What is to be
-    printed is returned.
+    is in decimal years; `origin` is the output pixel of the zero point, (0, 0) by default.  Filter,
+    scale and size are as of `calibration_at`; image, ltv and corner as of `images_of`.  What is to
+    be printed is returned.
     """
     output = Path(output)
     check_output(output, force)
-    found = calibration_at(path, filter=filter, scale=scale)
+    found = calibration_at(path, filter=filter, scale=scale, size=size)
     chips_of = found.in_frame(epoch)
     pixel, source = found.pixel(epoch)
     ox, oy = origin or (0.0, 0.0)

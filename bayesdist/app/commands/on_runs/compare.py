@@ -20,7 +20,7 @@ from bayesdist.assess.comparison.gap import (
 from bayesdist.assess.comparison.sentences import comparison_lines, gap_lines, gap_verdict, verdict
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
-from bayesdist.products.formats.sip.calibration import MissingSizeError
+from bayesdist.products.formats.common.document import MissingSizeError
 
 __all__ = ["compare_files"]
 
@@ -35,20 +35,21 @@ def compare_files(
     chip: int | None = None,
     filter: str | None = None,
     epoch: float | None = None,
+    size: tuple[float, float] | None = None,
     keep: bool = False,
     grid: Sequence[int] = DEFAULT_GRID,
     command: str = "",
 ) -> str:
     """Verdicts on two calibrations, as text; tables, summary and figure in a new folder `output`.
 
-    `a` and `b` are each a run directory, posterior.nc, fit.nc, IDCTAB, SIP header or WISE meta-data
-    file.  All chips that both have are compared by default, each by itself.  `filter` is of
-    IDCTABs, or the band of WISE meta-data; two, joined by a colon, are for A and B.  `epoch` is in
-    decimal years; `keep` leaves shift, rotation and scale in the difference; `grid` are points on
-    x and y.
+    `a` and `b` are each a run directory, posterior.nc, fit.nc, or a file that holds a calibration,
+    of any format.  All chips that both have are compared by default, each by itself.  `filter` is
+    of IDCTABs, or the band of WISE meta-data; two, joined by a colon, are for A and B.  `epoch` is
+    in decimal years; `keep` leaves shift, rotation and scale in the difference; `grid` are points
+    on x and y; `size` is of files that do not say.
     """
     first, _, second = (filter or "").partition(":")
-    both = _read((Path(a), Path(b)), (first or None, second or first or None))
+    both = _read((Path(a), Path(b)), (first or None, second or first or None), size)
     maps = [one.by_chip(epoch) for one in both]
     numbers = _common(both, chip)
     rng = np.random.default_rng(SEED)
@@ -62,13 +63,15 @@ def compare_files(
 
 
 def _read(
-    paths: tuple[Path, Path], filters: tuple[str | None, str | None]
+    paths: tuple[Path, Path],
+    filters: tuple[str | None, str | None],
+    size: tuple[float, float] | None,
 ) -> tuple[Calibration, Calibration]:
-    """Both calibrations; a SIP header that does not say its size has that of the other one."""
-    sizes: list[tuple[float, float] | None] = [None, None]
+    """Both calibrations; a header that does not say its size has the given, or the other's."""
+    sizes: list[tuple[float, float] | None] = [size, size]
     for k, other in ((0, 1), (1, 0)):
         try:
-            calibration_at(paths[k], filter=filters[k])
+            calibration_at(paths[k], filter=filters[k], size=size)
         except MissingSizeError:
             sizes[k] = calibration_at(paths[other], filter=filters[other]).model.chips[0].size
     a, b = (

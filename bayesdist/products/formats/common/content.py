@@ -101,6 +101,14 @@ class Content:
 
     name: str
     raw: bytes
+    path: Path | None = None  # of a file; None in memory
+
+    def beside(self, name: str) -> Content | None:
+        """Content of a file in the same folder; None in memory, or where there is none."""
+        if self.path is None or not name or Path(name).name != name:
+            return None
+        path = self.path.parent / name
+        return read_content(path) if path.is_file() else None
 
     @property
     def is_fits(self) -> bool:
@@ -211,7 +219,7 @@ def read_content(path: str | os.PathLike[str]) -> Content:
             raise FormatError(
                 f"holds more than {LARGEST} bytes", where=where, do="decompress it first"
             )
-    return Content(where, raw)
+    return Content(where, raw, Path(path))
 
 
 def read_hdus(path: str | os.PathLike[str]) -> tuple[Hdu, ...]:

@@ -17,11 +17,13 @@ from pydantic import BaseModel, ConfigDict
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
 from bayesdist.model import LookupTable
+from bayesdist.model.basis import MAX_ORDER
 from bayesdist.products.formats.common.content import Content, readable
 from bayesdist.products.formats.common.read_back import ReadBack
 
 __all__ = [
     "LEVELS",
+    "PARAMETERS",
     "BuildOptions",
     "Built",
     "Choice",
@@ -29,6 +31,7 @@ __all__ = [
     "Finding",
     "Format",
     "FormatSettings",
+    "MissingSizeError",
     "finding_lines",
     "identity_lines",
     "missing_identity",
@@ -36,6 +39,7 @@ __all__ = [
 ]
 
 LEVELS = ("error", "warning", "note")
+PARAMETERS = "parameters"  # kind of a file that stands beside another, with its covariance
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,10 @@ def finding_lines(findings: Sequence[Finding]) -> list[str]:
     return ["Findings:", *(f"  {finding}" for finding in ordered)]
 
 
+class MissingSizeError(InputError):
+    """Error of a file that does not state the size of its image."""
+
+
 @dataclass(frozen=True)
 class Choice:
     """Choice among the calibrations of a file, and values that the file may lack."""
@@ -92,6 +100,7 @@ class Choice:
     # as in "W2"
     filter: str | None = None
     size: tuple[float, float] | None = None  # columns and rows, for a header that lacks them
+    as_used: bool = False  # as other programs have it: without the parameters that stand beside it
 
 
 class FormatSettings(BaseModel):
@@ -158,6 +167,10 @@ class Format:
         From files that were built, and the calibration and options that they were built from, to
         what they say of positions, one `ReadBack` for each row of the budget.  By default they are
         read by `calibration`, and laid on the solution.
+    highest_order : int
+        Of the polynomials that can be built.
+    holds_tables : bool
+        True where what is built has the look-up tables of the calibration.
     """
 
     key: str
@@ -172,6 +185,8 @@ class Format:
     read_back: Callable[[Sequence[Built], Calibration, BuildOptions], Sequence[ReadBack]] | None = (
         None
     )
+    highest_order: int = MAX_ORDER
+    holds_tables: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.model import TimeDependence
 
-__all__ = ["Positions", "ReadBack", "by_calibrations"]
+__all__ = ["Positions", "ReadBack", "by_calibrations", "of_chips"]
 
 Float = NDArray[np.float64]
 Positions = Callable[[Float, Float, int, float | None], Float]
@@ -61,15 +61,48 @@ def by_calibrations(
             return sets[0]
         return sets[int(np.searchsorted(time.breaks, epoch, side="right"))]
 
+    def within(one: Calibration, chip: int) -> int:
+        # a file of one chip may count from 1
+        return chip if chip in one.numbers or len(one.numbers) > 1 else one.numbers[0]
+
     def forward(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
-        # a table without drift would refuse a date
-        return of(epoch).forward(x, y, chip=chip, epoch=None if time is None else epoch)
+        one = of(epoch)
+        # a file without drift would refuse a date
+        return one.forward(x, y, chip=within(one, chip), epoch=epoch if one.model.time else None)
 
     def missed(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
         one = of(epoch)
-        about_zero = one.at(origin="chip")[chip]  # at the reference date, for which the rows are
-        back = one.inverses[chip].pixels(*about_zero.at(x, y))
+        its = within(one, chip)
+        about_zero = one.at(origin="chip")[its]  # at the reference date, for which the rows are
+        back = one.inverses[its].pixels(*about_zero.at(x, y))
         return np.stack([back[0] - x, back[1] - y], axis=-1)
 
     inverses = all(one.inverses for one in sets)
     return ReadBack(file, forward, missed if inverses else None, own_axes=True)
+
+
+def of_chips(parts: Mapping[int, ReadBack]) -> ReadBack:
+    """Positions by several files of one format, each of some chips, as by one file.
+
+    Parameters
+    ----------
+    parts : mapping of int to ReadBack
+        By the number of the chip.
+    """
+
+    def forward(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
+        return parts[chip].forward(x, y, chip, epoch)
+
+    def missed(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
+        back = parts[chip].missed
+        assert back is not None
+        return back(x, y, chip, epoch)
+
+    each = parts.values()
+    names = dict.fromkeys(one.file for one in each)
+    return ReadBack(
+        ", ".join(names),
+        forward,
+        missed if all(one.missed is not None for one in each) else None,
+        own_axes=any(one.own_axes for one in each),
+    )

@@ -8,17 +8,13 @@ from numpy.typing import NDArray
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import fitted_map
 from bayesdist.calibration.plane import Plane
-from bayesdist.errors import InputError
 from bayesdist.model import polynomial_terms
+from bayesdist.products.formats.common.document import MissingSizeError
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
 
-__all__ = ["MissingSizeError", "sip_calibration"]
+__all__ = ["sip_calibration"]
 
 Float = NDArray[np.float64]
-
-
-class MissingSizeError(InputError):
-    """Error of a header that does not state the size of its image."""
 
 
 def sip_calibration(

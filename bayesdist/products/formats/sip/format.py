@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from bayesdist.calibration.calibration import Calibration
+from bayesdist.products.formats.common.cards import header_of
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import (
     BuildOptions,
@@ -44,7 +45,10 @@ def _lint(content: Content) -> tuple[Finding, ...]:
 
 
 def _calibration(content: Content, name: str, choice: Choice) -> Calibration:
-    return sip_calibration(sip_of(content), name, size=choice.size)
+    sip = sip_of(content)
+    stated = [k for k in ("D2IMDIS1", "D2IMDIS2", "CPDIS1", "CPDIS2") if k in header_of(sip.cards)]
+    notes = (f"without the look-up tables of {', '.join(stated)}",) if stated else ()
+    return sip_calibration(sip, name, size=choice.size, notes=notes)
 
 
 def _read_back(

@@ -14,7 +14,7 @@ from astropy.wcs import WCS, FITSFixedWarning
 
 from bayesdist.products.formats.common.cards import holds_wcs
 from bayesdist.products.formats.common.content import Content, Hdu
-from bayesdist.products.formats.common.document import finding_lines
+from bayesdist.products.formats.common.document import Finding, finding_lines
 from bayesdist.products.formats.sip.lint import lint_sip
 from bayesdist.products.formats.sip.read import image_size, parsed
 from bayesdist.products.formats.sip.text import coefficient_lines, sip_lines
@@ -37,8 +37,10 @@ def _wcs_cards(header: fits.Header) -> tuple[tuple[str, str], ...]:
     return tuple(sorted(found))
 
 
-def describe_wcs(file: Content) -> list[str]:
+def describe_wcs(file: Content, extra: Sequence[Finding] = ()) -> list[str]:
     """Lines of text on every world coordinate system of a file, with its findings.
+
+    `extra` findings on the file are listed with those of its first system.
 
     HDUs that repeat the system of an earlier one are named with it.  FormatError for SIP keywords
     that are missing or no numbers.
@@ -52,10 +54,11 @@ def describe_wcs(file: Content) -> list[str]:
             shown.setdefault((*_wcs_cards(hdu.header), _extent(hdu.header)), []).append(hdu)
     groups = list(shown.values())
     if len(file.hdus) == 1:
-        return _hdu_lines(file, groups[0][0], file.name)
+        return _hdu_lines(file, groups[0][0], file.name, extra=extra)
     out = [f"{file.name}: {len(file.hdus)} HDUs, {len(groups)} different WCS"]
     for first, *others in groups:
-        out += ["", *_hdu_lines(file, first, _label(first), others)]
+        out += ["", *_hdu_lines(file, first, _label(first), others, extra)]
+        extra = ()
     return out
 
 
@@ -67,9 +70,15 @@ def _label(hdu: Hdu) -> str:
     return f"HDU {hdu.number}" + (f" ({hdu.label})" if hdu.label else "")
 
 
-def _hdu_lines(file: Content, hdu: Hdu, name: str, others: Sequence[Hdu] = ()) -> list[str]:
+def _hdu_lines(
+    file: Content,
+    hdu: Hdu,
+    name: str,
+    others: Sequence[Hdu] = (),
+    extra: Sequence[Finding] = (),
+) -> list[str]:
     """Lines of one HDU."""
-    header, text, terms = hdu.header, HeaderText(), list[str]()
+    header, text, terms = hdu.header, HeaderText(findings=list(extra)), list[str]()
     size = image_size(header)
     if "A_ORDER" in header:
         sip = parsed(header, name)

@@ -1,0 +1,315 @@
+"""`bayesdist convert`: a calibration in another format, with what is lost by it."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import date, time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from bayesdist.app.commands.on_files.calibrations import calibration_at
+from bayesdist.app.screen import number as digits
+from bayesdist.app.tables.output import refuse_existing
+from bayesdist.calibration.calibration import Calibration, calibration_of_maps
+from bayesdist.calibration.inverse import detector_grid
+from bayesdist.calibration.plane import ARCSEC, Plane
+from bayesdist.data.sky.tangent import sky_of_plane
+from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
+from bayesdist.products.formats.common.document import (
+    PARAMETERS,
+    BuildOptions,
+    Built,
+    Choice,
+    Format,
+    FormatSettings,
+)
+from bayesdist.products.registry import build, format_of, open_document, product_settings
+
+__all__ = ["convert"]
+
+Float = NDArray[np.float64]
+
+_GRID = 65  # points of each axis over which the loss is measured
+_ROUNDING = 1e-6  # pixels: what is less is called none
+
+
+def convert(
+    path: str | Path,
+    to: str,
+    output: str | Path | None = None,
+    *,
+    options: Sequence[str] = (),
+    order: int | None = None,
+    chip: int | None = None,
+    filter: str | None = None,
+    epoch: float | None = None,
+    scale: float | None = None,
+    size: tuple[float, float] | None = None,
+    force: bool = False,
+) -> str:
+    """Write the calibration of a file or a run in another format, and say what was lost.
+
+    `to` is the key of a format that can be built, `options` are KEY=VALUE of its table in a
+    configuration, values as in TOML.  `output` is a folder, or the name of the file where the
+    format makes one; by default the present folder.  `order` is of the polynomial where another one
+    than that of the calibration is wanted; look-up tables go into it where the format has none.
+    `scale` is arcseconds in a pixel.  `filter`, `epoch` and `size` are as of `calibration_at`.
+    What is to be printed is returned.  InputError for what the format cannot hold, or files that
+    are there without `force`.
+    """
+    target = format_of(to)
+    settings = _settings(to, product_settings()[to], options)
+    found = _on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
+    source = found if chip is None else found.only(chip, epoch)
+    at = None
+    if source.model.time is not None:
+        at = source.reference_date if epoch is None else epoch
+    made, notes = _representable(source, target, order, at)
+    if scale is not None and not (np.isfinite(scale) and scale > 0):
+        raise InputError(f"the scale is {scale}", where="--scale", do="give a positive number")
+    built = build(to, made, settings, BuildOptions(at, scale))
+    places = _written(built, output, force)
+    held = [p for p, one in zip(places, built, strict=True) if one.kind != PARAMETERS]
+    lines = [f"{', '.join(str(p) for p in places)}: by {source.name}"]
+    back = _read_back(held, filter, made.model.chips[0].size)
+    lines += [f"  {note}" for note in notes]
+    used = _read_back(held, filter, made.model.chips[0].size, as_used=True)
+    lines += [f"  {line}" for line in _losses(source, back, used, at, scale)]
+    return "\n".join(lines)
+
+
+def _on_the_sky(path: Path, found: Calibration) -> Calibration:
+    """Calibration of a run about the point where its stars touch the sky, where they do."""
+    home = path if path.is_dir() else path.parent
+    summary = home / "summary.json"
+    if found.plane.kind != "free" or not (home / "run.json").exists() or not summary.exists():
+        return found
+    point = json.loads(summary.read_text(encoding="utf-8"))["data"].get("tangent_point")
+    if point is None:
+        return found
+    return replace(found, plane=Plane("sky", point=(float(point[0]), float(point[1]))))
+
+
+def _settings(to: str, kind: type[FormatSettings], options: Sequence[str]) -> FormatSettings:
+    values: dict[str, Any] = {}
+    for text in options:
+        key, mark, value = text.partition("=")
+        if not mark or not key.strip():
+            raise InputError(f"{text!r} is not KEY=VALUE", where="--option", do="write it so")
+        try:
+            found = tomllib.loads(f"x = {value}")["x"]
+        except tomllib.TOMLDecodeError:
+            found = value.strip()
+        # settings have dates as text
+        values[key.strip()] = value.strip() if isinstance(found, (date, time)) else found
+    try:
+        return kind(**values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or to
+        keys = ", ".join(kind.model_fields) or "none"
+        raise InputError(
+            first["msg"].lower(), where=f"products.{to}.{where}",
+            do=f"give it by --option KEY=VALUE; the keys of {to} are {keys}",
+        ) from None  # fmt: skip
+
+
+def _representable(
+    source: Calibration, to: Format, order: int | None, epoch: float | None
+) -> tuple[Calibration, list[str]]:
+    """Calibration that the format can hold as polynomials go, and what was done for it."""
+    tables = bool(source.before or source.after)
+    if order is None and (not tables or to.holds_tables):
+        return source, []
+    wanted = to.highest_order if order is None else order
+    if not 1 <= wanted <= to.highest_order:
+        raise InputError(
+            f"the order is {wanted}",
+            where="--order",
+            do=f"choose one from 1 to {to.highest_order} for {to.title}",
+        )
+    kept = source.with_tables(source.at(epoch, origin="stated"))
+    maps, worst, rms = {}, 0.0, 0.0
+    for number, one in kept.items():
+        maps[number], most, mean = one.polynomial(wanted)
+        worst, rms = max(worst, most), max(rms, mean)
+    K = 2 * next(iter(maps.values())).basis.n_terms
+    cov = _joint(source, epoch, K)
+    made = calibration_of_maps(maps, source.name, cov=cov, errors=source.errors)
+    done = "its look-up tables go" if tables else f"its order {source.model.order} goes"
+    note = f"{done} into a polynomial of order {wanted}: {digits(worst, 3)} pix off at worst"
+    note += f", {digits(rms, 3)} rms"
+    return replace(
+        source, solution=made.solution, before=(), after=(), inverses={}, reference_date=None,
+        undated="",
+    ), [note]  # fmt: skip
+
+
+def _joint(source: Calibration, epoch: float | None, size: int) -> Float | None:
+    """Covariance of all chips, for polynomials of `size` coefficients a chip."""
+    whole = source.joint_covariance(source.numbers, epoch, origin="stated")
+    if whole is None:
+        return None
+    n, K = len(source.numbers), source.model.n_terms
+    out = np.zeros((n, 2, size // 2, n, 2, size // 2))
+    same = min(K, size // 2)
+    parts = whole.reshape(n, 2, K, n, 2, K)
+    out[:, :, :same, :, :, :same] = parts[:, :, :same, :, :, :same]
+    return out.reshape(n * size, n * size)
+
+
+# -- files ----------------------------------------------------------------------------------------
+
+
+def _written(built: Sequence[Built], output: str | Path | None, force: bool) -> list[Path]:
+    """Places of the files: in a folder, or the one file under the name that is given."""
+    target = Path("." if output is None else output)
+    single = len(built) == 1 and output is not None and not target.is_dir() and target.suffix
+    places = [target] if single else [target / one.file_name for one in built]
+    if not single and target.suffix and not target.is_dir():
+        names = ", ".join(one.file_name for one in built)
+        raise InputError(
+            f"{len(built)} files are made ({names})", where=str(target), do="name a folder"
+        )
+    for place in places:
+        refuse_existing(place, force)
+    for place, one in zip(places, built, strict=True):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(place) as temporary:
+            temporary.write_bytes(one.content)
+    return places
+
+
+def _read_back(
+    places: Sequence[Path],
+    filter: str | None,
+    size: tuple[float, float],
+    *,
+    as_used: bool = False,
+) -> list[Calibration]:
+    """Calibrations of files that were written; with `as_used` as other programs have them."""
+    return [open_document(place).calibration(Choice(filter, size, as_used)) for place in places]
+
+
+# -- what is lost ---------------------------------------------------------------------------------
+
+
+def _losses(
+    source: Calibration,
+    back: Sequence[Calibration],
+    used: Sequence[Calibration],
+    epoch: float | None,
+    scale: float | None,
+) -> list[str]:
+    lines = []
+    errors = min((one.errors for one in back), key=("none", "sigma", "covariance").index)
+    if source.errors == "covariance" and errors != "covariance":
+        lost = {"sigma": "correlations of the coefficients", "none": "all errors"}[errors]
+        lines.append(f"lost: {lost}")
+    elif source.errors == "sigma" and errors == "none":
+        lines.append("lost: all errors")
+    apart = len(back) > 1 and not _comparable(source, back) and source.plane.point is None
+    if apart:
+        lines.append("lost: where the chips lie to each other, of which each has a file")
+    if len(back) > 1 and source.errors == "covariance":
+        lines.append("lost: correlations between chips, of which each has a file")
+    if source.model.time is not None and all(one.model.time is None for one in back):
+        lines.append(f"lost: the dependence on time; the file is of {epoch:g}")
+    if source.plane.kind == "sky" and all(one.plane.kind != "sky" for one in back):
+        lines.append("lost: where the plane touches the sky")
+    worst, rms, frame = _difference(source, used, epoch)
+    mas = _mas_per_pixel(source, scale, epoch)
+    text = f"{digits(worst, 3)} pix at worst"
+    if mas is not None:
+        text += f" ({digits(worst * mas, 3)} mas)"
+    text += f", {digits(rms, 3)} pix rms"
+    if worst < _ROUNDING:
+        return [*lines, f"positions agree: {text}{frame}"]
+    return [*lines, f"positions differ by {text}{frame}"]
+
+
+def _difference(
+    source: Calibration, back: Sequence[Calibration], epoch: float | None
+) -> tuple[float, float, str]:
+    """Largest and rms difference of positions over the detector grid, pixels, and in which frame.
+
+    On the sky where both lie there, as they are where both have one plane and unit, and else after
+    the best similarity, which planes of different kinds leave open: over all chips, or of each
+    chip where it has a file of its own.
+    """
+    here, there, pixels = [], [], []
+    pairs = _pairs(source, back)
+    sky = source.plane.point is not None and all(one.plane.point for _, one, _ in pairs)
+    for number, one, its in pairs:
+        size = source.model.chips[source.numbers.index(number)].size
+        x, y = detector_grid(size, _GRID)
+        a = source.forward(x, y, chip=number, epoch=epoch)
+        drifts = epoch if one.model.time is not None else None
+        b = one.forward(x, y, chip=its, epoch=drifts)
+        if sky:
+            a, b = (_on_sky(c, p) for c, p in ((source, a), (one, b)))
+        here.append(a)
+        there.append(b)
+        pixels.append(float(np.sqrt(abs(np.linalg.det(source.chip(number, epoch).linear)))))
+    if not sky and not _comparable(source, back) and len(back) == 1:
+        here, there = [np.concatenate(here)], [np.concatenate(there)]
+    parts, frame = [], ""
+    for k, (a, b) in enumerate(zip(here, there, strict=True)):
+        if sky:
+            east = (a[:, 0] - b[:, 0] + 180) % 360 - 180
+            far = 3600 * np.hypot(east * np.cos(np.radians(a[:, 1])), a[:, 1] - b[:, 1])
+            far, frame = far / ARCSEC[source.unit], ", on the sky"
+        elif _comparable(source, back):
+            far = np.hypot(*(a - b).T)
+        else:
+            far = _after_similarity(a, b)
+            frame = ", after the best shift, rotation and scale"
+            frame += " of each chip" if len(back) > 1 else ""
+        parts.append(far / pixels[k])
+    off = np.concatenate(parts)
+    return float(off.max()), float(np.sqrt(np.mean(off**2))), frame
+
+
+def _comparable(source: Calibration, back: Sequence[Calibration]) -> bool:
+    """True where positions of both are in one plane and unit, about one zero point."""
+    mine = (source.plane.kind, source.unit)
+    same = all((one.plane.kind, one.unit) == mine for one in back)
+    return same and source.plane.kind != "aperture"
+
+
+def _pairs(source: Calibration, back: Sequence[Calibration]) -> list[tuple[int, Calibration, int]]:
+    """Chips of the source with the file that has each, and its number there."""
+    if len(back) == len(source.numbers):  # one file for each chip
+        return [(n, one, one.numbers[0]) for n, one in zip(source.numbers, back, strict=True)]
+    [one] = back
+    return [(n, one, n if n in one.numbers else one.numbers[0]) for n in source.numbers]
+
+
+def _on_sky(one: Calibration, at: Float) -> Float:
+    assert one.plane.point is not None
+    xi, eta = (at * ARCSEC[one.unit]).T
+    return np.stack(sky_of_plane(xi, eta, one.plane.point), axis=-1)
+
+
+def _after_similarity(a: Float, b: Float) -> Float:
+    """Distances that the best similarity leaves, mirrored or not."""
+    z, w = (at[:, 0] + 1j * at[:, 1] for at in (a, b))
+    found = []
+    for v in (w, w.conj()):
+        v, here = v - v.mean(), z - z.mean()
+        found.append(np.abs(here - np.vdot(v, here) / np.vdot(v, v) * v))
+    return min(found, key=lambda far: float(far.max()))
+
+
+def _mas_per_pixel(source: Calibration, scale: float | None, epoch: float | None) -> float | None:
+    if source.unit == "pix":
+        return None if scale is None else 1e3 * scale
+    return 1e3 * ARCSEC[source.unit] * source.pixel(epoch)[0]

@@ -1,0 +1,129 @@
+"""Text file with an AST mapping from pixels to intermediate coordinates, and its calibration.
+
+Inputs are pixels counted from 0, as in Rubin's pipelines, and outputs degrees on the tangent plane.
+Comments of the form ``# bayesdist KEY VALUE`` say more, which AST passes over.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.calibration.calibration import Calibration, calibration_of_maps
+from bayesdist.calibration.chip_map import fitted_map
+from bayesdist.calibration.plane import ARCSEC, Plane
+from bayesdist.errors import FormatError, InputError
+from bayesdist.model.basis import MAX_ORDER
+from bayesdist.products.formats.ast.dump import parse_dump
+from bayesdist.products.formats.ast.mapping import Step, steps_of
+from bayesdist.products.formats.common.content import Content
+from bayesdist.products.formats.common.document import MissingSizeError
+from bayesdist.products.formats.common.parameters import with_parameters
+
+__all__ = ["AstFile", "ast_calibration", "ast_of"]
+
+Float = NDArray[np.float64]
+
+_REMARK = re.compile(r"#\s*bayesdist\s+(\w+)\s+(.*?)\s*$", re.MULTILINE)
+_BEGIN = re.compile(r"(#.*\n|\s*\n)*\s*Begin\s+\w+")
+
+
+@dataclass(frozen=True, eq=False)
+class AstFile:
+    """Chain of mappings in a file."""
+
+    content: Content
+    steps: tuple[Step, ...]
+    remarks: dict[str, str]  # by key, of the comments
+
+    @property
+    def order(self) -> int:
+        """Order of the chain."""
+        return int(np.prod([step.poly.order for step in self.steps]))
+
+    @property
+    def side_file(self) -> str:
+        """Name of the file with the parameters; empty where none is named."""
+        return self.remarks.get("parameters", "")
+
+    @property
+    def size(self) -> tuple[float, float] | None:
+        """Columns and rows; None where nothing says them."""
+        return self._pair("size")
+
+    def _pair(self, key: str) -> tuple[float, float] | None:
+        if key not in self.remarks:
+            return None
+        try:
+            a, b = (float(v) for v in self.remarks[key].split())
+        except ValueError:
+            raise FormatError(
+                f"the remark {key} is {self.remarks[key]!r}", where=self.content.name,
+                do="give two numbers",
+            ) from None  # fmt: skip
+        return a, b
+
+    def degrees(self, x: Float, y: Float) -> tuple[Float, Float]:
+        """Intermediate coordinates (N,) of FITS 1-based pixels (N,)."""
+        u, v = np.asarray(x, float) - 1.0, np.asarray(y, float) - 1.0
+        for step in self.steps:
+            u, v = step.poly.at(u, v)
+        return u, v
+
+
+def ast_of(content: Content) -> AstFile | None:
+    """Mapping of a text; None for a text of another kind."""
+    if not _BEGIN.match(content.text):
+        return None
+    steps = steps_of(parse_dump(content.text, content.name), content.name)
+    remarks = {match[1]: match[2] for match in _REMARK.finditer(content.text)}
+    return AstFile(content, steps, remarks)
+
+
+def ast_calibration(
+    file: AstFile,
+    name: str,
+    *,
+    size: tuple[float, float] | None = None,
+    as_used: bool = False,
+) -> Calibration:
+    """Calibration of the mapping, with the covariance of the file beside it if that is there.
+
+    `size` is columns and rows, for files without remarks (else MissingSizeError);
+    with `as_used` nothing but the mapping counts.
+    """
+    order = file.order
+    if order > MAX_ORDER:
+        raise InputError(
+            f"its mappings make a polynomial of order {order}",
+            where=name,
+            do=f"give those up to order {MAX_ORDER} by themselves",
+        )
+    found = file.size or size
+    if found is None:
+        raise MissingSizeError(
+            "does not say how large the detector is", where=name, do="give it by --size NX NY"
+        )
+    unit = file.remarks.get("unit", "arcsec")
+    factor = 3600.0 / float(file.remarks.get("arcsec", ARCSEC.get(unit, 1.0)))
+    reference = file._pair("reference") or ((found[0] + 1) / 2, (found[1] + 1) / 2)
+
+    def positions(x: Float, y: Float) -> tuple[Float, Float]:
+        u, v = file.degrees(x, y)
+        return factor * u, factor * v
+
+    one = fitted_map(positions, name, order=order, size=found, reference_pixel=reference, unit=unit)
+    kind, point = file.remarks.get("plane", "free"), file._pair("point")
+    numbered = "chip" in file.remarks
+    number = int(file.remarks.get("chip", 1))
+    made = calibration_of_maps(
+        {number: one}, name, plane=Plane(kind, point=point), numbered=numbered
+    )
+    if not file.remarks:
+        made = replace(made, notes=("pixels are counted from 0, positions in degrees",))
+    if as_used:
+        return made
+    return with_parameters(made, file.content.beside(file.side_file), file.side_file)

@@ -1,0 +1,108 @@
+"""Transform, inverse and record of a distortion reference file from a calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from astropy.modeling import Model
+from numpy.typing import NDArray
+
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.inverse import detector_grid, fitted_inverse
+from bayesdist.calibration.plane import Plane
+from bayesdist.errors import InputError
+from bayesdist.products.formats.common.asdf.distortion import closure_of
+from bayesdist.products.formats.common.asdf.settings import PlacedSettings
+from bayesdist.products.formats.common.asdf.transforms import (
+    forward_transform,
+    inverse_transform,
+    tables_of,
+)
+from bayesdist.products.formats.common.coefficients import require_regular
+from bayesdist.products.formats.common.document import BuildOptions
+from bayesdist.products.formats.common.record import at_date, record_of
+
+__all__ = ["ChipTransform", "chip_transforms"]
+
+
+@dataclass(frozen=True, eq=False)
+class ChipTransform:
+    """Transform of one chip, with all that its file says of it."""
+
+    calibration: Calibration  # of the chip, in its aperture
+    chip: int
+    chip_name: str
+    model: Model  # with its inverse
+    record: dict[str, Any]
+    closure: float  # pixels
+
+    @property
+    def table_arrays(self) -> list[NDArray[np.float64]]:
+        """Arrays of the look-up tables, forward and back."""
+        both = [*tables_of(self.model), *tables_of(self.model.inverse)]
+        return [array for one in both for array in (one.lookup_table, *one.points)]
+
+
+def chip_transforms(
+    calibration: Calibration, settings: PlacedSettings, options: BuildOptions, where: str
+) -> Iterator[ChipTransform]:
+    """Transforms of all chips; `where` is the section of the configuration, for messages.
+
+    InputError for a position or orientation that nothing states, and as for `at_date` and
+    `fitted_inverse`.
+    """
+    plane = _placed(calibration.plane, settings, where)
+    matrix, v2v3 = plane.to_v2v3, plane.v2v3
+    assert matrix is not None
+    assert v2v3 is not None
+    for known in calibration.model.chips:
+        number = known.number
+        one = at_date(calibration, number, options.epoch, options.scale_arcsec, where=where)
+        one = replace(one, plane=plane)
+        chip = one.chip(number, origin="stated")
+        poly = chip.monomials()
+        require_regular(poly.linear, number)
+        model = forward_transform(poly, matrix, v2v3, one.before)
+        back = inverse_transform(
+            fitted_inverse(chip, settings.inverse_order), matrix, v2v3, one.before
+        )
+        closure = closure_of(model, back, *detector_grid(known.size))
+        if not np.isfinite(closure):
+            raise InputError(
+                "the inverse of its look-up tables does not converge",
+                where=where,
+                do="check the tables: they move pixels over each other",
+            )
+        model.inverse = back
+        date = options.epoch if calibration.model.time is not None else None
+        record = record_of(one, calibration, epoch=date, closure=closure)
+        yield ChipTransform(one, number, known.name, model, record, closure)
+
+
+def _placed(plane: Plane, settings: PlacedSettings, where: str) -> Plane:
+    """Plane in an aperture: by the settings, else as the calibration has it; parity -1."""
+    v2v3 = plane.v2v3 or (None, None)
+    values = {
+        "v2ref": settings.v2ref if settings.v2ref is not None else v2v3[0],
+        "v3ref": settings.v3ref if settings.v3ref is not None else v2v3[1],
+        "v3idlyangle": settings.v3idlyangle if settings.v3idlyangle is not None else plane.v3_angle,
+    }
+    missing = [name for name, value in values.items() if value is None]
+    if missing:
+        raise InputError(
+            f"{' and '.join(missing)} of (u, v) = 0 {'is' if len(missing) == 1 else 'are'} not "
+            "known",
+            where=where,
+            do="take them from the SIAF of the aperture",
+        )
+    v2, v3, angle = (float(value) for value in values.values() if value is not None)
+    return Plane(
+        "aperture",
+        v2v3=(v2, v3),
+        v3_angle=angle,
+        parity=settings.parity or plane.parity or -1,
+        orientation=plane.orientation,
+    )

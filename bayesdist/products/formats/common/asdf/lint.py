@@ -1,0 +1,168 @@
+"""Checks of a distortion reference file against what pipelines do with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from astropy.modeling import Model, models
+from numpy.typing import NDArray
+
+from bayesdist.errors import BayesdistError
+from bayesdist.products.formats.common.asdf.distortion import (
+    AGREEMENT,
+    DistortionFile,
+    closure_of,
+    departure,
+    recorded,
+)
+from bayesdist.products.formats.common.asdf.transforms import exchanged, leaves
+from bayesdist.products.formats.common.document import Finding, repeated_values
+
+__all__ = ["lint_distortion"]
+
+Float = NDArray[np.float64]
+
+PIXEL, SKY = ("pix", "pixel"), ("arcsec",)
+# Closure that a good inverse reaches, and one that only a wrong coefficient leaves; pixels.
+_CLOSURE_GOOD, _CLOSURE_BAD = 0.01, 0.5
+_CLOSURE_RELATIVE = 1e-2
+# How far the scale of an imager may be from its nominal one: filters and corners change it by less.
+_SCALE_RATIO = 1.2
+_PER_DEGREE = 3600.0
+
+
+def lint_distortion(file: DistortionFile) -> list[Finding]:
+    """Findings in the transform of a file, its units and its record."""
+    findings = [*_units(file)]
+    if file.size is None:
+        message = "the detector is not known here: inverse, parity and scale are not checked"
+        findings.append(Finding("note", "meta.instrument", message))
+        return findings
+    x, y = file.grid()
+    if not np.isfinite(file.v2v3(x, y)).all():
+        return [*findings, Finding("error", "model", "gives values that are not finite")]
+    return [
+        *findings,
+        *_linear(file),
+        *_inverse(file),
+        *_repeated(file.model),
+        *_record(file),
+    ]
+
+
+def _units(file: DistortionFile) -> Iterator[Finding]:
+    for name, unit, wanted in zip(
+        ("input_units", "output_units"), file.units, (PIXEL, SKY), strict=True
+    ):
+        if unit and unit not in wanted:
+            yield Finding(
+                "error", f"meta.{name}",
+                f"units are {unit!r}; pipelines take pixels to arcsec whatever stands here",
+            )  # fmt: skip
+        elif not unit:
+            yield Finding("warning", f"meta.{name}", f"is missing; it should be {wanted[0]!r}")
+
+
+def _linear(file: DistortionFile) -> Iterator[Finding]:
+    """Findings on parity and scale at the middle of the detector."""
+    assert file.size is not None
+    x, y = ((n + 1) / 2 for n in file.size)
+    at = file.v2v3([x, x + 0.5, x - 0.5, x, x], [y, y, y, y + 0.5, y - 0.5])
+    slope = np.stack([at[:, 1] - at[:, 2], at[:, 3] - at[:, 4]], axis=1)
+    area = float(np.linalg.det(slope))
+    if area > 0:
+        yield Finding(
+            "error", "parity",
+            "V2, V3 run as x, y do: the image is a mirror image of the sky, which no imager of "
+            f"{file.observatory} gives (VIdlParity is -1)",
+        )  # fmt: skip
+    scale = np.sqrt(abs(area))
+    if file.detector is None:
+        return
+    ratio = float(scale / file.detector.scale)
+    if not 1 / _SCALE_RATIO < ratio < _SCALE_RATIO:
+        message = f"a pixel is {scale:.4g} arcsec, and nominally {file.detector.scale:g}"
+        if 1 / _SCALE_RATIO < ratio * _PER_DEGREE < _SCALE_RATIO:
+            message += ": the transform gives degrees"
+        yield Finding("error", "scale", message)
+
+
+def _inverse(file: DistortionFile) -> Iterator[Finding]:
+    back = file.inverse
+    if back is None:
+        yield Finding(
+            "error", "inverse",
+            "is missing: gwcs cannot go from the sky to pixels, and pipelines stop where they must",
+        )  # fmt: skip
+        return
+    x, y = file.grid()
+    closure = closure_of(file.model, back, x, y)
+    if not closure <= _CLOSURE_GOOD:
+        blamed = _exchanged(file.model, back, x, y, closure)
+        if blamed:
+            yield Finding(
+                "error", blamed, "the order of coefficients: powers of x and y are exchanged "
+                f"(closure {closure:.3g} px)",
+            )  # fmt: skip
+        elif not closure <= _CLOSURE_BAD:
+            yield Finding(
+                "error", "inverse", f"misses the inverse of the model by up to {closure:.3g} px: a "
+                "coefficient of one or the other is wrong",
+            )  # fmt: skip
+        else:
+            yield Finding("warning", "inverse", f"leaves up to {closure:.3g} px; raise its order")
+    stated = file.stated_closure
+    if stated is not None and closure > stated * (1 + _CLOSURE_RELATIVE) + 1e-9:
+        yield Finding(
+            "error", "bayesdist.inverse",
+            f"states {stated:.3g} px, and the inverse leaves {closure:.3g} px",
+        )  # fmt: skip
+
+
+def _exchanged(model: Model, back: Model, x: Float, y: Float, closure: float) -> str:
+    """Part in which powers are exchanged, where that alone makes forward and back agree."""
+    # where both are exchanged they nearly agree again: the better one is right
+    left = closure / 10
+    blamed = ""
+    for lowest in (1, 2):
+        for where, one, two in (
+            ("inverse", model, exchanged(back, lowest)),
+            ("model", exchanged(model, lowest), back),
+        ):
+            one_left = closure_of(one, two, x, y)
+            if one_left < left:
+                left, blamed = one_left, where
+    return blamed
+
+
+def _repeated(model: Model) -> Iterator[Finding]:
+    for one in leaves(model):
+        if not isinstance(one, models.Polynomial2D) or one.degree < 2:
+            continue
+        values = {
+            name: float(c)
+            for name, c in zip(one.param_names, one.parameters, strict=True)
+            if sum(map(int, name[1:].split("_"))) > 1
+        }
+        for names in repeated_values(values):
+            message = f"the same value, {abs(values[names[0]]):.7g}: one may have been copied"
+            yield Finding("warning", ", ".join(names), f"{message} over the other")
+
+
+def _record(file: DistortionFile) -> Iterator[Finding]:
+    """Findings on our own record."""
+    if file.record is None:
+        yield Finding("note", "bayesdist", "is not there: the file states no uncertainty")
+        return
+    try:
+        found = recorded(file)
+    except BayesdistError as error:
+        yield Finding("error", "bayesdist", error.cause)
+        return
+    far = departure(file, found)
+    if not far <= AGREEMENT:
+        yield Finding(
+            "error", "bayesdist.parameters",
+            f"are another map than the model, by up to {far:.3g} px: one of them has been changed",
+        )  # fmt: skip

@@ -1,0 +1,191 @@
+"""Parameters of a calibration with their covariance, as a FITS table beside any format.
+
+Most formats have no room for a covariance.  This table has all of it, in doubles, at one date: one
+row for each Legendre coefficient, in an extension BDPARAM of the same file, or in a file of its own
+next to a text file that names it.  With X = (2 x - (NX + 1)) / NX, and Y alike, x and y in FITS
+1-based pixels, the position of a pixel is
+
+    u = sum VALUE P_I(X) P_J(Y)    over the rows of its CHIP whose AXIS is 'u',
+
+and COV is the row of the covariance matrix, in the order of the rows.  Look-up tables are not part
+of it: they stand in the file beside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from bayesdist.calibration.calibration import Calibration, GaussianSolution
+from bayesdist.calibration.inverse import detector_grid
+from bayesdist.calibration.plane import Plane
+from bayesdist.errors import FormatError
+from bayesdist.model import Chip, DistortionModel
+from bayesdist.products.formats.common.content import Content, Hdu, hdus_of
+
+__all__ = [
+    "EXTENSION",
+    "agreeing",
+    "largest_difference",
+    "parameters_content",
+    "parameters_hdu",
+    "stored_calibration",
+    "stored_in",
+    "with_parameters",
+]
+
+Float = NDArray[np.float64]
+
+EXTENSION = "BDPARAM"
+AGREE = 1e-6  # pixels by which numbers that were printed may differ from the parameters
+_GRID = 33  # points of each axis over which two calibrations are compared
+_PLANES = ("free", "sky", "detector", "aperture")
+_ERRORS = ("covariance", "sigma", "none")
+
+
+def parameters_hdu(calibration: Calibration, epoch: float | None = None) -> fits.BinTableHDU:
+    """Table of all parameters at a date, with their covariance."""
+    model = calibration.model
+    one = calibration.at_date(epoch)
+    mean, cov = np.asarray(one.solution.mean), np.asarray(one.solution.cov)
+    basis = model.basis()
+    rows = [(c, a, i, j) for c in model.chips for a in "uv" for i, j in basis.terms]
+    D = len(rows)
+    columns = [
+        fits.Column("CHIP", "J", array=[c.number for c, *_ in rows]),
+        fits.Column("AXIS", "1A", array=[a for _, a, *_ in rows]),
+        fits.Column("I", "J", array=[i for *_, i, _ in rows]),
+        fits.Column("J", "J", array=[j for *_, j in rows]),
+        fits.Column("VALUE", "D", array=mean[:D]),
+        fits.Column("SIGMA", "D", array=np.sqrt(np.maximum(np.diag(cov)[:D], 0.0))),
+        fits.Column("COV", f"{D}D", array=cov[:D, :D]),
+        fits.Column("NX", "D", array=[c.size[0] for c, *_ in rows]),
+        fits.Column("NY", "D", array=[c.size[1] for c, *_ in rows]),
+        fits.Column("XREF", "D", array=[c.reference_pixel[0] for c, *_ in rows]),
+        fits.Column("YREF", "D", array=[c.reference_pixel[1] for c, *_ in rows]),
+    ]
+    hdu = fits.BinTableHDU.from_columns(columns, name=EXTENSION)
+    header = hdu.header
+    header["BDUNIT"] = model.unit, "unit of u and v"
+    header["BDORDER"] = model.order, "order of the polynomials"
+    header["BDERROR"] = calibration.errors, "covariance, sigma (no correlations) or none"
+    header["BDNUMB"] = calibration.numbered, "are the chips numbered?"
+    header["BDPLANE"] = calibration.plane.kind, "plane of u and v"
+    if calibration.plane.point is not None:
+        for k, value in enumerate(calibration.plane.point, start=1):
+            header[f"BDTAN{k}"] = float(value), "[deg] sky position of u, v = 0"
+    if epoch is not None and model.time is not None:
+        header["BDEPOCH"] = float(epoch), "[yr] date of the coefficients"
+    if calibration.scale is not None:
+        header["BDSCALE"] = float(calibration.scale), "size of a corrected pixel"
+    for keyword, text in (("DETECTOR", calibration.detector), ("FILTER", calibration.filter)):
+        if text:
+            header[keyword] = text
+    header.add_comment("u = sum VALUE P_I(X) P_J(Y), P Legendre, X = (2 x - (NX + 1)) / NX")
+    return hdu
+
+
+def parameters_content(calibration: Calibration, epoch: float | None = None) -> bytes:
+    """FITS file with the table alone."""
+    made = hdus_of([fits.PrimaryHDU(), parameters_hdu(calibration, epoch)])
+    return b"".join(hdu.to_bytes() for hdu in made)
+
+
+def stored_in(content: Content) -> Hdu | None:
+    """HDU of the table in a file; None where there is none."""
+    return next((hdu for hdu in content.tables if hdu.name == EXTENSION), None)
+
+
+def stored_calibration(hdu: Hdu, name: str) -> Calibration:
+    """Calibration of a table; FormatError where it is not whole."""
+    header, rows = hdu.header, hdu.rows
+    where = f"{name}, extension {EXTENSION}"
+    missing = {"CHIP", "AXIS", "I", "J", "VALUE", "COV", "NX", "NY", "XREF", "YREF"} - set(
+        rows.dtype.names or ()
+    )
+    if missing:
+        raise FormatError(f"has no column {min(missing)}", where=where, do="write the file again")
+    first = np.unique(rows["CHIP"], return_index=True)[1]
+    chips = tuple(
+        Chip(int(r["CHIP"]), str(r["CHIP"]), (float(r["NX"]), float(r["NY"])),
+             (float(r["XREF"]), float(r["YREF"])))
+        for r in rows[np.sort(first)]
+    )  # fmt: skip
+    model = DistortionModel(int(header["BDORDER"]), chips, str(header["BDUNIT"]), None)
+    expected = [(c.number, a, *t) for c in chips for a in "uv" for t in model.basis().terms]
+    found = [(int(r["CHIP"]), str(r["AXIS"]), int(r["I"]), int(r["J"])) for r in rows]
+    cov = np.asarray(rows["COV"], float).reshape(len(rows), -1)
+    if found != expected or cov.shape[0] != cov.shape[1]:
+        raise FormatError(
+            "has not the rows of its order and chips", where=where, do="write the file again"
+        )
+    mean = np.asarray(rows["VALUE"], float)
+    if not (np.isfinite(mean).all() and np.isfinite(cov).all()):
+        raise FormatError("holds numbers that are not finite", where=where, do="check the file")
+    kind, errors = str(header.get("BDPLANE", "free")), str(header.get("BDERROR", "covariance"))
+    if kind not in _PLANES or errors not in _ERRORS:
+        raise FormatError(f"is of a plane {kind!r}", where=where, do="write the file again")
+    point = (float(header["BDTAN1"]), float(header["BDTAN2"])) if "BDTAN1" in header else None
+    scale = float(header["BDSCALE"]) if "BDSCALE" in header else None
+    return Calibration(
+        name,
+        GaussianSolution(model, mean, cov),
+        plane=Plane(kind, point=point),
+        detector=str(header.get("DETECTOR", "")),
+        filter=str(header.get("FILTER", "")),
+        errors=errors,
+        numbered=bool(header.get("BDNUMB", True)),
+        scale=scale,
+        scale_from="" if scale is None else EXTENSION,
+    )
+
+
+def largest_difference(a: Calibration, b: Calibration) -> float:
+    """Largest distance of positions by two calibrations of the same chips and unit, pixels."""
+    worst = 0.0
+    for chip in a.model.chips:
+        x, y = detector_grid(chip.size, _GRID)
+        far = np.hypot(*(a.forward(x, y, chip=chip.number) - b.forward(x, y, chip=chip.number)).T)
+        pixel = np.sqrt(abs(np.linalg.det(a.chip(chip.number).linear)))
+        worst = max(worst, float(far.max() / pixel))
+    return worst
+
+
+def agreeing(stored: Calibration, read: Calibration, pixels: float) -> Calibration:
+    """Stored calibration, after a check that a file that was read says the same.
+
+    FormatError where chips or unit are others, or positions differ by more than so many pixels.
+    """
+    chips = [(c.number, c.size) for c in stored.model.chips]
+    if chips != [(c.number, c.size) for c in read.model.chips] or stored.unit != read.unit:
+        raise FormatError(
+            "the parameters beside it are of other chips or another unit",
+            where=read.name,
+            do="keep together what was written together",
+        )
+    far = largest_difference(stored, read)
+    if not far <= pixels:
+        raise FormatError(
+            f"the parameters beside it are off by {far:.2g} pixels: one of the two was changed",
+            where=read.name,
+            do="keep together what was written together",
+        )
+    return replace(stored, name=read.name, before=read.before, after=read.after, notes=read.notes)
+
+
+def with_parameters(found: Calibration, content: Content | None, named: str) -> Calibration:
+    """Calibration with the parameters that a content holds, after a check that the two agree.
+
+    `named` is the file in which they should be: without it a note says that they are not here.
+    FormatError where they are others.
+    """
+    hdu = None if content is None else stored_in(content)
+    if hdu is not None:
+        return agreeing(stored_calibration(hdu, found.name), found, AGREE)
+    if not named:
+        return found
+    note = f"its covariance is in {named}, which is not here"
+    return replace(found, notes=(*found.notes, note))

@@ -1,0 +1,240 @@
+"""Calibration of one chip at one date as a record of names, numbers and arrays, and back.
+
+It stands in a file beside what a pipeline reads, and holds what that cannot: the parameters as they
+were fitted, their covariance, what fixes the gauge, and where they are from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of_maps
+from bayesdist.calibration.plane import ARCSEC, Plane
+from bayesdist.errors import FormatError, InputError
+from bayesdist.model import Chip, DistortionModel, LookupTable
+from bayesdist.version import __version__
+
+__all__ = ["at_date", "calibration_from", "record_of"]
+
+Float = NDArray[np.float64]
+
+VERSION = 1
+_PARTS = ("parameters", "gauge", "provenance", "chip", "plane")
+
+
+def at_date(
+    calibration: Calibration,
+    chip: int,
+    epoch: float | None,
+    scale_arcsec: float | None,
+    *,
+    where: str,
+) -> Calibration:
+    """Calibration of one chip at one date, in arcseconds, with the tables of that chip.
+
+    InputError, that names the configuration `where`, for u, v in pixels without a scale, a date
+    that is missing, and tables behind the polynomial.
+    """
+    if calibration.model.time is not None and epoch is None and calibration.reference_date is None:
+        raise InputError(
+            "the file holds for one epoch, and the model depends on time",
+            where=where,
+            do="give an epoch in decimal years",
+        )
+    if any(table.chip == chip for table in calibration.after):
+        raise InputError(
+            "the look-up tables are applied after the polynomial, which the file cannot hold",
+            where=where,
+            do="fit tables of pixels",
+        )
+    unit = calibration.unit
+    if unit == "pix" and scale_arcsec is None:
+        raise InputError(
+            "u and v are in pixels, and the file is in arcseconds",
+            where="detector.scale_mas",
+            do="give the pixel scale",
+        )
+    date = epoch if calibration.model.time is not None else None
+    factor = float(scale_arcsec or 1.0) if unit == "pix" else ARCSEC[unit]
+    one = calibration.chip(chip, date, origin="stated")
+    if unit != "arcsec":
+        one = replace(one.transformed(factor * np.eye(2)), unit="arcsec")
+    tables = [t for t in calibration.before if t.chip == chip]
+    known = calibration.model.chips[calibration.model.chip_code(chip)]
+    made = calibration_of_maps(
+        {chip: one},
+        calibration.name,
+        cov=one.cov,
+        errors=calibration.errors,
+        plane=calibration.plane,
+        instrument=calibration.instrument,
+        detector=calibration.detector,
+        filter=calibration.filter,
+        numbered=calibration.numbered,
+        before=tuple(t for t in tables if t.filter in ("", calibration.filter)),
+        notes=calibration.notes,
+    )
+    model = replace(made.model, chips=(known,))
+    solution = replace(made.solution, model=model)  # type: ignore[type-var]
+    return replace(made, solution=solution)
+
+
+def record_of(
+    calibration: Calibration,
+    source: Calibration,
+    *,
+    epoch: float | None = None,
+    closure: float | None = None,
+) -> dict[str, Any]:
+    """Record of a calibration of one chip at one date.
+
+    `source` is what it was made from; `closure` the largest error of the inverse, pixels.
+    """
+    model, plane = calibration.model, calibration.plane
+    [chip] = model.chips
+    convergence = source.solution.convergence
+    record: dict[str, Any] = {
+        "version": VERSION,
+        "parameters": {
+            "meaning": "Legendre products over the chip, pixels to (u, v)",
+            "unit": model.unit,
+            "order": model.order,
+            "names": list(model.names),
+            "values": np.array(calibration.solution.mean, float),
+        },
+        "errors": calibration.errors,
+        "gauge": _gauge(source),
+        "chip": {
+            "number": chip.number if calibration.numbered else None,
+            "name": chip.name,
+            "size": list(map(float, chip.size)),
+            "reference_pixel": list(map(float, chip.reference_pixel)),
+        },
+        "plane": {
+            "kind": plane.kind,
+            "v2v3": None if plane.v2v3 is None else list(map(float, plane.v2v3)),
+            "v3_angle": plane.v3_angle,
+            "parity": plane.parity,
+        },
+        "tables": [_table_entry(table) for table in calibration.before],
+        "provenance": {
+            "software": f"bayesdist {__version__}",
+            "source": source.name,
+            "instrument": calibration.instrument,
+            "detector": calibration.detector,
+            "filter": calibration.filter,
+            "epoch": None if epoch is None else float(epoch),
+            "kind": source.solution.kind,
+            "converged": None if convergence is None else bool(convergence.converged),
+            "approximation": source.solution.approximation,
+            "notes": list(source.notes),
+        },
+    }
+    if closure is not None:
+        record["inverse"] = {"closure_pix": float(closure)}
+    if calibration.errors != "none":
+        record["covariance"] = np.array(calibration.solution.cov, float)
+    return record
+
+
+def _gauge(source: Calibration) -> str:
+    """Sentence on what the covariance holds of position and orientation."""
+    orientation = source.plane.orientation
+    if orientation is not None:
+        return f"Oriented by {orientation.source}; the error of that is in the covariance."
+    if source.plane.kind == "free":
+        return "Position, scale and angle in V2, V3 are taken as exact."
+    return "Position and angle of the aperture in V2, V3 are taken as exact."
+
+
+def _table_entry(table: LookupTable) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "filter": table.filter,
+        "first": list(table.first),
+        "step": list(table.step),
+    }
+    if table.sigma is not None:
+        entry["sigma"] = np.array(table.sigma)
+    return entry
+
+
+# -- and back -------------------------------------------------------------------------------------
+
+
+def calibration_from(
+    record: Mapping[str, Any], name: str, table_values: Sequence[Float] = ()
+) -> Calibration:
+    """Calibration of a record, whose tables have these values (2, ny, nx) in their order.
+
+    FormatError for a record of another version, or one that lacks a part.
+    """
+    where = f"{name}, bayesdist"
+    if record.get("version") != VERSION:
+        raise FormatError(
+            f"the record is of version {record.get('version')}, and {VERSION} is read here",
+            where=where,
+            do="use the version of bayesdist that wrote it",
+        )
+    missing = [part for part in _PARTS if part not in record]
+    if missing:
+        raise FormatError(
+            f"{', '.join(missing)} is missing", where=where, do="fetch the file again"
+        )
+    given, chip, plane = record["parameters"], record["chip"], record["plane"]
+    number = 1 if chip["number"] is None else int(chip["number"])
+    known = Chip(number, str(chip["name"]), _pair(chip["size"]), _pair(chip["reference_pixel"]))
+    model = DistortionModel(int(given["order"]), (known,), str(given["unit"]))
+    mean = np.array(given["values"], float)
+    errors = str(record.get("errors", "none"))
+    cov = np.zeros((model.n_params, model.n_params))
+    if errors != "none":
+        cov = np.array(record["covariance"], float)
+    if mean.shape != (model.n_params,) or cov.shape != (model.n_params,) * 2:
+        raise FormatError(
+            f"{mean.size} parameters and a covariance of {' x '.join(map(str, cov.shape))} do not "
+            f"go with order {model.order}",
+            where=where,
+            do="fetch the file again",
+        )
+    entries, filter = record.get("tables", []), str(record["provenance"].get("filter", ""))
+    tables = tuple(
+        LookupTable(
+            number, values, str(e["filter"]), _pair(e["first"]), _pair(e["step"]), e.get("sigma")
+        )
+        for e, values in zip(entries, table_values, strict=True)
+    )
+    v2v3 = plane.get("v2v3")
+    return Calibration(
+        name,
+        GaussianSolution(model, mean, cov),
+        Plane(
+            str(plane["kind"]),
+            v2v3=None if v2v3 is None else _pair(v2v3),
+            v3_angle=plane.get("v3_angle"),
+            parity=plane.get("parity"),
+        ),
+        instrument=str(record["provenance"].get("instrument", "")),
+        detector=str(record["provenance"].get("detector", "")),
+        filter=filter,
+        errors=errors,
+        numbered=chip["number"] is not None,
+        before=tables,
+        notes=_notes(record["provenance"]),
+    )
+
+
+def _pair(values: Sequence[float]) -> tuple[float, float]:
+    a, b = values
+    return float(a), float(b)
+
+
+def _notes(provenance: Mapping[str, Any]) -> tuple[str, ...]:
+    notes = [str(note) for note in provenance.get("notes", ())]
+    if provenance.get("converged") is False:
+        notes.append("has not converged")
+    return tuple(notes)

@@ -1,0 +1,1 @@
+"""Look-up tables by CPDIS and DP records, of FITS WCS Paper IV."""

@@ -1,0 +1,259 @@
+"""Images whose headers name look-up tables: CPDISi = 'LOOKUP' with DPi records.
+
+    p' = p + (table 1, table 2)(p),    (x, y) = CD (p' - CRPIX)
+
+with tables in pixels, which are extensions WCSDVARR of the same file; node k (from 1) of axis a
+lies at pixel CRVALa + (k - CRPIXa) CDELTa.  A file of ours has in addition, where no consumer
+looks: extensions WCSDVERR, standard errors of the nodes, and BDPARAM, the parameters with their
+covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from bayesdist.calibration.calibration import Calibration, calibration_of_maps
+from bayesdist.calibration.chip_map import ChipMap, fitted_map
+from bayesdist.calibration.inverse import detector_grid
+from bayesdist.calibration.plane import ARCSEC, Plane
+from bayesdist.errors import FormatError, InputError
+from bayesdist.model import LookupTable
+from bayesdist.products.formats.common.content import Content, Hdu
+from bayesdist.products.formats.common.document import MissingSizeError
+from bayesdist.products.formats.common.parameters import stored_calibration, stored_in
+from bayesdist.products.formats.lookup.plane import Plane as TablePlane
+from bayesdist.products.formats.sip.read import cd_matrix, image_size
+
+__all__ = ["ERRORS", "TABLES", "CpdisFile", "CpdisImage", "cpdis_calibration", "cpdis_of"]
+
+Float = NDArray[np.float64]
+
+TABLES, ERRORS = "WCSDVARR", "WCSDVERR"
+_DEGREES = {"deg": 1.0, "arcsec": 1 / 3600, "mas": 1 / 3.6e6, "rad": 180 / np.pi, "": 1.0}
+_SLACK = 1e-9  # pixels: rounding of a check
+
+
+@dataclass(frozen=True, eq=False)
+class CpdisImage:
+    """Image with look-up tables."""
+
+    hdu: Hdu
+    tables: dict[tuple[str, int], Hdu]  # of the file, by EXTNAME and EXTVER
+    place: int  # among the images of the file, from 1
+    where: str  # for messages
+
+    @cached_property
+    def header(self) -> fits.Header:
+        """Header of the image."""
+        return self.hdu.header
+
+    @property
+    def number(self) -> int:
+        """Number of the chip; its place where nothing says it."""
+        return next(
+            (int(self.header[k]) for k in ("BDCHIP", "CCDCHIP") if k in self.header), self.place
+        )
+
+    def function(self, axis: int) -> str:
+        """CPDIS of an axis (1 or 2), in capitals; empty where there is none."""
+        return str(self.header.get(f"CPDIS{axis}", "")).strip().upper()
+
+    def version(self, axis: int) -> int:
+        """EXTVER of the table of an axis; 1 where no record says it, as for astropy.wcs."""
+        return int(self.header.get(f"DP{axis}.EXTVER", 1))
+
+    def axes(self, axis: int) -> tuple[int | None, ...]:
+        """Image axes of the table's, by the records; None where one is missing."""
+        found = (self.header.get(f"DP{axis}.AXIS.{k}") for k in (1, 2))
+        return tuple(None if value is None else int(value) for value in found)
+
+    def plane(self, axis: int) -> TablePlane | None:
+        """Table of an axis; None where there is no such function, or no extension."""
+        if self.function(axis) != "LOOKUP":
+            return None
+        version = self.version(axis)
+        hdu = self.tables.get((TABLES, version))
+        return None if hdu is None else TablePlane(hdu, TABLES, f"{self.where}, {TABLES},{version}")
+
+    def table(self) -> LookupTable:
+        """Tables of both axes; FormatError where they cannot be read."""
+        planes = [self.plane(axis) for axis in (1, 2)]
+        for axis, plane in enumerate(planes, start=1):
+            function = self.function(axis)
+            if function and function != "LOOKUP":
+                raise FormatError(
+                    f"CPDIS{axis} is {function}, no look-up table", where=self.where,
+                    do="give a header with CPDIS LOOKUP",
+                )  # fmt: skip
+            if function and plane is None:
+                raise FormatError(
+                    f"has no extension {TABLES},{self.version(axis)} for CPDIS{axis}",
+                    where=self.where, do="give the whole file",
+                )  # fmt: skip
+            if function and self.axes(axis) != (1, 2):
+                raise FormatError(
+                    f"the records DP{axis}.AXIS are {self.axes(axis)}, which not all programs read",
+                    where=self.where, do="write the table with axes 1, 2",
+                )  # fmt: skip
+        there = [p for p in planes if p is not None]
+        if not all(np.isfinite(plane.values).all() for plane in there):
+            raise FormatError(
+                "has nodes that are not finite", where=self.where, do="give the whole file"
+            )
+        first = there[0]
+        for other in there[1:]:
+            same = (first.values.shape, first.first, first.step)
+            if (other.values.shape, other.first, other.step) != same:
+                raise FormatError(
+                    "the tables of the two axes are on different grids", where=self.where,
+                    do="give both on one grid",
+                )  # fmt: skip
+        zero = np.zeros(first.values.shape)
+        values = [zero if p is None or self._dropped(a) else p.values
+                  for a, p in enumerate(planes, start=1)]  # fmt: skip
+        return LookupTable(self.number, np.stack(values), first=first.first, step=first.step)
+
+    def _dropped(self, axis: int) -> bool:
+        """True where astropy.wcs leaves a table out."""
+        return float(self.header.get(f"CPERR{axis}", 0.0)) < 0
+
+    @property
+    def crpix(self) -> tuple[float, float]:
+        """Reference pixel."""
+        return float(self.header.get("CRPIX1", 0.0)), float(self.header.get("CRPIX2", 0.0))
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Columns and rows of the image."""
+        return image_size(self.header)
+
+    @property
+    def cd(self) -> Float:
+        """Degrees in a pixel (2, 2)."""
+        units = [str(self.header.get(f"CUNIT{k}", "deg")).strip() for k in (1, 2)]
+        factors = [_DEGREES.get(unit, 1.0) for unit in units]
+        return cd_matrix(self.header, self.where) * np.array(factors)[:, None]
+
+    @property
+    def plane_of_sky(self) -> Plane:
+        """Plane of the intermediate coordinates."""
+        kind = str(self.header.get("BDPLANE", "")).strip()
+        types = [str(self.header.get(f"CTYPE{k}", "")) for k in (1, 2)]
+        tangent = types[0].startswith("RA") and all(t.endswith("TAN") for t in types)
+        if kind not in ("", "sky") or not tangent:
+            return Plane(kind if kind not in ("", "sky") else "free")
+        return Plane("sky", point=(float(self.header["CRVAL1"]), float(self.header["CRVAL2"])))
+
+
+@dataclass(frozen=True, eq=False)
+class CpdisFile:
+    """File with such images."""
+
+    content: Content
+    images: tuple[CpdisImage, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of the file, for messages."""
+        return self.content.name
+
+
+def cpdis_of(content: Content) -> CpdisFile | None:
+    """Images of a content; None where there is none, or SIP or TPV beside the tables."""
+    hdus = content.hdus
+    mine = [hdu for hdu in hdus if {"CPDIS1", "CPDIS2"} & set(hdu.header)]
+    if not mine or any("A_ORDER" in hdu.header for hdu in mine):
+        return None
+    if any(str(hdu.header.get("CTYPE1", "")).endswith("TPV") for hdu in mine):
+        return None
+    tables = {
+        (hdu.name, int(hdu.header.get("EXTVER", 1))): hdu
+        for hdu in hdus
+        if hdu.name in (TABLES, ERRORS) and hdu.state == "whole"
+    }
+    images = tuple(
+        CpdisImage(hdu, tables, k, content.name + (f", {hdu.label}" if len(mine) > 1 else ""))
+        for k, hdu in enumerate(mine, start=1)
+    )
+    return CpdisFile(content, images)
+
+
+def cpdis_calibration(
+    file: CpdisFile,
+    name: str,
+    *,
+    size: tuple[float, float] | None = None,
+    as_used: bool = False,
+) -> Calibration:
+    """Calibration of the tables and linear parts; of a file of ours the one it was made from.
+
+    `size` is columns and rows, for headers without them (else MissingSizeError);
+    with `as_used` nothing but header and tables counts.  FormatError for tables that cannot be
+    read, or that differ from the parameters in the file.
+    """
+    first = file.images[0]
+    unit = str(first.header.get("BDUNIT", "arcsec"))
+    factor = 3600.0 / float(first.header.get("BDARCS", ARCSEC.get(unit, 1.0)))
+    points = {image.plane_of_sky.point for image in file.images}
+    if len(points) > 1:
+        raise InputError(
+            "its images touch the sky at different points", where=name, do="give one by itself"
+        )
+    maps = {image.number: _linear(image, name, size, unit, factor) for image in file.images}
+    found = calibration_of_maps(maps, name, plane=first.plane_of_sky)
+    found = replace(found, before=tuple(image.table() for image in file.images))
+    hdu = stored_in(file.content)
+    return found if hdu is None or as_used else _of_ours(file, stored_calibration(hdu, name), found)
+
+
+def _linear(
+    image: CpdisImage, name: str, size: tuple[float, float] | None, unit: str, factor: float
+) -> ChipMap:
+    """Map of one image without its tables, `factor` of the unit in a degree."""
+    given = size if image.size is None else (float(image.size[0]), float(image.size[1]))
+    if given is None:
+        raise MissingSizeError(
+            "does not say how large the image is", where=name, do="give it by --size NX NY"
+        )
+    cd, crpix = factor * image.cd, image.crpix
+
+    def positions(x: Float, y: Float) -> tuple[Float, Float]:
+        u, v = cd @ np.stack([x - crpix[0], y - crpix[1]])
+        return u, v
+
+    return fitted_map(
+        positions, name, order=1, size=given, reference_pixel=crpix, unit=unit, chip=image.number
+    )
+
+
+def _of_ours(file: CpdisFile, stored: Calibration, found: Calibration) -> Calibration:
+    """Stored calibration, after a check of the tables; what else these have is its own table."""
+    header = file.images[0].header
+    if header.get("BDTABLES", False) and stored.model.order == 1:
+        return replace(stored, before=found.before)
+    if header.get("BDTABLES", False):
+        return replace(stored, after=tuple(_rest(stored, found, t) for t in found.before))
+    for image in file.images:
+        x, y = detector_grid(stored.model.chips[stored.numbers.index(image.number)].size, 129)
+        far = found.forward(x, y, chip=image.number) - stored.forward(x, y, chip=image.number)
+        pixel = np.sqrt(abs(np.linalg.det(stored.chip(image.number).linear)))
+        off = float(np.hypot(*far.T).max() / pixel)
+        if not off <= 1.5 * float(image.header.get("BDWORST", 0.0)) + _SLACK:
+            raise FormatError(
+                f"its tables are off by {off:.2g} pixels from its parameters: one was changed",
+                where=image.where,
+                do="write the file again",
+            )
+    return stored
+
+
+def _rest(stored: Calibration, found: Calibration, table: LookupTable) -> LookupTable:
+    """Table of what the polynomial leaves at the nodes, in the unit of the plane."""
+    x, y = (v.ravel() for v in np.meshgrid(*table.nodes()))
+    rest = found.forward(x, y, chip=table.chip) - stored.forward(x, y, chip=table.chip)
+    return replace(table, values=rest.T.reshape(2, *table.shape))

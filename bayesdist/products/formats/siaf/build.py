@@ -1,0 +1,152 @@
+"""A SIAF table from a calibration, with its side file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.chip_map import ChipMap, Monomials
+from bayesdist.calibration.inverse import fit_inverse
+from bayesdist.model.basis import MAX_ORDER, polynomial_terms
+from bayesdist.products.formats.common.coefficients import require_regular
+from bayesdist.products.formats.common.content import Content
+from bayesdist.products.formats.common.document import BuildOptions
+from bayesdist.products.formats.common.record import at_date, record_of
+from bayesdist.products.formats.siaf.table import (
+    COLUMNS,
+    KEYWORDS,
+    NAMES,
+    SIDE,
+    SiafTable,
+    side_name,
+    table_of,
+)
+
+__all__ = ["SiafFiles", "siaf_files"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SiafFiles:
+    """Table and side file of one chip."""
+
+    name: str
+    text: str
+    table: SiafTable  # as read back
+    side_name: str
+    side_text: str
+    closure: float  # pixels
+
+
+def siaf_files(
+    calibration: Calibration,
+    chip: int,
+    aperture: str,
+    *,
+    order: int | None,
+    options: BuildOptions,
+    where: str,
+) -> SiafFiles:
+    """Table and side file of one chip, at one date.
+
+    (u, v) are taken as Ideal coordinates of the aperture.  Look-up tables are left out.  `order` is
+    that of the rows and with it of the inverse, by default that of the polynomial; errors as for
+    `at_date` and `fit_inverse`.
+    """
+    one = replace(
+        at_date(calibration, chip, options.epoch, options.scale_arcsec, where=where), before=()
+    )
+    tables = [t for t in calibration.before if t.chip == chip]
+    known = one.chip(chip, origin="stated")
+    poly = known.monomials()
+    require_regular(poly.linear, chip)
+    rows_order = min(max(order or 0, known.basis.order), MAX_ORDER)
+    columns = [*_forward(poly), *_inverse(known, rows_order)]
+    date = options.epoch if calibration.model.time is not None else None
+    name = f"siaf_distortion_{aperture}.txt".lower()
+    size, reference = known.basis.size, known.basis.reference_pixel
+    head = [
+        f"{aperture} distortion coefficients by bayesdist",
+        f"from {calibration.name}" + ("" if date is None else f", at {date:g}"),
+        *calibration.notes,
+        *(["Look-up tables are left out."] if tables else []),
+        f"The covariance of Sci2Idl is in {side_name(name)}.",
+        *(f"{k} = {v!r}" for k, v in zip(KEYWORDS, (*size, *reference), strict=True)),
+    ]
+    lines = _lines(aperture, rows_order, columns)
+    closure = table_of(Content("new table", _joined(head, lines))).closure()
+    assert closure is not None
+    head.append(f"Idl2Sci of Sci2Idl misses a pixel by {closure:.2g} pixels at worst.")
+    raw = _joined(head, lines)
+    record = record_of(one, calibration, epoch=date, closure=closure)
+    record["provenance"]["detector"] = aperture
+    side = {SIDE: 1, "table": name} | _covariance(poly) | {"bayesdist": record}
+    return SiafFiles(
+        name,
+        raw.decode("ascii"),
+        table_of(Content("new table", raw)),
+        side_name(name),
+        json.dumps(_listed(side), indent=1, allow_nan=False) + "\n",
+        closure,
+    )
+
+
+def _forward(poly: Monomials) -> list[dict[tuple[int, int], float]]:
+    return [dict(zip(poly.terms, c.tolist(), strict=True)) for c in poly.values]
+
+
+def _inverse(chip: ChipMap, order: int) -> list[dict[tuple[int, int], float]]:
+    """Terms of the way back by powers of the Ideal coordinates."""
+    sign = float(np.sign(np.linalg.det(chip.linear)))  # the fit wants axes that are not mirrored
+
+    def forward(x: Float, y: Float) -> tuple[Float, Float]:
+        u, v = chip.at(x, y)
+        return u, sign * v
+
+    reference, size = chip.basis.reference_pixel, chip.basis.size
+    out = []
+    for axis, terms in enumerate(fit_inverse(forward, reference, size, order)):
+        power = (1, 0) if axis == 0 else (0, 1)
+        whole = dict(terms) | {power: terms.get(power, 0.0) + 1.0}
+        out.append({(i, j): c * sign**j for (i, j), c in whole.items()})
+    return out
+
+
+def _lines(aperture: str, order: int, columns: Sequence[dict[tuple[int, int], float]]) -> list[str]:
+    width = max(len(aperture), len(COLUMNS[0]))
+    lines = [" , ".join([COLUMNS[0].rjust(width), *COLUMNS[1:4], *(n.rjust(24) for n in NAMES)])]
+    for i, j in polynomial_terms(order):
+        numbers = [f"{float(column.get((i, j), 0.0))!r:>24}" for column in columns]
+        cells = [aperture.rjust(width), f"{i + j}{j}".rjust(10), f"{i:>10}", f"{j:>10}"]
+        lines.append(" , ".join([*cells, *numbers]))
+    return lines
+
+
+def _joined(head: Sequence[str], lines: Sequence[str]) -> bytes:
+    plain = (f"# {line}" for text in head for line in text.splitlines())
+    return ("\n".join([*plain, "#", *lines]) + "\n").encode("ascii", "replace")
+
+
+def _covariance(poly: Monomials) -> dict[str, Any]:
+    """Coefficients of Sci2Idl with sigmas and covariance, u before v, under their SIAF names."""
+    names = [f"Sci2Idl{axis}{i + j}{j}" for axis in "XY" for i, j in poly.terms]
+    out: dict[str, Any] = {"names": names, "values": poly.values.ravel()}
+    if poly.cov is not None:
+        out["sigma"] = np.sqrt(np.maximum(np.diag(poly.cov), 0.0))
+        out["covariance"] = poly.cov
+    return out
+
+
+def _listed(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _listed(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_listed(one) for one in value]
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value

@@ -1,0 +1,323 @@
+"""A SIAF table of coefficients, the side file with its covariance, and the calibration of both.
+
+    AperName , siaf_index , exponent_x , exponent_y , Sci2IdlX , Sci2IdlY , Idl2SciX , Idl2SciY
+
+A row multiplies x^exponent_x y^exponent_y, pixels from (XSciRef, YSciRef) on the way to Ideal
+coordinates in arcsec, and those on the way back.  The table has neither a size nor a reference
+pixel: ours state them in comments.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.calibration.calibration import Calibration, calibration_of_maps
+from bayesdist.calibration.chip_map import fitted_map
+from bayesdist.calibration.inverse import ExplicitInverse, detector_grid
+from bayesdist.calibration.plane import Plane
+from bayesdist.errors import FormatError, InputError
+from bayesdist.model.basis import MAX_ORDER
+from bayesdist.products.formats.common.coefficients import Coefficients, evaluate
+from bayesdist.products.formats.common.content import Content, read_content
+from bayesdist.products.formats.common.document import Choice, MissingSizeError
+from bayesdist.products.formats.common.read_back import ReadBack
+from bayesdist.products.formats.common.record import calibration_from
+
+__all__ = [
+    "AGREEMENT",
+    "COLUMNS",
+    "KEYWORDS",
+    "NAMES",
+    "SIDE",
+    "Row",
+    "SiafTable",
+    "departure",
+    "holds_table",
+    "record_beside",
+    "siaf_calibration",
+    "side_name",
+    "table_of",
+]
+
+Float = NDArray[np.float64]
+
+NAMES = ("Sci2IdlX", "Sci2IdlY", "Idl2SciX", "Idl2SciY")
+COLUMNS = ("AperName", "siaf_index", "exponent_x", "exponent_y", *NAMES)
+KEYWORDS = ("XSciSize", "YSciSize", "XSciRef", "YSciRef")
+SIDE = "siaf_covariance"  # first key of a side file
+AGREEMENT = 1e-6  # pixels: as far as table and side file may differ
+_STATED = re.compile(r"#\s*(XSciSize|YSciSize|XSciRef|YSciRef)\s*=\s*(\S+)")
+# Columns and rows of the full apertures, by the beginning of their names.
+_SIZES = {
+    "NRC": (2048.0, 2048.0), "NIS": (2048.0, 2048.0), "FGS": (2048.0, 2048.0),
+    "MIRIM": (1032.0, 1024.0), "WFI": (4088.0, 4088.0),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Row:
+    """Line of a table."""
+
+    line: int
+    index: str  # siaf_index, as it stands
+    powers: tuple[int, int]
+    values: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class SiafTable:
+    """Parsed table, or a side file alone (which has no rows)."""
+
+    name: str
+    aperture: str
+    rows: tuple[Row, ...]
+    stated: Mapping[str, float]  # KEYWORDS
+    record: Mapping[str, Any] | None = None  # see `common.record`
+
+    @property
+    def order(self) -> int:
+        """Largest total power."""
+        return max(sum(row.powers) for row in self.rows)
+
+    @property
+    def size(self) -> tuple[float, float] | None:
+        """Columns and rows, as stated, else by the name of the aperture."""
+        if "XSciSize" in self.stated and "YSciSize" in self.stated:
+            return self.stated["XSciSize"], self.stated["YSciSize"]
+        return next((s for start, s in _SIZES.items() if self.aperture.startswith(start)), None)
+
+    def reference_pixel(self, size: tuple[float, float]) -> tuple[float, float]:
+        """XSciRef and YSciRef, by default the middle of the detector."""
+        x = self.stated.get("XSciRef", (size[0] + 1) / 2)
+        return x, self.stated.get("YSciRef", (size[1] + 1) / 2)
+
+    def terms(self, name: str) -> Coefficients:
+        """Coefficients of one of NAMES by powers of x and y; of equal rows the last one counts."""
+        k = NAMES.index(name)
+        return {row.powers: row.values[k] for row in self.rows}
+
+    def ideal(self, dx: Float, dy: Float) -> tuple[Float, Float]:
+        """Ideal coordinates (N,) in arcsec of offsets (N,) from the reference pixel."""
+        x, y = (evaluate(self.terms(name), dx, dy) for name in NAMES[:2])
+        return x, y
+
+    def pixels(self, x: Float, y: Float) -> tuple[Float, Float]:
+        """Offsets (N,) from the reference pixel of Ideal coordinates (N,)."""
+        dx, dy = (evaluate(self.terms(name), x, y) for name in NAMES[2:])
+        return dx, dy
+
+    @property
+    def inverse(self) -> ExplicitInverse | None:
+        """Idl2Sci as an inverse; None where its columns are zero."""
+        terms = [dict(self.terms(name)) for name in NAMES[2:]]
+        if self.size is None or not any(any(one.values()) for one in terms):
+            return None
+        for axis, power in enumerate(((1, 0), (0, 1))):
+            terms[axis][power] = terms[axis].get(power, 0.0) - 1.0
+        return ExplicitInverse(self.reference_pixel(self.size), terms[0], terms[1])
+
+    def closure(self) -> float | None:
+        """Largest distance of pixels from where Sci2Idl and Idl2Sci take them; None if unknown."""
+        size = self.size
+        if size is None or self.inverse is None:
+            return None
+        x, y = detector_grid(size)
+        x0, y0 = self.reference_pixel(size)
+        back = self.inverse.pixels(*self.ideal(x - x0, y - y0))
+        return float(np.hypot(back[0] - x, back[1] - y).max())
+
+
+# -- reading --------------------------------------------------------------------------------------
+
+
+def holds_table(content: Content) -> bool:
+    """True for a table of coefficients or a side file of one, right or wrong."""
+    return _is_side(content) or any(_is_header(line) for line in content.text.splitlines())
+
+
+def _is_side(content: Content) -> bool:
+    return content.text.lstrip().startswith("{") and f'"{SIDE}"' in content.text[:200]
+
+
+def _is_header(line: str) -> bool:
+    cells = [cell.strip() for cell in line.split(",")]
+    return cells[0] == "AperName" and "siaf_index" in cells
+
+
+def side_name(name: str) -> str:
+    """Name of the side file of a table."""
+    return f"{Path(name).stem}_covariance.json"
+
+
+def table_of(content: Content) -> SiafTable:
+    """Table of a file, with the record of the side file in its folder, where there is one.
+
+    FormatError for columns or values that are missing.
+    """
+    if _is_side(content):
+        record = _record_of_side(content)
+        return SiafTable(content.name, str(record["provenance"]["detector"]), (), {}, record)
+    lines = content.text.splitlines()
+    at = next(k for k, line in enumerate(lines) if _is_header(line))
+    names = [cell.strip() for cell in lines[at].split(",")]
+    missing = [column for column in COLUMNS if column not in names]
+    if missing:
+        raise FormatError(
+            f"the columns {', '.join(missing)} are missing",
+            where=content.name,
+            do="give a table of distortion coefficients",
+        )
+    rows, apertures = [], []
+    for number, line in enumerate(lines[at + 1 :], start=at + 2):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        cells = [cell.strip() for cell in line.split(",")]
+        where = f"{content.name}, line {number}"
+        if len(cells) != len(names):
+            raise FormatError(
+                f"has {len(cells)} values, and there are {len(names)} columns",
+                where=where,
+                do="fetch the file again",
+            )
+        found = dict(zip(names, cells, strict=True))
+        apertures.append(found["AperName"])
+        rows.append(_row(found, number, where))
+    if not rows:
+        raise FormatError("there are no rows", where=content.name, do="fetch the file again")
+    if len(set(apertures)) > 1:
+        raise FormatError(
+            f"holds the apertures {', '.join(dict.fromkeys(apertures))}",
+            where=content.name,
+            do="give a table of one aperture",
+        )
+    stated = {
+        m[1]: _number(m[2], f"{content.name}, {m[1]}")
+        for line in lines
+        if (m := _STATED.match(line))
+    }
+    table = SiafTable(content.name, apertures[0], tuple(rows), stated)
+    return replace(table, record=record_beside(content.name))
+
+
+def _row(cells: Mapping[str, str], number: int, where: str) -> Row:
+    i, j = (_number(cells[key], where) for key in COLUMNS[2:4])
+    values = [_number(cells[key], where) for key in NAMES]
+    if not (i.is_integer() and j.is_integer() and i >= 0 and j >= 0 and i + j <= MAX_ORDER):
+        raise FormatError(
+            f"the powers are {i:g} and {j:g}", where=where, do=f"give 0 to {MAX_ORDER} in all"
+        )
+    return Row(
+        number,
+        cells["siaf_index"].zfill(2),
+        (int(i), int(j)),
+        (values[0], values[1], values[2], values[3]),
+    )
+
+
+def _number(text: str, where: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise FormatError(f"{text!r} is no finite number", where=where, do="correct the value")
+    return value
+
+
+def record_beside(name: str) -> Mapping[str, Any] | None:
+    """Record of the side file in the folder of a table; None where there is none."""
+    path = Path(name).with_name(side_name(name))
+    return _record_of_side(read_content(path)) if path.is_file() else None
+
+
+def _record_of_side(content: Content) -> Mapping[str, Any]:
+    try:
+        record = json.loads(content.text)["bayesdist"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise FormatError(
+            f"is no side file of a SIAF table ({error})",
+            where=content.name,
+            do="fetch the file again",
+        ) from error
+    calibration_from(record, content.name)  # whole, or refused
+    return record
+
+
+# -- calibration ----------------------------------------------------------------------------------
+
+
+def departure(table: SiafTable, calibration: Calibration) -> float:
+    """Largest distance over the detector between a calibration and the table, in pixels."""
+    [chip] = calibration.model.chips
+    x, y = detector_grid(chip.size, 65)
+    x0, y0 = chip.reference_pixel
+    far = calibration.forward(x, y, chip=chip.number).T - np.stack(table.ideal(x - x0, y - y0))
+    return float(np.hypot(*far).max() / calibration.pixel()[0])
+
+
+def siaf_read_back(table: SiafTable) -> ReadBack:
+    """Ideal coordinates by a table that states its size, and where Sci2Idl and Idl2Sci lead."""
+    size = table.size
+    assert size is not None
+    x0, y0 = table.reference_pixel(size)
+
+    def forward(x: Float, y: Float, _: int, __: float | None) -> Float:
+        return np.stack(table.ideal(x - x0, y - y0), axis=-1)
+
+    def missed(x: Float, y: Float, _: int, __: float | None) -> Float:
+        dx, dy = table.pixels(*table.ideal(x - x0, y - y0))
+        return np.stack([dx + x0 - x, dy + y0 - y], axis=-1)
+
+    return ReadBack(table.name, forward, missed, own_axes=True)
+
+
+def siaf_calibration(table: SiafTable, choice: Choice) -> Calibration:
+    """Calibration in Ideal coordinates, with the covariance of the side file where both agree.
+
+    MissingSizeError for a table of an unknown aperture without a size.
+    """
+    notes: tuple[str, ...] = ()
+    inverse = table.inverse if table.rows else None
+    if table.record is not None:
+        found = calibration_from(table.record, table.name)
+        far = departure(table, found) if table.rows else 0.0
+        if far <= AGREEMENT:
+            inverses = {} if inverse is None else {found.numbers[0]: inverse}
+            return replace(found, inverses=inverses)
+        notes = (f"the side file is {far:.2g} px from the table: without its covariance",)
+    size = table.size or choice.size
+    if size is None:
+        raise MissingSizeError(
+            f"does not say how large the image is, and the aperture {table.aperture} is not known "
+            "here",
+            where=table.name,
+            do="compare it with a file that says",
+        )
+    if table.order < 1:
+        raise InputError("has no linear terms", where=table.name, do="check its rows")
+    x0, y0 = table.reference_pixel(size)
+    one = fitted_map(
+        lambda x, y: table.ideal(x - x0, y - y0),
+        table.name,
+        order=table.order,
+        size=size,
+        reference_pixel=(x0, y0),
+        unit="arcsec",
+    )
+    return calibration_of_maps(
+        {1: one},
+        table.name,
+        plane=Plane("aperture"),
+        detector=table.aperture,
+        numbered=False,
+        inverses={} if inverse is None else {1: inverse},
+        notes=notes,
+    )

@@ -1,0 +1,1 @@
+"""STDGDC: tables of every pixel, as hst1pass reads them."""

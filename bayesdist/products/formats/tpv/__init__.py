@@ -1,0 +1,1 @@
+"""TPV headers: polynomials of intermediate world coordinates, as SCAMP writes them."""

@@ -1,0 +1,163 @@
+"""Header of one chip with CTYPE TPV, and the headers that a file holds."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.errors import FormatError
+from bayesdist.products.formats.common.content import Content, read_content, readable
+from bayesdist.products.formats.sip.read import cd_matrix, image_size
+from bayesdist.products.formats.tpv.pv import KEYWORD, POWERS, RADIAL, pv_value
+
+__all__ = ["SIDE_FILE", "TpvFile", "TpvHead", "holds_tpv", "read_tpv", "tpv_of"]
+
+Float = NDArray[np.float64]
+
+SIDE_FILE = "BDPARAM"  # keyword with the name of the file that has the covariance
+_BEYOND_TAN = 5  # the m from which on wcslib and astropy.wcs take the PV of a TAN for those of TPV
+_CHIP = ("BDCHIP", "CCDNUM", "CCDCHIP", "EXTVER")
+
+
+@dataclass(frozen=True, eq=False)
+class TpvHead:
+    """World coordinates of one chip."""
+
+    number: int  # of the chip; by its place in the file where nothing says it
+    numbered: bool
+    ctype: tuple[str, str]
+    crpix: tuple[float, float]
+    crval: tuple[float, float]  # degrees
+    cd: Float  # (2, 2), degrees in a pixel
+    pv: tuple[Mapping[int, float], Mapping[int, float]]  # PV1_m and PV2_m by m
+    size: tuple[int, int] | None = None
+    header: fits.Header = field(default_factory=fits.Header)
+
+    @property
+    def order(self) -> int:
+        """Largest total power with a coefficient that is not zero, at least 1."""
+        found = [sum(POWERS[m]) for pv in self.pv for m, c in pv.items() if c and m in POWERS]
+        return max(1, *found) if found else 1
+
+    @property
+    def radial(self) -> bool:
+        """True where a power of r has a coefficient that is not zero."""
+        return any(pv.get(m, 0.0) for pv in self.pv for m in RADIAL)
+
+    def intermediate(self, x: ArrayLike, y: ArrayLike) -> Float:
+        """Intermediate coordinates (2, N) of pixels (N,), degrees."""
+        offset = np.stack([np.asarray(x, float), np.asarray(y, float)])
+        offset = offset - np.array(self.crpix)[:, None]
+        return np.asarray(self.cd @ offset)
+
+    def plane(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
+        """Positions xi, eta (N,) of pixels on the tangent plane of CRVAL, degrees."""
+        at = self.intermediate(x, y)
+        return pv_value(0, self.pv[0], *at), pv_value(1, self.pv[1], *at)
+
+
+@dataclass(frozen=True, eq=False)
+class TpvFile:
+    """Headers of a file, one for each chip, with what is beside it."""
+
+    content: Content
+    heads: tuple[TpvHead, ...]
+
+    @property
+    def side_file(self) -> str:
+        """Name of the file with the parameters; empty where none is named."""
+        return str(self.heads[0].header.get(SIDE_FILE, "")).strip()
+
+
+def read_tpv(path: str | os.PathLike[str]) -> TpvFile:
+    """Read the headers of a .head file or a FITS file; FormatError for one without TPV."""
+    found = tpv_of(read_content(path))
+    if found is None:
+        raise FormatError("has no TPV header", where=str(path), do="give one with CTYPE TPV")
+    return found
+
+
+def tpv_of(content: Content) -> TpvFile | None:
+    """TPV headers of a content; None where there is none."""
+    headers = [h for h in _headers(content) if holds_tpv(h)]
+    if not headers:
+        return None
+    heads = []
+    for place, header in enumerate(headers, start=1):
+        where = content.name if len(headers) == 1 else f"{content.name}, TPV header {place}"
+        with readable(where):
+            heads.append(_head(header, place, where))
+    numbers = [head.number for head in heads]
+    if len(set(numbers)) < len(numbers):
+        raise FormatError(
+            f"has several headers of chip {max(numbers, key=numbers.count)}",
+            where=content.name,
+            do="number the chips by BDCHIP or CCDNUM",
+        )
+    return TpvFile(content, tuple(heads))
+
+
+def holds_tpv(header: fits.Header) -> bool:
+    """True for a header whose celestial axes are TPV, or TAN with SCAMP's PV."""
+    types = [str(header.get(f"CTYPE{k}", "")) for k in (1, 2)]
+    if "A_ORDER" in header or "CPDIS1" in header or "CPDIS2" in header:
+        return False
+    if any(t.endswith("TPV") for t in types):
+        return True
+    numbers = [int(match[2]) for keyword in header if (match := KEYWORD.match(keyword))]
+    return all(t.endswith("-TAN") for t in types) and max(numbers, default=0) >= _BEYOND_TAN
+
+
+def _headers(content: Content) -> list[fits.Header]:
+    """Headers of a FITS file, or of a text file whose headers end with END each."""
+    lines = content.text.splitlines()
+    if content.is_fits or len(lines) < 2 or "CTYPE1" not in content.text:
+        return [hdu.header for hdu in content.hdus]
+    out, cards = [], list[str]()
+    for line in [*lines, "END"]:
+        if line.strip() != "END":
+            cards.append(line.encode("ascii", "replace").decode())  # of comments in Latin-1
+        elif any(cards):
+            with readable(content.name):
+                out.append(fits.Header.fromstring("\n".join(cards), sep="\n"))
+            cards = []
+    return out
+
+
+def _head(header: fits.Header, place: int, where: str) -> TpvHead:
+    pv: tuple[dict[int, float], dict[int, float]] = ({}, {})
+    for keyword in header:
+        if (match := KEYWORD.match(keyword)) is not None:
+            m = int(match[2])
+            if m not in POWERS and m not in RADIAL:
+                raise FormatError(
+                    "is of an order above 7, which TPV has not",
+                    where=f"{where}, keyword {keyword}",
+                    do="remove it, or lower the order",
+                )
+            pv[int(match[1]) - 1][m] = _number(header, keyword, where)
+    keyword = next((k for k in _CHIP if isinstance(header.get(k), int)), None)
+    return TpvHead(
+        number=place if keyword is None else int(header[keyword]),
+        numbered=keyword is not None,
+        ctype=(str(header["CTYPE1"]), str(header["CTYPE2"])),
+        crpix=(_number(header, "CRPIX1", where), _number(header, "CRPIX2", where)),
+        crval=(_number(header, "CRVAL1", where), _number(header, "CRVAL2", where)),
+        cd=cd_matrix(header, where),
+        pv=pv,
+        size=image_size(header),
+        header=header,
+    )
+
+
+def _number(header: fits.Header, keyword: str, where: str) -> float:
+    value = header.get(keyword)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        what = "is missing" if value is None else f"value {value!r} is no finite number"
+        raise FormatError(what, where=f"{where}, keyword {keyword}", do="correct the header")
+    return float(value)
