@@ -286,6 +286,10 @@ def siaf_calibration(table: SiafTable, choice: Choice) -> Calibration:
     """
     notes: tuple[str, ...] = ()
     inverse = table.inverse if table.rows else None
+    if inverse is not None:
+        # a calibration's inverse takes positions about that of the reference pixel
+        cx, cy = (float(at[0]) for at in table.ideal(np.zeros(1), np.zeros(1)))
+        inverse = replace(inverse, zero=(-cx, -cy))
     if table.record is not None:
         found = calibration_from(table.record, table.name)
         far = departure(table, found) if table.rows else 0.0
