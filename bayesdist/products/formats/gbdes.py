@@ -12,14 +12,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
-from bayesdist.data.tables.files import read_table
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import polynomial_terms
 from bayesdist.model.basis import MAX_ORDER, PolynomialBasis
@@ -31,6 +30,9 @@ from bayesdist.products.formats.common.document import (
     MissingSizeError,
     finding_lines,
 )
+
+if TYPE_CHECKING:
+    from astropy.table import Table  # slow to import, and needed for few files
 
 __all__ = ["FORMAT", "GbdesParameters"]
 
@@ -99,6 +101,8 @@ def _parse(content: Content) -> GbdesParameters | None:
     # of thousands of columns the names stand anywhere in the end of a Parquet file
     if content.path is None or not all(name.encode() in content.raw for name in _COLUMNS):
         return None
+    from bayesdist.data.tables.files import read_table  # slow to import
+
     table = read_table(content.path)
     if not set(_COLUMNS) <= set(table.colnames):
         return None

@@ -226,7 +226,7 @@ def test_other_commands(three_rolls, tmp_path):
     assert "total" in good("budget", run, "--at", 512, 512).out
     for arguments, word in (
         (("select-order", three_rolls.config), "is a self-calibration"),
-        (("monitor", run, run), "is a run"),
+        (("monitor", run, run), "is the released run itself"),
         (("monitor", run, run / "stars.ecsv"), "self-calibration"),
         (("wise", "bands", run, "-o", tmp_path / "bands"), "self-calibration"),
         (("plan", run), "has no requirements"),
