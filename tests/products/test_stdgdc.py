@@ -200,7 +200,7 @@ def _order(hdus):
 FAULTS = {
     "missing extension": (lambda h: h.pop(3), "MGC", "missing"),
     "missing inverse": (lambda h: (h.pop(5), h.pop(4)), "XCG", "missing"),
-    "order of extensions": (_order, "YGC, XGC, MGC, XCG, YCG", "by their place"),
+    "order of extensions": (_order, "YGC, XGC, MGC, XCG, YCG", "by their position"),
     "x and y exchanged": (_exchange, "XGC, YGC", "exchanged"),
     "parity": (lambda h: _scale(h, -1.0), "XGC", "parity"),
     "arcsec": (lambda h: _scale(h, 0.05), "XGC", "unit is the pixel"),
