@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +22,6 @@ from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import read_wise_meta
 from bayesdist.report.documentation import BASE
 from bayesdist.simulate import simulate_matches
-from tests.app.conftest import sketched  # noqa: F401  (its figures are not looked at here)
 from tests.app.support import (
     REPOSITORY,
     SIZE,
@@ -35,6 +35,7 @@ from tests.app.support import (
     truth_of,
     write_job,
 )
+from tests.sketches import sketched
 
 PAIRS = 20_000
 BINS = 9
@@ -65,6 +66,13 @@ class Compared:
 
     def table(self, name: str) -> Table:
         return Table.read(self.output / f"table_{name}.ecsv")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_reports(full):
+    """Figures of reports are not drawn, unless run in full."""
+    with nullcontext() if full else sketched():
+        yield
 
 
 @pytest.fixture(scope="module")
