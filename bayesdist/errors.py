@@ -14,6 +14,7 @@ __all__ = [
     "DegenerateError",
     "FormatError",
     "InputError",
+    "MemoryLimitError",
     "NotConvergedError",
     "NotSettledError",
     "RenamedError",
@@ -90,6 +91,10 @@ class FormatError(InputError):
 
 class DegenerateError(InputError):
     """The data do not determine the parameters that are asked for."""
+
+
+class MemoryLimitError(InputError):
+    """A computation that needs more memory than there is."""
 
 
 class NotSettledError(InputError):
