@@ -22,6 +22,7 @@ from bayesdist.infer.linear import Rejection
 from bayesdist.infer.nodes import corrected_matches, inside_chips, pixel_shifts
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import outline_pixels
+from bayesdist.reading.tables import read_ecsv
 from bayesdist.report.campaign import (
     CampaignResults,
     CatalogStars,
@@ -51,7 +52,7 @@ def campaign_results(results: Results) -> CampaignResults:
         Of a run that has been assessed.
     """
     run, config, fitted = results.run, results.config, results.fitted
-    matched, matching = results.matched, Table.read(run / "matching.ecsv")
+    matched, matching = results.matched, read_ecsv(run / "matching.ecsv")
     inputs: Inputs = results.inputs
     return CampaignResults(
         summary=dict(run.summary),
@@ -220,7 +221,7 @@ def _series(run: RunDirectory, model: DistortionModel, matching: Table) -> Linea
     time = model.time
     if time is None or "time_dependence" not in run.summary:
         return None
-    exposures = Table.read(run / "series.ecsv")
+    exposures = read_ecsv(run / "series.ecsv")
     place = {str(name): k for k, name in enumerate(matching["exposure"])}
     order = [place[str(name)] for name in exposures["exposure"]]
     vafactor, pa_v3 = (
@@ -229,7 +230,7 @@ def _series(run: RunDirectory, model: DistortionModel, matching: Table) -> Linea
     )
     return LinearSeries(
         exposures=exposures,
-        drift=Table.read(run / "drift.ecsv"),
+        drift=read_ecsv(run / "drift.ecsv"),
         vafactor=vafactor,
         pa_v3=pa_v3,
         breaks=tuple(time.breaks),
