@@ -153,18 +153,19 @@ def deviation_columns(
     counts: Float,
     *,
     exposures: bool = True,
+    most: int = MAX_EXPOSURES,
 ) -> DeviationColumns | None:
     """Deviations that the frames of a model do not fit, and curvatures of its drift.
 
     `counts` (G,) is the number of stars of each group.  Single exposures deviate only if
     `exposures`; not where a hierarchy of them has been fitted.  None where nothing can deviate:
-    without a drift for a single exposure, and for very many, whose scatter averages out.
+    without a drift for a single exposure, and for more than `most`, whose scatter averages out.
     """
     keys = np.column_stack([groups.exposure, groups.epoch])
     distinct, of_group = np.unique(keys, axis=0, return_inverse=True)
     n_exposures = len(distinct)
     kinds = tuple(k for k, fitted in KINDS.items() if model.frames not in fitted)
-    if n_exposures < 2 or n_exposures > MAX_EXPOSURES or not exposures:
+    if n_exposures < 2 or n_exposures > most or not exposures:
         kinds = ()
     per_exposure = [SCATTERS[k] for k in kinds for _ in LINEAR.get(k, "uv")]
     terms = _bending(model)
