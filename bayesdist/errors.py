@@ -114,8 +114,8 @@ class RenamedError(BayesdistError):
     exit_code = 2
 
 
-def required(value: T | None, cause: str, *, do: str = "") -> T:
+def required(value: T | None, cause: str) -> T:
     """The value, if there is one; InputError, with this cause, if there is none."""
     if value is None:
-        raise InputError(cause, do=do)
+        raise InputError(cause)
     return value
