@@ -198,5 +198,7 @@ def with_mas(value: float, unit: str, scale_mas: float | None, digits: int = 3) 
 
 
 def size_of(value: float, unit: str = "pix", digits: int = 3) -> str:
-    """Length in the unit that needs few zeros."""
+    """Length in the unit that needs few zeros; pixels as other numbers, since they have one unit."""
+    if unit == "pix":
+        return with_mas(value, unit, None, digits)
     return display_scale(unit, value).text(value, digits)

@@ -76,7 +76,7 @@ def _magnitude_table(r: ReportInput) -> TextTable:
     e = needed(r.magnitude_errors)
     scale = display_scale(r.unit, np.concatenate([e.sigma_u, e.sigma_v]))
     rows = tuple(
-        (f"{mag:.2f}", count(n), number(su * scale.factor), number(sv * scale.factor))
+        (f"{mag:.2f}".replace("-", "−"), count(n), number(su * scale.factor), number(sv * scale.factor))
         for mag, n, su, sv in zip(e.mag, e.n, e.sigma_u, e.sigma_v, strict=True)
     )
     return TextTable(

@@ -111,7 +111,8 @@ def verdict(r: ReportInput) -> Verdict:
         if names:
             clauses.append((level, _rows_clause(names, verb)))
     if r.warnings:
-        clauses.append(("warn", "read the warnings"))
+        n = len(r.warnings)
+        clauses.append(("warn", "one warning below" if n == 1 else f"{n} warnings below"))
     clauses.append((worst(groups.get("Validity", ())), validity_clause(r)))
     # the kind of solution first, then what is worst
     clauses.sort(key=lambda one: (one[1] == _UNSAMPLED, LEVELS.index(one[0])), reverse=True)
