@@ -19,8 +19,8 @@ __all__ = ["plan_patterns"]
 
 LEGEND = (
     "reach: largest distance of two pointings, pix; free: directions that detections leave free; "
-    "the rest is errors of positions over the detector, per axis, 1 sigma, pix (CE68 is 1.51 times, "
-    "CE95 2.45 times as large where both axes are alike); gauge-free: without the free directions; "
+    "the rest is errors of positions over the detector, per axis, 1 sigma, pix (CE68 is 1.51 and "
+    "CE95 2.45 times that where both axes are alike); gauge-free: without the free directions; "
     "shape: without shift, rotation and scale, by which patterns are sorted; absolute: without the "
     "zero point alone; -: nothing bounds it"
 )

@@ -124,7 +124,7 @@ class PlannedPattern:
     maps: dict[str, tuple[UncertaintyMap, ...] | None]
 
     def per_axis(self, kind: str) -> Float:
-        """Errors per axis (1 sigma) at all points of the grid, pixels; infinite where unbounded."""
+        """Errors per axis (1 sigma) at all points of the grid, pixels; infinite if unbounded."""
         maps = self.maps[kind]
         if maps is None:
             return np.array([np.inf])
@@ -172,7 +172,8 @@ class PlannedPattern:
                     fraction * variance[model.coefficient_slice(chip.number, axis)] * mean_square
                 )
         return {
-            int(k): float(np.sqrt(of_term[degree == k].sum() / 2)) for k in range(1, model.order + 1)
+            int(k): float(np.sqrt(of_term[degree == k].sum() / 2))
+            for k in range(1, model.order + 1)
         }
 
     @cached_property

@@ -11,8 +11,8 @@ from bayesdist.app.commands.options import chip_of
 from bayesdist.app.results import open_results
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.assess.circular import circular_error, per_axis
 from bayesdist.assess.budget.budget import TOTAL, ErrorBudget, place_budget
+from bayesdist.assess.circular import circular_error, per_axis
 from bayesdist.assess.terms.forms import PRODUCT
 
 __all__ = ["budget_at"]
@@ -79,7 +79,7 @@ def _text(found: ErrorBudget, at: tuple[float, float], scale_mas: float | None) 
             rows.append(row | {"source": t.source})
         lines += [place, table_text(rows), ""]
     lines += [
-        "1 sigma; per axis: rms of u and v; CE68, CE95: circles that hold 68 and 95 % of such errors",
+        "1 sigma; per axis: rms of u and v; CE68, CE95: radii that hold 68 and 95 % of such errors",
         "terms of the model are correlated and enter the total jointly",
     ]
     if any(t.kind == PRODUCT for t in found.every):

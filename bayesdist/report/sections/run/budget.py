@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 
 from bayesdist.assess.circular import circular_error, per_axis
 from bayesdist.assess.terms.forms import PRODUCT
-from bayesdist.numbers import MISSING, display_scale, percent, size_of, with_mas
+from bayesdist.numbers import MISSING, display_scale, percent, with_mas
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.fields import Grid, scalar_map
@@ -68,13 +68,14 @@ def budget_table(r: ReportInput) -> TextTable:
     unit, mas = budget.unit, r.scale_mas
     names = {str(c.chip.number): c.chip.name for c in r.chips} | {"all": "all"}
     rows = budget.rows_by_chip() if r.several else budget.rows()
+    typical = _per_axis(budget.rows()[-1])
     out = [
         (
             str(row["name"]),
             *((names[str(row["chip"])],) if r.several else ()),
             str(row["kind"]),
             AS_ABOVE if str(row.get("chip", "all")) != "all" else str(row["source"]) or MISSING,
-            *(r.marked(text) for text in _sizes(row, mas, unit)),
+            *(r.marked(text) for text in _sizes(row, mas, unit, typical)),
             _known_to(row),
         )
         for row in rows
@@ -97,15 +98,15 @@ def budget_table(r: ReportInput) -> TextTable:
     )
 
 
-def _sizes(row: Mapping[str, Any], mas: float | None, unit: str) -> tuple[str, ...]:
+def _sizes(row: Mapping[str, Any], mas: float | None, unit: str, typical: float) -> tuple[str, ...]:
     """Errors of u, of v, per axis (in mas as well), CE68 and CE95, of the rms over the detector."""
     u, v = float(row["u"]), float(row["v"])
     circles = (float(circular_error(u, v, 0.0, p)) for p in (0.68, 0.95))
     return (
-        size_of(u, unit),
-        size_of(v, unit),
-        with_mas(_per_axis(row), unit, mas),
-        *(size_of(radius, unit) for radius in circles),
+        with_mas(u, unit, None, like=typical),
+        with_mas(v, unit, None, like=typical),
+        with_mas(_per_axis(row), unit, mas, like=typical),
+        *(with_mas(radius, unit, None, like=typical) for radius in circles),
     )
 
 
