@@ -18,6 +18,7 @@ __all__ = [
     "display_scale",
     "interval",
     "ladder",
+    "length_scale",
     "number",
     "percent",
     "probability",
@@ -179,6 +180,11 @@ def ladder(unit: str) -> tuple[tuple[float, str], ...]:
     return _LADDERS.get(unit, ((1.0, unit),))
 
 
+def length_scale(unit: str, like: float) -> Scale:
+    """Unit of lengths in tables and sentences: pixels, or the angle that one needs."""
+    return Scale(1.0, "pix") if unit == "pix" else display_scale(unit, like)
+
+
 def with_mas(
     value: float,
     unit: str,
@@ -195,11 +201,9 @@ def with_mas(
     if not np.isfinite(value):
         return MISSING
     like = value if like is None else like
-    if unit != "pix":
-        angle = display_scale(unit, like)
-        return f"{number(value * angle.factor, digits)}\u202f{angle.unit}"
-    text = f"{number(value, digits)}\u202fpix"
-    if scale_mas is None:
+    scale = length_scale(unit, like)
+    text = f"{number(value * scale.factor, digits)}\u202f{scale.unit}"
+    if unit != "pix" or scale_mas is None:
         return text
     return f"{text} ({with_mas(value * scale_mas, 'mas', None, digits, like=like * scale_mas)})"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,12 +39,12 @@ def selfcal_tables(r: ReportInput) -> tuple[TextTable, ...]:
 def _gauge(found: SelfcalResults) -> TextTable:
     rows = [
         (
-            str(row["name"]).replace("_", " "),
+            _property(str(row["name"])),
             str(row["state"]),
             _sigma(row["sigma_detections"], row["unit"]),
             _sigma(row["sigma_fixed"], row["unit"]),
             _edge(row["sigma_fixed"], row["edge_pix"]),
-            str(row["fixed_by"]) or MISSING,
+            MISSING if np.ma.is_masked(row["fixed_by"]) else str(row["fixed_by"]) or MISSING,
         )
         for row in found.gauge
     ]
@@ -63,6 +64,11 @@ def _gauge(found: SelfcalResults) -> TextTable:
         note=f"{found.words} Relative positions do not depend on any of it: their errors are in"
         " the maps of that name.",
     )
+
+
+def _property(name: str) -> str:
+    """Name of a direction as words; those of coefficients stay as they are."""
+    return name if re.search(r"_\d", name) else name.replace("_", " ")
 
 
 def _sigma(value: Any, unit: Any) -> str:
@@ -86,7 +92,7 @@ def _detections(found: SelfcalResults) -> TextTable:
             **{reason[0].upper() + reason[1:]: count(n) for reason, n in d["unused"].items()},
             "Detections used": count(d["used"]),
             "Stars": count(s["n_stars"]),
-            "Detections of a star, median and most": f"{number(s['per_star']['median'])}, "
+            "Detections of a star, median and most": f"{s['per_star']['median']:g}, "
             f"{count(s['per_star']['most'])}",
             "Ambiguous groups": count(s["n_ambiguous"]),
             "Rounds of grouping and solving": count(s["iterations"]),
