@@ -33,6 +33,7 @@ CORE = {
     "apply": f"{COMMANDS}.calibrations:apply",
     "convert": f"{COMMANDS}.calibrations:convert",
     "release": f"{COMMANDS}.calibrations:release",
+    "docs": f"{COMMANDS}.documentation:docs",
 }
 RENAMED = {
     **{name: f"stage {name}" for name in ("match", "fit", "sample", "assess", "export")},

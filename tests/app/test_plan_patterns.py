@@ -84,7 +84,8 @@ def test_files_say_the_same_as_the_screen(job):
     assert last["lacks"][1] == "no offsets: the polynomials are free"
     shape = record["patterns"][0]["shape"]
     assert printed.splitlines()[-1] == (
-        f"Best: listed, shape known to {shape['rms']:.2g} pix rms, {shape['max']:.2g} at worst "
+        f"Best: listed, shape known per axis to {shape['rms']:.2g} pix rms, "
+        f"{shape['max']:.2g} at worst "
         f"({50 * shape['rms']:.2g} and {50 * shape['max']:.2g} mas)"
     )
     line = next(text for text in printed.splitlines() if text.startswith("not moved"))
