@@ -79,7 +79,7 @@ class _Root(LazyGroup):
 
     def invoke(self, ctx: click.Context) -> int:
         # here, as click ends with codes of its own on an interrupt and a closed pipe
-        return _exit_code(lambda: super(_Root, self).invoke(ctx), ctx.obj or self.name)
+        return _exit_code(lambda: super(_Root, self).invoke(ctx), str(ctx.obj or "bayesdist"))
 
 
 bayesdist = click.version_option(__version__, message="bayesdist %(version)s")(
