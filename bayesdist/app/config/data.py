@@ -24,7 +24,7 @@ from bayesdist.app.config.fit import ComputeBlock, Fit, HoldoutBlock, Outliers, 
 from bayesdist.app.config.model import MatchedModel, PriorBlock, TablesBlock
 from bayesdist.app.config.products import MatchedProducts
 from bayesdist.app.config.run import RunConfig
-from bayesdist.app.config.section import Section, Unit
+from bayesdist.app.config.section import Epoch, RightAscensionDeclination, Section, Unit
 from bayesdist.data import FORMATS
 from bayesdist.data.reading.formats import mission_formats
 from bayesdist.data.tables.units import length_advice
@@ -44,9 +44,9 @@ class Data(Section):
     unit: Unit | None = None
     sigma: Literal["columns", "by_magnitude"] | PositiveFloat = "columns"
     pixel_origin: Literal[0, 1] | None = None
-    tangent_point: tuple[float, float] | None = None
-    epoch: float | str | None = None
-    catalogue_epoch: float | None = None
+    tangent_point: RightAscensionDeclination | None = None
+    epoch: Epoch | str | None = None
+    catalogue_epoch: Epoch | None = None
     not_finite: Literal["refuse", "reject"] = "refuse"
     simulated: bool = False
 
@@ -167,6 +167,14 @@ class MatchesConfig(RunConfig):
         """
         fit = self.fit.model_copy(update={"radial_weight": 1.0})
         return super().of_order(order).model_copy(update={"prior": [], "fit": fit})
+
+    @model_validator(mode="after")
+    def _one_prior_each(self) -> MatchesConfig:
+        names = [one.parameter for one in self.prior]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"two [[prior]] blocks are of {twice!r}; give each parameter one")
+        return self
 
     @model_validator(mode="after")
     def _one_array(self) -> MatchesConfig:
