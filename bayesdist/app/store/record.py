@@ -153,6 +153,12 @@ class Record:
             do="use that version, or choose another folder",
         )
 
+    @property
+    def file_names(self) -> set[str]:
+        """Files that stages have written, or may have."""
+        found = {name for one in self.artefacts.values() for name in one.files}
+        return found.union((self.under_way or {}).get("files", ()))
+
     def begins_file(self, name: str) -> bool:
         """Note that the stage under way writes a file; False where that is known."""
         if self.under_way is None or name in self.under_way["files"]:
