@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import click
 
 from bayesdist.app.commands.groups import LazyGroup
+from bayesdist.app.screen import open_streams
 from bayesdist.errors import BayesdistError, RenamedError
 from bayesdist.mission import load_mission, mission_names, missions
 from bayesdist.version import __version__
@@ -106,6 +107,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 good; 1 bad input; 2 usage; 3 not converged under --strict; 4 requirement missed; 130
         interrupted.
     """
+    open_streams()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     line = shlex.join(["bayesdist", *arguments])
     return _exit_code(
