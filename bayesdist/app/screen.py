@@ -32,8 +32,8 @@ def open_streams() -> None:
         except OSError:
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # it gets the lowest number
         if getattr(sys, name) is None:
-            empty = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115  while it runs
-            setattr(sys, name, empty)
+            stream = os.fdopen(number_of, mode, encoding="utf-8", closefd=False)
+            setattr(sys, name, stream)
 
 
 def start_logging(verbosity: int = 0) -> None:

@@ -168,7 +168,7 @@ def test_a_full_stdout_is_an_error_and_no_traceback(usual):
         pytest.skip("there is no /dev/full")
     with Path("/dev/full").open("w") as full:
         done = started("budget", usual, "--at", 10, 10, stdout=full)
-    assert done.returncode == 1
+    assert done.returncode == 74
     assert done.stderr.startswith("bayesdist: ") and "No space left on device" in done.stderr
     assert len(done.stderr.splitlines()) == 1
 

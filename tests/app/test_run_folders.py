@@ -128,7 +128,7 @@ def test_a_record_that_names_files_elsewhere_is_refused(project, finished, tmp_p
     name = name.format(absolute=outside)
     record = json.loads((run / "run.json").read_text())
     if where == "artefact":
-        record["artefacts"]["evaluate"]["files"][name] = {"size": 8, "sha256": "0"}
+        record["artefacts"]["evaluate"]["files"][name] = {"size": 8, "sha256": 64 * "0"}
     else:
         record["under_way"] = {"stage": "evaluate", "files": [name]}
     (run / "run.json").write_text(json.dumps(record), encoding="utf-8")

@@ -16,6 +16,8 @@ from pathlib import Path
 
 from numba import config
 
+from bayesdist.reading.regular import read_bytes
+
 __all__ = ["kept_by_content"]
 
 log = logging.getLogger("bayesdist")
@@ -43,7 +45,7 @@ def _folder() -> Path:
     here = Path(__file__).parent
     digest = hashlib.sha256()
     for source in sorted(here.glob("*.py")):
-        digest.update(source.read_bytes())
+        digest.update(read_bytes(source))
     name = digest.hexdigest()[:16]
     for folder in (here / "__pycache__", *_user_cache()):
         if _is_writable(folder / name):
