@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import click
 
 from bayesdist.app.commands.groups import LazyGroup
+from bayesdist.app.screen import open_streams
 from bayesdist.errors import BayesdistError, RenamedError
 from bayesdist.mission import load_mission, mission_names, missions
 from bayesdist.version import __version__
@@ -109,6 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nested too deep; 70 a defect; 71 too little memory; 74 refused by the system; 130
         interrupted.
     """
+    open_streams()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     line = shlex.join(["bayesdist", *arguments])
     return _exit_code(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -13,10 +14,26 @@ from typing import Any
 
 from bayesdist.errors import InputError
 
-__all__ = ["log_file", "number", "progress_bar", "start_logging", "table_text"]
+__all__ = ["log_file", "number", "open_streams", "progress_bar", "start_logging", "table_text"]
 
 log = logging.getLogger("bayesdist")
 FORMAT = "%(asctime)s %(levelname)-7s %(message)s"
+
+
+def open_streams() -> None:
+    """Give a process that was started without standard streams empty ones.
+
+    The files that it opens would get their numbers, and what a library writes to stderr would end
+    in one of them.
+    """
+    for number_of, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        try:
+            os.fstat(number_of)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # it gets the lowest number
+        if getattr(sys, name) is None:
+            stream = os.fdopen(number_of, mode, encoding="utf-8", closefd=False)
+            setattr(sys, name, stream)
 
 
 def start_logging(verbosity: int = 0) -> None:
@@ -57,8 +74,9 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
     """A progress bar on stderr, silent where stderr is no terminal."""
     from tqdm import tqdm
 
+    is_terminal = sys.stderr is not None and sys.stderr.isatty()
     with tqdm(
-        desc=label, unit="step", disable=not sys.stderr.isatty(), leave=False, file=sys.stderr
+        desc=label, unit="step", disable=not is_terminal, leave=False, file=sys.stderr
     ) as bar:
 
         def update(made: int, most: int) -> None:

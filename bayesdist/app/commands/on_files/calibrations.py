@@ -13,7 +13,7 @@ from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.calibration.subarray import Subarray, subarray_at_corner, subarrays_of_image
 from bayesdist.errors import InputError
-from bayesdist.infer import load_fit, load_posterior
+from bayesdist.infer import LinearFit, load_fit, load_posterior
 from bayesdist.infer.solution import Solution
 from bayesdist.products.formats.common.content import read_hdus
 from bayesdist.products.registry import read_calibration
@@ -75,12 +75,19 @@ def solution_at(path: Path) -> Solution | None:
     if path.is_dir():
         if (path / "posterior.nc").exists() or not (path / "fit.nc").exists():
             return _as_assessed(path)
-        return load_fit(path / "fit.nc")
+        return _fit_at(path / "fit.nc")
     if path.suffix != ".nc":
         return None
     if path.name == "fit.nc":
-        return load_fit(path)
+        return _fit_at(path)
     return _as_assessed(path.parent) if path.name == "posterior.nc" else load_posterior(path)
+
+
+def _fit_at(path: Path) -> LinearFit:
+    """The fit of a file, which is as it was written where it is that of a run."""
+    if (path.parent / "run.json").exists():
+        RunDirectory(path.parent).refuse_damaged("fit")
+    return load_fit(path)
 
 
 def _as_assessed(folder: Path) -> Solution:

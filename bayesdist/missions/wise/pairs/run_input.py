@@ -46,7 +46,7 @@ class RvbInput:
         band's.
         """
         data, size = self._settings
-        path = self.run.config.named_files(Path(self.run.facts["base"]))
+        path = self.run.config.named_files(self.run.base)
         options = _options(data, size)
         if not is_large(path):
             return load_rvb(path, data, size)
