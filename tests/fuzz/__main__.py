@@ -30,14 +30,16 @@ def main() -> int:
         cases = kept()
         if not given.kept:
             cases += drawn(known, given.cases, given.seed)
-        verdicts = tried(known, cases)
-    failed = [v for v in verdicts if v.failed]
+        verdicts, failed = [], []
+        for verdict in tried(known, cases):
+            verdicts.append(verdict)
+            if verdict.failed:
+                failed.append(verdict)
+                print(verdict.told, file=sys.stderr, flush=True)
     used = [sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     table = table_of(verdicts)
     print(table, "", table_of(verdicts, lambda v: MUTATIONS[v.case.mutation].kind), sep="\n")
     print(f"\n{used[0]:.0f} s of processor time here, {used[1]:.0f} s in {len(verdicts)} cases")
-    for one in failed:
-        print(one.told)
     if given.failed:
         Path(given.failed).write_text("".join(f"{v.case.line}\n" for v in failed), "utf-8")
     if given.json:

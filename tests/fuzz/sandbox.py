@@ -14,7 +14,7 @@ import signal
 import tempfile
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -60,12 +60,13 @@ def _ring(*_: object) -> None:
     raise _Overdue
 
 
-def answers(pairs: Sequence[tuple[Input, Case, str]]) -> list[Answer]:
-    """Answers of commands to inputs, which are damaged by a case where there is one."""
-    found: list[Answer] = []
-    while len(found) < len(pairs):
-        found += _batch(pairs[len(found) : len(found) + BATCH])
-    return found
+def answers(pairs: Sequence[tuple[Input, Case, str]]) -> Iterator[Answer]:
+    """Answers of commands to inputs that are damaged by a case, as they come."""
+    n = 0
+    while n < len(pairs):
+        some = _batch(pairs[n : n + BATCH])
+        yield from some
+        n += len(some)
 
 
 def _batch(pairs: Sequence[tuple[Input, Case, str]]) -> list[Answer]:
@@ -115,6 +116,7 @@ def _child(pairs: Sequence[tuple[Input, Case, str]], folder: Path, pipe: int) ->
         signal.signal(signal.SIGALRM, _ring)
         for stream in (0, 1, 2):
             os.dup2(os.open(os.devnull, os.O_RDWR), stream)
+        os.chdir(folder)
         with sketched():
             for k, (one, case, command) in enumerate(pairs):
                 answer = _answer(one, case, command, folder / str(k))
@@ -146,6 +148,9 @@ def _answer(one: Input, case: Case | None, command: str, copy: Path) -> Answer:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
     seconds = time.process_time() - begun
+    for path in Path().glob("bayesdist-error-*.txt"):  # a defect, of which the screen says less
+        err.write("\n".join(path.read_text("utf-8").splitlines()[-16:]))
+        path.unlink()
     texts = [out.getvalue(), *(_text(copy / name) for name in one.outputs)]
     said, wrong = ("\n".join(texts), err.getvalue())
     found = [TIMES.sub("", text.replace(str(copy), HERE)) for text in (said, wrong)]
@@ -176,7 +181,11 @@ def plain_answers(asked: Sequence[tuple[Input, str]]) -> list[Answer]:
     """
     known: dict[tuple[Path, tuple[str, ...]], Answer] = {}
     out = []
-    with tempfile.TemporaryDirectory(prefix="bayesdist-fuzz-") as folder, sketched():
+    with (
+        tempfile.TemporaryDirectory(prefix="bayesdist-fuzz-") as folder,
+        contextlib.chdir(folder),
+        sketched(),
+    ):
         for one, command in asked:
             key = one.folder, (*one.commands[command],)
             if key not in known:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
+from bayesdist.app.failures import DEFECT, NO_MEMORY, NO_SYSTEM, TOO_DEEP
 from tests.fuzz.cases import Case
 from tests.fuzz.inputs import Input
 from tests.fuzz.mutation import HARMLESS, KNOWABLE, MUTATIONS, OPEN
@@ -14,6 +15,7 @@ from tests.fuzz.sandbox import Answer, answers, plain_answers
 
 GOOD = ("refused", "warned", "equal", "other")
 BAD = ("unclear", "traceback", "hang", "memory", "silent")
+REFUSED = (1, 2, 3, NO_SYSTEM)
 TITLES = {
     "refused": "refused with a sentence",
     "warned": "warned",
@@ -25,7 +27,6 @@ TITLES = {
     "memory": "memory",
     "silent": "changed number without a warning",
 }
-DEFECT = 70  # exit code
 # of exceptions that were meant for programmers
 PYTHON = re.compile(
     r"Traceback|NoneType|object has no|not subscriptable|not iterable|index out of|out of bounds"
@@ -63,7 +64,7 @@ class Verdict:
         return f"{self.became}: {self.case.line}\n    " + "\n    ".join(last)
 
 
-def tried(inputs: Sequence[Input], cases: Iterable[Case]) -> list[Verdict]:
+def tried(inputs: Sequence[Input], cases: Iterable[Case]) -> Iterator[Verdict]:
     """Verdicts of cases; each command's answer to the file as it was is found first."""
     known = {one.name: one for one in inputs}
     cases = [c for c in cases if c.input in known and c.command in known[c.input].commands]
@@ -71,22 +72,20 @@ def tried(inputs: Sequence[Input], cases: Iterable[Case]) -> list[Verdict]:
     plain = plain_answers([(known[name], command) for name, command in asked])
     before = dict(zip(asked, plain, strict=True))
     after = answers([(known[c.input], c, c.command) for c in cases])
-    return [
-        Verdict(c, known[c.input].kind, became(c, before[c.input, c.command], a), a)
-        for c, a in zip(cases, after, strict=True)
-    ]
+    for c, a in zip(cases, after, strict=True):
+        yield Verdict(c, known[c.input].kind, became(c, before[c.input, c.command], a), a)
 
 
 def became(case: Case, before: Answer, after: Answer) -> str:
     """Key of TITLES."""
     if after.end in ("hang", "memory"):
         return after.end
-    if NO_ROOM.search(after.err):
+    if after.code == NO_MEMORY or NO_ROOM.search(after.err):
         return "memory"
-    if after.end != "returned" or after.code == DEFECT:
+    if after.end != "returned" or after.code in (DEFECT, TOO_DEEP):
         return "traceback"
-    if after.code in (1, 2, 3):
-        return "refused" if after.code != 1 or is_sentence(after.err) else "unclear"
+    if after.code in REFUSED:
+        return "refused" if after.code == 2 or is_sentence(after.err) else "unclear"
     if (after.code, after.out) == (before.code, before.out):
         return "equal"
     if _warnings(after) - _warnings(before):
