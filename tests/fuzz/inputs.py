@@ -8,16 +8,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from astropy.table import Table
 
+from bayesdist.missions.wise.simulate.bringup import simulate_unpaired
 from bayesdist.products import registry
+from bayesdist.products.formats.lookup.d2im import write_d2im
 from tests.app import layouts
-from tests.app.rvb_jobs import rvb_job, rvb_pairs
+from tests.app.rvb_jobs import rvb_job, rvb_pairs, write_rvb_table
 from tests.app.selfcal.support import commanded, list_table, small, write_selfcal
 from tests.app.support import as_table, good, simulated, write_config, write_job
 from tests.app.test_plan_patterns import SMALL
 from tests.data.test_hst1pass import LIST
 from tests.fuzz.settings import CAMPAIGN, MATCHED, REQUIREMENTS
-from tests.products.test_formats import SETTINGS, calibration_for
+from tests.missions.wise.test_bringup import write_lists
+from tests.products.test_ast import gbdes_table
+from tests.products.test_formats import OPTIONS, SETTINGS, calibration_for
+from tests.products.test_lookup_files import table as lookup_table
 from tests.sketches import sketched
 
 HERE = "@"  # the copy of the folder, in the arguments of a command
@@ -79,7 +85,9 @@ def inputs(folder: Path) -> list[Input]:
             *_stars(folder / "stars", run),
             *_star_lists(folder / "lists"),
             *_settings(folder / "settings", run),
+            *_of_wise(folder / "wise"),
             *_products(folder / "products"),
+            *_foreign_products(folder / "foreign"),
             *_of_run(run, folder),
         ]
     names = [one.name for one in found]
@@ -157,6 +165,27 @@ def _star_lists(folder: Path) -> Iterator[Input]:
         yield Input(f"selfcal-{name}", "star lists", here, name, CHECK)
 
 
+def _of_wise(folder: Path) -> Iterator[Input]:
+    """Solutions of frames beside their pairs, and lists that nobody has paired."""
+    here = folder / "solutions"
+    pairs = rvb_pairs(150)
+    frames = sorted(set(pairs["frame"]))
+    shifts = {name: np.full(len(frames), 1e-3) for name in ("shift_u", "shift_v", "rotation")}
+    for name, file in (("from", {"frame": frames} | shifts), ("to", {"frame": frames} | shifts)):
+        write_rvb_table(Table(file), here / f"{name}.tbl")
+    write_rvb_table(pairs, here / "pairs.parquet")
+    line = ["wise", "rvb", "rereference", "@/pairs.parquet", "--from", "@/from.tbl", "--to",
+            "@/to.tbl", "-o", "@/out", "--band", "W4"]  # fmt: skip
+    yield Input("solutions.tbl", "star lists", here, "from.tbl", {"rereference": line})
+    here = folder / "unpaired"
+    here.mkdir()
+    write_lists(simulate_unpaired(2, rng=np.random.default_rng(8), density=2e-4), here)
+    line = ["wise", "bring-up", "@/detections.ecsv", "@/reference.ecsv", "-o", "@/out", "--band",
+            "W2", "--optical", "@/optical.hdr", "--order", "2"]  # fmt: skip
+    for name in ("detections.ecsv", "optical.hdr"):
+        yield Input(f"bring-up-{name}", "star lists", here, name, {"bring-up": line})
+
+
 # -- configurations -------------------------------------------------------------------------------
 
 
@@ -194,7 +223,7 @@ def _products(folder: Path) -> Iterator[Input]:
         here = folder / key
         here.mkdir(parents=True)
         made = registry.product_settings()[key](**settings)
-        files = registry.build(key, calibration_for(key), made, _options())
+        files = registry.build(key, calibration_for(key), made, OPTIONS)
         for one in files:
             (here / one.file_name).write_bytes(one.content)
         main = files[-1].file_name
@@ -217,10 +246,28 @@ def _products(folder: Path) -> Iterator[Input]:
             yield Input(f"{key}-{one.file_name}", "products", here, one.file_name, commands)
 
 
-def _options():
-    from tests.products.test_formats import OPTIONS
-
-    return OPTIONS
+def _foreign_products(folder: Path) -> Iterator[Input]:
+    """Parameters of gbdes, which we read and do not write, and a table of D2IM."""
+    folder.mkdir()
+    parameters, *_ = gbdes_table()
+    for name in ("gbdes.parquet", "gbdes.ecsv"):
+        here = folder / name.replace(".", "-")
+        (here / "whole").mkdir(parents=True)
+        for path in (here / name, here / "whole" / name):
+            parameters.write(path)
+        size = ["--size", "4000", "4072"]
+        commands = {
+            "inspect": ["inspect", f"@/{name}"],
+            "compare": ["compare", f"@/{name}", f"@/whole/{name}", *size, "--grid", "9", "9"],
+            "convert": ["convert", f"@/{name}", "--to", "tpv", "-o", "@/converted", *size],
+        }
+        yield Input(name, "products", here, name, commands)
+    here = folder / "d2im"
+    here.mkdir()
+    given = [lookup_table(chip, np.random.default_rng(chip), shape=(6, 8)) for chip in (1, 2)]
+    write_d2im(given, here / "a_d2i.fits")
+    inspect = {"inspect": ["inspect", "@/a_d2i.fits"]}
+    yield Input("a_d2i.fits", "products", here, "a_d2i.fits", inspect)
 
 
 # -- a run ----------------------------------------------------------------------------------------
