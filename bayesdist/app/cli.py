@@ -80,7 +80,7 @@ class _Root(LazyGroup):
 
     def invoke(self, ctx: click.Context) -> int:
         # here, as click ends with codes of its own on an interrupt and a closed pipe
-        return _exit_code(lambda: super(_Root, self).invoke(ctx), ctx.obj or self.name)
+        return _exit_code(lambda: super(_Root, self).invoke(ctx), ctx.obj or "bayesdist")
 
 
 bayesdist = click.version_option(__version__, message="bayesdist %(version)s")(
@@ -121,6 +121,8 @@ def _exit_code(call: Callable[[], int | None], command: str) -> int:
     """Exit code of a call whose errors are said in one sentence."""
     try:
         return call() or 0
+    except click.exceptions.Exit as end:  # after help was shown
+        return end.exit_code
     except click.ClickException as error:
         error.show(file=sys.stderr)
         return error.exit_code
@@ -128,7 +130,7 @@ def _exit_code(call: Callable[[], int | None], command: str) -> int:
         sentence = " ".join(str(error).split())  # libraries below break their reasons into lines
         print(f"bayesdist: {sentence}", file=sys.stderr)
         return error.exit_code
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, click.Abort):
         print("bayesdist: interrupted; resume with --resume", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of a pipe had enough
