@@ -330,4 +330,5 @@ class RunDirectory(RunStore):
 def _hashes(config: Config, base: Path) -> dict[str, str]:
     """SHA-256 of every file that the configuration names, by its absolute path."""
     named, others = config.named_files(base.resolve()), config.files_of_products(base.resolve())
+    others += config.files_of_priors(base.resolve())
     return {str(f): sha256_of(f) for f in [*input_files(named), *others]}
