@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field
 
 from bayesdist.calibration.calibration import Calibration
@@ -20,6 +21,7 @@ from bayesdist.products.formats.common.document import (
 )
 from bayesdist.products.formats.common.read_back import ReadBack
 from bayesdist.products.formats.sip.calibration import sip_calibration
+from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
 from bayesdist.products.formats.sip.lint import lint_sip
 from bayesdist.products.formats.sip.read import holds_sip, sip_of
 from bayesdist.products.formats.sip.write import sip_text
@@ -33,6 +35,7 @@ class Settings(FormatSettings):
 
     inverse_order: Annotated[int, Field(ge=2, le=9)] | None = None
     linear: Literal["cd", "sip"] = "cd"
+    axes: Literal["sky", "linear"] = "sky"
     crval: tuple[float, float] | None = None
 
 
@@ -80,7 +83,33 @@ def _build(
         )
         name = f"sip_{number}.hdr" if len(calibration.numbers) > 1 else "sip.hdr"
         summary = {"closure_pix": sip.closure, "a_dmax": sip.a_dmax, "b_dmax": sip.b_dmax}
-        out.append(Built(name, "SIP", sip_text(sip).encode("ascii"), sip, number, summary))
+        text = sip_text(sip).encode("ascii")
+        out.append(Built(name, "SIP", text, sip, number, summary, _warnings(sip, calibration)))
+    return tuple(out)
+
+
+def _warnings(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
+    """Warnings on what programs will make of a header that the solution does not say."""
+    out = []
+    if not sip.linear_axes and calibration.plane.point is None:
+        placed = "CRVAL is a placeholder" if sip.crval == (0.0, 0.0) else "CRVAL is as it was given"
+        mirrored = (
+            ", which makes the image a mirror of the sky" if np.linalg.det(sip.cd) > 0 else ""
+        )
+        other = ", or axes = 'linear'" if calibration.unit == "pix" else ""
+        out.append(
+            f"{placed}, and u is taken for east and v for north{mirrored}: set "
+            f"products.sip.crval{other}"
+        )
+    low = {k: c for terms in (sip.a, sip.b) for k, c in terms.items() if sum(k) < 2 and c}
+    if low:
+        out.append(
+            "A and B hold constant or linear terms, which astropy applies and stwcs and gwcs drop: "
+            "set products.sip.linear = 'cd' for those"
+            if any(sum(k) == 1 for k in low)
+            else "A_0_0 and B_0_0 hold what CRVAL leaves, which astropy applies and stwcs and gwcs "
+            "drop"
+        )
     return tuple(out)
 
 
@@ -95,4 +124,5 @@ FORMAT = Format(
     Settings,
     _build,
     _read_back,
+    highest_order=SIP_ORDERS[1],
 )

@@ -69,6 +69,12 @@ def lint_sip(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Findi
 def _frame(sip: SipHeader) -> Iterator[Finding]:
     if np.linalg.det(sip.cd) == 0:
         yield Finding("error", "CD", "the matrix is singular: no pixel has a position on the sky")
+    elif sip.linear_axes:
+        yield Finding(
+            "note", "CTYPE", "positions are u, v in a frame of pixels, and not the sky; astropy "
+            "applies A and B, and remarks that CTYPE does not end in -SIP",
+        )  # fmt: skip
+        return
     elif np.linalg.det(sip.cd) > 0:
         yield Finding(
             "note",

@@ -45,6 +45,8 @@ def sip_positions(
         plane = tangent_plane(*sky_of_header(sip_header(sip), x, y), tangent_point)
         return np.stack(plane, axis=-1) / ARCSEC[unit]
     stated = like or sip
+    if stated.linear_axes:
+        return np.stack(sip.forward(x, y), axis=-1) @ stated.cd.T + stated.crval
     in_unit = 3600.0 / (ARCSEC[unit] if unit != "pix" else scale_arcsec or 1.0)
     offset = stated.offset or (0.0, 0.0)
     return np.stack(sip.forward(x, y), axis=-1) @ (in_unit * stated.cd).T + offset
