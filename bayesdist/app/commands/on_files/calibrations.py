@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from bayesdist.app.products.made_files import further_errors
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.calibration.calibration import Calibration, calibration_of
-from bayesdist.calibration.plane import ARCSEC
+from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.calibration.subarray import Subarray, subarray_at_corner, subarrays_of_image
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior
@@ -18,7 +21,7 @@ from bayesdist.infer.solution import Solution
 from bayesdist.products.formats.common.content import read_hdus
 from bayesdist.products.registry import read_calibration
 
-__all__ = ["calibration_at", "images_of", "notes_of", "solution_at"]
+__all__ = ["calibration_at", "images_of", "notes_of", "on_the_sky", "solution_at"]
 
 
 def calibration_at(
@@ -59,6 +62,7 @@ def calibration_at(
         found = read_calibration(path, filter=filter, size=size)
     else:
         found = calibration_of(solution, str(path), scale=_scale_of_run(path, solution))
+        found = replace(found, further=further_errors(_summary_of(path).get("budget", ())))
     if scale is None:
         return found
     if not (np.isfinite(scale) and scale > 0):
@@ -89,6 +93,24 @@ def _as_assessed(folder: Path) -> Solution:
         return load_posterior(folder)
     with open_results(RunDirectory(folder)) as results:
         return results.solution
+
+
+def on_the_sky(path: Path, found: Calibration) -> Calibration:
+    """Calibration of a run about the point where its stars touch the sky, where they do."""
+    point = _summary_of(path).get("data", {}).get("tangent_point")
+    if point is None or found.plane.kind != "free":
+        return found
+    return replace(found, plane=Plane("sky", point=(float(point[0]), float(point[1]))))
+
+
+def _summary_of(path: Path) -> dict[str, Any]:
+    """Summary of the run that a file or folder is of; empty where it is of none."""
+    home = path if path.is_dir() else path.parent
+    summary = home / "summary.json"
+    if not (home / "run.json").exists() or not summary.exists():
+        return {}
+    found: dict[str, Any] = json.loads(summary.read_text(encoding="utf-8"))
+    return found
 
 
 def _scale_of_run(path: Path, solution: Solution) -> tuple[float, str] | None:
