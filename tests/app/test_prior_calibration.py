@@ -19,6 +19,7 @@ from .support import as_table
 SIZE = (1000.0, 800.0)
 CHIP = bd.Chip(1, "chip 1", SIZE, (500.5, 400.5))
 SIGMA = 0.01
+CHANGE = 0.05
 
 
 def model_of(order=3, unit="pix", **what):
@@ -101,7 +102,7 @@ def test_intervals_cover_as_they_say():
     rng, model = np.random.default_rng(3), model_of(3)
     held = model_of(4)
     x, y = rng.uniform(1, 1000, 50), rng.uniform(1, 800, 50)
-    pulls, wider = [], []
+    pulls, wider, changed = [], [], []
     for _ in range(150):
         theta = truth_of(model, rng)
         turn, shift = np.exp(1j * rng.uniform(0, 2 * np.pi)), complex(*rng.normal(size=2))
@@ -118,12 +119,22 @@ def test_intervals_cover_as_they_say():
         found = fitted(more, held, prior.loose())
         off = found.mean - _padded(turned(theta, model, 1.0, shift), model, held)
         wider.append(_pulls(held, off, found.cov, x, y))
-    for pull in (np.array(pulls), np.array(wider)):
+        # another filter, whose distortion has changed by as much as is said
+        prior = earlier(fitted(first, model), model, change_pix=CHANGE)
+        other = theta + CHANGE * _even(model) * rng.normal(size=model.n_params)
+        found = fitted(stars_of(model, other, 10, rng), model, prior.loose())
+        changed.append(_pulls(model, found.mean - other, found.cov, x, y))
+    for pull in (np.array(pulls), np.array(wider), np.array(changed)):
         # mean over positions of one truth: these are independent of each other
         for level, sigmas in ((0.6827, 1.0), (0.9545, 2.0)):
             covered = (np.abs(pull) < sigmas).mean(axis=1)
             error = covered.std(ddof=1) / np.sqrt(len(covered))
             assert abs(covered.mean() - level) < 4 * error
+
+
+def _even(model):
+    """Standard deviations of coefficients that have one rms each, and together one on each axis."""
+    return np.tile(1 / np.sqrt(model.n_terms * model.basis().mean_squares), 2)
 
 
 def _pulls(model, off, cov, x, y):

@@ -10,10 +10,19 @@ from astropy.io import fits
 from astropy.wcs import WCS, FITSFixedWarning
 
 import bayesdist as bd
-from bayesdist.calibration.calibration import calibration_of
+from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of
+from bayesdist.calibration.further import FurtherError
+from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
-from bayesdist.products.formats.common.document import BuildOptions
-from bayesdist.products.registry import build, lint, product_settings, read_back, read_calibration
+from bayesdist.products.formats.common.document import BuildOptions, Choice
+from bayesdist.products.registry import (
+    build,
+    lint,
+    open_document,
+    product_settings,
+    read_back,
+    read_calibration,
+)
 
 
 @pytest.fixture(scope="module")
@@ -83,3 +92,33 @@ def test_constant_and_linear_terms_are_warned_of(tmp_path):
 def test_axes_of_the_sky_are_not_linear(fit, tmp_path):
     with pytest.raises(InputError, match="leave axes out"):
         made(fit, tmp_path, axes="linear", crval=(1.0, 2.0))
+
+
+def test_parameters_beside_a_header_have_the_covariance(fit, tmp_path):
+    """Read together they are the solution; apart the sigmas, with a note; changed an error."""
+    chip = bd.Chip(1, "camera", (900.0, 700.0), (450.5, 350.5))
+    model = bd.DistortionModel(3, (chip,), "arcsec")
+    further = (FurtherError("structure", "local", 0.002, 0.001),)
+    mean = 0.25 * fit.mean
+    mean[[0, model.n_terms]] = 20.0, -10.0
+    solution = GaussianSolution(model, mean, 0.0625 * fit.cov)
+    calibration = Calibration("run", solution, Plane("sky", point=(30.0, 60.0)), further=further)
+    files = build("sip", calibration, product_settings()["sip"](parameters=True), BuildOptions())
+    for one in files:
+        (tmp_path / one.file_name).write_bytes(one.content)
+    assert [one.file_name for one in files] == ["sip_parameters.fits", "sip.hdr"]
+    found = read_calibration(tmp_path / "sip.hdr")
+    np.testing.assert_array_equal(found.solution.cov, solution.cov)
+    assert found.errors == "covariance" and found.further == further
+    used = open_document(tmp_path / "sip.hdr").calibration(Choice(as_used=True))
+    assert used.errors == "sigma"
+    text = (tmp_path / "sip.hdr").read_text()
+    card = next(line for line in text.splitlines() if line.startswith("CD1_1"))
+    value = float(card[10:].split("/")[0])
+    (tmp_path / "sip.hdr").write_text(text.replace(card, f"CD1_1   = {value * (1 + 1e-5):.15E}"))
+    with pytest.raises(InputError, match="one of the two was changed"):
+        read_calibration(tmp_path / "sip.hdr")
+    (tmp_path / "sip.hdr").write_text(text)
+    (tmp_path / "sip_parameters.fits").unlink()
+    found = read_calibration(tmp_path / "sip.hdr")
+    assert found.errors == "sigma" and "which is not here" in found.notes[-1]

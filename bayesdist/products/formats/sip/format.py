@@ -23,6 +23,11 @@ from bayesdist.products.formats.common.read_back import ReadBack
 from bayesdist.products.formats.sip.calibration import sip_calibration
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
 from bayesdist.products.formats.sip.lint import lint_sip
+from bayesdist.products.formats.sip.parameters import (
+    side_file,
+    with_covariance,
+    with_side_file,
+)
 from bayesdist.products.formats.sip.read import holds_sip, sip_of
 from bayesdist.products.formats.sip.write import sip_text
 from bayesdist.products.formats.wcs.format import describe as describe_wcs
@@ -37,6 +42,7 @@ class Settings(FormatSettings):
     linear: Literal["cd", "sip"] = "cd"
     axes: Literal["sky", "linear"] = "sky"
     crval: tuple[float, float] | None = None
+    parameters: bool = False  # whether a file with the covariance is written beside
 
 
 def _parse(content: Content) -> Content | None:
@@ -51,7 +57,8 @@ def _calibration(content: Content, name: str, choice: Choice) -> Calibration:
     sip = sip_of(content)
     stated = [k for k in ("D2IMDIS1", "D2IMDIS2", "CPDIS1", "CPDIS2") if k in header_of(sip.cards)]
     notes = (f"without the look-up tables of {', '.join(stated)}",) if stated else ()
-    return sip_calibration(sip, name, size=choice.size, notes=notes)
+    found = sip_calibration(sip, name, size=choice.size, notes=notes)
+    return found if choice.as_used else with_covariance(found, sip, content)
 
 
 def _read_back(
@@ -79,9 +86,13 @@ def _build(
             epoch=options.epoch,
             scale_arcsec=options.scale_arcsec,
             notes=notes,
-            **settings.model_dump(),
+            **settings.model_dump(exclude={"parameters"}),
         )
         name = f"sip_{number}.hdr" if len(calibration.numbers) > 1 else "sip.hdr"
+        if settings.parameters:
+            beside = side_file(calibration, number, options.epoch, name)
+            sip = with_side_file(sip, beside.file_name)
+            out.append(beside)
         summary = {"closure_pix": sip.closure, "a_dmax": sip.a_dmax, "b_dmax": sip.b_dmax}
         text = sip_text(sip).encode("ascii")
         out.append(Built(name, "SIP", text, sip, number, summary, _warnings(sip, calibration)))
