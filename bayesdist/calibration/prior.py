@@ -151,7 +151,8 @@ class CalibrationPrior:
                 f"its {self.draws:.0f} effective draws are too few for the covariance of {n} "
                 "parameters",
                 where=self.name,
-                do=f"sample it to sampler.target_ess = {FEWEST_DRAWS * n:.0f}, or name its fit.nc",
+                do=f"sample it to a sampler.target_ess of {FEWEST_DRAWS * n:.0f}, or name the file "
+                "of its least-squares fit",
             )
         return (self.draws - n - 2) / (self.draws - 1)
 
