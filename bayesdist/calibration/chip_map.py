@@ -101,6 +101,10 @@ class ChipMap:
                 out[:, rows] += _shift(table, px, py)
         return out
 
+    def design(self, x: Float, y: Float) -> Float:
+        """Basis functions (N, K) at pixels (N,), tables before the polynomial included."""
+        return self.basis.evaluate(*self._corrected(x, y))
+
     def slope(self, x: ArrayLike, y: ArrayLike) -> Float:
         """Derivatives d(u, v) / d(x, y) at pixels (N,), shape (N, 2, 2)."""
         x, y = np.atleast_1d(np.asarray(x, float)), np.atleast_1d(np.asarray(y, float))

@@ -17,6 +17,11 @@ log = logging.getLogger("bayesdist")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?|nan|inf", re.IGNORECASE)
 MARKS = {"ascii.csv": ",", "ascii.tab": "\t"}
 ROWS_ABOVE, FEWEST_ABOVE = 20, 3  # that the last cell is held against
+_DAOPHOT = "DAOPHOT"  # the program's own lists, not the tables of IRAF's version
+_DAOPHOT_COLUMNS = {
+    9: ("id", "x", "y", "mag", "mag_err", "sky", "iterations", "chi", "sharp"),  # ALLSTAR
+    7: ("id", "x", "y", "mag", "sharp", "round", "round_marginal"),  # FIND
+}
 _SEXTRACTOR = re.compile(r"#\s*1\s+[A-Z]\w*")
 
 
@@ -34,6 +39,8 @@ def _kind(lines: Sequence[str]) -> str | None:
         return "ascii.ecsv"
     if first.startswith(("#K ", "#N ")):
         return "ascii.daophot"
+    if first.split()[:3] == ["NL", "NX", "NY"]:
+        return _DAOPHOT
     if _SEXTRACTOR.match(first):
         return "ascii.sextractor"
     comments = [line.strip() for line in lines if line.strip().startswith("#")]
@@ -54,8 +61,9 @@ def _kind(lines: Sequence[str]) -> str | None:
 def parse_text_table(lines: Sequence[str], *, where: str) -> Table:
     """Table of lines of text, with their ends; a row of an IPAC table that is cut short is refused.
 
-    Known are an IPAC table, the ASCII_HEAD catalogue of SExtractor, a table of IRAF's daophot, and
-    columns under a line of names, with "#" before it or not, separated by blanks, commas or tabs.
+    Known are an IPAC table, the ASCII_HEAD catalogue of SExtractor, a table of IRAF's daophot, a
+    list of DAOPHOT II or ALLSTAR, and columns under a line of names, with "#" before it or not,
+    separated by blanks, commas or tabs.
     """
     ended = not lines or lines[-1].endswith(("\n", "\r"))
     whole, lines = lines, [line.rstrip("\r\n") for line in lines]
@@ -67,6 +75,8 @@ def parse_text_table(lines: Sequence[str], *, where: str) -> Table:
             do="write one above the numbers",
         )
     options: dict[str, object] = {}
+    if kind == _DAOPHOT:
+        return _daophot_list(lines, where)
     if kind == "ascii.ipac":
         _refuse_short_rows(lines, where, ended=ended)
     else:
@@ -103,6 +113,27 @@ def refuse_cut_end(lines: Sequence[str], mark: str | None, *, where: str) -> Non
             do="the table may be truncated: fetch or write it again",
         )
     log.warning("%s: its last line has no end, so that the file may be truncated", where)
+
+
+def _daophot_list(lines: Sequence[str], where: str) -> Table:
+    """List of DAOPHOT II or ALLSTAR, three lines above the stars; one row for each star."""
+    if len(lines) < 2 or lines[1].split()[:1] == ["2"]:
+        raise FormatError(
+            "is a list of aperture photometry, with several lines for each star",
+            where=where,
+            do="give the list of ALLSTAR (.als) or of FIND (.coo)",
+        )
+    rows = [line.split() for line in lines[3:] if line.strip()]
+    names = _DAOPHOT_COLUMNS.get(len(rows[0]) if rows else 0, ("id", "x", "y", "mag"))
+    for number, row in enumerate(rows, start=1):
+        if len(row) < len(names) or len(row) != len(rows[0]):
+            raise FormatError(
+                f"has {len(row)} numbers, and the first row {len(rows[0])}",
+                where=f"{where}, row {number}",
+                do="the list may be truncated: fetch or write it again",
+            )
+    cut = [" ".join(row[: len(names)]) for row in rows]
+    return Table.read([" ".join(names), *cut], format="ascii.basic", guess=False)
 
 
 def _refuse_short_rows(lines: Sequence[str], where: str, *, ended: bool) -> None:

@@ -62,6 +62,7 @@ class CampaignConfig(RunConfig):
     selfcal: ClassVar[None] = None
     periods: ClassVar[None] = None
     prior: ClassVar[tuple[PriorBlock, ...]] = ()
+    prior_calibration: ClassVar[None] = None
 
     campaign: CampaignBlock
     tables: TablesBlock = TablesBlock()

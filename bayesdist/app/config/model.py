@@ -9,12 +9,14 @@ from pydantic import Field, PositiveFloat
 from bayesdist.app.config.detector import Pair
 from bayesdist.app.config.section import Epoch, Section
 from bayesdist.model import FRAME_KINDS, TimeDependence
+from bayesdist.model.basis import MAX_ORDER
 
 __all__ = [
     "CampaignModel",
     "MatchedModel",
     "Polynomials",
     "PriorBlock",
+    "PriorCalibrationBlock",
     "SelfcalModel",
     "TablesBlock",
 ]
@@ -48,7 +50,7 @@ class CampaignTdd(_Drift):
 class Polynomials(Section):
     """Order of the polynomials, and where they are centred."""
 
-    order: Annotated[int, Field(ge=1, le=9)]
+    order: Annotated[int, Field(ge=1, le=MAX_ORDER)]
     reference_pixel: Pair | None = None
 
 
@@ -81,6 +83,18 @@ class PriorBlock(Section):
     parameter: str
     mean: float
     sigma: PositiveFloat
+
+
+class PriorCalibrationBlock(Section):
+    """An earlier calibration of the detector, which is the prior of this one."""
+
+    source: str
+    frame: Literal["none", "shift", "shift_rotation", "shift_rotation_scale", "affine"] | None = (
+        None
+    )
+    filter: str | None = None
+    epoch: float | None = None
+    change_pix: Annotated[float, Field(ge=0)] = 0.0
 
 
 class TablesBlock(Section):

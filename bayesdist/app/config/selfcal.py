@@ -119,6 +119,7 @@ class SelfcalConfig(RunConfig):
     compute: ClassVar[ComputeBlock] = ComputeBlock()
     periods: ClassVar[None] = None
     holdout: ClassVar[None] = None
+    prior_calibration: ClassVar[None] = None
 
     selfcal: SelfcalBlock
     gauge: GaugeBlock = GaugeBlock()

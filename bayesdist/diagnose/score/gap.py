@@ -134,7 +134,7 @@ def _drifts(projection: Projection, chip: int, way: int) -> bool:
         return False
     first = model.tdd_slice(model.chips[chip].number).start
     first += model.time.terms.index(term) * model.time.n_values
-    return bool(projection.precision[first] == 0)
+    return bool(projection.precision[first, first] == 0)
 
 
 def visit_codes(epoch: Float) -> Int:

@@ -43,7 +43,7 @@ matches = {matches}
 {not_finite}
 {detector}
 [model]
-order = {order}                       # 1 to 9
+order = {order}                       # 1 to 12
 {reference}# of each exposure: none | shift | shift_rotation | shift_rotation_scale | affine
 frames = "{frames}"
 # [model.tdd]                   # terms that drift with time: axis, power of x, power of y

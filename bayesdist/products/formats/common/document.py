@@ -138,6 +138,7 @@ class Built:
     made: Any  # source of the content, in the terms of its format
     chip: int | None = None  # of a file of one chip
     summary: Mapping[str, Any] = field(default_factory=dict)  # further entries of summary.json
+    warnings: tuple[str, ...] = ()  # on what programs will make of it, for the terminal
 
 
 @dataclass(frozen=True)

@@ -75,6 +75,12 @@ def _frame(sip: SipHeader) -> Iterator[Finding]:
         yield Finding("error", "CRPIX1, CRPIX2", f"{sip.crpix[0]:g}, {sip.crpix[1]:g} is no pixel")
     if np.linalg.det(sip.cd) == 0:
         yield Finding("error", "CD", "the matrix is singular: no pixel has a position on the sky")
+    elif sip.linear_axes:
+        yield Finding(
+            "note", "CTYPE", "positions are u, v in a frame of pixels, and not the sky; astropy "
+            "applies A and B, and remarks that CTYPE does not end in -SIP",
+        )  # fmt: skip
+        return
     elif np.linalg.det(sip.cd) > 0:
         yield Finding(
             "note",
