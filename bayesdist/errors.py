@@ -6,6 +6,7 @@ one sentence and exits with its code.  Any other exception is a defect of the pr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypeVar
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "NotConvergedError",
     "NotSettledError",
     "RenamedError",
+    "require_known",
     "required",
 ]
 
@@ -113,3 +115,29 @@ def required(value: T | None, cause: str) -> T:
     if value is None:
         raise InputError(cause)
     return value
+
+
+def require_known(name: str, known: Sequence[str], what: str, *, where: str = "") -> None:
+    """Pass a known name.
+
+    Parameters
+    ----------
+    name : str
+    known : sequence of str
+    what : str
+        What the name stands for, as in ``"statistic"``.
+    where : str, optional
+        Where it was given.
+
+    Raises
+    ------
+    InputError
+        For an unknown name; it names the nearest known one, or all of them where none is near.
+    """
+    if name in known:
+        return
+    from difflib import get_close_matches  # which takes longer to load than all else here
+
+    near = get_close_matches(str(name).lower(), known, n=1, cutoff=0.5)
+    do = f"use {near[0]!r} if that is meant" if near else f"choose one of {', '.join(known)}"
+    raise InputError(f"unknown {what} {name!r}", where=where, do=do)
