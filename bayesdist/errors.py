@@ -1,7 +1,8 @@
 """One family of errors: what is wrong, where, and what to do next.
 
 Everything that a user can put right is raised as a `BayesdistError`; the command line prints its
-one sentence and exits with its code.  Any other exception is a defect of the program.
+one sentence and exits with its code.  Any other exception is a defect of the program, and the
+command line says so (`bayesdist.app.failures`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ __all__ = [
     "DegenerateError",
     "FormatError",
     "InputError",
+    "MemoryLimitError",
     "NotConvergedError",
     "NotSettledError",
     "RenamedError",
@@ -92,6 +94,10 @@ class FormatError(InputError):
 
 class DegenerateError(InputError):
     """The data do not determine the parameters that are asked for."""
+
+
+class MemoryLimitError(InputError):
+    """A computation that needs more memory than there is."""
 
 
 class NotSettledError(InputError):

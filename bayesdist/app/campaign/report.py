@@ -22,6 +22,7 @@ from bayesdist.infer.linear import Rejection
 from bayesdist.infer.nodes import corrected_matches, inside_chips, pixel_shifts
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import outline_pixels
+from bayesdist.reading.tables import read_ecsv
 from bayesdist.report.campaign import (
     CampaignResults,
     CatalogStars,
@@ -63,7 +64,7 @@ def campaign_results(
         Of stars in several exposures.
     """
     model, fitted, matched = posterior.model, data.fitted, data.matched
-    matching = Table.read(run / "matching.ecsv")
+    matching = read_ecsv(run / "matching.ecsv")
     return CampaignResults(
         summary=dict(run.summary),
         config=as_json(run.config.model_dump(exclude_none=True)),
@@ -231,7 +232,7 @@ def _series(run: RunDirectory, model: DistortionModel, matching: Table) -> Linea
     time = model.time
     if time is None or "time_dependence" not in run.summary:
         return None
-    exposures = Table.read(run / "series.ecsv")
+    exposures = read_ecsv(run / "series.ecsv")
     place = {str(name): k for k, name in enumerate(matching["exposure"])}
     order = [place[str(name)] for name in exposures["exposure"]]
     vafactor, pa_v3 = (
@@ -240,7 +241,7 @@ def _series(run: RunDirectory, model: DistortionModel, matching: Table) -> Linea
     )
     return LinearSeries(
         exposures=exposures,
-        drift=Table.read(run / "drift.ecsv"),
+        drift=read_ecsv(run / "drift.ecsv"),
         vafactor=vafactor,
         pa_v3=pa_v3,
         breaks=tuple(time.breaks),

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from astropy.table import Table
 
 from bayesdist.app.kinds.fitted import Fitted, required
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer import Posterior
 from bayesdist.model.grid import outline_pixels
+from bayesdist.reading.tables import read_ecsv
 from bayesdist.report.context import SelfcalResults
 
 __all__ = ["selfcal_results"]
@@ -41,9 +41,9 @@ def selfcal_results(
     names = model.names
     return SelfcalResults(
         words=solved.gauge_words,
-        gauge=Table.read(run / "gauge.ecsv"),
-        matching=Table.read(run / "matching.ecsv"),
-        stars=Table.read(run / "stars.ecsv"),
+        gauge=read_ecsv(run / "gauge.ecsv"),
+        matching=read_ecsv(run / "matching.ecsv"),
+        stars=read_ecsv(run / "stars.ecsv"),
         outlines=tuple(outlines),
         held=tuple(names[k] for k in solved.gauge.held),
         summary=run.summary["selfcal"],

@@ -44,10 +44,11 @@ __all__ = [
 def map_table(r: ReportInput) -> TextTable:
     """Table of the extremes of the uncertainty maps."""
     rows = []
+    typical = max(float(m.per_axis.max()) for c in r.chips for m in c.maps)
     for c in r.chips:
         for m in c.maps:
             cells = [
-                with_mas(v, m.unit, r.scale_mas)
+                with_mas(v, m.unit, r.scale_mas, like=typical)
                 for v in (
                     m.sigma_u_max,
                     m.sigma_v_max,
