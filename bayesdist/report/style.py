@@ -179,9 +179,9 @@ def plain_ticks(figure: Figure) -> None:
                 elif type(now) is LogFormatterSciNotation:
                     put(
                         _Powers(
-                            now._base,  # type: ignore[attr-defined]
+                            now._base,  # type: ignore[attr-defined]  # it has no getter
                             labelOnlyBase=now.labelOnlyBase,
                             minor_thresholds=now.minor_thresholds,
-                            linthresh=now._linthresh,  # type: ignore[attr-defined]
+                            linthresh=now._linthresh,  # type: ignore[attr-defined]  # nor this
                         )
                     )

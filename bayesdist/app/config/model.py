@@ -57,7 +57,7 @@ class Polynomials(Section):
 class MatchedModel(Polynomials):
     """Structure of the distortion model, with the frames of the exposures."""
 
-    frames: Literal[FRAME_KINDS] = "none"  # type: ignore[valid-type]
+    frames: Literal[FRAME_KINDS] = "none"  # type: ignore[valid-type]  # names of the model
     tdd: Tdd | None = None
 
 

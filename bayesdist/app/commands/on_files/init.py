@@ -16,8 +16,8 @@ from bayesdist.app.matches.reading import load_matches
 from bayesdist.app.matches.sources import mission_template
 from bayesdist.app.tables.output import refuse_existing
 from bayesdist.data import FORMATS, Matches
-from bayesdist.data.reading.formats import mission_formats
-from bayesdist.data.reading.layout import TableLayout, table_layout
+from bayesdist.data.formats.files import mission_formats
+from bayesdist.data.formats.layout import TableLayout, table_layout
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 
