@@ -169,7 +169,7 @@ def check_coverage(model: DistortionModel, survey: Survey, n_priors: int = 0) ->
             raise DegenerateError(
                 found.outside,
                 where=where,
-                do="correct detector.size, the columns or data.pixel_origin",
+                do="correct detector.size, the columns or data.pixel_origin, or leave the row out",
             )
         a, b, aa, ab, bb = found.sums / found.n
         spread = np.linalg.eigvalsh([[aa - a * a, ab - a * b], [ab - a * b, bb - b * b]])
