@@ -135,8 +135,9 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 def _typeset(value: object) -> object:
     """Text for the page: sentences are written for terminals too; commands and data stay."""
-    sentence = isinstance(value, str) and not isinstance(value, Markup) and " " in value
-    if not sentence or value.startswith("bayesdist "):
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    if " " not in value or value.startswith("bayesdist "):
         return value
     return _MINUS.sub("−", _POWER.sub(_raised, value.replace(" +- ", " ± ")))
 
