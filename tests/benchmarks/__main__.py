@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +21,7 @@ from tests.benchmarks.timing import say
 
 __all__ = ["main"]
 
+FIGURE = "figures/scaling.png"  # beside the page
 PARTS = {
     "samplers": samplers,
     "kernel": likelihood,
@@ -107,13 +109,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         start = time.perf_counter()
         part = module.run(module.QUICK if options.quick else module.FULL)
         part["wall_s"] = time.perf_counter() - start
-        if name == "scaling" and options.docs is not None:
-            draw_scaling(part, options.docs / "figures" / "scaling.png")
-            part["figure"] = "figures/scaling.png"
+        if name == "scaling":
+            draw_scaling(part, options.output / FIGURE)
+            part["figure"] = FIGURE
         bench["parts"][name] = part
         _write(bench, options.output)
     if options.docs is not None:
         _document(bench, options.docs)
+        shutil.copy(options.output / FIGURE, options.docs / FIGURE)
     say(f"written: {options.output / 'bench.json'}, {options.output / 'bench.md'}")
     return 0
 
