@@ -258,5 +258,5 @@ def refuse_repeated(columns: Columns, *, place: Callable[[int], str]) -> None:
         raise InputError(
             f"repeats {place(first)}: the same x, y, u, v, exposure and chip",
             where=place(second),
-            do="drop one of them",
+            do="keep each row once",
         )

@@ -35,7 +35,7 @@ _NOT_FINITE = ("value is nan", "value is inf", "value is -inf")
 _GUESSED_UNIT = "unit = {unit:22s}# GUESSED: the table does not say\n"
 
 _TEMPLATE = """\
-# A calibration of geometric distortion; see docs/configuration.md for every key.
+# A calibration of geometric distortion; see 'bayesdist docs configuration' for every key.
 
 [data]
 matches = {matches}

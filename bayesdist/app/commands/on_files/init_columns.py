@@ -69,7 +69,8 @@ def _remarks(layout: TableLayout) -> list[str]:
             "reference"
         )
     if "chip" not in layout.taken:
-        for name, n in list(layout.like_chips.items())[:_TOLD]:
+        like_chips = {k: n for k, n in layout.like_chips.items() if "flag" not in k.lower()}
+        for name, n in list(like_chips.items())[:_TOLD]:
             out.append(
                 f"LOOK: column {name} has {n} values; if these are chips, add chip = {quoted(name)}"
                 " (init --columns chip=NAME)"
