@@ -1,7 +1,8 @@
 """One family of errors: what is wrong, where, and what to do next.
 
 Everything that a user can put right is raised as a `BayesdistError`; the command line prints its
-one sentence and exits with its code.  Any other exception is a defect of the program.
+one sentence and exits with its code.  Any other exception is a defect of the program, and the
+command line says so (`bayesdist.app.failures`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ __all__ = [
     "DegenerateError",
     "FormatError",
     "InputError",
+    "MemoryLimitError",
     "NotConvergedError",
     "NotSettledError",
     "RenamedError",
@@ -92,6 +94,10 @@ class DegenerateError(InputError):
     """The data do not determine the parameters that are asked for."""
 
 
+class MemoryLimitError(InputError):
+    """A computation that needs more memory than there is."""
+
+
 class NotSettledError(InputError):
     """An iteration over the data that does not come to rest."""
 
@@ -108,8 +114,8 @@ class RenamedError(BayesdistError):
     exit_code = 2
 
 
-def required(value: T | None, cause: str, *, do: str = "") -> T:
+def required(value: T | None, cause: str) -> T:
     """The value, if there is one; InputError, with this cause, if there is none."""
     if value is None:
-        raise InputError(cause, do=do)
+        raise InputError(cause)
     return value

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from bayesdist.errors import InputError
+from bayesdist.reading.regular import opened
 
 __all__ = [
     "atomic_path",
@@ -154,12 +155,5 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
     InputError
         When the file cannot be read.
     """
-    try:
-        with Path(path).open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(
-            f"cannot be read ({error.strerror or error})",
-            where=str(path),
-            do="check the path and its permissions",
-        ) from error
+    with opened(path) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -14,9 +14,9 @@ from bayesdist.app.assessment.diagnosing import diagnose_fit_of_run, diagnose_ru
 from bayesdist.app.assessment.error_terms import errors_of_run
 from bayesdist.app.assessment.settings import assessment_epoch, evaluation_settings
 from bayesdist.app.config import Config
+from bayesdist.app.kind import Kind, kind_of
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.app.kinds.kind import Kind, kind_of
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.matches.sources import RunInput, input_of_run
@@ -203,11 +203,6 @@ class Results:
         """Ingredients of the files of the solution."""
         source = str(self.run.path)
         return product_of(self.posterior, self.stored, self.data, self.config, source)
-
-    @property
-    def gauge_words(self) -> str:
-        """In which gauge the products stand, as a sentence; empty where that is no question."""
-        return "" if self.fitted.solved is None else self.fitted.solved.gauge_words
 
     @property
     def series(self) -> Mapping[str, Any]:

@@ -7,6 +7,7 @@ draws.
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -67,6 +68,22 @@ class DrawnErrors:
     def unit(self) -> str:
         """Unit of all errors."""
         return self.solution.model.unit
+
+    @property
+    def n_effective(self) -> float:
+        """Independent draws that are worth as much as those of the solution; at least 1.
+
+        Drawing n rows from a chain worth `ess` independent samples adds the chain's own Monte-Carlo
+        variance to that of the drawing: 1 / n_eff = 1 / n + 1 / ess.  Draws of a fit are
+        independent; a posterior is worth the smaller of its bulk and tail effective sample sizes (a
+        probability far from a half is a matter of the tails).
+        """
+        convergence = self.solution.convergence
+        if convergence is None:
+            return float(self.n_draws)
+        sizes = [convergence.ess_bulk_min, convergence.ess_tail_min]
+        ess = 1.0 if any(math.isnan(s) for s in sizes) else max(min(sizes), 1.0)
+        return max(1.0 / (1.0 / self.n_draws + 1.0 / ess), 1.0)
 
     def at(self, domain: EvaluationDomain) -> tuple[ErrorField, ...]:
         """The errors of each term at the positions of a domain."""

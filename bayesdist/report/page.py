@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import jinja2
 from markupsafe import Markup
 
 from bayesdist.numbers import MISSING
-from bayesdist.report.documentation import page_of
+from bayesdist.report.documentation import explanation_of, section_of
 from bayesdist.report.drawing import DPI, Drawing
 from bayesdist.report.registry import Registry
 from bayesdist.report.texttable import Level, TextTable
@@ -114,7 +115,8 @@ def template(name: str, package: str = REPORT) -> jinja2.Template:
     environment.filters["md"] = _markdown
     environment.filters["css"] = _css
     environment.filters["base64"] = _base64
-    environment.globals["page_of"] = page_of
+    environment.globals["explanation_of"] = explanation_of
+    environment.globals["section_of"] = section_of
     environment.tests["level"] = lambda value: isinstance(value, Level)
     return environment.get_template(name)
 
@@ -125,9 +127,24 @@ _SPECIAL = str.maketrans(
 )
 
 
+# numbers as terminals have them: a power of ten, a minus at the beginning of a word
+_POWER = re.compile(r"(?<![\w.])(-?\d+(?:\.\d+)?)e([+-])0*(\d+)\b")
+_MINUS = re.compile(r"(?<![^\s(=±])-(?=\.?\d)")
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
 def _typeset(value: object) -> object:
-    """Text for the page: sentences are written for terminals too, where +- stands for the sign."""
-    return value.replace(" +- ", " ± ") if isinstance(value, str) else value
+    """Text for the page: sentences are written for terminals too; commands and data stay."""
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    if " " not in value or value.startswith("bayesdist "):
+        return value
+    return _MINUS.sub("−", _POWER.sub(_raised, value.replace(" +- ", " ± ")))
+
+
+def _raised(found: re.Match[str]) -> str:
+    sign = "-" if found[2] == "-" else ""
+    return f"{found[1]}\u202f×\u202f10{(sign + found[3]).translate(_RAISED)}"
 
 
 def _markdown(value: object) -> str:

@@ -377,6 +377,25 @@ def test_no_table_is_cut_on_a_screen_of_a_desk(wide):
     assert total.find_elements("tag name", "td")[-1].is_displayed()
 
 
+def test_captions_stay_on_the_screen_of_a_phone(wide):
+    """A table that is wider than the screen scrolls, and its caption does not."""
+    right = edges(wide, 390, "main caption")
+    assert len(right) > 10 and max(right) <= 390
+
+
+def test_heads_are_without_buttons_on_paper(opened):
+    """Chromium does not repeat a head with a button's box in it on the next page."""
+    boxes = (
+        "return [...document.querySelectorAll('thead button')]"
+        ".filter(b => b.getClientRects().length).length"
+    )
+    assert opened.execute_script(boxes) > 20
+    opened.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    on_paper = opened.execute_script(boxes)
+    opened.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+    assert on_paper == 0
+
+
 def test_every_printed_page_can_be_traced(opened):
     """The line at its foot is one that the browser knows: it takes it up as it was written."""
     rules = opened.execute_script(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +15,8 @@ from bayesdist.app.config.kinds import CONFIG, KINDS, Config
 from bayesdist.app.config.section import Section
 from bayesdist.assess import Requirement
 from bayesdist.errors import ConfigError, InputError
+from bayesdist.reading.documents import toml_of
+from bayesdist.reading.regular import MOST_TEXT, read_text
 
 __all__ = [
     "config_of_record",
@@ -92,13 +93,9 @@ def load_requirements(path: str | Path) -> tuple[Requirement, ...]:
 def load_text(path: str | Path) -> str:
     """Text of a file as it stands, with its line ends."""
     try:
-        with Path(path).open(encoding="utf-8", newline="") as stream:
-            return stream.read()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise ConfigError(
-            f"cannot be read ({reason})", where=str(path), do="check the path and the file"
-        ) from error
+        return read_text(path, most=MOST_TEXT)
+    except InputError as error:
+        raise ConfigError(error.cause, where=error.where, do=error.do) from error
 
 
 def validated(kind: type[Section], text: str, where: str, *, begin: str) -> Any:
@@ -119,11 +116,9 @@ def validated(kind: type[Section], text: str, where: str, *, begin: str) -> Any:
 def _settings(text: str, where: str, *, begin: str) -> dict[str, Any]:
     """Settings of a TOML text, of which there have to be some."""
     try:
-        raw = tomllib.loads(text.removeprefix("\ufeff"))
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(
-            f"is not valid TOML ({error})", where=where, do="correct it there"
-        ) from error
+        raw = toml_of(text.removeprefix("\ufeff"), where)
+    except InputError as error:
+        raise ConfigError(error.cause, where=error.where, do=error.do) from error
     if not raw:
         raise ConfigError("holds no settings", where=where, do=begin)
     return raw

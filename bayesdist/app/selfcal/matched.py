@@ -21,6 +21,7 @@ from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal.elimination import Mixture
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import DistortionModel
+from bayesdist.reading.documents import json_of
 
 __all__ = ["SelfcalMatched", "load_matched_selfcal", "selfcal_matched"]
 
@@ -93,7 +94,8 @@ def load_matched_selfcal(
         For a missing or damaged file.
     """
     arrays = read_arrays(folder / DETECTIONS, "", ARRAYS, do="run the stage 'match' again")
-    model = DistortionModel.from_dict(json.loads(arrays["model"].astype(np.uint8).tobytes()))
+    text = arrays["model"].astype(np.uint8).tobytes().decode()
+    model = DistortionModel.from_dict(json_of(text, str(folder / DETECTIONS)))
     detections = replace(
         inputs.detections,
         x=arrays["x"],

@@ -214,7 +214,15 @@ class RunDirectory(RunStore):
     @property
     def facts(self) -> dict[str, Any]:
         """Facts that the run is made from: configuration, inputs, seed, versions."""
-        return self.record.facts
+        facts = self.record.facts
+        for name in ("config", "base", "inputs", "seed", "versions", "created"):
+            if name not in facts:
+                raise InputError(
+                    f"lacks {name!r}",
+                    where=str(self / "run.json"),
+                    do="restore it, or choose another folder",
+                )
+        return facts
 
     def note(self, **facts: Any) -> None:
         """Add facts to run.json."""

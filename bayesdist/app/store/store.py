@@ -25,6 +25,7 @@ from bayesdist.app.store.record import (
 )
 from bayesdist.errors import InputError
 from bayesdist.files import is_leftover, made_folder, remove_leftovers, watched_writes
+from bayesdist.reading.regular import read_bytes
 
 __all__ = ["Made", "RunStore", "Stage"]
 
@@ -345,7 +346,7 @@ class RunStore:
             return
         content = {"schema": SCHEMA, **self.head(record.facts), **sections}
         text = json_text(content)
-        if not path.is_file() or path.read_bytes() != text.encode():
+        if not path.is_file() or read_bytes(path) != text.encode():
             write_json(path, content)
 
     # -- removing ---------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from bayesdist.diagnose.correlated.storage import discrepancy_from_arrays, discr
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.diagnose.score.result import ScoreTest
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.catalogue.star_errors import StarCovariance
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
@@ -42,8 +42,8 @@ def write_diagnostics(
 ) -> None:
     """Write diagnostics of a fit and a posterior, and their sections of summary.json."""
     fingerprint = fingerprint_of(fit, posterior)
-    assert found.correlated is not None
-    arrays, facts = discrepancy_to_arrays(found.correlated)
+    correlated = required(found.correlated, "correlated errors are diagnosed of a posterior only")
+    arrays, facts = discrepancy_to_arrays(correlated)
     write_arrays(run / CORRELATED, fingerprint, arrays)
     if found.catalogue is not None:
         _save_catalogue(run, fingerprint, found.catalogue)

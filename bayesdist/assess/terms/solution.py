@@ -81,9 +81,7 @@ class SolutionDraws:
 
     def on(self, domain: EvaluationDomain, image: Image) -> TogetherField:
         """The errors at the positions of a domain."""
-        exact = self.of.without is None
-        shown = self.of.solution if exact else self.of.without
-        assert shown is not None
+        exact, shown = self.of.without is None, self.of.without or self.of.solution
         parts = _parts(shown, self.shown, domain.epoch, image.exposure)
         fields = [
             # rows of another solution cannot be taken off the draws of this one

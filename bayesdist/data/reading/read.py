@@ -29,9 +29,10 @@ from bayesdist.data.reading.table import matches_from_table, sky_positions
 from bayesdist.data.sky.tangent import mean_direction
 from bayesdist.data.tables.checks import absent
 from bayesdist.data.tables.column import SourceColumn
-from bayesdist.data.tables.files import read_lines, read_table
 from bayesdist.data.tables.names import ALIASES, find_columns
 from bayesdist.errors import InputError
+from bayesdist.reading.regular import read_lines
+from bayesdist.reading.tables import read_table
 
 __all__ = ["read_matches"]
 

@@ -13,6 +13,8 @@ from pathlib import Path
 
 from numba import config
 
+from bayesdist.reading.regular import read_bytes
+
 __all__ = ["kept_by_content"]
 
 
@@ -25,7 +27,7 @@ def kept_by_content() -> Iterator[None]:
     here = Path(__file__).parent
     digest = hashlib.sha256()
     for source in sorted(here.glob("*.py")):
-        digest.update(source.read_bytes())
+        digest.update(read_bytes(source))
     folder, before = here / "__pycache__" / digest.hexdigest()[:16], config.CACHE_DIR
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
+from bayesdist.reading.hdf5 import hdf5_arrays
 
 __all__ = ["Block", "Walkers", "block_path", "read_arrays", "write_arrays"]
 
@@ -51,12 +52,13 @@ def read_arrays(
     data or settings.
     """
     try:
-        with h5py.File(path, "r") as file:
-            known = file.attrs["fingerprint"]
-            arrays = {name: file[name][...] for name in names or file}
-    except (OSError, KeyError) as error:
+        arrays, marks = hdf5_arrays(path, names)
+        known = marks["fingerprint"]
+    except InputError as error:
+        raise InputError(error.cause, where=error.where, do=do) from error
+    except Exception as error:  # HDF5 raises errors of all kinds on damaged files
         raise InputError("the checkpoint cannot be read", where=str(path), do=do) from error
-    if known != fingerprint:
+    if not isinstance(known, str) or known != fingerprint:
         raise InputError(
             "the checkpoints belong to other data or settings",
             where=str(path.parent),

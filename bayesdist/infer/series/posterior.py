@@ -291,8 +291,10 @@ class SeriesPosterior:
 
     def _unseen(self, t: Float) -> Float:
         """Variance (M,) of the random part outside the series, of unit amplitude."""
-        assert self.design.drift is not None
-        return np.where(self._outside(t), self.design.drift.unseen(t), 0.0)
+        drift = self.design.drift
+        return (
+            np.zeros(len(t)) if drift is None else np.where(self._outside(t), drift.unseen(t), 0.0)
+        )
 
     @property
     def _amplitude(self) -> Float:

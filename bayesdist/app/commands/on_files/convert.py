@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import date, time
@@ -12,10 +10,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from bayesdist.app.commands.on_files.calibrations import calibration_at
 from bayesdist.app.screen import number as digits
+from bayesdist.app.summary import Summary
 from bayesdist.app.tables.output import refuse_existing
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.inverse import detector_grid
@@ -32,12 +31,14 @@ from bayesdist.products.formats.common.document import (
     FormatSettings,
 )
 from bayesdist.products.registry import build, format_of, open_document, product_settings
+from bayesdist.reading.documents import read_json_as, toml_of
 
 __all__ = ["convert"]
 
 Float = NDArray[np.float64]
 
 _GRID = 65  # points of each axis over which the loss is measured
+_SUMMARY = TypeAdapter(Summary)
 _ROUNDING = 1e-6  # pixels: what is less is called none
 
 
@@ -92,10 +93,11 @@ def _on_the_sky(path: Path, found: Calibration) -> Calibration:
     summary = home / "summary.json"
     if found.plane.kind != "free" or not (home / "run.json").exists() or not summary.exists():
         return found
-    point = json.loads(summary.read_text(encoding="utf-8"))["data"].get("tangent_point")
-    if point is None:
+    data = read_json_as(_SUMMARY, summary, do="resume the run, which writes it again").data
+    if data is None or data.tangent_point is None:
         return found
-    return replace(found, plane=Plane("sky", point=(float(point[0]), float(point[1]))))
+    ra, dec = data.tangent_point
+    return replace(found, plane=Plane("sky", point=(ra, dec)))
 
 
 def _settings(to: str, kind: type[FormatSettings], options: Sequence[str]) -> FormatSettings:
@@ -105,8 +107,8 @@ def _settings(to: str, kind: type[FormatSettings], options: Sequence[str]) -> Fo
         if not mark or not key.strip():
             raise InputError(f"{text!r} is not KEY=VALUE", where="--option", do="write it so")
         try:
-            found = tomllib.loads(f"x = {value}")["x"]
-        except tomllib.TOMLDecodeError:
+            found = toml_of(f"x = {value}", "--option")["x"]
+        except InputError:
             found = value.strip()
         # settings have dates as text
         values[key.strip()] = value.strip() if isinstance(found, (date, time)) else found

@@ -111,7 +111,8 @@ def verdict(r: ReportInput) -> Verdict:
         if names:
             clauses.append((level, _rows_clause(names, verb)))
     if r.warnings:
-        clauses.append(("warn", "read the warnings"))
+        n = len(r.warnings)
+        clauses.append(("warn", "one warning below" if n == 1 else f"{n} warnings below"))
     clauses.append((worst(groups.get("Validity", ())), validity_clause(r)))
     # the kind of solution first, then what is worst
     clauses.sort(key=lambda one: (one[1] == _UNSAMPLED, LEVELS.index(one[0])), reverse=True)
@@ -167,22 +168,25 @@ def _accuracy_sentence(r: ReportInput) -> str:
     best = worst.best_map
     maps = [c.best_map for c in r.chips]
     median = float(np.median(np.concatenate([m.per_axis.ravel() for m in maps])))
-    largest = with_mas(float(best.per_axis.max()), r.unit, r.scale_mas)
+    like = float(best.per_axis.max())
+
+    def length(value: float) -> str:
+        return with_mas(value, r.unit, r.scale_mas, like=like)
+
     circles = " and ".join(
-        f"CE{p} {r.length(max(float(m.circular_error(p / 100).max()) for m in maps))}"
+        f"CE{p} {length(max(float(m.circular_error(p / 100).max()) for m in maps))}"
         for p in (68, 95)
     )
     text = (
         f"The {whose} uncertainty of the distortion (per axis, 1 σ) is"
-        f" {with_mas(median, r.unit, r.scale_mas)} at the median position and at most {largest},"
+        f" {length(median)} at the median position and at most {length(like)},"
         f" at pixel {r.position(best.position_of_max, worst.chip.number)}{_with_shift(r)}"
         f" ({circles} at most)"
     )
     if r.budget is None:
         return f"{text}."
     total = r.budget.rows()[-1]
-    per_axis_rms = float(per_axis(total["u"], total["v"]))
-    with_budget = with_mas(per_axis_rms, r.budget.unit, r.scale_mas)
+    with_budget = length(float(per_axis(total["u"], total["v"])))
     whom = (
         ""
         if r.campaign is None
