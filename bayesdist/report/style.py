@@ -74,6 +74,7 @@ _RC: Any = {
     "font.size": 8.5,
     "axes.titlesize": 8.5,
     "axes.titlelocation": "left",
+    "axes.titley": 1.0,  # else all ticks are measured again in case that some are above the panel
     "axes.labelsize": 8.5,
     "axes.linewidth": 0.7,
     "axes.edgecolor": INK,
