@@ -18,6 +18,7 @@ from bayesdist.infer.exposures.scatter import Scatter
 from bayesdist.infer.transforms import lines, reference_gauge
 from bayesdist.model import FRAME_KINDS
 from bayesdist.model.frames import CHIP_DEVIATIONS
+from tests.reduced import case_in_full
 
 from ..small_campaign import LINEAR, campaign, campaign_model, seen_by, true_lines
 from ..support import UNCLIPPED, columns_of, residual_of
@@ -279,10 +280,16 @@ def named_by_chance(n, campaigns=20_000):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("own", [None, OWN], ids=["together", "apart"])
+@pytest.mark.parametrize(
+    "own",
+    [
+        case_in_full(None, instead="chips that deviate by themselves are run", id="together"),
+        pytest.param(OWN, id="apart"),
+    ],
+)
 def test_scatter_and_lines_over_many_truths(full, own):
     """Pulls of alpha and beta, and where the true tau lies in its posterior."""
-    n = 100 if full else 6
+    n = 100 if full else 4
     truth = TAU if own is None else np.concatenate([TAU, own])
     pulls, ranks, outlying = [], [], 0
     for seed in range(n):
@@ -327,7 +334,7 @@ def test_a_gap_that_goes_with_the_shear_is_no_second_measurement_of_it(full):
     In the gauge of WFC2 its B_2 deviates by twice the shear, and no error of its rate can be below
     what that scatter leaves of a line through the exposures.
     """
-    n = 60 if full else 4
+    n = 60 if full else 2
     pulls, ratio = [], []
     for seed in range(n):
         whole, matches, theta = campaign(2000 + seed, 40, 150, tau=(5e-6, 5e-6, 5e-6))
@@ -343,7 +350,7 @@ def test_a_gap_that_goes_with_the_shear_is_no_second_measurement_of_it(full):
     assert np.sqrt(np.mean(np.square(pulls))) < 1 + 3 / np.sqrt(2 * 2 * n)  # two are independent
 
 
-def test_exposures_that_went_wrong_are_named_and_do_no_harm():
+def test_exposures_that_went_wrong_are_named_and_do_no_harm(full):
     wrong = {"j004.scale": 3e-4, "j011.shear_plus": -2e-4, "j011.WFC1.rotation": 1e-4}
     model, matches, theta = campaign(16, 30, 200, own=OWN, wrong=wrong)
     found = fit_hierarchical(matches, model)
@@ -358,7 +365,7 @@ def test_exposures_that_went_wrong_are_named_and_do_no_harm():
     assert found.mean[k] == pytest.approx(theta[k], abs=5 * found.sigma[k])
     # not only gross ones, and two of few: everything of ten times the usual size
     rng = np.random.default_rng(3)
-    for seed in (18, 19, 20):
+    for seed in (18, 19, 20) if full else (18,):
         wrong = {
             f"{e}.{kind}": 10 * t * rng.standard_normal()
             for e in ("j003", "j009")
