@@ -5,10 +5,15 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
+from tests import ALONE
 from tests.reduced import FULL
+
+if not ALONE:
+    numba.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")
