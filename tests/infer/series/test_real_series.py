@@ -17,6 +17,7 @@ from bayesdist.infer.series import (
     held_out,
     serial_correlation,
 )
+from tests.reduced import only_in_full
 
 from .straight import straight_lines
 
@@ -196,13 +197,12 @@ def second_half(series: Series, kind: str) -> np.ndarray:
 
 
 @pytest.mark.slow
+@only_in_full("held-out dates of these series and predictions of simulated ones are run")
 @pytest.mark.parametrize("kind", ["constant", "line"])
-def test_second_halves_of_real_series_are_covered(decam, tess, kind, full, capsys):
+def test_second_halves_of_real_series_are_covered(decam, tess, kind, capsys):
     """Successive dates are correlated: 0.61/0.85 and 0.39/0.68 were covered without that."""
-    if not full and kind != "line":
-        pytest.skip("lines are run: set BAYESDIST_FULL=1")
-    measured = [s.take(np.array(s.names, int) <= LAST_MEASURED) for s in some(tess, full, 3)]
-    for label, series in (("DECam", some(decam, full, 5)), ("TESS", measured)):
+    measured = [s.take(np.array(s.names, int) <= LAST_MEASURED) for s in tess.values()]
+    for label, series in (("DECam", list(decam.values())), ("TESS", measured)):
         rank = np.concatenate([second_half(one, kind).ravel() for one in series])
         inside = [(np.abs(rank - 0.5) < level / 2).mean() for level in (0.683, 0.95)]
         with capsys.disabled():
