@@ -24,6 +24,7 @@ from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.solution import Solution
+from bayesdist.memory import require_memory
 from bayesdist.model import LookupTable
 from bayesdist.model.grid import DEFAULT_GRID
 
@@ -72,10 +73,16 @@ class ErrorModel:
         Raises
         ------
         InputError
-            For fewer than two draws.
+            For fewer than two draws, or more than fit into memory.
         """
         if n < 2:
             raise InputError(f"the number of draws is {n}", do="ask for at least 2")
+        require_memory(
+            8.0 * n * len(self.solution.solution.model.names),
+            f"{n} draws of {len(self.solution.solution.model.names)} parameters",
+            where="assess.draws",
+            do="ask for fewer",
+        )
         one = self.solution.draw(n, rng)
         solution, fitted = self.solution.solution, self.solution.fitted_exposures
         image = Image()

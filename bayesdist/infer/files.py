@@ -203,6 +203,8 @@ def load_posterior(path: str | Path) -> Posterior:
         _refuse_other_shape(draws["theta"].values, shape)
         for one in (stats["lp"], *(draws[k] for k in ("j", "f", "s_out") if k in draws)):
             _refuse_other_shape(one.values, shape[:2])
+        for check in DIAGNOSTICS:  # NaN where a parameter does not move
+            _refuse_other_shape(np.nan_to_num(checks[check].values), checks["sampled"].shape)
         return Posterior(
             model=model,
             mixture=OutlierMixture(**mixture),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from pathlib import Path
 from typing import Any, TypeVar
@@ -71,7 +72,7 @@ def model_of(kind: TypeAdapter[T], tree: Any, where: str, *, do: str) -> T:
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
-        reason = first["msg"].removeprefix("Value error, ").rstrip(".")
+        reason = re.sub(r" or instance of \w+", "", first["msg"]).rstrip(".")
         raise FormatError(
             f"is not as bayesdist wrote it ({f'{key}: ' if key else ''}{reason})",
             where=where,

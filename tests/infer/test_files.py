@@ -7,6 +7,7 @@ import resource
 from dataclasses import replace
 
 import arviz as az
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -290,3 +291,42 @@ def test_damage_that_hdf5_reports_in_its_own_way(tmp_path, monkeypatch, kind):
     path.write_bytes(b"whatever")
     with pytest.raises(FormatError, match=r"bad\.nc"):
         load(path)
+
+
+HARM = {
+    "nan": lambda values: np.full(values.shape, np.nan),
+    "short": lambda values: values[:-1],
+    "flat": lambda values: values.reshape(-1),
+    "text": lambda values: "text",
+    "number": lambda values: 1.0,
+}
+
+
+@pytest.mark.parametrize("how", [*HARM, "gone"])
+@pytest.mark.parametrize("name", ["posterior/theta", "sample_stats/lp", "diagnostics/rhat"])
+def test_arrays_of_a_posterior_that_are_not_as_they_were(written, tmp_path, name, how):
+    """Whatever stands in their place, the answer is a posterior or one error."""
+    path = tmp_path / "posterior.nc"
+    path.write_bytes(written[2].read_bytes())
+    with h5py.File(path, "r+") as file:
+        values = file[name][...]
+        del file[name]
+        if how != "gone":
+            file[name] = HARM[how](values)
+    if name.startswith("diagnostics") and how in ("nan", "flat"):
+        return  # convergence that is not known is no damage
+    with pytest.raises(FormatError, match=r"posterior\.nc: this is not a posterior|damaged"):
+        load_posterior(path)
+
+
+@pytest.mark.parametrize("value", ["x", "[]", "null", '{"a": 1}', "[" * 5000, "9" * 5000, 1.5])
+@pytest.mark.parametrize("name", ["model", "mixture", "certificate", "n_stars", "creator"])
+def test_attributes_of_a_posterior_that_are_not_as_they_were(written, tmp_path, name, value):
+    path = tmp_path / "posterior.nc"
+    path.write_bytes(written[2].read_bytes())
+    with h5py.File(path, "r+") as file:
+        file.attrs[name] = value
+    if (name, value) in (("certificate", "null"), ("n_stars", 1.5)):
+        return
+    with pytest.raises(FormatError, match=r"posterior\.nc"):
+        load_posterior(path)

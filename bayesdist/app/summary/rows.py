@@ -70,8 +70,8 @@ class StructureRow(Part):
     chip: int
     axis: Literal["u", "v"]
     rms: Number = Field(description="over the chip and the draws")
-    median: Number = Field(description="of the draws' rms")
-    most: Number = Field(description="95 % quantile of the draws' rms")
+    median: float = Field(description="of the draws' rms")
+    most: float = Field(description="95 % quantile of the draws' rms")
     length_pix: Number = Field(description="correlation length, pixels")
 
 

@@ -28,9 +28,11 @@ from bayesdist.infer.stars.loading import opened
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars
+from bayesdist.memory import require_memory
 
 __all__ = ["sample"]
 
+STEPS_KEPT = 100  # at least, of each walker
 METHODS = ("exact", "certified")
 FORMAT = 3  # of the checkpoints
 ENGINES = ("emcee", "numba", "numpy", "scipy")  # another version may compute other bits
@@ -114,6 +116,12 @@ def sample(
     >>> posterior.convergence.converged
     True
     """
+    require_memory(
+        8.0 * ensembles * (walkers or 1) * len(fit.model.names) * STEPS_KEPT,
+        f"the draws of {ensembles} ensembles",
+        where="sampler.ensembles",
+        do="ask for fewer ensembles or walkers",
+    )
     seeds = ensemble_seeds(seed, ensembles)
     if method not in METHODS:
         raise InputError(
