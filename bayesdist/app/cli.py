@@ -36,6 +36,7 @@ CORE = {
     "release": f"{COMMANDS}.calibrations:release",
     "docs": f"{COMMANDS}.documentation:docs",
 }
+SIMULATED = {"camera": f"{COMMANDS}.simulated:camera"}
 RENAMED = {
     **{name: f"stage {name}" for name in ("match", "fit", "sample", "assess", "export")},
     "validate": "requirements",
@@ -71,6 +72,7 @@ class _Root(LazyGroup):
             return LazyGroup(cmd_name, help=mission.title, lazy=mission.commands)
         if cmd_name == "simulate":
             lazy = {k: v for mission in missions().values() for k, v in mission.simulate.items()}
+            lazy = SIMULATED | lazy
             return LazyGroup("simulate", help="Simulate data of known truth.", lazy=lazy)
         for name, mission in missions().items():
             if cmd_name in mission.beside_core:

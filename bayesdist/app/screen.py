@@ -48,18 +48,23 @@ def start_logging(verbosity: int = 0) -> None:
     log.addHandler(handler)
 
 
+class _QuietHandler(logging.FileHandler):
+    """A log whose own errors do not bury that which stops the run, as of a full disk."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  logging's own name
+        """Pass over it."""
+
+
 @contextmanager
 def log_file(path: Path) -> Iterator[None]:
     """Send the log to a file as well."""
     try:
-        handler = logging.FileHandler(path, encoding="utf-8")
+        handler = _QuietHandler(path, encoding="utf-8")
     except OSError as error:
         raise InputError(
             f"cannot be written ({error.strerror})", where=str(path), do="check its permissions"
         ) from error
     handler.setFormatter(logging.Formatter(FORMAT))
-    # a full disk must not bury the error that stops the run under logging's own tracebacks
-    handler.handleError = lambda record: None  # type: ignore[method-assign]
     log.addHandler(handler)
     try:
         yield

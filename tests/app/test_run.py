@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import math
+import os
 import re
 import shutil
 import tomllib
@@ -31,6 +32,7 @@ from bayesdist.assess.terms.correlated import STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.data import read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior, memberships, residuals
+from bayesdist.reading.documents import read_json
 from tests.app.support import (
     SIZE,
     begin_stagewise,
@@ -84,7 +86,8 @@ def test_the_record(finished):
     record = json.loads((finished.path / "run.json").read_text())
     stars = finished.config.parent / "stars.ecsv"
     digest = hashlib.sha256(stars.read_bytes()).hexdigest()
-    assert record["inputs"] == {str(stars): digest}
+    assert record["inputs"] == {stars.name: digest}
+    assert (Path(record["base"]) / stars.name).samefile(stars)
     assert record["seed"] == 1
     for package in (
         "python",
@@ -473,9 +476,13 @@ def test_the_seed_of_the_command_line_is_recorded(finished, tmp_path):
 
 
 def test_resuming_a_finished_run_changes_nothing(copy, finished):
-    before = {n: (copy / n).read_bytes() for n in FILES if n != "bayesdist.log"}
+    names = set(FILES) - {"bayesdist.log", "run.json"}
+    before, record = {n: (copy / n).read_bytes() for n in names}, read_json(copy / "run.json")
     good("run", finished.config, "-o", copy, "--resume", "--seed", "1")
-    assert {n: (copy / n).read_bytes() for n in before} == before
+    assert {n: (copy / n).read_bytes() for n in names} == before
+    # a copy lies elsewhere as seen from its inputs
+    elsewhere = Path(os.path.relpath(finished.config.parent, copy)).as_posix()
+    assert read_json(copy / "run.json") == record | {"base_from_run": elsewhere}
 
 
 def test_an_interrupted_run_goes_on(finished, posterior, tmp_path, monkeypatch):

@@ -26,14 +26,15 @@ def input_name(path: Path, *bases: Path) -> str:
     return str(path)
 
 
-def hashes_of(config: Config, base: Path, *others: Path) -> dict[str, str]:
+def hashes_of(config: Config, base: Path, *before: Path) -> dict[str, str]:
     """SHA-256 of every file that a configuration names, by its name.
 
-    `base` is the folder that names are relative to, `others` are those that it was before.
+    `base` is the folder that names are relative to, `before` are those that it was.
     """
     base = base.resolve()
-    named = [*input_files(config.named_files(base)), *config.files_of_products(base)]
-    return {input_name(path, base, *others): sha256_of(path) for path in named}
+    others = [*config.files_of_products(base), *config.files_of_priors(base)]
+    named = [*input_files(config.named_files(base)), *others]
+    return {input_name(path, base, *before): sha256_of(path) for path in named}
 
 
 def places_of(base: Path, run: Path) -> dict[str, str]:

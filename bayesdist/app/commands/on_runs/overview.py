@@ -28,7 +28,7 @@ def overview(runs: Sequence[str | Path], output: str | Path) -> str:
     rows = [_row(RunDirectory(run), Path(output)) for run in runs]
     write_overview(output, rows)
     worst = [row.name for row in rows if row.level == "fail"]
-    failed = f"; that of {', '.join(worst)} fails" if worst else ""
+    failed = f"; failed: {', '.join(worst)}" if worst else ""
     return f"{output}: verdicts of {len(rows)} run{'s' if len(rows) > 1 else ''}{failed}"
 
 
