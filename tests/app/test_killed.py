@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import os
 import random
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -16,6 +19,8 @@ import pytest
 import xarray as xr
 
 from bayesdist.app.cli import main
+from tests.app.selfcal.support import list_table, small, write_selfcal
+from tests.app.support import good
 
 pytestmark = pytest.mark.slow
 
@@ -38,6 +43,9 @@ checkpoint_every = 25
 [assess]
 grid = [5, 5]
 draws = 100
+
+[products]
+sip = {{}}
 """
 
 
@@ -47,23 +55,28 @@ def _draws(run: Path) -> dict[str, np.ndarray]:
 
 
 def _assert_same(one: Path, other: Path) -> None:
+    """Draws, and the files that follow from them, are the same to the last bit."""
     expected, got = _draws(one), _draws(other)
     assert expected.keys() == got.keys()
     for name, values in expected.items():
-        assert np.array_equal(values, got[name]), name
+        assert values.tobytes() == got[name].tobytes(), name
+    for name in TABLES:
+        assert (one / name).read_bytes() == (other / name).read_bytes(), name
+    for path in one.glob("*.hdr"):
+        assert path.read_bytes() == (other / path.name).read_bytes(), path.name
 
 
 class Forked:
-    """A command in a process whose modules are imported already, and without the figures.
+    """A command in a process whose modules are imported already, without what takes longest.
 
-    Both would take most of the time, and kills would find nothing else.
+    That would be most of the time, and kills would find nothing else.
     """
 
     context = get_context("forkserver")
     context.set_forkserver_preload(["tests.app.test_killed", "bayesdist.app.run"])
 
     def __init__(self, arguments: list[str]) -> None:
-        self._process = self.context.Process(target=_without_figures, args=(arguments,))
+        self._process = self.context.Process(target=_in_short, args=(arguments,))
         self._process.start()
 
     def poll(self) -> int | None:
@@ -78,10 +91,17 @@ class Forked:
         return self._process.exitcode
 
 
-def _without_figures(arguments: list[str]) -> None:
+def _in_short(arguments: list[str]) -> None:
+    """The command without figures, and without tests of each term of a campaign against time."""
     from bayesdist.app import run
+    from bayesdist.app.exposures import series
 
     run.report = lambda results, pdf: []
+    series._verdict = lambda exposures, k, *options: {
+        "term": exposures.coefficients[k],
+        "claim": "not asked",
+        "text": "Not asked.",
+    }
     sys.exit(main(arguments))
 
 
@@ -90,12 +110,67 @@ def _in_full(arguments: list[str]) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-m", "bayesdist", *arguments])
 
 
-def test_sigkill_changes_nothing(tmp_path, full, capsys):
-    """Reduced, kills are seen while it samples and assesses, but not while it draws."""
-    kills, steps, stars = (10, 1500, 3000) if full else (2, 300, 1000)
-    assert main(["simulate", "wise", "-o", str(tmp_path), "--stars", str(stars), "-q"]) == 0
-    config = tmp_path / "config.toml"
+def _of_matches(folder: Path, full: bool) -> Path:
+    """A run of matched stars whose sampler goes on to its last step."""
+    steps, stars = (1500, 3000) if full else (300, 1000)
+    good("simulate", "wise", "-o", folder, "--stars", stars, "-q")
+    config = folder / "config.toml"
     config.write_text(CONFIG.format(steps=steps))
+    return config
+
+
+def _of_campaign(folder: Path, full: bool) -> Path:
+    """Star lists of a few exposures, tables, and a drift."""
+    good("simulate", "acs", "-o", folder, "--exposures", 8, "--stars", 3000, "--seed", 3, "-q")
+    config = folder / "campaign_f606w.toml"
+    text = config.read_text(encoding="utf-8")
+    for old, new in {
+        'method = "field"': 'step = [512.0, 512.0]\nmethod = "field"',
+        "[assess]": "[sampler]\nensembles = 2\ntarget_ess = 50\ntarget_rhat = 1.2\n\n[assess]",
+        "grid = [33, 17]": "grid = [5, 3]\ndraws = 100",
+    }.items():
+        assert old in text
+        text = text.replace(old, new)
+    config.write_text(text, encoding="utf-8")
+    return config
+
+
+def _of_selfcal(folder: Path, full: bool) -> Path:
+    """Dithered exposures without a catalogue."""
+    given = {"sampler": {"target_ess": 100}, "assess": {"grid": (5, 5), "draws": 100}}
+    return write_selfcal(folder, list_table(small()), products={"sip": {}}, **given)
+
+
+JOBS = {"matches": _of_matches, "campaign": _of_campaign, "selfcal": _of_selfcal}
+TABLES = ("coefficients.ecsv", "budget.ecsv", "margins.ecsv")
+
+
+def _under_way(run: Path) -> str:
+    """Stage that a run is in; empty between stages, and before the first one."""
+    try:
+        record = json.loads((run / "run.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return ""
+    return (record["under_way"] or {}).get("stage", "")
+
+
+def _seconds(run: Path) -> dict[str, float]:
+    """How long the stages took that have ended."""
+    try:
+        stages = json.loads((run / "run.json").read_text(encoding="utf-8"))["stages"]
+    except (OSError, ValueError):
+        return {}
+    return {name: one["wall_s"] for name, one in stages.items()}
+
+
+@pytest.mark.parametrize("kind", JOBS)
+def test_sigkill_changes_nothing(kind, tmp_path, full, capsys):
+    """Killed within each stage, by turns, at a random moment of it.
+
+    Reduced, in the stages that write draws, tables and files; figures are drawn in full alone.
+    """
+    kills = int(os.environ.get("BAYESDIST_KILLS", 50 if full else 3))
+    config = JOBS[kind](tmp_path / "input", full)
     whole, torn = tmp_path / "whole", tmp_path / "torn"
     begun = _in_full if full else Forked
 
@@ -104,28 +179,31 @@ def test_sigkill_changes_nothing(tmp_path, full, capsys):
         return ["run", str(config), "-o", str(run), "-q", *flags]
 
     assert begun(["--version"]).wait() == 0  # what is made once is no part of the duration
-    started = time.monotonic()
     assert begun(command(whole)).wait() == 0
-    duration = time.monotonic() - started
+    seconds = _seconds(whole)
 
-    moments = random.Random(17)
-    landed, progress = 0, []
-    while landed < kills:
+    moments, landed = random.Random(17), Counter()
+    while landed.total() < kills:
+        left = [name for name in seconds if name not in _seconds(torn)]
+        if not left:  # it came to its end in spite of all kills: compare, and begin anew
+            _assert_same(whole, torn)
+            shutil.rmtree(torn)
+            continue
+        wanted = min(left, key=lambda name: landed[name])
+        delay = moments.uniform(0.0, 0.7) * seconds[wanted]
         process = begun(command(torn))
-        time.sleep(moments.uniform(0.1, 0.4) * duration)
-        alive = process.poll() is None
+        while process.poll() is None and _under_way(torn) != wanted:
+            time.sleep(0.002)
+        time.sleep(delay)
+        within, alive = _under_way(torn), process.poll() is None
         if alive:
             process.kill()
         assert process.wait() == (-signal.SIGKILL if alive else 0)
-        progress.append(len(list(torn.glob("chain-*.h5"))))
-        landed += alive
-        if not alive:  # it came to its end in spite of all kills: compare, and begin anew
-            _assert_same(whole, torn)
-            shutil.rmtree(torn)
+        landed[within] += alive
     assert begun(command(torn)).wait() == 0
 
     with capsys.disabled():
-        print(f"\n{landed} kills of a live run; checkpoints after each: {progress}")
+        print(f"\n{kind}: {landed.total()} kills of a live run, in {dict(landed)}")
     _assert_same(whole, torn)
     # nothing half-written is left behind by the run that ended
-    assert not [p.name for p in torn.iterdir() if p.name.startswith(".")]
+    assert not [p.name for p in torn.rglob("*") if p.name.startswith(".")]

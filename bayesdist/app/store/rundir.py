@@ -317,8 +317,9 @@ class RunDirectory(RunStore):
         name = "" if artefact is None else self.harmed(artefact, thorough=True)
         if not name:
             return None
-        is_there = (self / name).is_file()
-        return name, f"is {'not as' if is_there else 'gone, not as'} stage '{stage}' wrote it"
+        if not (self / name).is_file():
+            return name, f"is gone, and not as stage '{stage}' wrote it"
+        return name, f"is not as stage '{stage}' wrote it"
 
     def refuse_damaged(self, stage: str) -> None:
         """Refuse to go by files that are not as their stage wrote them."""

@@ -270,6 +270,7 @@ def _connected(compute: Compute) -> tuple[Any, LocalCluster | None, int | None]:
             cluster = LocalCluster(
                 n_workers=workers,
                 threads_per_worker=1,
+                host="127.0.0.1",  # whoever reaches a scheduler runs code there: nobody else does
                 processes=True,
                 memory_limit=0,
                 dashboard_address="127.0.0.1:0",  # None is port 8787, which may be taken

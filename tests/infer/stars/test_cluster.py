@@ -18,6 +18,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import dask
 import numpy as np
 import psutil
 import pyarrow as pa
@@ -468,6 +469,64 @@ def test_own_cluster_ends_with_the_shards(problem, by_threads):
     shards.close()
     assert worker_pids() == before
     shards.close()  # once more does no harm
+
+
+def test_own_cluster_is_reached_from_this_machine_alone(problem):
+    """Scheduler and workers listen at the loopback, with all their ports."""
+    model, matches = problem
+    shards = load(model, matches, Compute(engine="dask", workers=2))
+    try:
+        processes = [psutil.Process(), *map(psutil.Process, worker_pids())]
+        listening = {
+            one.laddr.ip
+            for process in processes
+            for one in process.net_connections("inet")
+            if one.status == psutil.CONN_LISTEN
+        }
+    finally:
+        shards.close()
+    assert listening == {"127.0.0.1"}
+
+
+@pytest.fixture
+def secured(tmp_path) -> dict[str, str]:
+    """Settings of distributed for a cluster that asks for a certificate of its own authority."""
+    certificate, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+    try:
+        subprocess.run(
+            [
+                *"openssl req -x509 -newkey rsa:2048 -nodes -days 1 -subj /CN=cluster".split(),
+                *("-keyout", str(key), "-out", str(certificate)),
+            ],
+            check=True,
+            capture_output=True,
+        )
+    except FileNotFoundError:
+        pytest.skip("there is no openssl to make a certificate")
+    names = ("scheduler", "worker", "client")
+    tls = "distributed.comm.tls"
+    own = {f"{tls}.{one}.{part}": str(path) for one in names
+           for part, path in (("cert", certificate), ("key", key))}  # fmt: skip
+    return {"distributed.comm.require-encryption": True, f"{tls}.ca-file": str(certificate)} | own
+
+
+def test_cluster_that_asks_for_certificates(problem, by_threads, secured, tmp_path):
+    """The settings of docs/scaling.md: with them the pass goes on, without them nobody connects."""
+    model, matches = problem
+    options = {"n_workers": 1, "threads_per_worker": 1, "memory_limit": 0, "protocol": "tls"}
+    options |= {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
+    with dask.config.set(secured), LocalCluster(**options) as safe:
+        compute = Compute(engine="dask", scheduler=safe.scheduler_address)
+        assert safe.scheduler_address.startswith("tls://")
+        shards = load(model, matches, compute)
+        assert_same_fit(fit_linear(shards, model), by_threads[0])
+        shards.close()
+        without = {key: None for key in secured if "require" not in key}
+        with (
+            dask.config.set({**without, "distributed.comm.require-encryption": False}),
+            pytest.raises(errors.InputError, match="no Dask scheduler answers at"),
+        ):
+            load(model, matches, compute)
 
 
 def test_own_cluster_ends_when_the_program_does(tmp_path):
