@@ -36,7 +36,9 @@ def main() -> int:
             if verdict.failed:
                 failed.append(verdict)
                 print(verdict.told, file=sys.stderr, flush=True)
-    used = [sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    used = [
+        sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    ]
     table = table_of(verdicts)
     print(table, "", table_of(verdicts, lambda v: MUTATIONS[v.case.mutation].kind), sep="\n")
     print(f"\n{used[0]:.0f} s of processor time here, {used[1]:.0f} s in {len(verdicts)} cases")

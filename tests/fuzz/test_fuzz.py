@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -62,7 +63,7 @@ def _large(line):
 
 
 def _said(line):
-    print(open(line[1]).read()[:9])
+    print(Path(line[1]).read_text()[:9])
 
 
 def _exits(line):
@@ -83,9 +84,9 @@ CASE = Case("a.csv", "say", "cell_not_finite", {"line": 1, "cell": 0, "text": "n
     ],
 )
 def test_each_kind_of_failure_is_seen(one, monkeypatch, command, expected):
-    monkeypatch.setattr(sandbox, "main", lambda line: command(line) and 0 or 0)
-    monkeypatch.setattr(sandbox, "SECONDS", 1.0)
-    found = answers([(one, CASE, "say")] * 2)
+    monkeypatch.setattr(sandbox, "main", lambda line: bool(command(line)) * 0)
+    monkeypatch.setattr(sandbox, "WAIT", 2.0)
+    found = list(answers([(one, CASE, "say")] * 2))
     before = Answer("returned", 0, "x,y\n1,2\n3", "")
     assert [became(CASE, before, answer) for answer in found] == [expected] * 2
 
