@@ -149,7 +149,11 @@ class Results:
     @cached_property
     def stored(self) -> Diagnostics | None:
         """Diagnostics as the run has them; None before."""
-        return self.made.get("stored") or load_diagnostics(self.run, self.fit, self.posterior)
+        found: Diagnostics | None = self.made.get("stored")
+        if found is not None:
+            return found
+        self.run.refuse_changed("diagnose")
+        return load_diagnostics(self.run, self.fit, self.posterior)
 
     @cached_property
     def diagnostics(self) -> Diagnostics:

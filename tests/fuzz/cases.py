@@ -56,7 +56,8 @@ def kept() -> list[Case]:
 def cases(draw, one: Input, suited) -> Case:
     """Strategy of cases of one input; `suited` are mutations with the strategy of arguments."""
     command = draw(st.sampled_from(sorted(one.commands)))
-    name = draw(st.sampled_from(sorted(suited)))
+    kind = draw(st.sampled_from(sorted({MUTATIONS[name].kind for name in suited})))
+    name = draw(st.sampled_from(sorted(n for n in suited if MUTATIONS[n].kind == kind)))
     return Case(one.name, command, name, draw(suited[name]))
 
 

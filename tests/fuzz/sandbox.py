@@ -181,21 +181,24 @@ def _linked(source: str, target: str) -> None:
         os.link(source, target)
 
 
-def plain_answers(asked: Sequence[tuple[Input, str]]) -> list[Answer]:
-    """Answers of commands to inputs as they are; each has to be good.
+class PlainAnswers:
+    """Answers of commands to inputs as they are.
 
-    They are found in this process, so that forked ones need not load anew what commands need.
+    They are found in this process, so that processes which are forked later need not load anew what
+    the commands need.
     """
-    known: dict[tuple[Path, tuple[str, ...]], Answer] = {}
-    out = []
-    with (
-        tempfile.TemporaryDirectory(prefix="bayesdist-fuzz-") as folder,
-        contextlib.chdir(folder),
-        sketched(),
-    ):
-        for one, command in asked:
-            key = one.folder, (*one.commands[command],)
-            if key not in known:
-                known[key] = _answer(one, None, command, Path(folder) / "copy")
-            out.append(known[key])
-    return out
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[Path, tuple[str, ...]], Answer] = {}
+
+    def of(self, one: Input, command: str) -> Answer:
+        """Answer to an input."""
+        key = one.folder, (*one.commands[command],)
+        if key not in self._known:
+            with (
+                tempfile.TemporaryDirectory(prefix="bayesdist-fuzz-") as folder,
+                contextlib.chdir(folder),
+                sketched(),
+            ):
+                self._known[key] = _answer(one, None, command, Path(folder) / "copy")
+        return self._known[key]

@@ -17,7 +17,7 @@ from tests.fuzz.cases import Case, kept
 from tests.fuzz.inputs import Input
 from tests.fuzz.mutation import MUTATIONS
 from tests.fuzz.sandbox import Answer, answers
-from tests.fuzz.verdicts import became
+from tests.fuzz.verdicts import accepted, not_accepted
 
 FEW, MANY = 300, 20_000
 PATH = os.pathsep.join([str(REPOSITORY), *sys.path])
@@ -42,6 +42,10 @@ def test_damaged_input_is_answered_warned_of_or_refused(full, tmp_path, capsys):
 
 
 # -- what counts the cases sees each kind of failure ----------------------------------------------
+
+
+def became(case: Case, before: Answer, after: Answer) -> str:
+    return not_accepted(after) or accepted(case, before, after)
 
 
 @pytest.fixture

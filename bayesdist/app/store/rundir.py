@@ -13,7 +13,7 @@ from bayesdist.app.config import (
     config_of_record,
     load_config,
 )
-from bayesdist.app.store import Made, Record, RunStore, as_json, versions
+from bayesdist.app.store import Artefact, Made, Record, RunStore, as_json, versions
 from bayesdist.app.store.made_from import STAGES, changes, made_from_of, with_seed
 from bayesdist.app.store.refusals import (
     refuse_another_solution,
@@ -297,19 +297,31 @@ class RunDirectory(RunStore):
                     where=str(self.path),
                     do=f"{do} first",
                 )
-            harmed = self.harmed(artefact, thorough=thorough)
-            if harmed:
-                raise InputError(
-                    f"is not as stage '{earlier}' wrote it",
-                    where=str(self / harmed),
-                    do=f"{do} again",
-                )
+            self._refuse_harmed(earlier, artefact, thorough=thorough)
             if not self.done(earlier):
                 raise InputError(
                     f"'{stage}' needs stage '{earlier}', which was made from something else",
                     where=str(self.path),
                     do=f"{do} again",
                 )
+
+    def refuse_changed(self, stage: str) -> None:
+        """Refuse an artefact one of whose files is not as its stage wrote it, or is lost.
+
+        What is made from its numbers would else be made without them.
+        """
+        artefact = self.record.artefacts.get(stage)
+        if artefact is not None:
+            self._refuse_harmed(stage, artefact, thorough=True)
+
+    def _refuse_harmed(self, stage: str, artefact: Artefact, *, thorough: bool) -> None:
+        harmed = self.harmed(artefact, thorough=thorough)
+        if harmed:
+            raise InputError(
+                f"is not as stage '{stage}' wrote it",
+                where=str(self / harmed),
+                do=f"run 'bayesdist stage {stage} {self.path}' again",
+            )
 
     @contextmanager
     def judged_by(self, requirements: Sequence[Requirement]) -> Iterator[None]:

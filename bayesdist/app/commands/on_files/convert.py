@@ -81,7 +81,7 @@ def convert(
     held = [p for p, one in zip(places, built, strict=True) if one.kind != PARAMETERS]
     lines = [f"{', '.join(str(p) for p in places)}: by {source.name}"]
     back = _read_back(held, filter, made.model.chips[0].size)
-    lines += [f"  {note}" for note in notes]
+    lines += [f"  {note}" for note in (*source.notes, *notes)]
     used = _read_back(held, filter, made.model.chips[0].size, as_used=True)
     lines += [f"  {line}" for line in _losses(source, back, used, at, scale)]
     return "\n".join(lines)

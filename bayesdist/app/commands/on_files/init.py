@@ -266,6 +266,12 @@ def _size(x: float, y: float, given: tuple[int, int] | None) -> dict[str, Any]:
 def _guess_size(largest: float) -> int:
     """Detector size: the next multiple of 2 above the data, or a power of 2 that is near."""
     largest -= 0.5
+    if largest < 1:
+        raise InputError(
+            "no star of a chip lies beyond the first pixel, on x or on y",
+            where="x, y",
+            do="name the columns of its pixels by --columns, or give --size",
+        )
     for power in (256, 512, 1024, 2048, 4096, 8192):
         if 0.97 * power <= largest <= power:
             return power
