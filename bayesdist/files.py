@@ -16,6 +16,7 @@ __all__ = [
     "atomic_path",
     "is_leftover",
     "made_folder",
+    "path_within",
     "remove_leftovers",
     "sha256_of",
     "watched_writes",
@@ -125,6 +126,45 @@ def made_folder(path: str | os.PathLike[str]) -> Path:
             do="choose one that you may write to",
         ) from error
     return folder
+
+
+def path_within(
+    folder: str | os.PathLike[str], name: str, *, where: str, links: bool = False
+) -> Path:
+    """Path of a file below a folder, by its name there.
+
+    Names that stand in files which others may have written are not to lead anywhere else.
+
+    Parameters
+    ----------
+    folder : path-like
+    name : str
+    where : str
+        The file that has the name, for the error.
+    links : bool
+        Follow symbolic links in the folders of the path, too.
+
+    Returns
+    -------
+    pathlib.Path
+
+    Raises
+    ------
+    InputError
+        For a name that leads out of the folder.
+    """
+    folder = Path(folder)
+    path = folder / name
+    inside = not Path(name).is_absolute() and ".." not in Path(name).parts and bool(name)
+    if inside and links:
+        inside = path.parent.resolve().is_relative_to(folder.resolve())
+    if not inside:
+        raise InputError(
+            f"names a file outside of its folder ({name!r})",
+            where=where,
+            do="restore it, or choose another folder",
+        )
+    return path
 
 
 def is_leftover(name: str) -> bool:

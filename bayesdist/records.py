@@ -52,15 +52,25 @@ def record_to_arrays(record: Any) -> dict[str, NDArray[Any]]:
     return {TREE: np.frombuffer(tree.encode(), np.uint8), **writer.arrays}
 
 
-def record_from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Any:
+def record_from_arrays(arrays: Mapping[str, NDArray[Any]], kind: type = object) -> Any:
     """The record that `record_to_arrays` described.
 
     Parameters
     ----------
     arrays : mapping of str to ndarray
+    kind : type
+        Which it has to be.
+
+    Raises
+    ------
+    TypeError, KeyError, AttributeError
+        For arrays that are no such record.
     """
     tree = json_of(np.asarray(arrays[TREE], np.uint8).tobytes().decode(), "record")
-    return _Reader(arrays).of(tree)
+    found = _Reader(arrays).of(tree)
+    if not isinstance(found, kind):
+        raise TypeError(f"holds a {type(found).__name__}, and no {kind.__name__}")
+    return found
 
 
 @runtime_checkable

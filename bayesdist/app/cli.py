@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import click
 
 from bayesdist.app.commands.groups import LazyGroup
+from bayesdist.app.screen import open_streams
 from bayesdist.errors import BayesdistError, RenamedError
 from bayesdist.mission import load_mission, mission_names, missions
 from bayesdist.version import __version__
@@ -35,6 +36,7 @@ CORE = {
     "release": f"{COMMANDS}.calibrations:release",
     "docs": f"{COMMANDS}.documentation:docs",
 }
+SIMULATED = {"camera": f"{COMMANDS}.simulated:camera"}
 RENAMED = {
     **{name: f"stage {name}" for name in ("match", "fit", "sample", "assess", "export")},
     "validate": "requirements",
@@ -70,6 +72,7 @@ class _Root(LazyGroup):
             return LazyGroup(cmd_name, help=mission.title, lazy=mission.commands)
         if cmd_name == "simulate":
             lazy = {k: v for mission in missions().values() for k, v in mission.simulate.items()}
+            lazy = SIMULATED | lazy
             return LazyGroup("simulate", help="Simulate data of known truth.", lazy=lazy)
         for name, mission in missions().items():
             if cmd_name in mission.beside_core:
@@ -109,6 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nested too deep; 70 a defect; 71 too little memory; 74 refused by the system; 130
         interrupted.
     """
+    open_streams()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     line = shlex.join(["bayesdist", *arguments])
     return _exit_code(

@@ -97,7 +97,7 @@ class Results:
     @cached_property
     def base(self) -> Path:
         """Folder that the configuration's files are relative to."""
-        return Path(self.run.facts["base"])
+        return self.run.base
 
     @cached_property
     def kind(self) -> Kind:
@@ -119,6 +119,7 @@ class Results:
         found: Matched | None = self.made.get("matched")
         if found is not None:
             return found
+        self.run.refuse_damaged("match")
         summary = self.run.summary
         return self.kind.load_matched(self.run.path, self.inputs, self.config, self.base, summary)
 
@@ -128,6 +129,7 @@ class Results:
         found: Fitted | None = self.made.get("fitted")
         if found is not None:
             return found
+        self.run.refuse_damaged("fit")
         summary = self.run.summary
         return self.kind.load_fitted(self.run.path, lambda: self.matched, self.config, summary)
 
@@ -139,7 +141,11 @@ class Results:
     @cached_property
     def posterior(self) -> Posterior:
         """The posterior as it was sampled."""
-        return self.made.get("posterior") or load_posterior(self.run / "posterior.nc")
+        found: Posterior | None = self.made.get("posterior")
+        if found is not None:
+            return found
+        self.run.refuse_damaged("sample")
+        return load_posterior(self.run / "posterior.nc")
 
     @property
     def is_sampled(self) -> bool:
@@ -152,7 +158,7 @@ class Results:
         found: Diagnostics | None = self.made.get("stored")
         if found is not None:
             return found
-        self.run.refuse_changed("diagnose")
+        self.run.refuse_damaged("diagnose")
         return load_diagnostics(self.run, self.fit, self.posterior)
 
     @cached_property
@@ -165,7 +171,11 @@ class Results:
     @cached_property
     def evaluation(self) -> Evaluation:
         """Maps, budget, margins and validity periods, as the assessment has found them."""
-        return self.made.get("evaluation") or load_evaluation(self.run, self.fit, self.posterior)
+        found: Evaluation | None = self.made.get("evaluation")
+        if found is not None:
+            return found
+        self.run.refuse_damaged("evaluate")
+        return load_evaluation(self.run, self.fit, self.posterior)
 
     @property
     def stored_evaluation(self) -> Evaluation | None:

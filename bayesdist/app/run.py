@@ -200,7 +200,7 @@ def continue_stage(
         )
     stages = ASSESS if stage == "assess" else (stage,)
     needs = (begins_with,) if stage == "fit" != begins_with else NEEDS[stages[0]]
-    directory.require(stage, needs, thorough=True)
+    directory.require(stage, needs)
     with initialized(directory) as results:
         results = make_stages(results, stages, force=True, pdf=pdf)
         if stage == "sample":

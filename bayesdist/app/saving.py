@@ -14,6 +14,7 @@ from bayesdist.app.exposures.series import write_series_tables
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.summary import fit_sections, log_fit, sample_sections
 from bayesdist.app.matches.added_errors import grouping_sentence
+from bayesdist.app.matches.plausibility import doubts_on_stars
 from bayesdist.app.rehearsal import rehearse_solution
 from bayesdist.app.results import Results
 from bayesdist.app.selfcal.stars import write_stars
@@ -76,6 +77,8 @@ def _log_matches(data: FitData, config: Config) -> None:
         log.info("fit: %s", note)
     for reason, count in matches.rejected.items():
         log.info("fit: %d rows were left out in reading: %s", count, reason)
+    for text in doubts_on_stars(data.stars, data.model, config):
+        log.warning("fit: WARNING: %s", text)
     shift = epoch_shift(data.sample, fit)
     if shift is not None and shift.significant:
         log.warning("fit: WARNING: %s", shift.sentence)

@@ -20,12 +20,12 @@ from bayesdist.assess.domain import EvaluationDomain, WorstPosition
 from bayesdist.assess.statistics import ErrorsOf, drawn_statistics
 from bayesdist.assess.terms.forms import (
     PRODUCT,
+    DrawnField,
     ErrorDraws,
     ErrorField,
     ErrorTerm,
     Image,
     Noise,
-    NoiseField,
     Row,
 )
 from bayesdist.infer.solution import Solution
@@ -200,16 +200,14 @@ class DrawnErrors:
         fields = self.at(domain)
         noises = [one for f in fields for one in f.noise(scale)]
         noise, noisy = _together(noises, domain), any(np.any(one.sigma) for one in noises)
-        drawn = [f for f in fields if not isinstance(f, NoiseField)]
+        drawn = [f for f in fields if isinstance(f, DrawnField)]
 
         def error_of(rows: slice, normal: Float) -> Float:
             out = np.zeros((rows.stop - rows.start, domain.size, 2))
             if noisy:
                 out += noise(rows, normal)
             for one in drawn:
-                error = one.errors(rows, scale)
-                if error is not None:
-                    out += error
+                out += one.errors(rows, scale)
             return out
 
         return error_of

@@ -16,7 +16,13 @@ from bayesdist.data.reading.table import with_sky_columns
 from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.data.sky.positions import sky_columns
 from bayesdist.data.sky.tangent import onto_plane
-from bayesdist.data.tables.checks import check_columns, columns_of, refuse_half, without_missing
+from bayesdist.data.tables.checks import (
+    COMPLETED,
+    check_columns,
+    columns_of,
+    refuse_half,
+    without_missing,
+)
 from bayesdist.data.tables.column import SourceColumn, row_number
 from bayesdist.data.tables.names import ALIASES, find_columns
 from bayesdist.data.tables.quantities import Quantities
@@ -91,7 +97,7 @@ class ReferenceCatalog:
     unit: str = "pix"
     tangent_point: tuple[float, float] | None = None
     source: str = "catalogue"
-    star: Int = None  # type: ignore[assignment]
+    star: Int = COMPLETED
     parallax: Float | None = None
     sigma_parallax: Float | None = None
     notes: tuple[str, ...] = ()

@@ -11,9 +11,9 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.data.detections import Detections
+from bayesdist.data.formats.files import exposure_names, input_files
 from bayesdist.data.formats.hst1pass import is_hst1pass, read_hst1pass
-from bayesdist.data.reading.formats import exposure_names, input_files
-from bayesdist.data.tables.checks import counted
+from bayesdist.data.tables.checks import COMPLETED, counted
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import BASIC, find_columns
 from bayesdist.errors import FormatError, InputError
@@ -166,7 +166,7 @@ def _of_table(
     whole = Detections(
         values["x"],
         values["y"],
-        chip=column("chip").integers() if "chip" in found else None,  # type: ignore[arg-type]
+        chip=column("chip").integers() if "chip" in found else COMPLETED,
         mag=values.get("mag"),
         q=values.get("q"),
         source=source,

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import FormatError
@@ -197,8 +198,13 @@ def load_posterior(path: str | Path) -> Posterior:
         mixture["fraction_prior"] = tuple(mixture["fraction_prior"])
         info: dict[str, Any] = {str(k): _plain(v) for k, v in stats.attrs.items()}
         info["exact"] = bool(info["exact"])
+        model = DistortionModel.from_dict(_tree(attrs["model"]))
+        shape = (*draws["theta"].shape[:2], len(model.names))
+        _refuse_other_shape(draws["theta"].values, shape)
+        for one in (stats["lp"], *(draws[k] for k in ("j", "f", "s_out") if k in draws)):
+            _refuse_other_shape(one.values, shape[:2])
         return Posterior(
-            model=DistortionModel.from_dict(_tree(attrs["model"])),
+            model=model,
             mixture=OutlierMixture(**mixture),
             theta=draws["theta"].values,
             hyper={k: draws[k].values for k in ("j", "f", "s_out") if k in draws},
@@ -224,6 +230,14 @@ def load_posterior(path: str | Path) -> Posterior:
 
 def _certificate(fields: dict[str, Any] | None) -> Certificate | None:
     return None if fields is None else Certificate(**fields | {"reasons": tuple(fields["reasons"])})
+
+
+def _refuse_other_shape(values: NDArray[Any], shape: tuple[int, ...]) -> None:
+    """Refuse (ValueError) an array of another shape, or with values that are no finite numbers."""
+    if values.shape != shape:
+        raise ValueError(f"an array has the shape {values.shape} in place of {shape}")
+    if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
+        raise ValueError("an array has values that are not finite")
 
 
 def _tree(text: object) -> Any:
@@ -272,8 +286,12 @@ def load_fit(path: str | Path) -> LinearFit:
     path = Path(path)
     with _reading(path, "a fit", "fit"):
         data = netcdf_dataset(path)
+        model = DistortionModel.from_dict(_tree(data.attrs["model"]))
+        n = len(model.names)
+        for name, shape in (("mean", (n,)), ("cov", (n, n)), ("clip", (n,))):
+            _refuse_other_shape(data[name].values, shape)
         return LinearFit(
-            model=DistortionModel.from_dict(_tree(data.attrs["model"])),
+            model=model,
             mean=data["mean"].values,
             cov=data["cov"].values,
             clip=Clip(

@@ -55,7 +55,7 @@ class DistortionModel(EffectiveCoefficients):
     Parameters
     ----------
     order : int
-        Total polynomial order, 1 to 9.
+        Total polynomial order, 1 to 12.
     chips : tuple of Chip
     unit : str
         Unit of u and v.

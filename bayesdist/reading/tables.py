@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,10 @@ from bayesdist.reading.faults import naming_faults
 from bayesdist.reading.fits import FITS_START, open_fits
 from bayesdist.reading.parquet import parquet_table
 from bayesdist.reading.regular import head_of, read_bytes, read_lines
-from bayesdist.reading.text_tables import is_text_table, parse_text_table
+from bayesdist.reading.text_tables import is_text_table, parse_text_table, refuse_cut_end
 from bayesdist.reading.unpacked import unpacked
+
+_COMMAS = re.compile(r"# delimiter: ['\"]?,")
 
 __all__ = ["TABLE_SUFFIXES", "is_binary", "is_fits", "read_ecsv", "read_table"]
 
@@ -39,15 +42,25 @@ def _reading(path: Path) -> Iterator[None]:
         yield
 
 
-def _bare_lines(path: Path) -> list[str]:
-    """Lines without their ends: as a list, for astropy takes a lone line for the name of a file."""
-    return [line.rstrip("\r\n") for line in read_lines(path)]
+def _whole_lines(path: Path, mark: str) -> list[str]:
+    """Lines without their ends: as a list, for astropy takes a lone line for the name of a file.
+
+    FormatError where the last one is cut.
+    """
+    lines = read_lines(path)
+    if lines and lines[0].startswith("# %ECSV"):
+        head = takewhile(lambda line: line.startswith("#"), lines)
+        mark = "," if any(_COMMAS.match(line) for line in head) else " "
+    bare = [line.rstrip("\r\n") for line in lines]
+    _refuse_short_rows(bare, mark, path)
+    refuse_cut_end(lines, mark, where=str(path))
+    return bare
 
 
 def read_ecsv(path: Path) -> Table:
     """Table of an ECSV file; errors as of `read_table`."""
     with _reading(path):
-        return Table.read(_bare_lines(path), format="ascii.ecsv")
+        return Table.read(_whole_lines(path, " "), format="ascii.ecsv")
 
 
 def _read_text(path: Path) -> Table:
@@ -55,9 +68,7 @@ def _read_text(path: Path) -> Table:
 
 
 def _read_separated(path: Path, *, mark: str, format: str) -> Table:
-    lines = _bare_lines(path)
-    _refuse_short_rows(lines, mark, path)
-    return Table.read(lines, format=format, comment="#", guess=False)
+    return Table.read(_whole_lines(path, mark), format=format, comment="#", guess=False)
 
 
 def _refuse_short_rows(lines: list[str], mark: str, path: Path) -> None:

@@ -54,7 +54,7 @@ def diagnose_run(posterior: Posterior, data: FitData, config: Config, base: Path
 
 def diagnose_fit_of_run(data: FitData, config: Config) -> Diagnostics:
     """Diagnostics of a fit alone."""
-    options = _of_kind(data, config)
+    options = _of_kind(data, config) | {"known": data.fitted.priors.joint is not None}
     return diagnose_fit(data.fit, None, data.stars, data.shards, data.sample, **options)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,6 +27,10 @@ __all__ = [
     "parse_config",
     "validated",
 ]
+
+
+# numbers of configurations: in all units beyond whatever is meant, and far from overflow
+LEAST, MOST, MOST_WHOLE = 1e-20, 1e15, 2**63 - 1
 
 
 class _RequirementFile(Section):
@@ -121,7 +126,28 @@ def _settings(text: str, where: str, *, begin: str) -> dict[str, Any]:
         raise ConfigError(error.cause, where=error.where, do=error.do) from error
     if not raw:
         raise ConfigError("holds no settings", where=where, do=begin)
+    for key, value in _numbers(raw, ""):
+        large = MOST_WHOLE if isinstance(value, int) else MOST
+        if abs(value) > large or 0 < abs(value) < LEAST:
+            said = str(value) if len(str(value)) < 30 else f"{str(value)[:20]}..."
+            raise ConfigError(
+                f"{said} is no plausible number",
+                where=f"{where}: {key}",
+                do=f"give one between {LEAST:g} and {large:g}",
+            )
     return raw
+
+
+def _numbers(tree: Any, key: str) -> Iterator[tuple[str, int | float]]:
+    """Numbers of a tree that are finite, with their keys."""
+    if isinstance(tree, dict):
+        for name, inner in tree.items():
+            yield from _numbers(inner, f"{key}.{name}" if key else name)
+    elif isinstance(tree, list):
+        for k, inner in enumerate(tree, 1):
+            yield from _numbers(inner, f"{key}[{k}]")
+    elif isinstance(tree, int) or (isinstance(tree, float) and math.isfinite(tree)):
+        yield key, tree
 
 
 def _validated(

@@ -105,6 +105,10 @@ class RunConfig(Section):
         others = named if isinstance(named, list) else [named]
         return [path for path in found if path not in others]
 
+    def files_of_priors(self, base: Path) -> list[Path]:  # noqa: ARG002 - of one kind of run
+        """Files of earlier calibrations that are priors of this one."""
+        return []
+
     def of_order(self, order: int) -> Self:
         """This configuration with polynomials of another order."""
         return self.model_copy(update={"model": self.model.model_copy(update={"order": order})})

@@ -12,6 +12,7 @@ from bayesdist.app.config import Config
 from bayesdist.app.kinds.errors import read_magnitude_errors
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted, required
+from bayesdist.app.store.inputs import input_name
 from bayesdist.app.store.rundir import PAIRS, RunDirectory, part_files
 from bayesdist.data import Matches, read_matches
 from bayesdist.errors import InputError
@@ -177,5 +178,5 @@ def _catalogue_of(run: RunDirectory) -> str | None:
     block, base = run.config.campaign, Path(run.facts["base"])
     if block is None:
         return None
-    found: str | None = run.facts["inputs"].get(str(base / block.catalog))
+    found: str | None = run.facts["inputs"].get(input_name(base / block.catalog, base))
     return found

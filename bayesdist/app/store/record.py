@@ -108,6 +108,7 @@ class _Whole(_Head):
     # facts of runs; a store by itself has none
     config: dict[str, Any] = Field(default_factory=dict)
     base: str = ""
+    base_from_run: str = ""
     inputs: dict[str, str] = Field(default_factory=dict)
     seed: int = 0
     command: str = ""
@@ -209,6 +210,12 @@ class Record:
         rest = {key: facts.pop(key) for key in ("stages", "under_way", "checkpoints")}
         del facts["schema"]
         return cls(facts, artefacts, **rest)
+
+    @property
+    def file_names(self) -> set[str]:
+        """Files that stages have written, or may have."""
+        found = {name for one in self.artefacts.values() for name in one.files}
+        return found.union((self.under_way or {}).get("files", ()))
 
     def begins_file(self, name: str) -> bool:
         """Note that the stage under way writes a file; False where that is known."""

@@ -18,6 +18,7 @@ from bayesdist.errors import InputError, required
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.catalogue.star_errors import StarCovariance
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
+from bayesdist.reading.faults import restoring
 from bayesdist.records import record_from_arrays, record_to_arrays
 
 __all__ = ["fingerprint_of", "load_diagnostics", "write_diagnostics"]
@@ -72,16 +73,20 @@ def load_diagnostics(run: RunDirectory, fit: LinearFit, posterior: Posterior) ->
     if not facts or not (run / OTHERS).exists():
         return None
     try:
-        others = record_from_arrays(read_arrays(run / OTHERS, fingerprint, do=""))
+        found = read_arrays(run / OTHERS, fingerprint, do="")
         arrays = read_arrays(run / CORRELATED, fingerprint, do="")
     except InputError:
         return None
-    correlated = discrepancy_from_arrays(posterior.model, arrays)
-    return replace(
-        others,
-        correlated=replace(correlated, facts=facts),
-        catalogue=_load_catalogue(run, fingerprint),
-    )
+    again = f"run 'bayesdist stage diagnose {run.path}' again"
+    with restoring(run / OTHERS, "diagnostics", do=again):
+        others = record_from_arrays(found, Diagnostics)
+    with restoring(run / CORRELATED, "correlated errors", do=again):
+        correlated = discrepancy_from_arrays(posterior.model, arrays)
+        return replace(
+            others,
+            correlated=replace(correlated, facts=facts),
+            catalogue=_load_catalogue(run, fingerprint),
+        )
 
 
 def _save_catalogue(run: RunDirectory, fingerprint: str, stars: StarCovariance) -> None:

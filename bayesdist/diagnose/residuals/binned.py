@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.errors import InputError
-from bayesdist.names import require_known
+from bayesdist.errors import InputError, require_known
 
 __all__ = [
     "BAND_AXES",

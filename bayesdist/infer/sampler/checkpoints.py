@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
+from bayesdist.reading.faults import restoring
 from bayesdist.reading.hdf5 import hdf5_arrays
 
 __all__ = ["Block", "Walkers", "block_path", "read_arrays", "write_arrays"]
@@ -108,10 +109,12 @@ class Block:
         """Block from a file; InputError when it cannot be read, or has another mark."""
         do = "delete it and resume: its steps are run again"
         stored = read_arrays(path, mark, (*BLOCK_ARRAYS, *END_ARRAYS), do=do)
-        log_q, keys, (position, has_gauss, gauss) = (stored.pop(name) for name in END_ARRAYS)
-        random = ("MT19937", keys, int(position), int(has_gauss), float(gauss))
-        end = Walkers(stored["coords"][-1], stored["log_prob"][-1], log_q, random)
-        return cls(**stored, end=end)
+        with restoring(path, "a checkpoint", do=do):
+            log_q, keys, (position, has_gauss, gauss) = (stored.pop(name) for name in END_ARRAYS)
+            random = ("MT19937", keys, int(position), int(has_gauss), float(gauss))
+            np.random.RandomState().set_state(random)  # refuses what is no such state
+            end = Walkers(stored["coords"][-1], stored["log_prob"][-1], log_q, random)
+            return cls(**stored, end=end)
 
 
 def block_path(folder: Path, ensemble: int, end: int) -> Path:

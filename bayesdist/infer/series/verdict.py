@@ -166,8 +166,8 @@ def _text(
             parts.append(f"Break at {middle:.2f} ({low:.2f} to {high:.2f} with 68 %).")
     parts += _named_slopes(posterior)
     if rivals and posterior.trend.has_slope:
-        names = _plain(", ".join(rivals))
-        parts.append(f"Others predict as well ({names}): the slope need not continue.")
+        named = _plain(", ".join(rivals))
+        parts.append(f"Others predict as well ({named}): the slope need not continue.")
     if comparison.scheme == "blocks":
         parts.append(
             f"Successive exposures are correlated ({comparison.correlation:.2f}); sigmas of slopes "

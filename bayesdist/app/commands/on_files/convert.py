@@ -10,15 +10,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
-from bayesdist.app.commands.on_files.calibrations import calibration_at
+from bayesdist.app.commands.on_files.calibrations import calibration_at, on_the_sky
 from bayesdist.app.screen import number as digits
-from bayesdist.app.summary import Summary
 from bayesdist.app.tables.output import refuse_existing
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.inverse import detector_grid
-from bayesdist.calibration.plane import ARCSEC, Plane
+from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky.tangent import sky_of_plane
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
@@ -31,14 +30,13 @@ from bayesdist.products.formats.common.document import (
     FormatSettings,
 )
 from bayesdist.products.registry import build, format_of, open_document, product_settings
-from bayesdist.reading.documents import read_json_as, toml_of
+from bayesdist.reading.documents import toml_of
 
 __all__ = ["convert"]
 
 Float = NDArray[np.float64]
 
 _GRID = 65  # points of each axis over which the loss is measured
-_SUMMARY = TypeAdapter(Summary)
 _ROUNDING = 1e-6  # pixels: what is less is called none
 
 
@@ -68,7 +66,7 @@ def convert(
     """
     target = format_of(to)
     settings = _settings(to, product_settings()[to], options)
-    found = _on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
+    found = on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
     source = found if chip is None else found.only(chip, epoch)
     at = None
     if source.model.time is not None:
@@ -82,22 +80,10 @@ def convert(
     lines = [f"{', '.join(str(p) for p in places)}: by {source.name}"]
     back = _read_back(held, filter, made.model.chips[0].size)
     lines += [f"  {note}" for note in (*source.notes, *notes)]
+    lines += [f"  warning: {w}" for w in dict.fromkeys(w for one in built for w in one.warnings)]
     used = _read_back(held, filter, made.model.chips[0].size, as_used=True)
     lines += [f"  {line}" for line in _losses(source, back, used, at, scale)]
     return "\n".join(lines)
-
-
-def _on_the_sky(path: Path, found: Calibration) -> Calibration:
-    """Calibration of a run about the point where its stars touch the sky, where they do."""
-    home = path if path.is_dir() else path.parent
-    summary = home / "summary.json"
-    if found.plane.kind != "free" or not (home / "run.json").exists() or not summary.exists():
-        return found
-    data = read_json_as(_SUMMARY, summary, do="resume the run, which writes it again").data
-    if data is None or data.tangent_point is None:
-        return found
-    ra, dec = data.tangent_point
-    return replace(found, plane=Plane("sky", point=(ra, dec)))
 
 
 def _settings(to: str, kind: type[FormatSettings], options: Sequence[str]) -> FormatSettings:

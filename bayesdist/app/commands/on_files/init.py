@@ -16,8 +16,8 @@ from bayesdist.app.matches.reading import load_matches
 from bayesdist.app.matches.sources import mission_template
 from bayesdist.app.tables.output import refuse_existing
 from bayesdist.data import FORMATS, Matches
-from bayesdist.data.reading.formats import mission_formats
-from bayesdist.data.reading.layout import TableLayout, table_layout
+from bayesdist.data.formats.files import mission_formats
+from bayesdist.data.formats.layout import TableLayout, table_layout
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 
@@ -35,7 +35,7 @@ _NOT_FINITE = ("value is nan", "value is inf", "value is -inf")
 _GUESSED_UNIT = "unit = {unit:22s}# GUESSED: the table does not say\n"
 
 _TEMPLATE = """\
-# A calibration of geometric distortion; see docs/configuration.md for every key.
+# A calibration of geometric distortion; see 'bayesdist docs configuration' for every key.
 
 [data]
 matches = {matches}
@@ -43,7 +43,7 @@ matches = {matches}
 {not_finite}
 {detector}
 [model]
-order = {order}                       # 1 to 9
+order = {order}                       # 1 to 12
 {reference}# of each exposure: none | shift | shift_rotation | shift_rotation_scale | affine
 frames = "{frames}"
 # [model.tdd]                   # terms that drift with time: axis, power of x, power of y

@@ -11,7 +11,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.data.batches import BATCH
-from bayesdist.data.reading.formats import input_files
+from bayesdist.data.formats.files import input_files
 from bayesdist.data.tables.column import Place, SourceColumn, row_number
 from bayesdist.data.tables.names import BASIC, find_columns
 from bayesdist.data.tables.parquet import ParquetPart, describe_part

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from bayesdist.errors import BayesdistError, FormatError
 from bayesdist.files import atomic_path
 from bayesdist.products.formats.common.cards import card_images, header_of
+from bayesdist.reading.faults import reason_of
 from bayesdist.reading.fits import HDU_STARTS, RECORD, data_size, open_fits, padded
 from bayesdist.reading.regular import read_bytes
 from bayesdist.reading.unpacked import unpacked
@@ -185,9 +186,11 @@ def readable(where: str) -> Iterator[None]:
             yield
     except BayesdistError:
         raise
-    except (fits.VerifyError, ValueError, KeyError, IndexError, TypeError, OSError) as error:
+    except Exception as error:  # libraries raise all kinds on values that no file should have
         raise FormatError(
-            f"is not a header that can be read ({error})", where=where, do="check the file"
+            f"is not a header that can be read ({reason_of(error)})",
+            where=where,
+            do="check the file",
         ) from error
 
 

@@ -23,7 +23,6 @@ from bayesdist.calibration.chip_map import fitted_map
 from bayesdist.calibration.inverse import ExplicitInverse, detector_grid
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError, InputError
-from bayesdist.model.basis import MAX_ORDER
 from bayesdist.products.formats.common.coefficients import Coefficients, evaluate
 from bayesdist.products.formats.common.content import Content, read_content
 from bayesdist.products.formats.common.document import Choice, MissingSizeError
@@ -34,6 +33,7 @@ from bayesdist.reading.documents import json_of
 __all__ = [
     "AGREEMENT",
     "COLUMNS",
+    "HIGHEST",
     "KEYWORDS",
     "NAMES",
     "SIDE",
@@ -52,6 +52,7 @@ Float = NDArray[np.float64]
 NAMES = ("Sci2IdlX", "Sci2IdlY", "Idl2SciX", "Idl2SciY")
 COLUMNS = ("AperName", "siaf_index", "exponent_x", "exponent_y", *NAMES)
 KEYWORDS = ("XSciSize", "YSciSize", "XSciRef", "YSciRef")
+HIGHEST = 9  # order: powers have one digit each in siaf_index
 SIDE = "siaf_covariance"  # first key of a side file
 AGREEMENT = 1e-6  # pixels: as far as table and side file may differ
 _STATED = re.compile(r"#\s*(XSciSize|YSciSize|XSciRef|YSciRef)\s*=\s*(\S+)")
@@ -210,9 +211,9 @@ def table_of(content: Content) -> SiafTable:
 def _row(cells: Mapping[str, str], number: int, where: str) -> Row:
     i, j = (_number(cells[key], where) for key in COLUMNS[2:4])
     values = [_number(cells[key], where) for key in NAMES]
-    if not (i.is_integer() and j.is_integer() and i >= 0 and j >= 0 and i + j <= MAX_ORDER):
+    if not (i.is_integer() and j.is_integer() and i >= 0 and j >= 0 and i + j <= HIGHEST):
         raise FormatError(
-            f"the powers are {i:g} and {j:g}", where=where, do=f"give 0 to {MAX_ORDER} in all"
+            f"the powers are {i:g} and {j:g}", where=where, do=f"give 0 to {HIGHEST} in all"
         )
     return Row(
         number,

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bayesdist.assess.circular import per_axis
-from bayesdist.checks import LEVELS, Check, worst
+from bayesdist.checks import LEVELS, Check, warnings_of, worst
 from bayesdist.numbers import number, rounded, with_mas
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput
+from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.sections.run.margins import VERDICT_LEVELS
 from bayesdist.report.sections.run.validity import (
     epoch_clause,
@@ -95,11 +95,14 @@ def verdict(r: ReportInput) -> Verdict:
     The headline says what is worst first, for which epoch, and until when it holds.
     """
     groups = status_checks(r)
-    sentences = [*(f"{text}." for text in r.warnings), _margin_sentence(r), _accuracy_sentence(r)]
+    numbers = (_margin_sentence(r), _accuracy_sentence(r))
     if r.provisional:
-        reasons = r.posterior.convergence.reasons  # type: ignore[union-attr]
-        sentences.insert(0, f"Why: {'; '.join(reasons) or 'no reason was recorded'}.")
-        return Verdict("fail", "NOT CONVERGED: do not rely on these numbers", tuple(sentences))
+        reasons = needed(r.posterior).convergence.reasons
+        why = f"Why: {'; '.join(reasons) or 'no reason was recorded'}."
+        remarks = warnings_of(c for c in r.checks if c.name != "Converged")  # it says the same
+        sentences = (why, *(f"{text}." for text in remarks), *numbers)
+        return Verdict("fail", "NOT CONVERGED: do not rely on these numbers", sentences)
+    sentences = (*(f"{text}." for text in r.warnings), *numbers)
     clauses = [(worst(groups.get("Requirements", ())), _requirements_clause(r))]
     own: tuple[str, ...] = _OWN_CLAUSE
     if r.posterior is None:
@@ -118,7 +121,7 @@ def verdict(r: ReportInput) -> Verdict:
     clauses.sort(key=lambda one: (one[1] == _UNSAMPLED, LEVELS.index(one[0])), reverse=True)
     level = max((level for level, _ in clauses), key=LEVELS.index)
     headline = "; ".join(text for _, text in clauses)
-    return Verdict(level, headline[:1].upper() + headline[1:], tuple(sentences))
+    return Verdict(level, headline[:1].upper() + headline[1:], sentences)
 
 
 def _requirements_clause(r: ReportInput) -> str:
