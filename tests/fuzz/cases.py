@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -73,12 +74,13 @@ def _suited(one: Input):
 
 
 def drawn(inputs: Iterable[Input], n: int, seed: int) -> list[Case]:
-    """n cases, the same number of each input but for one, each of them different."""
+    """n cases, the same number of each input but for one, in any order."""
     out: list[Case] = []
     known = list(inputs)
     for k, one in enumerate(known):
         many = n * (k + 1) // len(known) - n * k // len(known)
         out += _of_input(one, many, seed + k)
+    random.Random(seed).shuffle(out)  # an end before time has seen some of each
     return out
 
 
