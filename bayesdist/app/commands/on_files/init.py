@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,6 +23,8 @@ from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 
 __all__ = ["init"]
+
+log = logging.getLogger("bayesdist")
 
 SIGMA = 0.05  # for tables that say nothing about their errors
 SAMPLE = 20_000  # matches that are looked at
@@ -162,6 +165,8 @@ def _of_matches(
             raise
         table, unit_line, sigma, read_sigma = _read(matches, columns, not_finite="reject")
         not_finite = _REJECT
+    for reason, count in table.rejected.items():
+        log.warning("%s: left out %d rows: %s", matches, count, reason)
     layout = table_layout(matches, columns, read_sigma=read_sigma)
     chips = {n: _size(*reach, size) for n, reach in _reach(table).items()}
     several = len(chips) > 1
