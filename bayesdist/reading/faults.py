@@ -70,7 +70,13 @@ def restoring(path: Path, what: str, *, do: str) -> Iterator[None]:
         ) from error
 
 
+# what they say is about the reader's code, not about the file
+_OF_CODE = (ArithmeticError, AssertionError, AttributeError, LookupError, NameError, TypeError)
+
+
 def reason_of(error: Exception) -> str:
-    """First line of what an exception says, or its kind where it says nothing."""
+    """First line of what an exception says of a file, or its kind where it says nothing."""
+    if isinstance(error, _OF_CODE):
+        return "it is not laid out as this format demands"
     line = next(iter(str(error).strip().splitlines()), "") or type(error).__name__
     return line[:160].rstrip(".")

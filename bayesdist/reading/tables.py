@@ -175,5 +175,7 @@ def read_table(path: Path) -> Table:
             where=str(path),
             do=f"give a file that ends in {', '.join(TABLE_SUFFIXES)}, or set the format",
         )
+    if path.is_file() and not path.stat().st_size:
+        raise FormatError("is empty", where=str(path), do="fetch or write it again")
     with _reading(path):
         return reader(path)

@@ -82,9 +82,11 @@ RUN = ("nan.fits", "chips_by_name.fits", "no_errors.ecsv", "errors_too_small.ecs
 
 
 def begun(folder, name):
-    """Configuration that `init` has written for a table."""
+    """Configuration that `init` has written for a table; it says which rows it left out."""
     CASES[name][0].write(folder / name)
-    good("init", folder / "my.toml", "--matches", folder / name)
+    said = good("init", folder / "my.toml", "--matches", folder / name).err
+    for word in CASES[name][2]:
+        assert "no value" not in word or f"left out {word}" in said
     return folder / "my.toml"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import resource
 import sys
@@ -31,12 +32,16 @@ def main() -> int:
         if not given.kept:
             cases += drawn(known, given.cases, given.seed)
         verdicts, failed = [], []
-        for verdict in tried(known, cases):
-            verdicts.append(verdict)
-            if verdict.failed:
-                failed.append(verdict)
-                print(verdict.told, file=sys.stderr, flush=True)
-    used = [sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+        # an interrupt ends it with the counts so far
+        with contextlib.suppress(KeyboardInterrupt):
+            for verdict in tried(known, cases):
+                verdicts.append(verdict)
+                if verdict.failed:
+                    failed.append(verdict)
+                    print(verdict.told, file=sys.stderr, flush=True)
+    used = [
+        sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    ]
     table = table_of(verdicts)
     print(table, "", table_of(verdicts, lambda v: MUTATIONS[v.case.mutation].kind), sep="\n")
     print(f"\n{used[0]:.0f} s of processor time here, {used[1]:.0f} s in {len(verdicts)} cases")

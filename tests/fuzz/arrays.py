@@ -46,8 +46,12 @@ def fields_of_one_name(content, column):
     return _as_parquet(table.rename_columns(names))
 
 
-@changes("wrong types", OPEN, "parquet",
-         arguments=_column(kind=st.sampled_from(["text", "list", "null", "bool", "struct", "time"])))  # fmt: skip
+@changes(
+    "wrong types",
+    OPEN,
+    "parquet",
+    arguments=_column(kind=st.sampled_from(["text", "list", "null", "bool", "struct", "time"])),
+)
 def field_of_another_type(content, column, kind):
     table = _parquet(content)
     one = column % table.num_columns
@@ -63,8 +67,14 @@ def field_of_another_type(content, column, kind):
     return _as_parquet(table.set_column(one, table.column_names[one], new))
 
 
-@changes("no number", KNOWABLE, "parquet", arguments=_column(row=st.floats(0, 1), value=st.sampled_from(
-    [float("nan"), float("inf"), None])))  # fmt: skip
+@changes(
+    "no number",
+    KNOWABLE,
+    "parquet",
+    arguments=_column(
+        row=st.floats(0, 1), value=st.sampled_from([float("nan"), float("inf"), None])
+    ),
+)
 def value_not_finite(content, column, row, value):
     table = _parquet(content)
     floats = [k for k, f in enumerate(table.schema) if pa.types.is_floating(f.type)]
@@ -119,8 +129,14 @@ def variable_lost(content, item):
     return _edited(content, change)
 
 
-@changes("wrong types", KNOWABLE, "hdf5", arguments=_item(
-    kind=st.sampled_from(["shape", "text", "empty", "group", "nan", "inf", "zero"])))  # fmt: skip
+@changes(
+    "wrong types",
+    KNOWABLE,
+    "hdf5",
+    arguments=_item(
+        kind=st.sampled_from(["shape", "text", "empty", "group", "nan", "inf", "zero"])
+    ),
+)
 def variable_is(content, item, kind):
     def change(file, names):
         name = names[item % len(names)]
@@ -144,8 +160,14 @@ def variable_is(content, item, kind):
     return _edited(content, change)
 
 
-@changes("wrong types", KNOWABLE, "hdf5", arguments=_item(
-    attribute=ANY, value=st.sampled_from([None, 0, -1, "", "abc", "{}", "[", 1e300, [1, 2]])))  # fmt: skip
+@changes(
+    "wrong types",
+    KNOWABLE,
+    "hdf5",
+    arguments=_item(
+        attribute=ANY, value=st.sampled_from([None, 0, -1, "", "abc", "{}", "[", 1e300, [1, 2]])
+    ),
+)
 def attribute_is(content, item, attribute, value):
     def change(file, names):
         places = [file, *(file[name] for name in names)]

@@ -14,8 +14,26 @@ from tests.fuzz.mutation import KNOWABLE, OPEN, changes
 
 BLOCK, CARD = 2880, 80
 STRUCTURE = re.compile(rb"(SIMPLE|XTENSION|BITPIX|NAXIS\d*|PCOUNT|GCOUNT|TFIELDS|TFORM\d+|END) ")
-IMPOSSIBLE = ["-1", "0", "1", "999", "100000", "2147483648", "99999999999999999999", "1.5", "nan",
-              "'abc'", "T", "", "1e400", "-64", "8", "'1QE(9999999999)'", "'Q'", "'1PD'"]  # fmt: skip
+IMPOSSIBLE = [
+    "-1",
+    "0",
+    "1",
+    "999",
+    "100000",
+    "2147483648",
+    "99999999999999999999",
+    "1.5",
+    "nan",
+    "'abc'",
+    "T",
+    "",
+    "1e400",
+    "-64",
+    "8",
+    "'1QE(9999999999)'",
+    "'Q'",
+    "'1PD'",
+]
 CARD_VALUES = [*IMPOSSIBLE, "inf", "-inf", "'nan'", "1e300", "-1e300", "(1,2)", "'", "''", "é"]
 COLUMN = st.integers(0, 40)
 
@@ -61,21 +79,23 @@ def _valued(text: str):
     return lambda card: card[:10] + text.rjust(20).encode("latin-1")
 
 
-@changes("headers", OPEN, "fits",
-         arguments=_of_a_card(True, text=st.sampled_from(IMPOSSIBLE)))  # fmt: skip
+@changes("headers", OPEN, "fits", arguments=_of_a_card(True, text=st.sampled_from(IMPOSSIBLE)))
 def structure_is(content, card, text):
     """A keyword that says how the file is laid out."""
     return _with_card(content, card, _valued(text))
 
 
-@changes("headers", OPEN, "fits",
-         arguments=_of_a_card(False, text=st.sampled_from(CARD_VALUES)))  # fmt: skip
+@changes("headers", OPEN, "fits", arguments=_of_a_card(False, text=st.sampled_from(CARD_VALUES)))
 def keyword_is(content, card, text):
     return _with_card(content, card, _valued(text))
 
 
-@changes("no number", KNOWABLE, "fits",
-         arguments=_of_a_card(False, text=st.sampled_from(["nan", "inf", "1e400"])))  # fmt: skip
+@changes(
+    "no number",
+    KNOWABLE,
+    "fits",
+    arguments=_of_a_card(False, text=st.sampled_from(["nan", "inf", "1e400"])),
+)
 def keyword_not_finite(content, card, text):
     return _with_card(content, card, _valued(text))
 
@@ -85,10 +105,9 @@ def keyword_lost(content, card):
     return _with_card(content, card, lambda _: b"COMMENT")
 
 
-@changes("headers", OPEN, "fits",
-         arguments=_of_a_card(False, other=st.integers(0, 60)))  # fmt: skip
+@changes("headers", OPEN, "fits", arguments=_of_a_card(False, other=st.integers(0, 60)))
 def keyword_twice(content, card, other):
-    """A card in the place of another, so that it stands twice with its value and lacks the other."""
+    """A card in the place of another, which is lost."""
     found = _cards(content)
     at = found[other % len(found)]
     return _with_card(content, card, lambda _: content[at : at + CARD])
@@ -162,14 +181,24 @@ def _set(content: bytes, hdu: int, column: int, row: float, value: float, whole:
 ROW = {"column": COLUMN, "row": st.floats(0, 1)}
 
 
-@changes("no number", KNOWABLE, "fits",
-         arguments=_of_an_extension(value=st.sampled_from([np.nan, np.inf, -np.inf]), **ROW))  # fmt: skip
+@changes(
+    "no number",
+    KNOWABLE,
+    "fits",
+    arguments=_of_an_extension(value=st.sampled_from([np.nan, np.inf, -np.inf]), **ROW),
+)
 def datum_not_finite(content, hdu, column, row, value):
     return _set(content, hdu, column, row, value, whole=False)
 
 
-@changes("odd numbers", OPEN, "fits",
-         arguments=_of_an_extension(value=st.sampled_from([0.0, -1.0, 1e300, -1e300, np.nan, 1e-320]), **ROW))  # fmt: skip
+@changes(
+    "odd numbers",
+    OPEN,
+    "fits",
+    arguments=_of_an_extension(
+        value=st.sampled_from([0.0, -1.0, 1e300, -1e300, np.nan, 1e-320]), **ROW
+    ),
+)
 def data_are(content, hdu, column, row, value):
     return _set(content, hdu, column, row, value, whole=True)
 
@@ -179,4 +208,3 @@ def deep_extensions(content):
     """Two thousand empty extensions behind the file's own."""
     empty = fits.ImageHDU().header.tostring().encode()
     return content + empty * 2000
-

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -56,7 +57,8 @@ def kept() -> list[Case]:
 def cases(draw, one: Input, suited) -> Case:
     """Strategy of cases of one input; `suited` are mutations with the strategy of arguments."""
     command = draw(st.sampled_from(sorted(one.commands)))
-    name = draw(st.sampled_from(sorted(suited)))
+    kind = draw(st.sampled_from(sorted({MUTATIONS[name].kind for name in suited})))
+    name = draw(st.sampled_from(sorted(n for n in suited if MUTATIONS[n].kind == kind)))
     return Case(one.name, command, name, draw(suited[name]))
 
 
@@ -72,12 +74,13 @@ def _suited(one: Input):
 
 
 def drawn(inputs: Iterable[Input], n: int, seed: int) -> list[Case]:
-    """n cases, the same number of each input but for one, each of them different."""
+    """n cases, the same number of each input but for one, in any order."""
     out: list[Case] = []
     known = list(inputs)
     for k, one in enumerate(known):
         many = n * (k + 1) // len(known) - n * k // len(known)
         out += _of_input(one, many, seed + k)
+    random.Random(seed).shuffle(out)  # an end before time has seen some of each
     return out
 
 

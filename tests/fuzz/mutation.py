@@ -1,4 +1,4 @@
-"""A kind of damage: which files it is for, what it takes, and whether it can be known afterwards."""
+"""A kind of damage: which files it is for, what it takes, and whether it can be known."""
 
 from __future__ import annotations
 

@@ -37,7 +37,9 @@ def emptied(content):
     return b""
 
 
-@changes("garbage", KNOWABLE, arguments=lambda c: st.fixed_dictionaries({"n": st.integers(1, 5000)}))
+@changes(
+    "garbage", KNOWABLE, arguments=lambda c: st.fixed_dictionaries({"n": st.integers(1, 5000)})
+)
 def zeros(content, n):
     return bytes(n)
 
@@ -67,12 +69,16 @@ def twice_from(content, at):
 
 
 @changes(
-    "encoding", OPEN, *TEXT,
+    "encoding",
+    OPEN,
+    *TEXT,
     arguments=lambda c: st.fixed_dictionaries(
-        {"at": st.integers(0, max(len(c) - 1, 0)),
-         "bytes": st.sampled_from(["\0", "\xff\xfe", "\xe9", "\x1b[2J", "\r", "\x0c", "\x1a"])}
+        {
+            "at": st.integers(0, max(len(c) - 1, 0)),
+            "bytes": st.sampled_from(["\0", "\xff\xfe", "\xe9", "\x1b[2J", "\r", "\x0c", "\x1a"]),
+        }
     ),
-)  # fmt: skip
+)
 def inserted(content, at, bytes):
     return content[:at] + bytes.encode("latin-1") + content[at:]
 
@@ -142,11 +148,12 @@ def fifo(path: Path):
 
 
 @replaces(
-    "no file", KNOWABLE,
+    "no file",
+    KNOWABLE,
     arguments=lambda c: st.fixed_dictionaries(
         {"device": st.sampled_from(["/dev/zero", "/dev/null", "/dev/full", "/dev/tty"])}
     ),
-)  # fmt: skip
+)
 def device(path: Path, device: str):
     path.unlink()
     path.symlink_to(device)

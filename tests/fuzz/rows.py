@@ -29,9 +29,7 @@ def _of_a_row(**more):
         rows = _rows(content)
         if len(rows) < 3:
             return None
-        return st.fixed_dictionaries(
-            {"line": st.sampled_from(rows[1:-1]), **{k: v for k, v in more.items()}}
-        )
+        return st.fixed_dictionaries({"line": st.sampled_from(rows[1:-1]), **more})
 
     return arguments
 
@@ -113,8 +111,12 @@ def cell_odd(content, line, cell, text):
     return _with_cell(content, line, cell, text.encode())
 
 
-@changes("odd numbers", OPEN, "rows",
-         arguments=lambda c: st.fixed_dictionaries({"cell": cells, "text": values.odd}))  # fmt: skip
+@changes(
+    "odd numbers",
+    OPEN,
+    "rows",
+    arguments=lambda c: st.fixed_dictionaries({"cell": cells, "text": values.odd}),
+)
 def column_odd(content, cell, text):
     """A number in place of a whole column."""
     for line in _rows(content):
@@ -132,13 +134,38 @@ def _names(content: bytes):
 def _of_a_name(**more):
     def arguments(content: bytes):
         names = _names(content)
-        return st.fixed_dictionaries({"name": st.integers(0, len(names) - 1), **more}) if names else None
+        return (
+            st.fixed_dictionaries({"name": st.integers(0, len(names) - 1), **more})
+            if names
+            else None
+        )
 
     return arguments
 
 
-HEADS = ["", "x", "y", "u", "ra", "dec", "chip", "arcsec", "furlong", "deg", "float64", "string",
-         "a b", "[", "{", "null", ": :", "é", '"', "x" * 3000, values.nested(values.DEEP)]  # fmt: skip
+HEADS = [
+    "",
+    "x",
+    "y",
+    "u",
+    "ra",
+    "dec",
+    "chip",
+    "arcsec",
+    "furlong",
+    "deg",
+    "float64",
+    "string",
+    "a b",
+    "[",
+    "{",
+    "null",
+    ": :",
+    "é",
+    '"',
+    "x" * 3000,
+    values.nested(values.DEEP),
+]
 
 
 @changes("headers", OPEN, "rows", "asdf", arguments=_of_a_name(text=st.sampled_from(HEADS)))
@@ -149,14 +176,25 @@ def head_word(content, name, text):
     return content[:begin] + text.encode() + content[end:]
 
 
-@changes("headers", OPEN, "rows", "text",
-         arguments=lambda c: st.fixed_dictionaries({"line": st.integers(0, 12)}))  # fmt: skip
+@changes(
+    "headers",
+    OPEN,
+    "rows",
+    "text",
+    arguments=lambda c: st.fixed_dictionaries({"line": st.integers(0, 12)}),
+)
 def line_lost(content, line):
     return _line(content, line, lambda _: [])
 
 
-@changes("headers", OPEN, "rows", "text", "toml",
-         arguments=lambda c: st.fixed_dictionaries({"line": st.integers(0, 12)}))  # fmt: skip
+@changes(
+    "headers",
+    OPEN,
+    "rows",
+    "text",
+    "toml",
+    arguments=lambda c: st.fixed_dictionaries({"line": st.integers(0, 12)}),
+)
 def line_twice(content, line):
     return _line(content, line, lambda one: [one, one])
 

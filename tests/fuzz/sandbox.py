@@ -24,7 +24,8 @@ from tests.fuzz.inputs import HERE, Input
 from tests.fuzz.mutation import MUTATIONS
 from tests.sketches import sketched
 
-SECONDS = 60.0  # of the clock: the machine may be busy
+SECONDS = 20.0  # of processor time
+WAIT = 120.0  # seconds of the clock: the machine may be busy
 MEMORY = 3 << 30  # beyond what the process has mapped when it begins
 BATCH = 40
 # answers that depend on the machine
@@ -91,7 +92,7 @@ def _collected(pipe: int, child: int, n: int) -> tuple[list[Answer], str]:
     """Answers as they come, and how the process ended that left some out."""
     text, found, end = b"", list[Answer](), "died"
     while len(found) < n:
-        ready, _, _ = select.select([pipe], [], [], SECONDS + 30)
+        ready, _, _ = select.select([pipe], [], [], WAIT + 30)
         if not ready:  # deaf to the alarm
             end = "hang"
             break
@@ -113,26 +114,31 @@ def _child(pairs: Sequence[tuple[Input, Case, str]], folder: Path, pipe: int) ->
         most = pages * os.sysconf("SC_PAGE_SIZE") + MEMORY
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        signal.signal(signal.SIGALRM, _ring)
+        for alarm in (signal.SIGALRM, signal.SIGPROF):
+            signal.signal(alarm, _ring)
         for stream in (0, 1, 2):
             os.dup2(os.open(os.devnull, os.O_RDWR), stream)
         os.chdir(folder)
         with sketched():
             for k, (one, case, command) in enumerate(pairs):
-                answer = _answer(one, case, command, folder / str(k))
+                answer = _answer(one, case, command, folder / str(k), alarmed=True)
                 os.write(pipe, json.dumps(asdict(answer)).encode() + b"\n")
     finally:
         os._exit(0)
 
 
-def _answer(one: Input, case: Case | None, command: str, copy: Path) -> Answer:
+def _answer(
+    one: Input, case: Case | None, command: str, copy: Path, *, alarmed: bool = False
+) -> Answer:
     _copied(one, copy)
     if case is not None:
         MUTATIONS[case.mutation].apply(copy / one.file, **case.arguments)
     arguments = [part.replace(HERE, str(copy)) for part in one.commands[command]]
     out, err = io.StringIO(), io.StringIO()
     end, code, begun = "returned", 0, time.process_time()
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    if alarmed:
+        signal.setitimer(signal.ITIMER_REAL, WAIT)
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             code = main(arguments)
@@ -146,7 +152,8 @@ def _answer(one: Input, case: Case | None, command: str, copy: Path) -> Answer:
         end = "raised"
         traceback.print_exc(limit=-12, file=err)
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        for timer in (signal.ITIMER_REAL, signal.ITIMER_PROF):
+            signal.setitimer(timer, 0)
     seconds = time.process_time() - begun
     for path in Path().glob("bayesdist-error-*.txt"):  # a defect, of which the screen says less
         err.write("\n".join(path.read_text("utf-8").splitlines()[-16:]))
@@ -174,21 +181,24 @@ def _linked(source: str, target: str) -> None:
         os.link(source, target)
 
 
-def plain_answers(asked: Sequence[tuple[Input, str]]) -> list[Answer]:
-    """Answers of commands to inputs as they are; each has to be good.
+class PlainAnswers:
+    """Answers of commands to inputs as they are.
 
-    They are found in this process, so that forked ones need not load anew what commands need.
+    They are found in this process, so that processes which are forked later need not load anew what
+    the commands need.
     """
-    known: dict[tuple[Path, tuple[str, ...]], Answer] = {}
-    out = []
-    with (
-        tempfile.TemporaryDirectory(prefix="bayesdist-fuzz-") as folder,
-        contextlib.chdir(folder),
-        sketched(),
-    ):
-        for one, command in asked:
-            key = one.folder, (*one.commands[command],)
-            if key not in known:
-                known[key] = _answer(one, None, command, Path(folder) / "copy")
-            out.append(known[key])
-    return out
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[Path, tuple[str, ...]], Answer] = {}
+
+    def of(self, one: Input, command: str) -> Answer:
+        """Answer to an input."""
+        key = one.folder, (*one.commands[command],)
+        if key not in self._known:
+            with (
+                tempfile.TemporaryDirectory(prefix="bayesdist-fuzz-") as folder,
+                contextlib.chdir(folder),
+                sketched(),
+            ):
+                self._known[key] = _answer(one, None, command, Path(folder) / "copy")
+        return self._known[key]

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -16,7 +17,7 @@ from tests.fuzz.cases import Case, kept
 from tests.fuzz.inputs import Input
 from tests.fuzz.mutation import MUTATIONS
 from tests.fuzz.sandbox import Answer, answers
-from tests.fuzz.verdicts import became
+from tests.fuzz.verdicts import accepted, not_accepted
 
 FEW, MANY = 300, 20_000
 PATH = os.pathsep.join([str(REPOSITORY), *sys.path])
@@ -43,6 +44,10 @@ def test_damaged_input_is_answered_warned_of_or_refused(full, tmp_path, capsys):
 # -- what counts the cases sees each kind of failure ----------------------------------------------
 
 
+def became(case: Case, before: Answer, after: Answer) -> str:
+    return not_accepted(after) or accepted(case, before, after)
+
+
 @pytest.fixture
 def one(tmp_path):
     (tmp_path / "a.csv").write_text("x,y\n1,2\n3,4\n5,6\n")
@@ -62,7 +67,7 @@ def _large(line):
 
 
 def _said(line):
-    print(open(line[1]).read()[:9])
+    print(Path(line[1]).read_text()[:9])
 
 
 def _exits(line):
@@ -83,9 +88,9 @@ CASE = Case("a.csv", "say", "cell_not_finite", {"line": 1, "cell": 0, "text": "n
     ],
 )
 def test_each_kind_of_failure_is_seen(one, monkeypatch, command, expected):
-    monkeypatch.setattr(sandbox, "main", lambda line: command(line) and 0 or 0)
-    monkeypatch.setattr(sandbox, "SECONDS", 1.0)
-    found = answers([(one, CASE, "say")] * 2)
+    monkeypatch.setattr(sandbox, "main", lambda line: bool(command(line)) * 0)
+    monkeypatch.setattr(sandbox, "WAIT", 2.0)
+    found = list(answers([(one, CASE, "say")] * 2))
     before = Answer("returned", 0, "x,y\n1,2\n3", "")
     assert [became(CASE, before, answer) for answer in found] == [expected] * 2
 

@@ -93,8 +93,7 @@ def setting_lost(content, at):
     return toml_text(_changed(_toml(content), at, _drop))
 
 
-@changes("unknown keys", KNOWABLE, "toml",
-         arguments=_in(_toml, key=st.sampled_from(KEYS)))  # fmt: skip
+@changes("unknown keys", KNOWABLE, "toml", arguments=_in(_toml, key=st.sampled_from(KEYS)))
 def setting_more(content, at, key):
     def change(parent: Any, last: Any) -> None:
         if isinstance(parent, dict) and key not in parent:
@@ -130,8 +129,14 @@ def entry_is(content, at, value):
     return _json_text(_changed(json.loads(content), at, _put(value)))
 
 
-@changes("wrong types", KNOWABLE, "json", arguments=lambda c: st.fixed_dictionaries(
-    {"value": st.sampled_from([None, [], {}, 0, "", "abc", True, [[]], {"a": None}])}))  # fmt: skip
+@changes(
+    "wrong types",
+    KNOWABLE,
+    "json",
+    arguments=lambda c: st.fixed_dictionaries(
+        {"value": st.sampled_from([None, [], {}, 0, "", "abc", True, [[]], {"a": None}])}
+    ),
+)
 def whole_is(content, value):
     return _json_text(value)
 

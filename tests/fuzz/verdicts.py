@@ -11,7 +11,7 @@ from bayesdist.app.failures import DEFECT, NO_MEMORY, NO_SYSTEM, TOO_DEEP
 from tests.fuzz.cases import Case
 from tests.fuzz.inputs import Input
 from tests.fuzz.mutation import HARMLESS, KNOWABLE, MUTATIONS, OPEN
-from tests.fuzz.sandbox import Answer, answers, plain_answers
+from tests.fuzz.sandbox import Answer, PlainAnswers, answers
 
 GOOD = ("refused", "warned", "equal", "other")
 BAD = ("unclear", "traceback", "hang", "memory", "silent")
@@ -36,8 +36,8 @@ PYTHON = re.compile(
 )
 NO_ROOM = re.compile(r"MemoryError|[Uu]nable to allocate|[Cc]annot allocate|malloc of size")
 WARNING = re.compile(
-    r"warn|reject|left out|ignored|skipped|error:|note:|does not|no value|missing|masked|again, as"
-    r"|incomplete|not as|degenerate|damaged|faults|not converged",
+    r"warn|reject|left out|not here|ignored|skipped|error:|note:|does not|no value|missing|masked"
+    r"|again, as|incomplete|not as|degenerate|damaged|faults|not converged",
     re.IGNORECASE,
 )
 
@@ -65,27 +65,31 @@ class Verdict:
 
 
 def tried(inputs: Sequence[Input], cases: Iterable[Case]) -> Iterator[Verdict]:
-    """Verdicts of cases; each command's answer to the file as it was is found first."""
-    known = {one.name: one for one in inputs}
+    """Verdicts of cases; an answer is compared with that to the file as it was."""
+    known, plain = {one.name: one for one in inputs}, PlainAnswers()
     cases = [c for c in cases if c.input in known and c.command in known[c.input].commands]
-    asked = sorted({(c.input, c.command) for c in cases})
-    plain = plain_answers([(known[name], command) for name, command in asked])
-    before = dict(zip(asked, plain, strict=True))
-    after = answers([(known[c.input], c, c.command) for c in cases])
-    for c, a in zip(cases, after, strict=True):
-        yield Verdict(c, known[c.input].kind, became(c, before[c.input, c.command], a), a)
+    found = answers([(known[c.input], c, c.command) for c in cases])
+    for c, answer in zip(cases, found, strict=True):
+        one = known[c.input]
+        end = not_accepted(answer) or accepted(c, plain.of(one, c.command), answer)
+        yield Verdict(c, one.kind, end, answer)
 
 
-def became(case: Case, before: Answer, after: Answer) -> str:
-    """Key of TITLES."""
-    if after.end in ("hang", "memory"):
-        return after.end
-    if after.code == NO_MEMORY or NO_ROOM.search(after.err):
+def not_accepted(answer: Answer) -> str:
+    """Key of TITLES, where a command did not take its input; '' where it did."""
+    if answer.end in ("hang", "memory"):
+        return answer.end
+    if answer.code == NO_MEMORY or NO_ROOM.search(answer.err):
         return "memory"
-    if after.end != "returned" or after.code in (DEFECT, TOO_DEEP):
+    if answer.end != "returned" or answer.code in (DEFECT, TOO_DEEP):
         return "traceback"
-    if after.code in REFUSED:
-        return "refused" if after.code == 2 or is_sentence(after.err) else "unclear"
+    if answer.code in REFUSED:
+        return "refused" if answer.code == 2 or is_sentence(answer.err) else "unclear"
+    return ""
+
+
+def accepted(case: Case, before: Answer, after: Answer) -> str:
+    """Key of TITLES, where a command took its input."""
     if (after.code, after.out) == (before.code, before.out):
         return "equal"
     if _warnings(after) - _warnings(before):

@@ -79,7 +79,7 @@ def convert(
     held = [p for p, one in zip(places, built, strict=True) if one.kind != PARAMETERS]
     lines = [f"{', '.join(str(p) for p in places)}: by {source.name}"]
     back = _read_back(held, filter, made.model.chips[0].size)
-    lines += [f"  {note}" for note in notes]
+    lines += [f"  {note}" for note in (*source.notes, *notes)]
     lines += [f"  warning: {w}" for w in dict.fromkeys(w for one in built for w in one.warnings)]
     used = _read_back(held, filter, made.model.chips[0].size, as_used=True)
     lines += [f"  {line}" for line in _losses(source, back, used, at, scale)]

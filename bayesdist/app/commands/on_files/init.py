@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,6 +23,8 @@ from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 
 __all__ = ["init"]
+
+log = logging.getLogger("bayesdist")
 
 SIGMA = 0.05  # for tables that say nothing about their errors
 SAMPLE = 20_000  # matches that are looked at
@@ -162,6 +165,8 @@ def _of_matches(
             raise
         table, unit_line, sigma, read_sigma = _read(matches, columns, not_finite="reject")
         not_finite = _REJECT
+    for reason, count in table.rejected.items():
+        log.warning("%s: left out %d rows: %s", matches, count, reason)
     layout = table_layout(matches, columns, read_sigma=read_sigma)
     chips = {n: _size(*reach, size) for n, reach in _reach(table).items()}
     several = len(chips) > 1
@@ -266,6 +271,12 @@ def _size(x: float, y: float, given: tuple[int, int] | None) -> dict[str, Any]:
 def _guess_size(largest: float) -> int:
     """Detector size: the next multiple of 2 above the data, or a power of 2 that is near."""
     largest -= 0.5
+    if largest < 1:
+        raise InputError(
+            "no star of a chip lies beyond the first pixel, on x or on y",
+            where="x, y",
+            do="name the columns of its pixels by --columns, or give --size",
+        )
     for power in (256, 512, 1024, 2048, 4096, 8192):
         if 0.97 * power <= largest <= power:
             return power
