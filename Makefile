@@ -3,7 +3,8 @@
 #   make test    the environment with the test extra, checks of the code, then the tests: some
 #                20 minutes on two cores
 #   make test-full  the same, with the statistical suites in full: some hours on two cores
-#   make bench   the same environment, then the benchmarks: build/bench/bench.json and bench.md;
+#   make bench   the same environment, then the benchmarks: build/bench/bench.json, and
+#                docs/benchmarks.md with what other pages state of it (docs/measured.toml);
 #                some 20 minutes on two cores that have nothing else to do
 #   make docs    the environment with the docs extra, then the site: build/docs/index.html; a
 #                warning is an error
@@ -37,7 +38,7 @@ docs: $(VENV)/.installed-docs
 	@echo build/docs/index.html
 
 bench: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks --output build/bench --figures build/bench/figures
+	$(BIN)/python -m tests.benchmarks --output build/bench --docs docs
 
 lint: $(VENV)/.installed-test
 	$(BIN)/ruff check --fix .

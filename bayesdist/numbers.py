@@ -18,6 +18,7 @@ __all__ = [
     "display_scale",
     "interval",
     "ladder",
+    "length_scale",
     "number",
     "percent",
     "probability",
@@ -30,6 +31,7 @@ MISSING = "–"
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _MINUS = str.maketrans("-", "−")
 _LEAST_P = 1e-300  # tails of distributions underflow not far below
+NAME_WIDTH = 10  # of a line of a name that is broken
 _MAX_DECIMALS = 10  # beyond this a fixed-point number is harder to read than a power of ten
 
 
@@ -118,11 +120,11 @@ def probability(p: Any) -> str:
     return f"p = {number(p, 2)}"
 
 
-def broken_name(name: str, width: int = 10) -> str:
+def broken_name(name: str) -> str:
     """Long name of a parameter on several lines, broken after its points."""
     lines = [""]
     for part in name.replace(".", ".\0").split("\0"):
-        if lines[-1] and len(lines[-1]) + len(part) > width:
+        if lines[-1] and len(lines[-1]) + len(part) > NAME_WIDTH:
             lines.append("")
         lines[-1] += part
     return "\n".join(lines)
@@ -179,24 +181,36 @@ def ladder(unit: str) -> tuple[tuple[float, str], ...]:
     return _LADDERS.get(unit, ((1.0, unit),))
 
 
-def with_mas(value: float, unit: str, scale_mas: float | None, digits: int = 3) -> str:
+def length_scale(unit: str, like: float) -> Scale:
+    """Unit of lengths in tables and sentences: pixels, or the angle that one needs."""
+    return Scale(1.0, "pix") if unit == "pix" else display_scale(unit, like)
+
+
+def with_mas(
+    value: float,
+    unit: str,
+    scale_mas: float | None,
+    digits: int = 3,
+    *,
+    like: float | None = None,
+) -> str:
     """Length with its unit, and in mas where the size of a pixel is known.
 
-    An example is ``"0.00930 pix (25.6 mas)"``; a dash where the value is not finite.
+    An example is ``"0.00930 pix (25.6 mas)"``; a dash where the value is not finite. `like`: a
+    length shown with it, whose unit is taken.
     """
     if not np.isfinite(value):
         return MISSING
-    if unit != "pix":
-        angle = display_scale(unit, value)
-        return f"{number(value * angle.factor, digits)}\u202f{angle.unit}"
-    text = f"{number(value, digits)}\u202fpix"
-    return (
-        text
-        if scale_mas is None
-        else f"{text} ({with_mas(value * scale_mas, 'mas', None, digits)})"
-    )
+    like = value if like is None else like
+    scale = length_scale(unit, like)
+    text = f"{number(value * scale.factor, digits)}\u202f{scale.unit}"
+    if unit != "pix" or scale_mas is None:
+        return text
+    return f"{text} ({with_mas(value * scale_mas, 'mas', None, digits, like=like * scale_mas)})"
 
 
 def size_of(value: float, unit: str = "pix", digits: int = 3) -> str:
-    """Length in the unit that needs few zeros."""
+    """Length in the unit that needs few zeros; pixels are written as plain numbers."""
+    if unit == "pix":
+        return with_mas(value, unit, None, digits)
     return display_scale(unit, value).text(value, digits)

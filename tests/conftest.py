@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
+
+from tests import ALONE
+from tests.reduced import FULL
+
+if not ALONE:
+    numba.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")
@@ -29,7 +37,7 @@ def rng() -> np.random.Generator:
 @pytest.fixture(scope="session")
 def full() -> bool:
     """Whether the statistical suites run at full size (BAYESDIST_FULL=1) or reduced."""
-    return os.environ.get("BAYESDIST_FULL", "") not in ("", "0")
+    return FULL
 
 
 # A run compiles the kernels that most tests need, and the files beside it none: a machine that has
@@ -51,8 +59,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=place)
 
 
+def pytest_collection_finish() -> None:
+    """Modules and tests stay: the garbage collector need not look at them again and again."""
+    gc.collect()
+    gc.freeze()
+
+
 # folders whose files look at the same thing, which is long in the making
-TOGETHER = ("tests/campaign/", "tests/report/")
+TOGETHER = ("tests/campaign/", "tests/report/", "tests/app/selfcal/")
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from .benchmarks.measured import cell_of, with_measured
+
 ROOT = Path(__file__).resolve().parents[1]
 MEASURED = tomllib.loads((ROOT / "docs" / "measured.toml").read_text(encoding="utf-8"))
 NUMBER = r"\d[\d.,]*\d|\d"
@@ -17,6 +19,9 @@ FIGURE = re.compile(rf"(?:{NUMBER})(?: (?:s|min|minutes|GB|MB|px|mas|times)\b| %
 
 def sentence_of(phrase: str, entry: dict[str, str]) -> tuple[str, str]:
     """A phrase with its value, and the pattern of the same phrase with any value."""
+    for other in re.findall(r"\{(\w+)\}", phrase):
+        if other != "percent":
+            phrase = phrase.replace(f"{{{other}}}", MEASURED[other]["value"])
     key = "{percent}" if "{percent}" in phrase else "{}"
     value = entry["percent"] if key == "{percent}" else entry["value"]
     before, _, after = phrase.partition(key)
@@ -45,6 +50,13 @@ def test_pages_state_the_measured_figure(key, page, phrase):
     assert wrong_figures(flowing(page), phrase, MEASURED[key]) == []
 
 
+@pytest.mark.parametrize("key", [key for key, entry in MEASURED.items() if "cell" in entry])
+def test_benchmarks_have_the_measured_figure(key):
+    page = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    assert cell_of(page, MEASURED[key]["cell"]) == MEASURED[key]["value"]
+    assert f"| revision | {MEASURED[key]['revision']} |" in page
+
+
 @pytest.mark.parametrize("key", MEASURED)
 def test_each_figure_says_what_and_how(key):
     entry = MEASURED[key]
@@ -70,3 +82,25 @@ def test_another_figure_would_be_refused():
     assert wrong_figures("it took 60 s on two cores", phrase, entry) == []
     assert wrong_figures("it took 41 s on two cores", phrase, entry) == ["41"]
     assert wrong_figures("it took long", phrase, entry) == ["missing"]
+
+
+def test_a_new_page_of_benchmarks_is_taken_over():
+    """Value and revision of the entry with a cell; all else stays, comments too."""
+    text = """# a comment
+[slow]
+value = "9 s"
+revision = "a"
+
+[fast]
+what = "x"
+value = "1.0"
+revision = "a"
+cell = ["Speed", "ours | 5", "s"]
+"""
+    page = "# P\n\n## Speed\n\n| who | N | s |\n|---|---|---|\n| ours | 5 | 0.70 |\n\n## End\n"
+    expected = text.replace('"1.0"', '"0.70"').replace(
+        'revision = "a"\ncell', 'revision = "b"\ncell'
+    )
+    assert with_measured(text, page, "b") == expected
+    with pytest.raises(KeyError, match="no row"):
+        with_measured(text, page.replace("ours", "theirs"), "b")

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from astropy.table import Table
 
 import bayesdist as bd
+from bayesdist.simulate.camera import camera, matched_to_gaia
 from tests.app.support import as_table
+
+from .docs_blocks import blocks
+
+README = Path(__file__).resolve().parents[1] / "README.md"
 
 
 def test_the_session_of_the_readme(tmp_path, monkeypatch):
@@ -77,3 +85,32 @@ def test_run_is_the_command_as_a_function(tmp_path):
     with pytest.raises(BayesdistError, match=r"none\.toml"):
         bd.run(tmp_path / "none.toml", tmp_path / "run")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_two_catalogues_become_matches_as_the_readme_says(tmp_path, monkeypatch):
+    """The header's own WCS has no distortion, so that stars are seen 0.4 arcsec off at most.
+
+    A match of one star with another has magnitudes that differ; those of one star do by 0.02.
+    """
+    rng, n = np.random.default_rng(3), 300
+    table = matched_to_gaia(n, rng)
+    plane = camera()
+    plane.sip, plane.wcs.ctype = None, ["RA---TAN", "DEC--TAN"]
+    sky = plane.pixel_to_world(table["XWIN_IMAGE"] - 1, table["YWIN_IMAGE"] - 1)
+    seen = table["XWIN_IMAGE", "YWIN_IMAGE", "MAG_AUTO"]
+    seen["ALPHA_J2000"], seen["DELTA_J2000"] = sky.ra.degree, sky.dec.degree
+    monkeypatch.chdir(tmp_path)
+    heads = [f"# {k:3} {name:20} text" for k, name in enumerate(seen.colnames, 1)]
+    rows = [" ".join(f"{value:.8f}" for value in row) for row in seen]
+    (tmp_path / "exposure.cat").write_text("\n".join([*heads, *rows]) + "\n")
+    gaia = table[[name for name in table.colnames if name not in seen.colnames]]
+    gaia[rng.permutation(n)].write("gaia.csv")
+
+    [block] = [text for _, text in blocks(README) if "match_to_catalog_sky" in text]
+    exec(compile(block, "README.md", "exec"), {})
+    matched = Table.read("stars.csv")
+    assert len(matched) > 0.95 * n
+    same = np.abs(matched["MAG_AUTO"] - matched["phot_g_mean_mag"]) < 0.1
+    assert np.mean(same) > 0.97
+    found = bd.read_matches("stars.csv", sigma=0.01, epoch=2024.3)
+    assert len(found) == len(matched) and found.unit == "arcsec"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -338,7 +339,7 @@ def calibration_of_maps(
     reference_date: float | None = None,
     cov: Float | None = None,
     errors: str = "none",
-    **what: object,
+    **what: Any,
 ) -> Calibration:
     """Calibration from the polynomials of its chips, as files state them.
 
@@ -372,5 +373,5 @@ def calibration_of_maps(
         GaussianSolution(model, mean, cov),
         errors=errors,
         reference_date=reference_date if time is not None else None,
-        **what,  # type: ignore[arg-type]
+        **what,
     )

@@ -1,44 +1,52 @@
-"""Pages of the documentation that explain what a report shows."""
+"""Pages of the documentation that explain what a report shows: `bayesdist docs PAGE` has them."""
 
 from __future__ import annotations
 
-__all__ = ["BASE", "page_of"]
+__all__ = ["EXPLAINED", "explanation_of", "section_of"]
 
-BASE = "https://bayesdist.readthedocs.io/en/latest/"  # where docs/ is published
+# page and heading by section of the report
+EXPLAINED = {
+    "status": ("report", "On top"),
+    "data": ("your_table", ""),
+    "campaign": ("campaign", ""),
+    "campaign-matching": ("campaign", "The catalogue"),
+    "campaign-tables": ("campaign", ""),
+    "campaign-time": ("campaign", ""),
+    "campaign-release": ("campaign", ""),
+    "selfcal": ("self_calibration", ""),
+    "fit": ("method", "Linear fit"),
+    "residuals": ("method", "Tests for what a model lacks"),
+    "outliers": ("concepts", "Jitter and membership"),
+    "coefficients": ("method", "Model"),
+    "maps": ("concepts", "What 68 % means"),
+    "periods": ("wise", ""),
+    "budget": ("method", "Error budget and margins"),
+    "margins": ("method", "What a verdict rests on"),
+    "holdout": ("method", "Held-out stars"),
+    "products": ("files", ""),
+    "provenance": ("files", ""),
+}
+_ANY = ("report", "Figures")  # of pages that are not the report of a run
 
-_FIGURES = "report.html#figures"
-# by section of the report, or group of the status table
-_PAGES = {
-    "status": "report.html#on-top",
-    "data": "your_table.html",
-    "campaign": "campaign.html",
-    "campaign-matching": "campaign.html#the-catalogue",
-    "campaign-tables": "campaign.html",
-    "campaign-time": "campaign.html",
-    "campaign-release": "campaign.html",
-    "selfcal": "self_calibration.html",
-    "fit": "method.html#linear-fit",
-    "residuals": "method.html#tests-for-what-a-model-lacks",
-    "outliers": "concepts.html#jitter-and-membership",
-    "coefficients": "method.html#model",
-    "maps": "concepts.html#what-68-means",
-    "periods": "wise.html",
-    "budget": "method.html#error-budget-and-margins",
-    "margins": "method.html#what-a-verdict-rests-on",
-    "holdout": "method.html#held-out-stars",
-    "products": "files.html",
-    "provenance": "files.html",
-    "Held-out truth": "method.html#held-out-stars",
-    "Campaign": "campaign.html",
-    "Sampling": "concepts.html#convergence-is-another-matter",
-    "Fit": "method.html#linear-fit",
-    "Assumptions": "method.html#the-catalogues-error",
-    "Requirements": "method.html#what-a-verdict-rests-on",
-    "Validity": "method.html#limits",
-    "Products": "files.html",
+# section of the report that has the numbers behind a group of the status table
+_SECTIONS = {
+    "Held-out truth": "holdout",
+    "Campaign": "campaign",
+    "Sampling": "outliers",
+    "Fit": "fit",
+    "Assumptions": "budget",
+    "Requirements": "margins",
+    "Validity": "margins",
+    "Products": "products",
 }
 
 
-def page_of(name: str) -> str:
-    """Address of the page about a section or a group of the status table."""
-    return BASE + _PAGES.get(name, _FIGURES)
+def explanation_of(section: str) -> str:
+    """Command that shows the page about a section, and the heading to look for."""
+    page, heading = EXPLAINED.get(section, _ANY)
+    return f"bayesdist docs {page}" + (f", “{heading}”" if heading else "")
+
+
+def section_of(group: str) -> str:
+    """Section of the report behind a group of the status table; the group itself if none is."""
+    return _SECTIONS.get(group, group)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -75,12 +76,17 @@ HEADS = (
 )
 
 
+def _badness(row: OverviewRow) -> tuple[int, float]:
+    """Level, and among equal levels the worst margin; runs without one last."""
+    return row.key, math.inf if row.worst_margin is None else row.worst_margin
+
+
 def write_overview(path: str | os.PathLike[str], rows: Sequence[OverviewRow]) -> None:
     """Write the page; the worst runs stand first.
 
     InputError when the file cannot be written.
     """
-    ordered = sorted(rows, key=lambda row: row.key)
+    ordered = sorted(rows, key=_badness)
     text = template("overview.html.jinja").render(rows=ordered, heads=HEADS)
     with atomic_path(Path(path)) as temporary:
         temporary.write_text(text, encoding="utf-8")

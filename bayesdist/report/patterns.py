@@ -39,8 +39,8 @@ FIRST = PALETTE["vermilion"]
 
 @figure_style()
 def pattern_maps(found: Sequence[PlannedPattern]) -> Figure:
-    """Footprints on one scale, each with its radial uncertainty on one colour scale."""
-    bounded = [one.radii(kind) for one in found for kind in SHOWN if one.maps[kind] is not None]
+    """Footprints on one scale, each with its uncertainty per axis on one colour scale."""
+    bounded = [one.per_axis(kind) for one in found for kind in SHOWN if one.maps[kind] is not None]
     values = np.concatenate(bounded)
     norm = LogNorm(max(values.min(), 1e-4 * values.max()), values.max() * (1 + 1e-9))
     outlines = [_outlines(one) for one in found]
@@ -58,7 +58,7 @@ def pattern_maps(found: Sequence[PlannedPattern]) -> Figure:
             filled += _map(ax, one, kind, norm, last)
             if not k:
                 ax.set_title(f"{kind}, rms\n{ax.get_title(loc='left')}")
-    label = "radius (1 σ) [pix]"
+    label = "per axis (1 σ) [pix]"
     fig.colorbar(filled[0], ax=list(axes[:, 1:].ravel()), label=label, **COLORBAR)
     return fig
 
@@ -109,7 +109,7 @@ def _map(ax: Axes, one: PlannedPattern, kind: str, norm: LogNorm, last: bool) ->
         x, y = mesh(m.x, m.y)
         u, v = model.predict(theta, x, y, exposure=0, chip=m.chip).T.reshape(2, len(m.y), len(m.x))
         look: dict[str, Any] = {"cmap": SEQUENTIAL, "shading": "gouraud", "rasterized": True}
-        filled.append(ax.pcolormesh(u, v, m.radius, norm=norm, **look))
+        filled.append(ax.pcolormesh(u, v, m.per_axis, norm=norm, **look))
     (x0, y0), (x1, y1) = _limits(np.concatenate(outlines))
     ax.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
     if maps is None:

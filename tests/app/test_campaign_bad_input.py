@@ -16,10 +16,10 @@ from bayesdist.app.campaign.input_validation import frames_not_set, shear_warnin
 from bayesdist.app.results import results_of
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches
-from bayesdist.data.tables.files import read_table
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import fit_linear, load_fit
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.reading.tables import read_table
 from tests.app.damaged import CONFIG, ONE, Campaign, masked, scattered, setting
 from tests.app.support import cli, good, one_sentence, refused, summary_of
 
@@ -585,6 +585,7 @@ def test_a_damaged_campaign_is_calibrated_and_says_so(campaign, monkeypatch):
     campaign.lists(scattered, ONE).lists(lambda t: t[t["chip"] == 1], "f606w-006")
     # a few steps: what is said does not rest on the draws
     campaign.replaced("target_ess = 100", "max_steps = 20")
+    campaign.replaced("grid = [33, 17]", "grid = [9, 5]\ndraws = 200")
     run = campaign.path.parent / "run"
     good("run", campaign.path / CONFIG, "-o", run, "-q")
     warnings = " ".join(summary_of(run)["warnings"])

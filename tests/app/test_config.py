@@ -335,8 +335,8 @@ def test_a_file_that_is_no_toml(tmp_path, content, word):
 
 
 def test_a_missing_file_and_a_folder(tmp_path):
-    for path in (tmp_path / "none.toml", tmp_path):
-        with pytest.raises(InputError, match="cannot be read"):
+    for path, word in ((tmp_path / "none.toml", "does not exist"), (tmp_path, "is a folder")):
+        with pytest.raises(InputError, match=word):
             load_config(path)
 
 

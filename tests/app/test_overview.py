@@ -28,19 +28,20 @@ def test_the_worst_run_stands_first_and_all_have_their_cells(tmp_path):
         valid_until=None, open_ended=False, epoch=None, uncertainty="", n_used=None,
         chi2_per_dof=None,
     )  # fmt: skip
-    write_overview(tmp_path / "all.html", [ROW, empty, bad])
+    worse = replace(bad, name="worse", worst_margin=-41.0)
+    write_overview(tmp_path / "all.html", [ROW, empty, bad, worse])
     tree = lxml_html.fromstring((tmp_path / "all.html").read_text("utf-8"))
     rows = tree.xpath("//tbody/tr")
     names = [row.xpath("./th")[0].text_content().split() for row in rows]
-    assert names == [["<b>&", "SIMULATED"], ["a"], ["c"]]
+    assert names == [["worse", "SIMULATED"], ["<b>&", "SIMULATED"], ["a"], ["c"]]
     heads = [head.text_content() for head in tree.xpath("//thead//th")]
-    first, second, third = ([cell.text_content() for cell in row] for row in rows)
+    _, first, second, third = ([cell.text_content() for cell in row] for row in rows)
     assert first[heads.index("Worst margin [% of the limit]")] == "\N{MINUS SIGN}40"
     assert second[heads.index("Valid until [yr]")] == "2020.3 or later"
     assert third[4:11] == 7 * ["–"]
     keys = [int(row.xpath("./td/@data-key")[0]) for row in rows]
     assert keys == sorted(keys)
-    assert [link.get("href") for link in tree.xpath("//tbody//a")] == 2 * ["a/report.html"]
+    assert [link.get("href") for link in tree.xpath("//tbody//a")] == 3 * ["a/report.html"]
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path):

@@ -84,7 +84,8 @@ def test_files_say_the_same_as_the_screen(job):
     assert last["lacks"][1] == "no offsets: the polynomials are free"
     shape = record["patterns"][0]["shape"]
     assert printed.splitlines()[-1] == (
-        f"Best: listed, shape known to {shape['rms']:.2g} pix rms, {shape['max']:.2g} at worst "
+        f"Best: listed, shape known per axis to {shape['rms']:.2g} pix rms, "
+        f"{shape['max']:.2g} at worst "
         f"({50 * shape['rms']:.2g} and {50 * shape['max']:.2g} mas)"
     )
     line = next(text for text in printed.splitlines() if text.startswith("not moved"))
@@ -197,7 +198,7 @@ def test_what_cannot_be_planned_is_refused(job, tmp_path):
     file, out, _ = job
     refused(tmp_path, "plan", file, words=["not a run", "bayesdist plan-dither"])
     refused(out, "plan-dither", file, "-o", out, words=["holds other files"])
-    refused(tmp_path, "plan-dither", tmp_path / "none.toml", words=["cannot be read"])
+    refused(tmp_path, "plan-dither", tmp_path / "none.toml", words=["does not exist"])
 
 
 def test_the_page_documents_every_key_and_its_example_is_sound(tmp_path):

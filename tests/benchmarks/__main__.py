@@ -1,10 +1,11 @@
-"""`python -m tests.benchmarks [--quick] [--only NAME ...] [--output DIR] [--figures DIR]`"""
+"""`python -m tests.benchmarks [--quick] [--only NAME ...] [--output DIR] [--docs DIR]`"""
 
 from __future__ import annotations
 
 import argparse
 import json
 import math
+import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,10 +16,12 @@ from tests.benchmarks import budget, dithers, likelihood, linear, samplers, scal
 from tests.benchmarks.figure import draw_scaling
 from tests.benchmarks.machine import describe
 from tests.benchmarks.markdown import to_markdown
+from tests.benchmarks.measured import with_measured
 from tests.benchmarks.timing import say
 
 __all__ = ["main"]
 
+FIGURE = "figures/scaling.png"  # beside the page
 PARTS = {
     "samplers": samplers,
     "kernel": likelihood,
@@ -54,6 +57,19 @@ def _write(bench: dict[str, Any], folder: Path) -> None:
             path.write_text(text, encoding="utf-8")
 
 
+def _document(bench: dict[str, Any], folder: Path) -> None:
+    """Write the page of the documentation, and the figures of it that other pages state."""
+    page, measured = to_markdown(_finite(bench)), folder / "measured.toml"
+    revision = bench["machine"]["revision"] or "unknown"
+    texts = {
+        measured: with_measured(measured.read_text(encoding="utf-8"), page, revision),
+        folder / "benchmarks.md": page,
+    }
+    for target, text in texts.items():
+        with atomic_path(target) as path:
+            path.write_text(text, encoding="utf-8")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the parts that are asked for; the files are renewed after each.
 
@@ -71,8 +87,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="tiny problems: does it work?")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), metavar="NAME")
     parser.add_argument("--output", type=Path, default=Path("build/bench"), metavar="DIR")
-    parser.add_argument("--figures", type=Path, metavar="DIR", help="draw scaling.png there")
+    parser.add_argument(
+        "--docs",
+        type=Path,
+        metavar="DIR",
+        help="write benchmarks.md, figures/scaling.png and the figures of measured.toml there",
+    )
     options = parser.parse_args(arguments)
+    if options.docs is not None and (options.quick or len(options.only) < len(PARTS)):
+        parser.error("--docs takes the whole benchmark: leave --quick and --only out")
     bench: dict[str, Any] = {
         "schema": 1,
         "quick": options.quick,
@@ -86,11 +109,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         start = time.perf_counter()
         part = module.run(module.QUICK if options.quick else module.FULL)
         part["wall_s"] = time.perf_counter() - start
-        if name == "scaling" and options.figures is not None:
-            draw_scaling(part, options.figures / "scaling.png")
-            part["figure"] = f"{options.figures.name}/scaling.png"
+        if name == "scaling":
+            draw_scaling(part, options.output / FIGURE)
+            part["figure"] = FIGURE
         bench["parts"][name] = part
         _write(bench, options.output)
+    if options.docs is not None:
+        _document(bench, options.docs)
+        shutil.copy(options.output / FIGURE, options.docs / FIGURE)
     say(f"written: {options.output / 'bench.json'}, {options.output / 'bench.md'}")
     return 0
 

@@ -160,14 +160,20 @@ def test_goes_on_where_scamp_is_missing(monkeypatch):
     assert part["rows"] == [] and "scamp" in part["absent"]
 
 
+@pytest.mark.parametrize("part", [["--quick"], ["--only", "kernel"]])
+def test_a_part_of_the_benchmark_is_no_page(part, tmp_path):
+    with pytest.raises(SystemExit):
+        program.main([*part, "--output", str(tmp_path), "--docs", str(tmp_path)])
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory, full):
     if not full:
         pytest.skip("all parts take a minute of processor time: set BAYESDIST_FULL=1")
     pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
     folder = tmp_path_factory.mktemp("bench")
-    figures = folder / "figures"
-    assert program.main(["--quick", "--output", str(folder), "--figures", str(figures)]) == 0
+    assert program.main(["--quick", "--output", str(folder)]) == 0
     return folder
 
 

@@ -12,10 +12,10 @@ from astropy.table import Table
 
 from bayesdist.data import ReadOptions, matches_from_table, open_matches, read_matches
 from bayesdist.data.reading.chips import numbered
-from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import ALIASES
-from bayesdist.data.tables.text import is_text_table
 from bayesdist.errors import InputError
+from bayesdist.reading.tables import read_table
+from bayesdist.reading.text_tables import is_text_table
 
 
 def stars(n=6, **more):

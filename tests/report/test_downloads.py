@@ -1,4 +1,4 @@
-"""Numbers of figures as CSV, and links to the documentation, in the page."""
+"""Numbers of figures as CSV, and the pages of the documentation that the page names."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 from lxml import html as lxml_html
 
-from bayesdist.report.documentation import _PAGES, BASE, page_of
+from bayesdist.report.documentation import EXPLAINED, explanation_of, section_of
 from bayesdist.report.figure_numbers import numbers_of
+from bayesdist.report.run_report import render_report
 from bayesdist.report.sections import REPORT
+from bayesdist.report.sections.run.status import GROUPS
 
 from .plots import drawings_of, plot_of
 
@@ -52,8 +54,6 @@ def test_a_matrix_is_read_from_the_top(converged):
 def test_numbers_are_in_the_page_and_what_they_hold_cannot_leave_them(converged):
     from dataclasses import replace
 
-    from bayesdist.report.run_report import render_report
-
     plot = plot_of(converged, "chi_square_by_exposure")
     (drawing,) = drawings_of({"a": plot}).values()
     evil = '"><script>alert(1)</script>'
@@ -65,13 +65,17 @@ def test_numbers_are_in_the_page_and_what_they_hold_cannot_leave_them(converged)
     assert base64.b64decode(link.get("href").partition("base64,")[2]).decode() == evil
 
 
-def test_each_section_has_a_page_that_exists():
+def test_each_section_names_a_page_and_a_heading_that_exist():
     for section in REPORT.sections:
-        assert section.name in _PAGES, section.name
-    for name, page in _PAGES.items():
-        file, _, anchor = page.partition("#")
-        text = (DOCS / file.replace(".html", ".md")).read_text("utf-8")
-        heads = [line.lstrip("# ").lower() for line in text.splitlines() if line.startswith("#")]
-        slugs = {"-".join("".join(c for c in h if c.isalnum() or c in " -").split()) for h in heads}
-        assert not anchor or anchor in slugs, name
-        assert page_of(name) == BASE + page
+        page, heading = EXPLAINED[section.name]
+        lines = (DOCS / f"{page}.md").read_text("utf-8").splitlines()
+        assert not heading or f"## {heading}" in lines, section.name
+        assert explanation_of(section.name).startswith(f"bayesdist docs {page}")
+
+
+def test_groups_of_the_status_table_link_to_sections(converged):
+    page = lxml_html.fromstring(render_report(converged, {}))
+    links = page.xpath("//a[@class='help']/@href")
+    assert len(links) >= 3
+    assert {link.removeprefix("#") for link in links} <= set(page.xpath("//section/@id"))
+    assert all(section_of(group) in {s.name for s in REPORT.sections} for group in GROUPS)

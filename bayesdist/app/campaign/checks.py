@@ -77,7 +77,7 @@ def campaign_checks(summary: Mapping[str, Any], remarks: Sequence[Check] = ()) -
         out.append(Check(GROUP, what, ", ".join(skipped), "none", "warn"))
     texts = [one.text for one in remarks if one.sentence]
     found = "; ".join(texts) or "none"
-    out.append(Check(GROUP, "Other doubts", found, "none", level_of(not texts, "warn")))
+    out.append(Check(GROUP, "Other warnings", found, "none", level_of(not texts, "warn")))
     return tuple(out)
 
 

@@ -30,9 +30,9 @@ from bayesdist.app.config.model import (
 from bayesdist.app.config.other_runs import calibration_file
 from bayesdist.app.config.products import MatchedProducts
 from bayesdist.app.config.run import RunConfig
-from bayesdist.app.config.section import Section, Unit
+from bayesdist.app.config.section import Epoch, RightAscensionDeclination, Section, Unit
 from bayesdist.data import FORMATS
-from bayesdist.data.reading.formats import mission_formats
+from bayesdist.data.formats.files import mission_formats
 from bayesdist.data.tables.units import length_advice
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.period_dates import check_periods, mjd_periods
@@ -50,9 +50,9 @@ class Data(Section):
     unit: Unit | None = None
     sigma: Literal["columns", "by_magnitude"] | PositiveFloat = "columns"
     pixel_origin: Literal[0, 1] | None = None
-    tangent_point: tuple[float, float] | None = None
-    epoch: float | str | None = None
-    catalogue_epoch: float | None = None
+    tangent_point: RightAscensionDeclination | None = None
+    epoch: Epoch | str | None = None
+    catalogue_epoch: Epoch | None = None
     not_finite: Literal["refuse", "reject"] = "refuse"
     simulated: bool = False
 
@@ -183,6 +183,14 @@ class MatchesConfig(RunConfig):
             .of_order(order)
             .model_copy(update={"prior": [], "prior_calibration": None, "fit": fit})
         )
+
+    @model_validator(mode="after")
+    def _one_prior_each(self) -> MatchesConfig:
+        names = [one.parameter for one in self.prior]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"two [[prior]] blocks are of {twice!r}; give each parameter one")
+        return self
 
     @model_validator(mode="after")
     def _one_array(self) -> MatchesConfig:

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, PositiveFloat
 
 from bayesdist.app.config.detector import Pair
-from bayesdist.app.config.section import Section
+from bayesdist.app.config.section import Epoch, Section
 from bayesdist.model import FRAME_KINDS, TimeDependence
 from bayesdist.model.basis import MAX_ORDER
 
@@ -23,9 +23,9 @@ __all__ = [
 
 
 class _Drift(Section):
-    epoch0: float | list[float]
+    epoch0: Epoch | list[Epoch]
     terms: list[tuple[Literal["u", "v"], Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]]
-    breaks: list[float] = Field(default_factory=list)
+    breaks: list[Epoch] = Field(default_factory=list)
 
     def time(self) -> TimeDependence | None:
         """Time dependence of the model; None without terms."""
@@ -57,7 +57,7 @@ class Polynomials(Section):
 class MatchedModel(Polynomials):
     """Structure of the distortion model, with the frames of the exposures."""
 
-    frames: Literal[FRAME_KINDS] = "none"  # type: ignore[valid-type]
+    frames: Literal[FRAME_KINDS] = "none"  # type: ignore[valid-type]  # names of the model
     tdd: Tdd | None = None
 
 

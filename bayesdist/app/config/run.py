@@ -25,6 +25,7 @@ from bayesdist.app.config.fit import (
     SelfcalSampler,
 )
 from bayesdist.app.config.model import CampaignModel, MatchedModel, SelfcalModel
+from bayesdist.app.config.other_runs import FREE
 from bayesdist.app.config.products import Products
 from bayesdist.app.config.section import Section
 from bayesdist.assess import Requirement, UserTerm
@@ -119,6 +120,11 @@ class RunConfig(Section):
     def time(self) -> TimeDependence | None:
         """Time dependence of the model."""
         return None if self.model.tdd is None else self.model.tdd.time()
+
+    @property
+    def has_free_rates(self) -> bool:
+        """Boolean: the drift is that of this run's own exposures."""
+        return self.model.tdd is None or self.model.tdd.rates == FREE
 
     def mixture(self) -> OutlierMixture:
         """The outlier mixture."""

@@ -19,9 +19,9 @@ from bayesdist.app.kinds.exposures import (
     write_hierarchy,
     write_series,
 )
+from bayesdist.app.kinds.solved import SelfCalibrated
 from bayesdist.app.kinds.table_file import StoredLookupTables, read_tables, write_tables
 from bayesdist.app.matches.added_errors import grouped_errors_of
-from bayesdist.app.selfcal.solved import SelfCalibrated
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, LinearFit, load_fit, save_fit
@@ -77,6 +77,11 @@ class Fitted:
     alone: Series | None = None
     solved: SelfCalibrated | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def gauge_words(self) -> str:
+        """In which gauge the products stand, as a sentence; empty where that is no question."""
+        return "" if self.solved is None else self.solved.gauge_words
 
     def placed(self, stars: Matches) -> Matches:
         """Stars at the pixels that the tables move them to, on their chips, with quoted errors.

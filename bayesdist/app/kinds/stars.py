@@ -19,6 +19,7 @@ from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.kinds.split import set_aside
 from bayesdist.app.matches.added_errors import compared_errors, knows_circle
+from bayesdist.app.matches.plausibility import doubts_on_stars
 from bayesdist.app.matches.reading import check_chips
 from bayesdist.app.matches.sources import read_configured
 from bayesdist.assess import SAMPLE
@@ -134,6 +135,7 @@ def fit_stars(
         with closing(StarReader(config.resources())) as reader:
             return fit_stars(matched, config, base, reader=reader)
     model = model_of(matched.stars, config)
+    doubts_on_stars(matched.stars, model, config)  # refuses what cannot be meant
     earlier = earlier_calibration(model, config, base)
     try:
         return _fitted(matched.stars, model, config, reader, earlier)

@@ -19,9 +19,10 @@ __all__ = ["plan_patterns"]
 
 LEGEND = (
     "reach: largest distance of two pointings, pix; free: directions that detections leave free; "
-    "the rest is errors of positions over the detector, radial, 1 sigma, pix; gauge-free: without "
-    "the free directions; shape: without shift, rotation and scale, by which patterns are sorted; "
-    "absolute: without the zero point alone; -: nothing bounds it"
+    "the rest is errors of positions over the detector, per axis, 1 sigma, pix (CE68 is 1.51 and "
+    "CE95 2.45 times that where both axes are alike); gauge-free: without the free directions; "
+    "shape: without shift, rotation and scale, by which patterns are sorted; absolute: without the "
+    "zero point alone; -: nothing bounds it"
 )
 
 
@@ -92,7 +93,7 @@ def _text(found: Sequence[PlannedPattern], config: PlanConfig) -> str:
     rms, largest = best.rms("shape"), best.largest("shape")
     if np.isfinite(rms):
         angle = "" if mas is None else f" ({mas * rms:.2g} and {mas * largest:.2g} mas)"
-        verdict = f"shape known to {rms:.2g} pix rms, {largest:.2g} at worst{angle}"
+        verdict = f"shape known per axis to {rms:.2g} pix rms, {largest:.2g} at worst{angle}"
     else:
         verdict = "and yet nothing bounds the shape, for want of rolls and of commanded offsets"
     lines += ["", f"Best: {best.pattern.name}, {verdict}"]

@@ -17,7 +17,7 @@ from bayesdist.app.products.sky_closure import sky_closure
 from bayesdist.assess.budget.budget import with_product
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.diagnose.residuals.sample import StarSample
-from bayesdist.files import atomic_path
+from bayesdist.files import atomic_path, path_within
 from bayesdist.limits import FILE_ERROR
 from bayesdist.products.registry import format_of, lint
 
@@ -52,7 +52,7 @@ def export_files(
     for key, files in made_files(product, config).items():
         left_out = _left_out(key, product)
         for built in files:
-            path = folder / built.file_name
+            path = path_within(folder, built.file_name, where="products")
             with atomic_path(path) as temporary:
                 temporary.write_bytes(built.content)
             entry: dict[str, Any] = {"path": built.file_name, "kind": built.kind}

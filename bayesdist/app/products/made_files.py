@@ -114,7 +114,7 @@ def product_input(solution: Solution, data: FitData, config: Config, source: str
         None if mas is None else mas / 1000,
         data.matched.tangent_point,
         model.exposures[0] if several else "",
-        "" if fitted.solved is None else fitted.solved.gauge_words,
+        fitted.gauge_words,
         fitted.tables.tables,
         data.matched.filter,
         fitted.scatter is not None,

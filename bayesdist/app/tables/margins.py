@@ -11,6 +11,7 @@ from astropy.table import Table
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Margin, Requirement
+from bayesdist.assess.circular import per_axis
 
 __all__ = [
     "judged_requirements",
@@ -96,8 +97,8 @@ def results_text(run: RunDirectory) -> str:
         else f"NOT CONVERGED: everything here is provisional ({'; '.join(c['reasons'])})"
     )
     parts = [
-        f"Error budget (rms over the detector, {summary['fit']['unit']})",
-        table_text([{k: v for k, v in r.items() if k != "source"} for r in summary["budget"]], 3),
+        f"Error budget (rms over the detector, 1 sigma, {summary['fit']['unit']})",
+        table_text([_budget_row(row) for row in summary["budget"]], 3),
         "",
         "Margins",
         margins_text(summary["margins"]),
@@ -108,6 +109,15 @@ def results_text(run: RunDirectory) -> str:
         f"Report:  {run / 'report.html'}",
     ]
     return "\n".join(parts)
+
+
+def _budget_row(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of the budget for the screen: u, v and per axis, with the error of the latter."""
+    error = row["radial_error"]
+    return {key: row[key] for key in ("name", "kind", "u", "v")} | {
+        "per axis": float(per_axis(row["u"], row["v"])),
+        "+-": None if error is None else error / 2**0.5,
+    }
 
 
 def margins_text(rows: list[dict]) -> str:

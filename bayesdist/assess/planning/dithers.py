@@ -123,20 +123,20 @@ class PlannedPattern:
     # 'absolute'     without the zero point alone. None where nothing bounds the errors
     maps: dict[str, tuple[UncertaintyMap, ...] | None]
 
-    def radii(self, kind: str) -> Float:
-        """Radial errors (1 sigma) at all points of the grid, pixels; infinite where unbounded."""
+    def per_axis(self, kind: str) -> Float:
+        """Errors per axis (1 sigma) at all points of the grid, pixels; infinite if unbounded."""
         maps = self.maps[kind]
-        return (
-            np.array([np.inf]) if maps is None else np.concatenate([m.radius.ravel() for m in maps])
-        )
+        if maps is None:
+            return np.array([np.inf])
+        return np.concatenate([m.per_axis.ravel() for m in maps])
 
     def rms(self, kind: str) -> float:
         """Root mean square of these."""
-        return float(np.sqrt(np.mean(self.radii(kind) ** 2)))
+        return float(np.sqrt(np.mean(self.per_axis(kind) ** 2)))
 
     def largest(self, kind: str) -> float:
         """The largest of these."""
-        return float(self.radii(kind).max())
+        return float(self.per_axis(kind).max())
 
     @property
     def n_free(self) -> int:
@@ -151,16 +151,14 @@ class PlannedPattern:
 
     @cached_property
     def by_degree(self) -> dict[int, float]:
-        """Gauge-free rms over the detector of the polynomials of each degree, pixels.
+        """Gauge-free rms over detector and axes of the polynomials of each degree, pixels.
 
         Legendre polynomials are orthogonal over a chip, and the mean square of P_i P_j is
         1 / ((2 i + 1) (2 j + 1)).
         """
         solution = self.solution
         model, gauge = solution.model, solution.gauge
-        cov = solution.up_to(gauge.null)
-        assert cov is not None  # what is open is free
-        variance = np.diag(cov)
+        variance = np.diag(solution.up_to(gauge.null))
         terms = np.array(model.basis().terms)
         mean_square = 1.0 / np.prod(2 * terms + 1, axis=1)
         degree = terms.sum(axis=1)
@@ -172,7 +170,8 @@ class PlannedPattern:
                     fraction * variance[model.coefficient_slice(chip.number, axis)] * mean_square
                 )
         return {
-            int(k): float(np.sqrt(of_term[degree == k].sum())) for k in range(1, model.order + 1)
+            int(k): float(np.sqrt(of_term[degree == k].sum() / 2))
+            for k in range(1, model.order + 1)
         }
 
     @cached_property
@@ -257,10 +256,9 @@ def _columns(move: dict[str, Float], *names: str) -> Float:
 
 
 def _maps(solution: ExpectedSolution, directions: Float) -> tuple[UncertaintyMap, ...] | None:
-    cov = solution.up_to(directions)
-    if cov is None:
+    if not solution.bounded_by(directions):
         return None
-    seen = replace(solution, cov=cov)
+    seen = replace(solution, cov=solution.up_to(directions))
     return tuple(uncertainty_map(seen, chip=chip.number) for chip in solution.model.chips)
 
 

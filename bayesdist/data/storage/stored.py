@@ -176,7 +176,7 @@ def scan(parts: Sequence[StoredFile]) -> Labels:
         raise InputError(
             f"repeats {first}: the same x, y, u, v, exposure and chip",
             where=second,
-            do="drop one of them",
+            do="keep each row once",
         )
     return Labels(
         unit=parts[0].unit,

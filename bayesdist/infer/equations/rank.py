@@ -172,7 +172,7 @@ def check_coverage(
             raise DegenerateError(
                 found.outside,
                 where=where,
-                do="correct detector.size, the columns or data.pixel_origin",
+                do="correct detector.size, the columns or data.pixel_origin, or leave the row out",
             )
         if known:
             continue

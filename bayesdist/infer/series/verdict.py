@@ -151,21 +151,23 @@ def _text(
         best = max(others, key=lambda i: comparison.scores[i].total)
         value, error = comparison.difference(best, constant)
         parts.append(
-            f"The best other trend ({trends[best].name}) predicts held-out {held} ({n_folds} "
-            f"folds) by {value:.1f} +- {error:.1f} better than a constant, which is not enough."
+            f"The best other trend ({_plain(trends[best].name)}) predicts held-out {held} "
+            f"({n_folds} folds) better than a constant by {value:.1f} +- {error:.1f} in log "
+            "density, which is not enough."
         )
     else:
         value, error = comparison.difference(here, constant)
         parts.append(
-            f"It predicts held-out {held} ({n_folds} folds) by {value:.1f} +- {error:.1f} better "
-            "than a constant."
+            f"It predicts held-out {held} ({n_folds} folds) better than a constant by "
+            f"{value:.1f} +- {error:.1f} in log density."
         )
     for middle, low, high in dates:
         if high > low:
             parts.append(f"Break at {middle:.2f} ({low:.2f} to {high:.2f} with 68 %).")
     parts += _named_slopes(posterior)
     if rivals and posterior.trend.has_slope:
-        parts.append(f"As well predicts: {', '.join(rivals)}; the slope need not go on.")
+        named = _plain(", ".join(rivals))
+        parts.append(f"Others predict as well ({named}): the slope need not continue.")
     if comparison.scheme == "blocks":
         parts.append(
             f"Successive exposures are correlated ({comparison.correlation:.2f}); sigmas of slopes "
@@ -174,6 +176,11 @@ def _text(
     if not posterior.convergence.converged:
         parts.append(f"The draws have not converged: {'; '.join(posterior.convergence.reasons)}.")
     return " ".join(parts)
+
+
+def _plain(names: str) -> str:
+    """Names of trends as words."""
+    return names.replace("_", " ")
 
 
 def _named_slopes(posterior: SeriesPosterior) -> list[str]:

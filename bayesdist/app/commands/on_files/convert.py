@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import date, time
@@ -31,6 +30,7 @@ from bayesdist.products.formats.common.document import (
     FormatSettings,
 )
 from bayesdist.products.registry import build, format_of, open_document, product_settings
+from bayesdist.reading.documents import toml_of
 
 __all__ = ["convert"]
 
@@ -93,8 +93,8 @@ def _settings(to: str, kind: type[FormatSettings], options: Sequence[str]) -> Fo
         if not mark or not key.strip():
             raise InputError(f"{text!r} is not KEY=VALUE", where="--option", do="write it so")
         try:
-            found = tomllib.loads(f"x = {value}")["x"]
-        except tomllib.TOMLDecodeError:
+            found = toml_of(f"x = {value}", "--option")["x"]
+        except InputError:
             found = value.strip()
         # settings have dates as text
         values[key.strip()] = value.strip() if isinstance(found, (date, time)) else found

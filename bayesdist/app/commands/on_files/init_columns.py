@@ -9,7 +9,7 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from bayesdist.data import Matches
-from bayesdist.data.reading.layout import TableLayout
+from bayesdist.data.formats.layout import TableLayout
 from bayesdist.model.basis import polynomial_terms
 
 __all__ = ["column_lines", "guessed_sigma", "quoted"]
@@ -69,7 +69,8 @@ def _remarks(layout: TableLayout) -> list[str]:
             "reference"
         )
     if "chip" not in layout.taken:
-        for name, n in list(layout.like_chips.items())[:_TOLD]:
+        like_chips = {k: n for k, n in layout.like_chips.items() if "flag" not in k.lower()}
+        for name, n in list(like_chips.items())[:_TOLD]:
             out.append(
                 f"LOOK: column {name} has {n} values; if these are chips, add chip = {quoted(name)}"
                 " (init --columns chip=NAME)"

@@ -24,10 +24,10 @@ from bayesdist.app.screen import number
 from bayesdist.calibration.apply import on_chip
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.sky_positions import SkyPositions, sky_positions
-from bayesdist.data.tables.files import read_table
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 from bayesdist.infer.solution import Solution
+from bayesdist.reading.tables import read_table
 
 if TYPE_CHECKING:
     import pandas

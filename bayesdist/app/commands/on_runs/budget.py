@@ -12,6 +12,7 @@ from bayesdist.app.results import open_results
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.budget.budget import TOTAL, ErrorBudget, place_budget
+from bayesdist.assess.circular import circular_error, per_axis
 from bayesdist.assess.terms.forms import PRODUCT
 
 __all__ = ["budget_at"]
@@ -61,24 +62,26 @@ def _text(found: ErrorBudget, at: tuple[float, float], scale_mas: float | None) 
             place = f"({at[0]:g}, {at[1]:g}) to {place}"
         rows: list[dict[str, Any]] = []
         for t in found.every:
-            radial = float(t.radial[k])
+            u, v = float(t.u[k]), float(t.v[k])
+            size = float(per_axis(u, v))
+            known = "" if t.relative_error is None else f" +- {number(t.relative_error * size, 1)}"
             row = {
                 "term": t.name,
                 "kind": "" if t.kind == TOTAL else t.kind,
-                f"u ({found.unit})": number(float(t.u[k])),
-                f"v ({found.unit})": number(float(t.v[k])),
-                "radial": number(radial)
-                + (
-                    ""
-                    if t.relative_error is None
-                    else f" +- {number(t.relative_error * radial, 1)}"
-                ),
+                f"u ({found.unit})": number(u),
+                f"v ({found.unit})": number(v),
+                "per axis": f"{number(size)}{known}",
             }
             if scale_mas is not None:
-                row["mas"] = number(radial * scale_mas)
+                row["mas"] = number(size * scale_mas)
+            for name, probability in (("CE68", 0.68), ("CE95", 0.95)):
+                row[name] = number(float(circular_error(u, v, 0.0, probability)), 3)
             rows.append(row | {"source": t.source})
         lines += [place, table_text(rows), ""]
-    lines.append("1 sigma; terms of the model are correlated and enter the total jointly")
+    lines += [
+        "1 sigma; per axis: rms of u and v; CE68, CE95: radii that hold 68 and 95 % of such errors",
+        "terms of the model are correlated and enter the total jointly",
+    ]
     if any(t.kind == PRODUCT for t in found.every):
         lines.append("rows of kind product come on top for whoever uses that file: in no total")
     return "\n".join(lines)

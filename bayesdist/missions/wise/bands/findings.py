@@ -31,9 +31,7 @@ def overview_table(inputs: BandsInput) -> TextTable:
     columns = ["Band", "Converged", "Pairs", "Structure", "Longest vector (pix)"]
     if inputs.wise:
         columns += ["vector printed", "difference"]
-    columns += ["Formal radius (pix)"]
-    if inputs.wise:
-        columns += ["radius printed"]
+    columns += ["Largest σ per axis (pix)"]
     return TextTable(
         "Overview",
         tuple(columns),
@@ -55,9 +53,7 @@ def _overview(b: BandResult, *, wise: bool) -> Iterator[str]:
         error = 2 * b.posterior_map.radius_max / here.longest_vector
         mark = "✗" if abs(apart) > error else "(within 2 σ)"
         yield f"{percent(apart, 2)} {'✓' if abs(apart) <= SAME_VECTOR else mark}"
-    yield _length(b, b.formal_map.radius_max)
-    if wise and here is not None:
-        yield number(here.formal_radius, 2)
+    yield _length(b, float(b.posterior_map.per_axis.max()))
 
 
 def _length(b: BandResult, value: float) -> str:
@@ -220,10 +216,11 @@ def coverage_table(inputs: BandsInput) -> TextTable:
 
 @BANDS.table("formal")
 def formal_table(inputs: BandsInput) -> TextTable:
-    """Largest formal radii, and what printed ones imply."""
-    columns = ["Band", "least squares", "posterior"]
+    """Table of the largest radii, with what printed ones imply, and of the errors per axis."""
+    columns = ["Band", "Radius, least squares", "Radius, posterior"]
     if inputs.wise:
-        columns += ["printed", "error of a pair it implies (pix)", "half width found (pix)"]
+        columns += ["Radius, printed", "Error of a pair it implies", "Half width found"]
+    columns += ["Posterior per axis", "CE68", "CE95"]
     rows = []
     for b in inputs.bands:
         cells = [b.name, *(_length(b, m.radius_max) for m in (b.formal_map, b.posterior_map))]
@@ -231,17 +228,25 @@ def formal_table(inputs: BandsInput) -> TextTable:
             width = float(b.sums.histograms["calibrated"].half_width().mean())
             cells += [number(b.printed.formal_radius, 2), number(b.printed.implied_sigma, 3)]
             cells.append(number(width, 3))
+        elif inputs.wise:
+            cells += [MISSING] * 3
+        m = b.posterior_map
+        errors = (m.per_axis, m.circular_error(0.68), m.circular_error(0.95))
+        cells += [_length(b, float(error.max())) for error in errors]
         rows.append(tuple(cells))
-    note = ""
+    note = (
+        "Radius: hypot of σ x and σ y, as WSDC D-T033 has it. Per axis: rms of σ x and σ y. CE68,"
+        " CE95: radii of the circles that hold 68 and 95 %."
+    )
     if inputs.wise:
-        note = (
-            "A printed radius implies an error of each pair if all published pairs lie evenly"
+        note += (
+            " A printed radius implies an error of each pair if all published pairs lie evenly"
             " over the array; where that is not the scatter found, the print used other pairs or"
             " weights."
         )
     unit = "pix" if inputs.bands[0].formal_map.unit == "pix" else "unit as given"
     return TextTable(
-        f"Largest radius, least squares and posterior ({unit})",
+        f"Largest uncertainty over the array, 1 σ ({unit})",
         tuple(columns),
         tuple(rows),
         note=note,

@@ -9,7 +9,6 @@ pixel: ours state them in comments.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -29,6 +28,7 @@ from bayesdist.products.formats.common.content import Content, read_content
 from bayesdist.products.formats.common.document import Choice, MissingSizeError
 from bayesdist.products.formats.common.read_back import ReadBack
 from bayesdist.products.formats.common.record import calibration_from
+from bayesdist.reading.documents import json_of
 
 __all__ = [
     "AGREEMENT",
@@ -241,8 +241,8 @@ def record_beside(name: str) -> Mapping[str, Any] | None:
 
 def _record_of_side(content: Content) -> Mapping[str, Any]:
     try:
-        record = json.loads(content.text)["bayesdist"]
-    except (ValueError, KeyError, TypeError) as error:
+        record = json_of(content.text, content.name)["bayesdist"]
+    except (FormatError, KeyError, TypeError) as error:
         raise FormatError(
             f"is no side file of a SIAF table ({error})",
             where=content.name,

@@ -213,8 +213,8 @@ def _check_options(
     if model.time is not None and epoch is None:
         raise InputError(
             "a SIP header holds for one epoch, and the model depends on time",
-            where="products.sip.epoch",
-            do="give an epoch in decimal years",
+            where="epoch",
+            do="give an epoch in decimal years (assess.epoch in a configuration)",
         )
     if tangent_point is not None and (model.unit == "pix" or origin is not None):
         raise InputError(

@@ -81,8 +81,8 @@ def _gauge(c: CampaignResults) -> TextTable:
             " chips live in its system: gap and rotation between chips are in their coefficients.",
             "Where it holds": "in the tables and figures of this part. The tables of coefficients"
             " further down are in the fit's own gauge, and differ by the shift and rotation below.",
-            "Shift that did it (u, v)": f"{shift} {scale.unit}",
-            "Rotation that did it": f"{rounded(rotation, sigma)} ± {number(sigma, 2)} 10⁻⁶ rad",
+            "Shift by which it was fixed (u, v)": f"{shift} {scale.unit}",
+            "Rotation": f"({rounded(rotation, sigma)} ± {number(sigma, 2)})\u202f×\u202f10⁻⁶ rad",
         },
     )
 

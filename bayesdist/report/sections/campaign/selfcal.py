@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
+from bayesdist.assess.circular import per_axis
 from bayesdist.numbers import MISSING, count, display_scale, number, percent, with_mas
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, SelfcalResults, needed
@@ -24,6 +26,7 @@ __all__ = [
 ]
 
 MAX_STARS_DRAWN = 20_000  # more only hide each other
+ONE_AXIS = 0.5**0.5  # of a radius hypot(sigma_u, sigma_v)
 
 
 @REPORT.table("selfcal", needs=("selfcal",))
@@ -36,12 +39,12 @@ def selfcal_tables(r: ReportInput) -> tuple[TextTable, ...]:
 def _gauge(found: SelfcalResults) -> TextTable:
     rows = [
         (
-            str(row["name"]).replace("_", " "),
+            _property(str(row["name"])),
             str(row["state"]),
             _sigma(row["sigma_detections"], row["unit"]),
             _sigma(row["sigma_fixed"], row["unit"]),
             _edge(row["sigma_fixed"], row["edge_pix"]),
-            str(row["fixed_by"]) or MISSING,
+            MISSING if np.ma.is_masked(row["fixed_by"]) else str(row["fixed_by"]) or MISSING,
         )
         for row in found.gauge
     ]
@@ -61,6 +64,11 @@ def _gauge(found: SelfcalResults) -> TextTable:
         note=f"{found.words} Relative positions do not depend on any of it: their errors are in"
         " the maps of that name.",
     )
+
+
+def _property(name: str) -> str:
+    """Name of a direction as words; those of coefficients stay as they are."""
+    return name if re.search(r"_\d", name) else name.replace("_", " ")
 
 
 def _sigma(value: Any, unit: Any) -> str:
@@ -84,7 +92,7 @@ def _detections(found: SelfcalResults) -> TextTable:
             **{reason[0].upper() + reason[1:]: count(n) for reason, n in d["unused"].items()},
             "Detections used": count(d["used"]),
             "Stars": count(s["n_stars"]),
-            "Detections of a star, median and most": f"{number(s['per_star']['median'])}, "
+            "Detections of a star, median and most": f"{s['per_star']['median']:g}, "
             f"{count(s['per_star']['most'])}",
             "Ambiguous groups": count(s["n_ambiguous"]),
             "Rounds of grouping and solving": count(s["iterations"]),
@@ -126,8 +134,10 @@ def _stars(found: SelfcalResults, r: ReportInput) -> TextTable:
         "The catalogue of the stars",
         {
             "Stars": count(s["n"]),
-            "Radius of the error, median": with_mas(s["radius_median"], s["unit"], mas),
-            "The same for a known distortion": with_mas(s["radius_own_median"], s["unit"], mas),
+            "Error per axis, median": with_mas(ONE_AXIS * s["radius_median"], s["unit"], mas),
+            "The same for a known distortion": with_mas(
+                ONE_AXIS * s["radius_own_median"], s["unit"], mas
+            ),
             "With two detections alone": count(s["n_two_detections"]),
             "Doubtful": count(s["n_doubtful"]),
             "Reference stars": count(s["n_reference"]),
@@ -158,31 +168,31 @@ def selfcal(r: ReportInput) -> Plot:
     for ax in (field, errors):
         ax.tick_params(colors=INK)
     s = found.summary["stars"]
-    size = with_mas(s["radius_median"], s["unit"], r.scale_mas)
+    size = with_mas(ONE_AXIS * s["radius_median"], s["unit"], r.scale_mas)
     return Plot(
         fig,
         "Exposures and stars",
         f"Outlines of the exposures over the {count(s['n'])} stars that were found, and the errors"
-        f" of these, {size} at the median, in the gauge of the run.",
+        f" of these per axis (1 σ), {size} at the median, in the gauge of the run.",
         f"Outlines of exposures over stars, and errors of the stars, median {size}.",
     )
 
 
 def _errors(ax: Axes, stars: Table, unit: str) -> None:
-    radius = np.hypot(stars["sigma_u"], stars["sigma_v"])
-    own = np.hypot(stars["sigma_own_u"], stars["sigma_own_v"])
-    scale = display_scale(unit, float(np.median(radius)))
+    whole = per_axis(stars["sigma_u"], stars["sigma_v"])
+    own = per_axis(stars["sigma_own_u"], stars["sigma_own_v"])
+    scale = display_scale(unit, float(np.median(whole)))
     by_mag = "mag" in stars.colnames
     x = np.asarray(stars["mag"] if by_mag else stars["n"], float)
     for values, color, label in (
-        (radius, CYCLE[0], "with distortion and frames"),
+        (whole, CYCLE[0], "with distortion and frames"),
         (own, CYCLE[1], "of a known distortion"),
     ):
         ax.plot(
             x, np.asarray(values) * scale.factor, ".", ms=2, mec="none", color=color, label=label
         )
     ax.set_yscale("log")
-    ax.set_xlabel("magnitude" if by_mag else "detections")
-    ax.set_ylabel(f"radius of the error (1 σ) [{scale.unit}]")
+    ax.set_xlabel("magnitude [mag]" if by_mag else "detections [count]")
+    ax.set_ylabel(f"per axis (1 σ) [{scale.unit}]")
     ax.set_title("Errors of the stars")
     ax.legend(markerscale=4)

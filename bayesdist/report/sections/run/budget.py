@@ -13,7 +13,15 @@ from matplotlib.patches import Patch
 
 from bayesdist.assess.circular import circular_error, per_axis
 from bayesdist.assess.terms.forms import PRODUCT
-from bayesdist.numbers import MISSING, display_scale, percent, size_of, with_mas
+from bayesdist.numbers import (
+    MISSING,
+    Scale,
+    display_scale,
+    length_scale,
+    number,
+    percent,
+    with_mas,
+)
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.fields import Grid, scalar_map
@@ -68,19 +76,22 @@ def budget_table(r: ReportInput) -> TextTable:
     unit, mas = budget.unit, r.scale_mas
     names = {str(c.chip.number): c.chip.name for c in r.chips} | {"all": "all"}
     rows = budget.rows_by_chip() if r.several else budget.rows()
+    typical = _per_axis(budget.rows()[-1])
+    scale = length_scale(unit, typical)
     out = [
         (
             str(row["name"]),
             *((names[str(row["chip"])],) if r.several else ()),
             str(row["kind"]),
             AS_ABOVE if str(row.get("chip", "all")) != "all" else str(row["source"]) or MISSING,
-            *(r.marked(text) for text in _sizes(row, mas, unit)),
+            *(r.marked(text) for text in _sizes(row, scale, mas, typical)),
             _known_to(row),
         )
         for row in rows
     ]
     of_chip = ("Chip",) if r.several else ()
-    heads = ("Term", *of_chip, "Kind", "Source", "u", "v", "Per axis", "CE68", "CE95", "Known to")
+    lengths = [f"{name} [{scale.unit}]" for name in ("u", "v", "Per axis", "CE68", "CE95")]
+    heads = ("Term", *of_chip, "Kind", "Source", *lengths, "Known to")
     epoch = budget.epoch
     when = "" if epoch is None else f" at epoch {epoch:.2f}"
     return TextTable(
@@ -89,7 +100,7 @@ def budget_table(r: ReportInput) -> TextTable:
         tuple(out),
         words=tuple(range(len(heads) - 6)),
         leading=len(budget.rows()),  # rows of all chips together
-        stacked=(heads.index("Per axis"),),
+        stacked=(heads.index(lengths[2]),),
         note="Per axis: rms of u and v; CE68, CE95: circles that hold 68 and 95 % of errors of that"
         " size, if Gaussian. The parts of the model are correlated and enter the total jointly, by"
         " draws; independent terms add in quadrature. The total therefore need not be the root"
@@ -97,16 +108,17 @@ def budget_table(r: ReportInput) -> TextTable:
     )
 
 
-def _sizes(row: Mapping[str, Any], mas: float | None, unit: str) -> tuple[str, ...]:
-    """Errors of u, of v, per axis (in mas as well), CE68 and CE95, of the rms over the detector."""
+def _sizes(
+    row: Mapping[str, Any], scale: Scale, mas: float | None, typical: float
+) -> tuple[str, ...]:
+    """Errors of u, of v, per axis (in mas as well), CE68 and CE95, rms over the detector."""
     u, v = float(row["u"]), float(row["v"])
     circles = (float(circular_error(u, v, 0.0, p)) for p in (0.68, 0.95))
-    return (
-        size_of(u, unit),
-        size_of(v, unit),
-        with_mas(_per_axis(row), unit, mas),
-        *(size_of(radius, unit) for radius in circles),
-    )
+    sizes = [number(scale.factor * size) for size in (u, v, _per_axis(row), *circles)]
+    if mas is not None and scale.unit == "pix":
+        angle = with_mas(_per_axis(row) * mas, "mas", None, like=typical * mas)
+        sizes[2] += f" ({angle})"
+    return tuple(sizes)
 
 
 def _per_axis(row: Mapping[str, Any]) -> float:

@@ -48,10 +48,11 @@ def data_tables(r: ReportInput) -> tuple[TextTable, ...]:
         pairs[f"Epochs [yr]{partial}"] = f"{np.min(m.epoch):.2f} to {np.max(m.epoch):.2f}"
     if m.mag is not None and np.isfinite(m.mag).any():
         pairs[f"Magnitudes{partial}"] = f"{np.nanmin(m.mag):.2f} to {np.nanmax(m.mag):.2f}"
+    given = r.setting("data", "sigma", "as given")
     pairs[f"Errors of the {words.rows}"] = (
         "by magnitude, see below"
         if r.magnitude_errors is not None
-        else str(r.setting("data", "sigma", "as given"))
+        else (str(given) if isinstance(given, str) else f"{given:g} {m.unit} on each axis")
     )
     reasons = [(f"{k} (reading)", count(v)) for k, v in m.rejected.items()]
     reasons += [(f"{k} ({words.rejection})", count(v)) for k, v in fit.rejected.items()]
@@ -76,7 +77,12 @@ def _magnitude_table(r: ReportInput) -> TextTable:
     e = needed(r.magnitude_errors)
     scale = display_scale(r.unit, np.concatenate([e.sigma_u, e.sigma_v]))
     rows = tuple(
-        (f"{mag:.2f}", count(n), number(su * scale.factor), number(sv * scale.factor))
+        (
+            f"{mag:.2f}".replace("-", "−"),
+            count(n),
+            number(su * scale.factor),
+            number(sv * scale.factor),
+        )
         for mag, n, su, sv in zip(e.mag, e.n, e.sigma_u, e.sigma_v, strict=True)
     )
     return TextTable(
@@ -134,10 +140,9 @@ def residuals_by_magnitude(r: ReportInput) -> Plot:
         text += f" {words.rows} lie between them{more}."
     if r.sample:
         text += f" Drawn from {r.sample}."
-    assert r.stars.table.mag is not None
     return Plot(
         _density(
-            r.stars.table.mag[known],
+            needed(r.stars.table.mag)[known],
             r.stars.residual[known],
             unit=r.unit,
             errors=r.magnitude_errors,

@@ -29,7 +29,7 @@ def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
         "Polynomial order": str(model.order),
         "Parameters": f"{count(model.n_params)} ({count(model.n_polynomial)} polynomial)",
         "Chips": ", ".join(c.name or str(c.number) for c in model.chips),
-        "Frame of each exposure": model.frames,
+        "Frame of each exposure": model.frames.replace("_", ", "),
         "Time-dependent terms": _drifting(r),
         "Chi-square / degrees of freedom": f"{number(fit.chi2, 6)} / {count(fit.dof)} ="
         f" {number(fit.chi2 / fit.dof if fit.dof > 0 else None)}",

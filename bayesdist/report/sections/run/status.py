@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bayesdist.assess.circular import per_axis
-from bayesdist.checks import LEVELS, Check, worst
+from bayesdist.checks import LEVELS, Check, warnings_of, worst
 from bayesdist.numbers import number, rounded, with_mas
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput
+from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.sections.run.margins import VERDICT_LEVELS
 from bayesdist.report.sections.run.validity import (
     epoch_clause,
@@ -95,11 +95,14 @@ def verdict(r: ReportInput) -> Verdict:
     The headline says what is worst first, for which epoch, and until when it holds.
     """
     groups = status_checks(r)
-    sentences = [*(f"{text}." for text in r.warnings), _margin_sentence(r), _accuracy_sentence(r)]
+    numbers = (_margin_sentence(r), _accuracy_sentence(r))
     if r.provisional:
-        reasons = r.posterior.convergence.reasons  # type: ignore[union-attr]
-        sentences.insert(0, f"Why: {'; '.join(reasons) or 'no reason was recorded'}.")
-        return Verdict("fail", "NOT CONVERGED: do not rely on these numbers", tuple(sentences))
+        reasons = needed(r.posterior).convergence.reasons
+        why = f"Why: {'; '.join(reasons) or 'no reason was recorded'}."
+        remarks = warnings_of(c for c in r.checks if c.name != "Converged")  # it says the same
+        sentences = (why, *(f"{text}." for text in remarks), *numbers)
+        return Verdict("fail", "NOT CONVERGED: do not rely on these numbers", sentences)
+    sentences = (*(f"{text}." for text in r.warnings), *numbers)
     clauses = [(worst(groups.get("Requirements", ())), _requirements_clause(r))]
     own: tuple[str, ...] = _OWN_CLAUSE
     if r.posterior is None:
@@ -111,13 +114,14 @@ def verdict(r: ReportInput) -> Verdict:
         if names:
             clauses.append((level, _rows_clause(names, verb)))
     if r.warnings:
-        clauses.append(("warn", "read the warnings"))
+        n = len(r.warnings)
+        clauses.append(("warn", "one warning below" if n == 1 else f"{n} warnings below"))
     clauses.append((worst(groups.get("Validity", ())), validity_clause(r)))
     # the kind of solution first, then what is worst
     clauses.sort(key=lambda one: (one[1] == _UNSAMPLED, LEVELS.index(one[0])), reverse=True)
     level = max((level for level, _ in clauses), key=LEVELS.index)
     headline = "; ".join(text for _, text in clauses)
-    return Verdict(level, headline[:1].upper() + headline[1:], tuple(sentences))
+    return Verdict(level, headline[:1].upper() + headline[1:], sentences)
 
 
 def _requirements_clause(r: ReportInput) -> str:
@@ -167,22 +171,25 @@ def _accuracy_sentence(r: ReportInput) -> str:
     best = worst.best_map
     maps = [c.best_map for c in r.chips]
     median = float(np.median(np.concatenate([m.per_axis.ravel() for m in maps])))
-    largest = with_mas(float(best.per_axis.max()), r.unit, r.scale_mas)
+    like = float(best.per_axis.max())
+
+    def length(value: float) -> str:
+        return with_mas(value, r.unit, r.scale_mas, like=like)
+
     circles = " and ".join(
-        f"CE{p} {r.length(max(float(m.circular_error(p / 100).max()) for m in maps))}"
+        f"CE{p} {length(max(float(m.circular_error(p / 100).max()) for m in maps))}"
         for p in (68, 95)
     )
     text = (
         f"The {whose} uncertainty of the distortion (per axis, 1 σ) is"
-        f" {with_mas(median, r.unit, r.scale_mas)} at the median position and at most {largest},"
+        f" {length(median)} at the median position and at most {length(like)},"
         f" at pixel {r.position(best.position_of_max, worst.chip.number)}{_with_shift(r)}"
         f" ({circles} at most)"
     )
     if r.budget is None:
         return f"{text}."
     total = r.budget.rows()[-1]
-    per_axis_rms = float(per_axis(total["u"], total["v"]))
-    with_budget = with_mas(per_axis_rms, r.budget.unit, r.scale_mas)
+    with_budget = length(float(per_axis(total["u"], total["v"])))
     whom = (
         ""
         if r.campaign is None

@@ -284,7 +284,7 @@ def residuals_by_property(r: ReportInput) -> Plot:
                 f"d{'uv'[axis]} against {what}: χ² {one.chi2[axis]:.0f} of {len(one.at)} bins"
             )
             ax.set_xlabel(label)
-            ax.xaxis.set_major_locator(MaxNLocator(5))
+            ax.xaxis.set_major_locator(MaxNLocator(_ticks(one.at)))
             guide_lines(ax)
         panels[0].set_ylabel(f"mean residual\n[{scale.unit}]")
         worst.append(f"{number(float(np.abs(one.mean / one.error).max()), 2)} ({what})")
@@ -298,6 +298,12 @@ def residuals_by_property(r: ReportInput) -> Plot:
         f" their errors: {listed}.{_sample_words(r)}",
         f"Mean residuals with errors; the largest in units of their errors: {listed}.",
     )
+
+
+def _ticks(values: Float) -> int:
+    """Intervals of an axis that its labels leave room for: dates of one night have ten digits."""
+    digits = np.log10(np.abs(values).max() / max(float(np.ptp(values)), 1e-300))
+    return 5 if digits < 4 else 2
 
 
 def _listed(names: Sequence[str]) -> str:

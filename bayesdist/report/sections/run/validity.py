@@ -39,7 +39,7 @@ def _validity_check(one: ValidityPeriod, began: float | None) -> Check:
 def validity_clause(r: ReportInput) -> str:
     """Clause on the validity period: that of the requirement that is the first to fail."""
     if r.fit.model.time is None:
-        return "the model does not depend on time, so that no validity period follows from it"
+        return "no validity period, as the model does not depend on time"
     if not r.validity:
         return "no validity period was computed"
     first = min(r.validity, key=lambda one: math.inf if one.date is None else one.date)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Sequence
 
@@ -9,9 +10,13 @@ from astropy.table import Table
 
 from bayesdist.errors import FormatError
 
-__all__ = ["is_text_table", "parse_text_table"]
+__all__ = ["is_text_table", "parse_text_table", "refuse_cut_end"]
+
+log = logging.getLogger("bayesdist")
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?|nan|inf", re.IGNORECASE)
+MARKS = {"ascii.csv": ",", "ascii.tab": "\t"}
+ROWS_ABOVE, FEWEST_ABOVE = 20, 3  # that the last cell is held against
 _DAOPHOT = "DAOPHOT"  # the program's own lists, not the tables of IRAF's version
 _DAOPHOT_COLUMNS = {
     9: ("id", "x", "y", "mag", "mag_err", "sky", "iterations", "chi", "sharp"),  # ALLSTAR
@@ -60,8 +65,8 @@ def parse_text_table(lines: Sequence[str], *, where: str) -> Table:
     list of DAOPHOT II or ALLSTAR, and columns under a line of names, with "#" before it or not,
     separated by blanks, commas or tabs.
     """
-    ended = not lines or lines[-1].endswith("\n")
-    lines = [line.rstrip("\r\n") for line in lines]
+    ended = not lines or lines[-1].endswith(("\n", "\r"))
+    whole, lines = lines, [line.rstrip("\r\n") for line in lines]
     kind = _kind(lines)
     if kind is None:
         raise FormatError(
@@ -74,12 +79,40 @@ def parse_text_table(lines: Sequence[str], *, where: str) -> Table:
         return _daophot_list(lines, where)
     if kind == "ascii.ipac":
         _refuse_short_rows(lines, where, ended=ended)
-    elif kind == "ascii.commented_header":
+    else:
+        refuse_cut_end(whole, MARKS.get(kind), where=where)
+    if kind == "ascii.commented_header":
         heads = [k for k, line in enumerate(lines) if line.strip().startswith("#")]
         lines = [line for k, line in enumerate(lines) if k not in heads[:-1]]
     elif kind in ("ascii.csv", "ascii.tab", "ascii.basic"):
         options["comment"] = "#"
     return Table.read(lines, format=kind, guess=False, **options)
+
+
+def refuse_cut_end(lines: Sequence[str], mark: str | None, *, where: str) -> None:
+    """Refuse a table whose last number has lost digits; warn of one that ends within a line.
+
+    `lines` have their ends; `mark` separates cells, None where blanks do.  The last cell is held
+    against those above it: fewer decimals where all have as many, or less than half their length.
+    """
+    if not lines or lines[-1].endswith(("\n", "\r")):
+        return
+    rows = [line for line in lines if line.strip() and not line.startswith("#")]
+    cells = [line.rstrip("\r\n").split(mark)[-1].strip() for line in rows[-1 - ROWS_ABOVE :]]
+    if not cells:
+        return
+    *above, last = cells
+    above = [cell for cell in above if _NUMBER.fullmatch(cell)]
+    decimals = {len(cell.partition(".")[2]) for cell in above}
+    short = len(decimals) == 1 and len(last.partition(".")[2]) < min(decimals)
+    tiny = bool(above) and 2 * len(last) < sorted(map(len, above))[len(above) // 2]
+    if len(above) >= FEWEST_ABOVE and (short or tiny):
+        raise FormatError(
+            f"ends within its last number ({last!r})",
+            where=where,
+            do="the table may be truncated: fetch or write it again",
+        )
+    log.warning("%s: its last line has no end, so that the file may be truncated", where)
 
 
 def _daophot_list(lines: Sequence[str], where: str) -> Table:

@@ -1,0 +1,51 @@
+"""Pages of the documentation, which are part of the package: they are read without a network."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from pathlib import Path
+
+import click
+
+import bayesdist.version
+from bayesdist.app.commands.options import command
+from bayesdist.errors import InputError
+from bayesdist.reading.regular import read_text
+
+__all__ = ["docs"]
+
+_PACKAGE = Path(bayesdist.version.__file__).parent
+_FOLDERS = (_PACKAGE / "docs", _PACKAGE.parent / "docs")  # as installed, and in the source
+
+
+@command()
+@click.argument("page", required=False)
+def docs(page: str | None) -> None:
+    """Show a page of the documentation, or list all pages."""
+    pages = _pages()
+    if page is None:
+        width = max(map(len, pages))
+        for name, path in pages.items():
+            click.echo(f"{name:{width}}  {_title(path)}")
+        return
+    name = page.removesuffix(".md")
+    if name not in pages:
+        near = get_close_matches(name, pages, n=1)
+        raise InputError(
+            f"the documentation has no page {page!r}",
+            do=f"give {near[0]!r}" if near else "list all pages with 'bayesdist docs'",
+        )
+    click.echo_via_pager(read_text(pages[name]))
+
+
+def _pages() -> dict[str, Path]:
+    """Files of the pages by name."""
+    for folder in _FOLDERS:
+        found = {path.stem: path for path in sorted(folder.glob("*.md"))}
+        if found:
+            return found
+    raise InputError("the documentation is not installed", do="install the package again")
+
+
+def _title(path: Path) -> str:
+    return read_text(path).partition("\n")[0].lstrip("# ")

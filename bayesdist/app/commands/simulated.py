@@ -1,0 +1,33 @@
+"""Simulated input that belongs to no mission."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import numpy as np
+
+from bayesdist.app.commands.options import command, force, seed
+from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
+
+__all__ = ["camera"]
+
+
+@command()
+@click.option(
+    "-o", "--output", default="camera_gaia.csv", metavar="FILE.csv", help="File to write."
+)
+@click.option("--stars", type=click.IntRange(min=1), default=4000, metavar="N", help="How many.")
+@seed
+@force
+def camera(output: str, stars: int, seed: int, force: bool) -> None:
+    """Simulate one SExtractor catalogue matched to Gaia, for the quickstart."""
+    from bayesdist.simulate.camera import matched_to_gaia
+
+    if Path(output).exists() and not force:
+        raise InputError("is there already", where=output, do="choose another name, or --force")
+    table = matched_to_gaia(stars, np.random.default_rng(seed))
+    with atomic_path(output) as path:
+        table.write(path, format="ascii.csv", overwrite=True)
+    click.echo(f"{output}: {stars} matched stars")
