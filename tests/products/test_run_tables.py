@@ -65,7 +65,8 @@ def test_a_file_has_the_tables_of_the_run(product, tmp_path, key):
     x, y = np.round(rng.uniform(2, 255, 400)), np.round(rng.uniform(2, 191, 400))
     expected = replace(calibration, before=product.tables).forward(x, y, chip=1)
     plain = calibration.forward(x, y, chip=1)
-    assert np.hypot(*(expected - plain).T).max() > 0.02  # arcsec: they are no trifle
+    effect = np.hypot(*(expected - plain).T).max()
+    assert effect > 0.02  # arcsec: they are no trifle
     [back] = read_back(key, files, calibration, options)
     found = back.forward(x, y, 1, None)
     # on axes of its own: the best similarity, within which the file's frame lies
@@ -77,7 +78,7 @@ def test_a_file_has_the_tables_of_the_run(product, tmp_path, key):
     limit = 1e-6  # these pixels are nodes of STDGDC
     if key == "cpdis":  # whose nodes lie between pixels: as the file states, on other pixels
         limit = 1.5 * 0.1 * fits.getheader(tmp_path / "cpdis.fits", 1)["BDWORST"]
-        assert limit < 1e-3
+        assert limit < effect / 10
     assert min(left) < limit
     if key != "stdgdc":
         name = next(f.file_name for f in files if f.kind != PARAMETERS)
