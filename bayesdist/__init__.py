@@ -79,6 +79,7 @@ _HOMES = {
         "write_npol",
         "write_sip",
     ),
+    "bayesdist.app.commands.on_files.sky": ("apply_to_sky",),
     "bayesdist.app.run": ("run",),
 }
 
@@ -94,6 +95,7 @@ def __dir__() -> list[str]:
 
 
 if TYPE_CHECKING:
+    from bayesdist.app.commands.on_files.sky import apply_to_sky as apply_to_sky
     from bayesdist.app.run import run as run
     from bayesdist.assess import check_requirements as check_requirements
     from bayesdist.assess import error_budget as error_budget

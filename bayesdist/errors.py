@@ -1,11 +1,13 @@
 """One family of errors: what is wrong, where, and what to do next.
 
 Everything that a user can put right is raised as a `BayesdistError`; the command line prints its
-one sentence and exits with its code.  Any other exception is a defect of the program.
+one sentence and exits with its code.  Any other exception is a defect of the program, and the
+command line says so (`bayesdist.app.failures`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypeVar
 
 __all__ = [
@@ -14,9 +16,11 @@ __all__ = [
     "DegenerateError",
     "FormatError",
     "InputError",
+    "MemoryLimitError",
     "NotConvergedError",
     "NotSettledError",
     "RenamedError",
+    "require_known",
     "required",
 ]
 
@@ -92,6 +96,10 @@ class DegenerateError(InputError):
     """The data do not determine the parameters that are asked for."""
 
 
+class MemoryLimitError(InputError):
+    """A computation that needs more memory than there is."""
+
+
 class NotSettledError(InputError):
     """An iteration over the data that does not come to rest."""
 
@@ -108,8 +116,34 @@ class RenamedError(BayesdistError):
     exit_code = 2
 
 
-def required(value: T | None, cause: str, *, do: str = "") -> T:
+def required(value: T | None, cause: str) -> T:
     """The value, if there is one; InputError, with this cause, if there is none."""
     if value is None:
-        raise InputError(cause, do=do)
+        raise InputError(cause)
     return value
+
+
+def require_known(name: str, known: Sequence[str], what: str, *, where: str = "") -> None:
+    """Pass a known name.
+
+    Parameters
+    ----------
+    name : str
+    known : sequence of str
+    what : str
+        What the name stands for, as in ``"statistic"``.
+    where : str, optional
+        Where it was given.
+
+    Raises
+    ------
+    InputError
+        For an unknown name; it names the nearest known one, or all of them where none is near.
+    """
+    if name in known:
+        return
+    from difflib import get_close_matches  # which takes longer to load than all else here
+
+    near = get_close_matches(str(name).lower(), known, n=1, cutoff=0.5)
+    do = f"use {near[0]!r} if that is meant" if near else f"choose one of {', '.join(known)}"
+    raise InputError(f"unknown {what} {name!r}", where=where, do=do)

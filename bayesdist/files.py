@@ -10,11 +10,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from bayesdist.errors import InputError
+from bayesdist.reading.regular import opened
 
 __all__ = [
     "atomic_path",
     "is_leftover",
     "made_folder",
+    "path_within",
     "remove_leftovers",
     "sha256_of",
     "watched_writes",
@@ -126,6 +128,45 @@ def made_folder(path: str | os.PathLike[str]) -> Path:
     return folder
 
 
+def path_within(
+    folder: str | os.PathLike[str], name: str, *, where: str, links: bool = False
+) -> Path:
+    """Path of a file below a folder, by its name there.
+
+    Names that stand in files which others may have written are not to lead anywhere else.
+
+    Parameters
+    ----------
+    folder : path-like
+    name : str
+    where : str
+        The file that has the name, for the error.
+    links : bool
+        Follow symbolic links in the folders of the path, too.
+
+    Returns
+    -------
+    pathlib.Path
+
+    Raises
+    ------
+    InputError
+        For a name that leads out of the folder.
+    """
+    folder = Path(folder)
+    path = folder / name
+    inside = not Path(name).is_absolute() and ".." not in Path(name).parts and bool(name)
+    if inside and links:
+        inside = path.parent.resolve().is_relative_to(folder.resolve())
+    if not inside:
+        raise InputError(
+            f"names a file outside of its folder ({name!r})",
+            where=where,
+            do="restore it, or choose another folder",
+        )
+    return path
+
+
 def is_leftover(name: str) -> bool:
     """Whether a file name is that of a temporary file, left by a process that was killed."""
     return name.startswith(_MARK)
@@ -154,12 +195,5 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
     InputError
         When the file cannot be read.
     """
-    try:
-        with Path(path).open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(
-            f"cannot be read ({error.strerror or error})",
-            where=str(path),
-            do="check the path and its permissions",
-        ) from error
+    with opened(path) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -31,6 +31,7 @@ MISSING = "–"
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _MINUS = str.maketrans("-", "−")
 _LEAST_P = 1e-300  # tails of distributions underflow not far below
+NAME_WIDTH = 10  # of a line of a name that is broken
 _MAX_DECIMALS = 10  # beyond this a fixed-point number is harder to read than a power of ten
 
 
@@ -119,11 +120,11 @@ def probability(p: Any) -> str:
     return f"p = {number(p, 2)}"
 
 
-def broken_name(name: str, width: int = 10) -> str:
+def broken_name(name: str) -> str:
     """Long name of a parameter on several lines, broken after its points."""
     lines = [""]
     for part in name.replace(".", ".\0").split("\0"):
-        if lines[-1] and len(lines[-1]) + len(part) > width:
+        if lines[-1] and len(lines[-1]) + len(part) > NAME_WIDTH:
             lines.append("")
         lines[-1] += part
     return "\n".join(lines)

@@ -15,6 +15,8 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.reading.documents import json_of
+
 __all__ = ["record_from_arrays", "record_to_arrays"]
 
 TREE = "tree"
@@ -50,15 +52,25 @@ def record_to_arrays(record: Any) -> dict[str, NDArray[Any]]:
     return {TREE: np.frombuffer(tree.encode(), np.uint8), **writer.arrays}
 
 
-def record_from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Any:
+def record_from_arrays(arrays: Mapping[str, NDArray[Any]], kind: type = object) -> Any:
     """The record that `record_to_arrays` described.
 
     Parameters
     ----------
     arrays : mapping of str to ndarray
+    kind : type
+        Which it has to be.
+
+    Raises
+    ------
+    TypeError, KeyError, AttributeError
+        For arrays that are no such record.
     """
-    tree = json.loads(np.asarray(arrays[TREE], np.uint8).tobytes())
-    return _Reader(arrays).of(tree)
+    tree = json_of(np.asarray(arrays[TREE], np.uint8).tobytes().decode(), "record")
+    found = _Reader(arrays).of(tree)
+    if not isinstance(found, kind):
+        raise TypeError(f"holds a {type(found).__name__}, and no {kind.__name__}")
+    return found
 
 
 @runtime_checkable
@@ -151,7 +163,10 @@ def _name(value: Any) -> str:
 
 
 def _class(name: str) -> Any:
+    """A class that records are made of; TypeError for a name of anything else."""
     module, _, qualified = name.partition(":")
-    if not module.startswith(PACKAGE):
-        raise TypeError(f"{name} is no class of this package")
-    return getattr(import_module(module), qualified)
+    found = getattr(import_module(module), qualified, None) if module.startswith(PACKAGE) else None
+    held = isinstance(found, type) and (is_dataclass(found) or hasattr(found, "from_dict"))
+    if not held or found.__module__ != module:
+        raise TypeError(f"{name} is no class of this package's records")
+    return found

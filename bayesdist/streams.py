@@ -24,5 +24,6 @@ def restarted(rng: np.random.Generator) -> np.random.Generator:
     True
     """
     seeds = rng.bit_generator.seed_seq
-    assert isinstance(seeds, np.random.SeedSequence)
+    if not isinstance(seeds, np.random.SeedSequence):
+        raise TypeError("the generator is not made from a seed")
     return np.random.default_rng(np.random.SeedSequence(seeds.entropy, spawn_key=seeds.spawn_key))

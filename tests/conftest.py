@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.reduced import FULL
+
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
@@ -29,7 +31,7 @@ def rng() -> np.random.Generator:
 @pytest.fixture(scope="session")
 def full() -> bool:
     """Whether the statistical suites run at full size (BAYESDIST_FULL=1) or reduced."""
-    return os.environ.get("BAYESDIST_FULL", "") not in ("", "0")
+    return FULL
 
 
 # A run compiles the kernels that most tests need, and the files beside it none: a machine that has
@@ -52,7 +54,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 # folders whose files look at the same thing, which is long in the making
-TOGETHER = ("tests/campaign/", "tests/report/")
+TOGETHER = ("tests/campaign/", "tests/report/", "tests/app/selfcal/")
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -91,6 +91,12 @@ def test_the_page_on_ground_based_cameras_runs(tmp_path, monkeypatch):
     assert Path("tpv/tpv.head").is_file() and "sigma_x_out" in Path("with_errors.ecsv").read_text()
 
 
+def test_the_page_on_positions_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    namespace = run_page(DOCS / "positions.md")
+    assert namespace["cov"].shape == (6, 6)
+
+
 @pytest.mark.parametrize("page", ["jwst.md", "roman.md"])
 def test_the_pages_of_the_pipelines_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -122,6 +128,7 @@ def test_every_block_that_could_run_is_run():
     run = {p.name for p in DOCS.glob("*.md") if {"console", "python"} & {b for b, _ in blocks(p)}}
     tutorials = {p.name for p in DOCS.glob("tutorial_*.md")}
     others = {"posterior_file.md", "new_instrument.md", "ground_based.md", "jwst.md", "roman.md"}
+    others |= {"positions.md"}
     assert run == tutorials | others
 
 

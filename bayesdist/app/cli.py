@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import click
 
 from bayesdist.app.commands.groups import LazyGroup
+from bayesdist.app.screen import open_streams
 from bayesdist.errors import BayesdistError, RenamedError
 from bayesdist.mission import load_mission, mission_names, missions
 from bayesdist.version import __version__
@@ -43,7 +44,8 @@ RENAMED = {
 }
 EPILOG = (
     "Exit codes: 0 success, 1 bad input, 2 wrong usage, 3 not converged under --strict, "
-    "4 requirement missed or undecided."
+    "4 requirement missed or undecided, 65 input nested too deep, 70 a defect of bayesdist, "
+    "71 too little memory, 74 refused by the system, 130 interrupted."
 )
 
 
@@ -81,7 +83,7 @@ class _Root(LazyGroup):
 
     def invoke(self, ctx: click.Context) -> int:
         # here, as click ends with codes of its own on an interrupt and a closed pipe
-        return _exit_code(lambda: super(_Root, self).invoke(ctx))
+        return _exit_code(lambda: super(_Root, self).invoke(ctx), ctx.obj or "bayesdist")
 
 
 bayesdist = click.version_option(__version__, message="bayesdist %(version)s")(
@@ -106,20 +108,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0 good; 1 bad input; 2 usage; 3 not converged under --strict; 4 requirement missed; 130
+        0 good; 1 bad input; 2 usage; 3 not converged under --strict; 4 requirement missed; 65
+        nested too deep; 70 a defect; 71 too little memory; 74 refused by the system; 130
         interrupted.
     """
+    open_streams()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     line = shlex.join(["bayesdist", *arguments])
     return _exit_code(
-        lambda: bayesdist.main(arguments, prog_name="bayesdist", standalone_mode=False, obj=line)
+        lambda: bayesdist.main(arguments, prog_name="bayesdist", standalone_mode=False, obj=line),
+        line,
     )
 
 
-def _exit_code(call: Callable[[], int | None]) -> int:
+def _exit_code(call: Callable[[], int | None], command: str) -> int:
     """Exit code of a call whose errors are said in one sentence."""
     try:
         return call() or 0
+    except click.exceptions.Exit as end:  # after help was shown
+        return end.exit_code
     except click.ClickException as error:
         error.show(file=sys.stderr)
         return error.exit_code
@@ -127,16 +134,18 @@ def _exit_code(call: Callable[[], int | None]) -> int:
         sentence = " ".join(str(error).split())  # libraries below break their reasons into lines
         print(f"bayesdist: {sentence}", file=sys.stderr)
         return error.exit_code
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, click.Abort):
         print("bayesdist: interrupted; resume with --resume", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of a pipe had enough
         sys.stderr.close()
         return 0
-    except OSError as error:  # the system refuses, and nobody below could say more
-        where = f"{error.filename}: " if error.filename else ""
-        print(f"bayesdist: {where}{error.strerror or error}.", file=sys.stderr)
-        return 1
+    except Exception as error:  # of which nobody below could say more
+        from bayesdist.app.failures import failure
+
+        code, sentence = failure(error, command)
+        print(f"bayesdist: {sentence}", file=sys.stderr)
+        return code
 
 
 if __name__ == "__main__":

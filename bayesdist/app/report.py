@@ -18,6 +18,7 @@ from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.evaluation import Evaluation
 from bayesdist.assess.solution import chip_places
 from bayesdist.checks import Check
+from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
 from bayesdist.model import Chip
 from bayesdist.report.context import ChipResults, Product, ReportInput
@@ -61,9 +62,15 @@ def _is_command_line() -> bool:
 
 
 def report_input(results: Results) -> ReportInput:
-    """All that the report shows."""
-    run, config, fitted = results.run, results.config, results.fitted
-    fit, posterior = results.fit, results.posterior
+    """All that the report shows, from the artefacts of a run."""
+    run, config, data, fitted = results.run, results.config, results.data, results.fitted
+    fit, posterior, solution = results.fit, results.posterior, results.solution
+    found, evaluation, epoch = results.diagnostics, results.evaluation, results.epoch
+    campaign, selfcal = None, None
+    if fitted.scatter is not None:
+        campaign = campaign_results(run, results.inputs, data, posterior, found.overlap)
+    if fitted.solved is not None:
+        selfcal = selfcal_results(run, fitted, posterior, epoch)
     facts, folder = run.facts, run.path.resolve().name
     products = tuple(
         Product(
@@ -73,7 +80,6 @@ def report_input(results: Results) -> ReportInput:
         )
         for p in run.summary.get("products", [])
     )
-    found, evaluation = results.diagnostics, results.evaluation
     return ReportInput(
         name=title_of(config) or folder,
         config=as_json(config.model_dump(exclude_none=True)),
@@ -81,8 +87,8 @@ def report_input(results: Results) -> ReportInput:
         exposures=found.sums.exposures,
         fit=fit,
         posterior=posterior,
-        chips=_chip_results(results, evaluation),
-        coefficients=coefficient_table(fit, results.solution),
+        chips=_chip_results(solution, found, evaluation, epoch),
+        coefficients=coefficient_table(fit, solution),
         budget=evaluation.budget,
         surface=evaluation.surface,
         margins=evaluation.margins,
@@ -95,8 +101,8 @@ def report_input(results: Results) -> ReportInput:
         magnitude_errors=fitted.errors.by_magnitude,
         added_errors=fitted.grouped,
         flagged=found.flagged,
-        campaign=None if fitted.scatter is None else campaign_results(results),
-        selfcal=None if fitted.solved is None else selfcal_results(results),
+        campaign=campaign,
+        selfcal=selfcal,
         provenance={"folder": folder}
         | {k: facts[k] for k in ("command", "created", "seed", "inputs", "versions")}
         | {"stages": run.record.stages},
@@ -112,25 +118,26 @@ def title_of(config: Config) -> str:
     return ", ".join(part for part in (named, band) if part)
 
 
-def _chip_results(results: Results, evaluation: Evaluation) -> tuple[ChipResults, ...]:
-    posterior, epoch = results.solution, results.epoch
+def _chip_results(
+    solution: Posterior, found: Diagnostics, evaluation: Evaluation, epoch: float | None
+) -> tuple[ChipResults, ...]:
     relative = evaluation.relative or (None,) * len(evaluation.maps)
     return tuple(
         ChipResults(
             chip=chip,
             formal_map=formal,
             posterior_map=with_errors,
-            displacement=_vectors(posterior, "no_constant", chip, epoch),
-            non_linear=_vectors(posterior, "non_linear", chip, epoch),
+            displacement=_vectors(solution, "no_constant", chip, epoch),
+            non_linear=_vectors(solution, "non_linear", chip, epoch),
             area=area,
             binned=sums.residuals(),
             place=place,
             relative_map=of_pairs,
         )
         for chip, place, sums, formal, with_errors, area, of_pairs in zip(
-            posterior.model.chips,
-            chip_places(posterior, epoch=epoch),
-            results.diagnostics.shown,
+            solution.model.chips,
+            chip_places(solution, epoch=epoch),
+            found.shown,
             evaluation.formal,
             evaluation.maps,
             evaluation.areas,

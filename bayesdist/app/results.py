@@ -14,9 +14,9 @@ from bayesdist.app.assessment.diagnosing import diagnose_fit_of_run, diagnose_ru
 from bayesdist.app.assessment.error_terms import errors_of_run
 from bayesdist.app.assessment.settings import assessment_epoch, evaluation_settings
 from bayesdist.app.config import Config
+from bayesdist.app.kind import Kind, kind_of
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.app.kinds.kind import Kind, kind_of
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.matches.sources import RunInput, input_of_run
@@ -97,7 +97,7 @@ class Results:
     @cached_property
     def base(self) -> Path:
         """Folder that the configuration's files are relative to."""
-        return Path(self.run.facts["base"])
+        return self.run.base
 
     @cached_property
     def kind(self) -> Kind:
@@ -119,6 +119,7 @@ class Results:
         found: Matched | None = self.made.get("matched")
         if found is not None:
             return found
+        self.run.refuse_damaged("match")
         summary = self.run.summary
         return self.kind.load_matched(self.run.path, self.inputs, self.config, self.base, summary)
 
@@ -128,6 +129,7 @@ class Results:
         found: Fitted | None = self.made.get("fitted")
         if found is not None:
             return found
+        self.run.refuse_damaged("fit")
         summary = self.run.summary
         return self.kind.load_fitted(self.run.path, lambda: self.matched, self.config, summary)
 
@@ -139,7 +141,11 @@ class Results:
     @cached_property
     def posterior(self) -> Posterior:
         """The posterior as it was sampled."""
-        return self.made.get("posterior") or load_posterior(self.run / "posterior.nc")
+        found: Posterior | None = self.made.get("posterior")
+        if found is not None:
+            return found
+        self.run.refuse_damaged("sample")
+        return load_posterior(self.run / "posterior.nc")
 
     @property
     def is_sampled(self) -> bool:
@@ -149,7 +155,11 @@ class Results:
     @cached_property
     def stored(self) -> Diagnostics | None:
         """Diagnostics as the run has them; None before."""
-        return self.made.get("stored") or load_diagnostics(self.run, self.fit, self.posterior)
+        found: Diagnostics | None = self.made.get("stored")
+        if found is not None:
+            return found
+        self.run.refuse_damaged("diagnose")
+        return load_diagnostics(self.run, self.fit, self.posterior)
 
     @cached_property
     def diagnostics(self) -> Diagnostics:
@@ -161,7 +171,11 @@ class Results:
     @cached_property
     def evaluation(self) -> Evaluation:
         """Maps, budget, margins and validity periods, as the assessment has found them."""
-        return self.made.get("evaluation") or load_evaluation(self.run, self.fit, self.posterior)
+        found: Evaluation | None = self.made.get("evaluation")
+        if found is not None:
+            return found
+        self.run.refuse_damaged("evaluate")
+        return load_evaluation(self.run, self.fit, self.posterior)
 
     @property
     def stored_evaluation(self) -> Evaluation | None:
@@ -203,11 +217,6 @@ class Results:
         """Ingredients of the files of the solution."""
         source = str(self.run.path)
         return product_of(self.posterior, self.stored, self.data, self.config, source)
-
-    @property
-    def gauge_words(self) -> str:
-        """In which gauge the products stand, as a sentence; empty where that is no question."""
-        return "" if self.fitted.solved is None else self.fitted.solved.gauge_words
 
     @property
     def series(self) -> Mapping[str, Any]:

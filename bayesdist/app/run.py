@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.app.config import load_config
+from bayesdist.app.kind import kind_of
 from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.pipeline import (
     diagnose,
     error_model,
@@ -200,7 +200,7 @@ def continue_stage(
         )
     stages = ASSESS if stage == "assess" else (stage,)
     needs = (begins_with,) if stage == "fit" != begins_with else NEEDS[stages[0]]
-    directory.require(stage, needs, thorough=True)
+    directory.require(stage, needs)
     with initialized(directory) as results:
         results = make_stages(results, stages, force=True, pdf=pdf)
         if stage == "sample":

@@ -8,18 +8,19 @@ from bayesdist.app.assessment.checks import frames_doubt, in_circle
 from bayesdist.app.assessment.holdout import holdout_summary, holdout_table
 from bayesdist.app.assessment.periods import periods_summary, periods_table
 from bayesdist.app.assessment.settings import idle_dates
+from bayesdist.app.campaign.linear_terms import line_sections
 from bayesdist.app.config import Config
-from bayesdist.app.exposures.linear_terms import line_sections
 from bayesdist.app.exposures.series import write_series_tables
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.summary import fit_sections, log_fit, sample_sections
 from bayesdist.app.matches.added_errors import grouping_sentence
+from bayesdist.app.matches.plausibility import doubts_on_stars
 from bayesdist.app.rehearsal import rehearse_solution
 from bayesdist.app.results import Results
 from bayesdist.app.selfcal.stars import write_stars
 from bayesdist.app.tables.diagnostics_files import write_diagnostics
 from bayesdist.app.tables.evaluation_files import write_evaluation
-from bayesdist.app.tables.output import write_table
+from bayesdist.app.tables.output import provenance_notes, write_table
 from bayesdist.app.tables.star_files import FOLDER, write_star_files
 from bayesdist.checks import warnings_of
 from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
@@ -76,6 +77,8 @@ def _log_matches(data: FitData, config: Config) -> None:
         log.info("fit: %s", note)
     for reason, count in matches.rejected.items():
         log.info("fit: %d rows were left out in reading: %s", count, reason)
+    for text in doubts_on_stars(data.stars, data.model, config):
+        log.warning("fit: WARNING: %s", text)
     shift = epoch_shift(data.sample, fit)
     if shift is not None and shift.significant:
         log.warning("fit: WARNING: %s", shift.sentence)
@@ -93,7 +96,7 @@ def _log_matches(data: FitData, config: Config) -> None:
 def save_sampled(results: Results) -> None:
     """Write the posterior, and what it says of each star."""
     run, data, posterior = results.run, results.data, results.posterior
-    facts, gauge = run.facts, results.gauge_words
+    facts, gauge = run.facts, results.fitted.gauge_words
     provenance = {k: facts[k] for k in ("inputs", "seed", "versions", "created")}
     provenance |= {"gauge": gauge} if gauge else {}
     table = data.stars if data.stars.in_memory else None
@@ -126,9 +129,11 @@ def save_diagnosed(results: Results) -> None:
         run.summarise(periods=periods_summary(periods))
         for text in (periods.verdict, periods.pattern_sentence, *periods.cautions):
             log.info("diagnose: %s", text)
-    if results.fitted.solved is not None:
-        known = run.summary.get("selfcal", {})
-        run.summarise(selfcal=known | {"stars": write_stars(results)})
+    solved = results.fitted.solved
+    if solved is not None:
+        notes = provenance_notes(results.posterior, solved.gauge_words)
+        stars = write_stars(run.path, solved, found.correlated, notes)
+        run.summarise(selfcal=run.summary.get("selfcal", {}) | {"stars": stars})
 
 
 def save_evaluation(results: Results) -> None:
@@ -138,7 +143,7 @@ def save_evaluation(results: Results) -> None:
         log.warning("evaluate: WARNING: %s", text)
     if idle := idle_dates(config, config.requirements()):
         log.warning("evaluate: WARNING: %s", idle)
-    gauge, solution = results.gauge_words, results.solution
+    gauge, solution = results.fitted.gauge_words, results.solution
     write_evaluation(run, results.fit, results.posterior, solution, gauge, found)
     if results.fitted.scatter is not None:
         run.summarise(**line_sections(solution, config.chips()[0].number))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -13,10 +14,26 @@ from typing import Any
 
 from bayesdist.errors import InputError
 
-__all__ = ["log_file", "number", "progress_bar", "start_logging", "table_text"]
+__all__ = ["log_file", "number", "open_streams", "progress_bar", "start_logging", "table_text"]
 
 log = logging.getLogger("bayesdist")
 FORMAT = "%(asctime)s %(levelname)-7s %(message)s"
+
+
+def open_streams() -> None:
+    """Give a process that was started without standard streams empty ones.
+
+    The files that it opens would get their numbers, and what a library writes to stderr would end
+    in one of them.
+    """
+    for number_of, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        try:
+            os.fstat(number_of)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # it gets the lowest number
+        if getattr(sys, name) is None:
+            stream = os.fdopen(number_of, mode, encoding="utf-8", closefd=False)
+            setattr(sys, name, stream)
 
 
 def start_logging(verbosity: int = 0) -> None:
@@ -31,18 +48,23 @@ def start_logging(verbosity: int = 0) -> None:
     log.addHandler(handler)
 
 
+class _QuietHandler(logging.FileHandler):
+    """A log whose own errors do not bury that which stops the run, as of a full disk."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  logging's own name
+        """Pass over it."""
+
+
 @contextmanager
 def log_file(path: Path) -> Iterator[None]:
     """Send the log to a file as well."""
     try:
-        handler = logging.FileHandler(path, encoding="utf-8")
+        handler = _QuietHandler(path, encoding="utf-8")
     except OSError as error:
         raise InputError(
             f"cannot be written ({error.strerror})", where=str(path), do="check its permissions"
         ) from error
     handler.setFormatter(logging.Formatter(FORMAT))
-    # a full disk must not bury the error that stops the run under logging's own tracebacks
-    handler.handleError = lambda record: None  # type: ignore[method-assign]
     log.addHandler(handler)
     try:
         yield
@@ -57,8 +79,9 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
     """A progress bar on stderr, silent where stderr is no terminal."""
     from tqdm import tqdm
 
+    is_terminal = sys.stderr is not None and sys.stderr.isatty()
     with tqdm(
-        desc=label, unit="step", disable=not sys.stderr.isatty(), leave=False, file=sys.stderr
+        desc=label, unit="step", disable=not is_terminal, leave=False, file=sys.stderr
     ) as bar:
 
         def update(made: int, most: int) -> None:

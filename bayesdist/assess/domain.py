@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.assess.requirements.regions import WHOLE, Region, in_region
+from bayesdist.assess.regions import WHOLE, Region, in_region
 from bayesdist.assess.solution import place_of
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel

@@ -7,6 +7,7 @@ draws.
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -19,12 +20,12 @@ from bayesdist.assess.domain import EvaluationDomain, WorstPosition
 from bayesdist.assess.statistics import ErrorsOf, drawn_statistics
 from bayesdist.assess.terms.forms import (
     PRODUCT,
+    DrawnField,
     ErrorDraws,
     ErrorField,
     ErrorTerm,
     Image,
     Noise,
-    NoiseField,
     Row,
 )
 from bayesdist.infer.solution import Solution
@@ -67,6 +68,22 @@ class DrawnErrors:
     def unit(self) -> str:
         """Unit of all errors."""
         return self.solution.model.unit
+
+    @property
+    def n_effective(self) -> float:
+        """Independent draws that are worth as much as those of the solution; at least 1.
+
+        Drawing n rows from a chain worth `ess` independent samples adds the chain's own Monte-Carlo
+        variance to that of the drawing: 1 / n_eff = 1 / n + 1 / ess.  Draws of a fit are
+        independent; a posterior is worth the smaller of its bulk and tail effective sample sizes (a
+        probability far from a half is a matter of the tails).
+        """
+        convergence = self.solution.convergence
+        if convergence is None:
+            return float(self.n_draws)
+        sizes = [convergence.ess_bulk_min, convergence.ess_tail_min]
+        ess = 1.0 if any(math.isnan(s) for s in sizes) else max(min(sizes), 1.0)
+        return max(1.0 / (1.0 / self.n_draws + 1.0 / ess), 1.0)
 
     def at(self, domain: EvaluationDomain) -> tuple[ErrorField, ...]:
         """The errors of each term at the positions of a domain."""
@@ -183,16 +200,14 @@ class DrawnErrors:
         fields = self.at(domain)
         noises = [one for f in fields for one in f.noise(scale)]
         noise, noisy = _together(noises, domain), any(np.any(one.sigma) for one in noises)
-        drawn = [f for f in fields if not isinstance(f, NoiseField)]
+        drawn = [f for f in fields if isinstance(f, DrawnField)]
 
         def error_of(rows: slice, normal: Float) -> Float:
             out = np.zeros((rows.stop - rows.start, domain.size, 2))
             if noisy:
                 out += noise(rows, normal)
             for one in drawn:
-                error = one.errors(rows, scale)
-                if error is not None:
-                    out += error
+                out += one.errors(rows, scale)
             return out
 
         return error_of

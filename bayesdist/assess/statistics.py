@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.names import require_known
+from bayesdist.errors import require_known
 
 __all__ = ["STATISTICS", "ErrorsOf", "drawn_statistics", "extent", "field_statistic"]
 

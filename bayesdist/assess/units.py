@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 
 from bayesdist.data.tables.units import UNITS
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, require_known
 from bayesdist.infer.solution import Solution
 from bayesdist.limits import PIXEL_SIZE
-from bayesdist.names import require_known
 
 __all__ = ["UNITS", "convert", "pixel_doubt", "pixel_scale_of", "require_scale"]
 

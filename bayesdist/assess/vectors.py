@@ -9,10 +9,9 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from bayesdist.assess.solution import Place, Solution, place_of
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, require_known
 from bayesdist.model.basis import point_blocks
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
-from bayesdist.names import require_known
 
 __all__ = ["PARTS", "VectorMap", "distortion_vectors"]
 

@@ -9,18 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.calibration.chip_map import ChipMap, sampling_of
+from bayesdist.calibration.further import FurtherError
 from bayesdist.calibration.inverse import ExplicitInverse
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
 from bayesdist.infer.solution import Solution
 from bayesdist.infer.transforms import without_frames
 from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence, corrected
-from bayesdist.model.basis import MAX_ORDER
 
 __all__ = [
     "Calibration",
@@ -33,6 +34,7 @@ __all__ = [
 Float = NDArray[np.float64]
 
 ORIGINS = ("stated", "reference", "chip")
+FOLLOWING_ORDER = 9  # of the polynomial that stands for look-up tables where two are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +62,7 @@ class Calibration:
     no_date: str = ""  # reason why it cannot be brought to a date; else empty
     with_plane: Float | None = None  # (D, 4), covariance with the orientation
     notes: tuple[str, ...] = ()  # notes for the reader
+    further: tuple[FurtherError, ...] = ()  # errors of positions that `solution` does not hold
 
     @property
     def model(self) -> DistortionModel:
@@ -117,16 +120,16 @@ class Calibration:
     def by_chip(self, epoch: float | None = None) -> dict[int, ChipMap]:
         """Polynomials for chips one by one: in an aperture each about its own zero point.
 
-        Look-up tables are followed by a polynomial of the highest order, and a note says how well.
+        Look-up tables are followed by a polynomial, and a note says how well.
         """
         maps = self.at(epoch, origin="chip" if self.plane.kind == "aperture" else "stated")
         if not self.before and not self.after:
             return maps
         out = {}
         for number, one in self.with_tables(maps).items():
-            made, worst, rms = one.polynomial(MAX_ORDER)
+            made, worst, rms = one.polynomial(FOLLOWING_ORDER)
             note = (
-                f"its look-up tables are followed by a polynomial of order {MAX_ORDER}, "
+                f"its look-up tables are followed by a polynomial of order {FOLLOWING_ORDER}, "
                 f"{worst:.2g} pix off at worst, {rms:.2g} rms"
             )
             out[number] = replace(made, notes=(*one.notes, note))
@@ -336,7 +339,7 @@ def calibration_of_maps(
     reference_date: float | None = None,
     cov: Float | None = None,
     errors: str = "none",
-    **what: object,
+    **what: Any,
 ) -> Calibration:
     """Calibration from the polynomials of its chips, as files state them.
 
@@ -370,5 +373,5 @@ def calibration_of_maps(
         GaussianSolution(model, mean, cov),
         errors=errors,
         reference_date=reference_date if time is not None else None,
-        **what,  # type: ignore[arg-type]
+        **what,
     )

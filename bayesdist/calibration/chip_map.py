@@ -25,6 +25,7 @@ Float = NDArray[np.float64]
 # Newton's method has converged when a step is this short in pixels, which rounding allows.
 STEP, MAX_STEPS = 1e-9, 30
 _FIT_NODES = 129  # points of each axis over which a map is followed by a polynomial
+MOST_ORDER = 20  # of the polynomials of any file
 SINGULAR = 1e-12  # of the largest slope squared: below that a linear part has no inverse
 
 
@@ -99,6 +100,10 @@ class ChipMap:
             for table in self.after:
                 out[:, rows] += _shift(table, px, py)
         return out
+
+    def design(self, x: Float, y: Float) -> Float:
+        """Basis functions (N, K) at pixels (N,), tables before the polynomial included."""
+        return self.basis.evaluate(*self._corrected(x, y))
 
     def slope(self, x: ArrayLike, y: ArrayLike) -> Float:
         """Derivatives d(u, v) / d(x, y) at pixels (N,), shape (N, 2, 2)."""
@@ -297,6 +302,12 @@ def fitted_map(
     `order`; `monomial_cov` (2 K, 2 K) is of the coefficients of (x - xref)^i (y - yref)^j, u before
     v; other arguments as in `PolynomialBasis` and `ChipMap`.
     """
+    if order > MOST_ORDER:  # time and memory go with its fourth power
+        raise InputError(
+            f"the order of its polynomials is {order}, and at most {MOST_ORDER} is read",
+            where=name,
+            do="correct the file",
+        )
     basis = PolynomialBasis(order, size, reference_pixel)
     # products of two terms have twice the order, for which so many nodes are exact
     x, y, weight = Chip(1, "", size, reference_pixel).quadrature(order + 1)

@@ -72,9 +72,9 @@ def fitted_inverse(
 ) -> ExplicitInverse:
     """Inverse of a map, fitted over the whole chip, with its derivatives.
 
-    The order is by default one above that of the map, and at most 9; `nodes` are the points of each
-    axis; P and Q have constant terms with `constant`; L is by default the derivatives at the
-    reference pixel.  InputError for an order outside 1 to 9, or a chip that is folded onto itself.
+    The order is by default one above that of the map, and at most 12; `nodes` are the points of
+    each axis; P and Q have constant terms with `constant`; L is by default the derivatives at the
+    reference pixel.  InputError for an order outside 1 to 12, or a chip that is folded onto itself.
     """
     basis = chip.basis
     if order is None:

@@ -1,4 +1,4 @@
-"""Calibrations in rotated or mirrored pixels.
+"""Coefficients of a distortion in rotated or mirrored pixels.
 
 With pixel offsets w = (u, v) from the reference pixel and an orthogonal matrix M, the new offsets
 are w' = M w, and a distortion f = (A, B) becomes
@@ -13,18 +13,14 @@ Calibration"), Appendix A. As there, a frame rotates by +90 degrees when u' = -v
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from math import comb
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.calibration.calibration import Calibration
-from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
-from bayesdist.model import Chip, DistortionModel
 
-__all__ = ["coefficient_map", "is_exact", "pixel_matrix", "rotated"]
+__all__ = ["coefficient_map", "is_exact", "pixel_matrix"]
 
 Float = NDArray[np.float64]
 
@@ -84,80 +80,3 @@ def coefficient_map(terms: Sequence[tuple[int, int]], matrix: ArrayLike) -> Floa
 def is_exact(M: Float) -> bool:
     """True where the rotated axes lie along axes again."""
     return bool(np.all(np.round(M) == M))
-
-
-def rotated(
-    calibration: Calibration,
-    degrees: float,
-    *,
-    mirror: bool = False,
-    origin: tuple[float, float] = (0.0, 0.0),
-) -> Calibration:
-    """Calibration in rotated or mirrored pixels, with (u, v) rotated alike.
-
-        (u', v') = origin + M ((u, v) - origin)   at the pixel   w' = M w
-
-    Degrees count from x towards y, and from u towards v, after a mirror of x and u.  The point
-    `origin` stays: in pixels of the detector, as WISE has them, its centre.  Every chip is the
-    smallest box along the new axes that holds the rotated one, and its first pixel is (1, 1) again:
-    at multiples of 90 degrees the rotated image.  InputError for a model with time dependence, or
-    an angle that is no finite number.
-    """
-    solution, model = calibration.solution, calibration.model
-    if model.time is not None:
-        raise InputError(
-            "the solution depends on time",
-            where="model.time",
-            do="rotate the pixels before the fit, or fit one period",
-        )
-    M = pixel_matrix(degrees, mirror=mirror)
-    new = replace(model, chips=tuple(_turned_chip(chip, M) for chip in model.chips))
-    linear = _parameter_map(model, new, M)
-    centre = np.asarray(origin, float)
-    shift = np.zeros(model.n_params)
-    for chip in new.chips:
-        for axis in (0, 1):  # P_0 P_0 = 1: the constant is the first coefficient
-            first = new.coefficient_slice(chip.number, axis).start
-            shift[first] = (centre - M @ centre)[axis]
-
-    def transform(theta: Float) -> Float:
-        return np.asarray(theta, float) @ linear.T + shift
-
-    turned = solution.transformed(new, transform, linear)
-    return replace(calibration, solution=turned, plane=Plane(), with_plane=None, inverses={})
-
-
-def _turned_chip(chip: Chip, M: Float) -> Chip:
-    """Box along the new axes that holds the rotated chip, its first pixel at (1, 1)."""
-    low = 0.5 - np.array(chip.reference_pixel)
-    high = low + np.array(chip.size)
-    corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])]) @ M.T
-    size, reference = np.ptp(corners, axis=0), 0.5 - corners.min(axis=0)
-    return replace(
-        chip,
-        size=(float(size[0]), float(size[1])),
-        reference_pixel=(float(reference[0]), float(reference[1])),
-    )
-
-
-def _parameter_map(model: DistortionModel, new: DistortionModel, M: Float) -> Float:
-    """Matrix (D, D) from the parameters of one model to those of the other, but for the shift."""
-    out = np.zeros((model.n_params, model.n_params))
-    exact = is_exact(M)
-    for chip in model.chips:
-        old_basis, new_basis = model.basis(chip.number), new.basis(chip.number)
-        R = coefficient_map(old_basis.terms, M)
-        K = old_basis.n_terms
-        if not exact:
-            to_powers = np.kron(np.eye(2), old_basis.monomial_matrix)
-            R = R @ to_powers
-            R = np.concatenate(
-                [new_basis.from_monomials(half.T).T for half in (R[:K], R[K:])], axis=0
-            )
-        # Legendre products lie about the middle of the detector and are even or odd as powers are,
-        # so that quarter turns act on them as on powers
-        columns = [model.coefficient_slice(chip.number, axis) for axis in (0, 1)]
-        for i, rows in enumerate(columns):
-            for j, cols in enumerate(columns):
-                out[rows, cols] = R[i * K : (i + 1) * K, j * K : (j + 1) * K]
-    return out

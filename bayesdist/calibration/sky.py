@@ -46,12 +46,14 @@ def reprojected(
     tangent_point: tuple[float, float],
     crval: tuple[float, float] | None = None,
     lowest: int = 1,
+    highest: int = MAX_ORDER,
 ) -> Reprojected:
     """Polynomial of a chip about the sky position of its reference pixel, or about a given CRVAL.
 
     `tangent_point` (degrees) is of the plane of `chip`, whose unit has `unit_arcsec`; the result is
-    of order `lowest` at least.  With `crval` (degrees) the reference pixel is that at which the map
-    has it; where the polynomial, continued, has no such pixel, it stays and the constants follow.
+    of an order from `lowest` to `highest`.  With `crval` (degrees) the reference pixel is that at
+    which the map has it; where the polynomial, continued, has no such pixel, it stays and the
+    constants follow.
     InputError for a CRVAL that is no position or 90 degrees or more from the field.
     """
     unit = unit_arcsec / ARCSEC
@@ -76,7 +78,7 @@ def reprojected(
             do="give a position in the field, or leave crval out",
         )
     pixel = float(np.sqrt(abs(np.linalg.det(poly.linear))))
-    for order in range(max(own.order, lowest), MAX_ORDER + 1):
+    for order in range(max(own.order, lowest), highest + 1):
         basis = PolynomialBasis(order, own.size, crpix or own.reference_pixel)
         design = basis.evaluate(x, y)
         inverse = np.linalg.pinv(design)

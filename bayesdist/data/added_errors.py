@@ -11,12 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["GROUPINGS", "AddedErrors"]
+__all__ = ["AddedErrors"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
-
-GROUPINGS = ("chip", "exposure", "filter")
 
 
 @dataclass(frozen=True, eq=False)

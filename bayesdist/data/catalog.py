@@ -16,13 +16,19 @@ from bayesdist.data.reading.table import with_sky_columns
 from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.data.sky.positions import sky_columns
 from bayesdist.data.sky.tangent import onto_plane
-from bayesdist.data.tables.checks import check_columns, columns_of, refuse_half, without_missing
+from bayesdist.data.tables.checks import (
+    COMPLETED,
+    check_columns,
+    columns_of,
+    refuse_half,
+    without_missing,
+)
 from bayesdist.data.tables.column import SourceColumn, row_number
-from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import ALIASES, find_columns
 from bayesdist.data.tables.quantities import Quantities
 from bayesdist.data.tables.units import check_unit
 from bayesdist.errors import InputError
+from bayesdist.reading.tables import read_table
 
 __all__ = ["ReferenceCatalog", "catalog_from_table", "read_catalog"]
 
@@ -91,7 +97,7 @@ class ReferenceCatalog:
     unit: str = "pix"
     tangent_point: tuple[float, float] | None = None
     source: str = "catalogue"
-    star: Int = None  # type: ignore[assignment]
+    star: Int = COMPLETED
     parallax: Float | None = None
     sigma_parallax: Float | None = None
     notes: tuple[str, ...] = ()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.tables.checks import check_columns, columns_of
+from bayesdist.data.tables.checks import COMPLETED, check_columns, columns_of
 from bayesdist.errors import InputError
 
 __all__ = ["NO_STAR", "Detections", "detections_of"]
@@ -61,16 +61,16 @@ class Detections:
 
     x: Float
     y: Float
-    exposure: Int = None  # type: ignore[assignment]
-    exposure_names: tuple[str, ...] = None  # type: ignore[assignment]
-    chip: Int = None  # type: ignore[assignment]
+    exposure: Int = COMPLETED
+    exposure_names: tuple[str, ...] = COMPLETED
+    chip: Int = COMPLETED
     epoch: Float | None = None
     sigma: Float | None = None
     mag: Float | None = None
-    star: Int = None  # type: ignore[assignment]
+    star: Int = COMPLETED
     source: str = "detections"
     q: Float | None = None
-    row: Int = None  # type: ignore[assignment]
+    row: Int = COMPLETED
 
     def __post_init__(self) -> None:
         n = np.size(self.x)

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from bayesdist.data.sky.earth import velocity_aberration
 from bayesdist.data.tables.column import SourceColumn
-from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
+from bayesdist.reading.tables import read_table
 
 __all__ = ["Exposure", "ExposureLog", "read_exposures", "write_exposures"]
 

@@ -11,13 +11,14 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.data.detections import Detections
+from bayesdist.data.formats.files import exposure_names, input_files
 from bayesdist.data.formats.hst1pass import is_hst1pass, read_hst1pass
-from bayesdist.data.reading.formats import exposure_names, input_files
-from bayesdist.data.tables.checks import counted
+from bayesdist.data.tables.checks import COMPLETED, counted
 from bayesdist.data.tables.column import SourceColumn
-from bayesdist.data.tables.files import TABLE_SUFFIXES, read_lines, read_table
 from bayesdist.data.tables.names import BASIC, find_columns
 from bayesdist.errors import FormatError, InputError
+from bayesdist.reading.regular import read_lines
+from bayesdist.reading.tables import TABLE_SUFFIXES, read_table
 
 __all__ = ["StarCuts", "read_star_lists"]
 
@@ -165,7 +166,7 @@ def _of_table(
     whole = Detections(
         values["x"],
         values["y"],
-        chip=column("chip").integers() if "chip" in found else None,  # type: ignore[arg-type]
+        chip=column("chip").integers() if "chip" in found else COMPLETED,
         mag=values.get("mag"),
         q=values.get("q"),
         source=source,

@@ -156,6 +156,7 @@ def diagnose_fit(
     eliminated: SelfCalibrationMode | None = None,
     centroid: MagnitudeErrors | Literal["residuals"] | None = "residuals",
     things: str = "pairs",
+    known: bool = False,
 ) -> Diagnostics:
     """Diagnostics of a fit, and of a posterior where there is one; nothing is estimated.
 
@@ -176,6 +177,8 @@ def diagnose_fit(
         residuals.
     things : str
         What is true or false.
+    known : bool
+        Whether an earlier calibration says where no stars are.
 
     Returns
     -------
@@ -197,7 +200,11 @@ def diagnose_fit(
         else (dithered_misfit(eliminated),),
         coverage=tuple(
             coverage_of(
-                sums.binned[chip.number, bins["cells"]], found.corners, chip, several=several
+                sums.binned[chip.number, bins["cells"]],
+                found.corners,
+                chip,
+                several=several,
+                known=known,
             )
             for chip, bins, found in zip(
                 model.chips, partitions.values(), survey.chips, strict=True
@@ -317,6 +324,7 @@ def diagnose(
         eliminated=eliminated,
         centroid=centroid,
         things=things,
+        known=priors is not None and priors.joint is not None,
     )
     in_memory = stars if stars.in_memory else None
     shared = None

@@ -183,16 +183,15 @@ def chosen_exposures(pairs: Matches) -> tuple[int, int] | None:
 
 def _shared(pairs: Matches, a: int, b: int) -> tuple[Int, Int]:
     """Rows of the same stars in two exposures."""
-    assert pairs.star is not None
+    star = pairs.column("star")
     rows = [np.flatnonzero(pairs.exposure == code) for code in (a, b)]
-    stars = [pairs.star[r] for r in rows]
+    stars = [star[r] for r in rows]
     _, first, second = np.intersect1d(*stars, return_indices=True)
     return rows[0][first], rows[1][second]
 
 
 def _epoch(pairs: Matches, rows: Int) -> float:
-    assert pairs.epoch is not None
-    return float(np.median(pairs.epoch[rows]))
+    return float(np.median(pairs.column("epoch")[rows]))
 
 
 def _known_plane(known: Calibration, pairs: Matches, rows: Int, epoch: float) -> Float:

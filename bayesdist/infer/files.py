@@ -9,14 +9,14 @@ files, in the parts of `stars/`.
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import FormatError
@@ -28,13 +28,15 @@ from bayesdist.infer.posterior.memberships import memberships, star_log_likeliho
 from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.model import DistortionModel
+from bayesdist.reading.documents import json_of
+from bayesdist.reading.faults import restoring
+from bayesdist.reading.hdf5 import NETCDF_ENGINE, netcdf_dataset, netcdf_tree
 
 if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = ["load_fit", "load_posterior", "save_fit", "save_posterior"]
 
-ENGINE: Final = "h5netcdf"
 SCHEMA = 2
 POSTERIOR_NUMBERS = ("n_stars", "n_flagged", "n_false", "reference_sigma")
 MOST_STARS = 1_000_000  # with more stars their data are not repeated in the file
@@ -182,25 +184,27 @@ def load_posterior(path: str | Path) -> Posterior:
     >>> bd.load_posterior("posterior.nc").model == posterior.model
     True
     """
-    import xarray as xr
-
     path = Path(path)
     if path.is_dir():
         path = path / "posterior.nc"
     with _reading(path, "a posterior", "sample"):
-        with xr.open_datatree(path, engine=ENGINE) as tree:
-            tree.load()
+        tree = netcdf_tree(path)
         attrs = tree.attrs
         draws, checks = tree["posterior"].to_dataset(), tree["diagnostics"].to_dataset()
         stats = tree["sample_stats"].to_dataset()
         if attrs.get("creator") != "bayesdist":
             raise KeyError("creator")
-        mixture = json.loads(attrs["mixture"])
+        mixture = _tree(attrs["mixture"])
         mixture["fraction_prior"] = tuple(mixture["fraction_prior"])
         info: dict[str, Any] = {str(k): _plain(v) for k, v in stats.attrs.items()}
         info["exact"] = bool(info["exact"])
+        model = DistortionModel.from_dict(_tree(attrs["model"]))
+        shape = (*draws["theta"].shape[:2], len(model.names))
+        _refuse_other_shape(draws["theta"].values, shape)
+        for one in (stats["lp"], *(draws[k] for k in ("j", "f", "s_out") if k in draws)):
+            _refuse_other_shape(one.values, shape[:2])
         return Posterior(
-            model=DistortionModel.from_dict(json.loads(attrs["model"])),
+            model=model,
             mixture=OutlierMixture(**mixture),
             theta=draws["theta"].values,
             hyper={k: draws[k].values for k in ("j", "f", "s_out") if k in draws},
@@ -215,17 +219,32 @@ def load_posterior(path: str | Path) -> Posterior:
                 pareto_k=float(checks.attrs["pareto_k"]),
                 importance_efficiency=float(checks.attrs["importance_efficiency"]),
                 converged=bool(checks.attrs["converged"]),
-                reasons=tuple(json.loads(checks.attrs["reasons"])),
+                reasons=tuple(_tree(checks.attrs["reasons"])),
                 limits=Limits(float(checks.attrs["limit_ess"]), float(checks.attrs["limit_rhat"])),
             ),
             sampler=SamplerInfo(**info),
-            certificate=_certificate(json.loads(attrs["certificate"])),
+            certificate=_certificate(_tree(attrs["certificate"])),
             own_places=bool(attrs.get("own_places", False)),
         )
 
 
 def _certificate(fields: dict[str, Any] | None) -> Certificate | None:
     return None if fields is None else Certificate(**fields | {"reasons": tuple(fields["reasons"])})
+
+
+def _refuse_other_shape(values: NDArray[Any], shape: tuple[int, ...]) -> None:
+    """Refuse (ValueError) an array of another shape, or with values that are no finite numbers."""
+    if values.shape != shape:
+        raise ValueError(f"an array has the shape {values.shape} in place of {shape}")
+    if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
+        raise ValueError("an array has values that are not finite")
+
+
+def _tree(text: object) -> Any:
+    """Tree of an attribute that holds JSON."""
+    if not isinstance(text, str):
+        raise TypeError("an attribute is no text")
+    return json_of(text, "")
 
 
 def _plain(value: object) -> object:
@@ -264,14 +283,15 @@ def load_fit(path: str | Path) -> LinearFit:
     FormatError
         When the file is missing or is not such a file.
     """
-    import xarray as xr
-
     path = Path(path)
     with _reading(path, "a fit", "fit"):
-        with xr.open_dataset(path, engine=ENGINE) as data:
-            data.load()
+        data = netcdf_dataset(path)
+        model = DistortionModel.from_dict(_tree(data.attrs["model"]))
+        n = len(model.names)
+        for name, shape in (("mean", (n,)), ("cov", (n, n)), ("clip", (n,))):
+            _refuse_other_shape(data[name].values, shape)
         return LinearFit(
-            model=DistortionModel.from_dict(json.loads(data.attrs["model"])),
+            model=model,
             mean=data["mean"].values,
             cov=data["cov"].values,
             clip=Clip(
@@ -279,7 +299,7 @@ def load_fit(path: str | Path) -> LinearFit:
                 float(data.attrs["clip_chi2_limit"]),
                 float(data.attrs["clip_abs_limit"]),
             ),
-            rejected=json.loads(data.attrs["rejected"]),
+            rejected=_tree(data.attrs["rejected"]),
             **{name: data.attrs[name].item() for name in FIT_NUMBERS},
         )
 
@@ -289,7 +309,7 @@ def _write(data: xr.Dataset | xr.DataTree, path: str | Path) -> None:
 
     The file is built in memory: on a full disk HDF5 itself would crash when it is closed.
     """
-    content = data.to_netcdf(engine=ENGINE)
+    content = data.to_netcdf(engine=NETCDF_ENGINE)
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
 
@@ -304,13 +324,5 @@ def _reading(path: Path, what: str, stage: str) -> Iterator[None]:
         raise FormatError(
             "there is no such file", where=str(path), do=f"run 'bayesdist stage {stage} RUN' first"
         )
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # foreign HDF5 files are reported below
-            yield
-    except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
-        raise FormatError(
-            f"this is not {what} that bayesdist wrote, or it is damaged",
-            where=str(path),
-            do=f"make it again with 'bayesdist stage {stage} RUN'",
-        ) from error
+    with restoring(path, what, do=f"make it again with 'bayesdist stage {stage} RUN'"):
+        yield

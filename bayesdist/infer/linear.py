@@ -193,7 +193,7 @@ def build_model(
     ----------
     matches : Matches
     order : int
-        Polynomial order, 1 to 9.
+        Polynomial order, 1 to 12.
     size : tuple of float, optional
         Columns and rows of a single chip; give this or `chips`.
     reference_pixel : tuple of float, optional
@@ -302,7 +302,7 @@ def _fitted(
     shards: Shards, model: DistortionModel, rejection: Rejection, priors: GaussianPriors
 ) -> LinearFit:
     radial_weight = rejection.radial_weight
-    check_coverage(model, shards.survey, priors.n_informative)
+    check_coverage(model, shards.survey, priors.n_informative, known=priors.joint is not None)
     first = shards.sum(least_squares, None, None, radial_weight)
     theta = starting_point(first, model, priors)
     refuse_absorbed_drift(first, theta, model, priors)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # a file is inspected without what they import
 
 __all__ = [
     "DerivedSolution",
+    "GaugedSolution",
     "ReferenceGauge",
     "Solution",
     "TransformedSolution",
@@ -212,8 +213,6 @@ class TransformedSolution(DerivedSolution):
     source : Solution
     transform : callable
         From parameters (..., D') of the source to (..., D).
-    gauge : ReferenceGauge, optional
-        Rotation and shift applied by `reference_gauge`.
     """
 
     model: DistortionModel
@@ -221,8 +220,20 @@ class TransformedSolution(DerivedSolution):
     cov: Float
     source: Solution
     transform: Callable[[Float], Float]
-    gauge: ReferenceGauge | None = None
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
         """Parameter vectors, shape (n, D): draws of the source, each transformed."""
         return self.transform(np.asarray(self.source.draws(n, rng), float))
+
+
+@dataclass(frozen=True, eq=False)
+class GaugedSolution(TransformedSolution):
+    """A solution rotated and shifted to the reference gauge.
+
+    Parameters
+    ----------
+    gauge : ReferenceGauge
+        Rotation and shift that were applied.
+    """
+
+    gauge: ReferenceGauge

@@ -12,7 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError, required
-from bayesdist.infer.solution import ReferenceGauge, Solution, TransformedSolution, root_of_diagonal
+from bayesdist.infer.solution import (
+    GaugedSolution,
+    ReferenceGauge,
+    Solution,
+    TransformedSolution,
+    root_of_diagonal,
+)
 from bayesdist.model import DistortionModel, TimeDependence
 from bayesdist.model.similarity import turned, turned_model
 
@@ -150,7 +156,7 @@ def segment(solution: Solution, s: int) -> TransformedSolution:
 
 def reference_gauge(
     solution: Solution, chip: int = 2, *, epoch: float | None = None
-) -> TransformedSolution:
+) -> GaugedSolution:
     """Rotate and shift (u, v) so that one chip has A_1 = B_1 = 0 and A_3 = 0.
 
     The gauge of ACS ISR 2015-06, section 4.2: at the chip's reference pixel there is neither an
@@ -168,7 +174,7 @@ def reference_gauge(
 
     Returns
     -------
-    TransformedSolution
+    GaugedSolution
         Without frames; `gauge` has the rotation and shift.  A rotation makes a term that drifted on
         one axis drift on both, so both are in the model of the view.
 
@@ -219,7 +225,7 @@ def reference_gauge(
         sigma_rotation=float(sigma[0]),
         sigma_shift=(float(sigma[1]), float(sigma[2])),
     )
-    return replace(view, gauge=gauge)
+    return GaugedSolution(view.model, view.mean, view.cov, view.source, view.transform, gauge)
 
 
 def linear_terms(

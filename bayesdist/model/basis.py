@@ -21,8 +21,8 @@ from bayesdist.errors import InputError
 
 __all__ = ["MAX_ORDER", "PolynomialBasis", "as_pair", "point_blocks", "polynomial_terms"]
 
-MAX_ORDER = 9
-# Points whose basis values are held at once: 55 terms (order 9) of them are 14 MB.
+MAX_ORDER = 12
+# Points whose basis values are held at once: 91 terms (order 12) of them are 24 MB.
 BLOCK = 32768
 
 Float = NDArray[np.float64]
@@ -109,7 +109,7 @@ class PolynomialBasis:
     Parameters
     ----------
     order : int
-        Total order, 1 to 9.
+        Total order, 1 to 12.
     size : tuple of float
         Columns and rows of the detector, in pixels.
     reference_pixel : tuple of float
@@ -118,7 +118,7 @@ class PolynomialBasis:
     Raises
     ------
     InputError
-        For an order outside 1..9 or a size that is not positive.
+        For an order outside 1..12 or a size that is not positive.
 
     Examples
     --------

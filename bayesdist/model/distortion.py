@@ -55,7 +55,7 @@ class DistortionModel(EffectiveCoefficients):
     Parameters
     ----------
     order : int
-        Total polynomial order, 1 to 9.
+        Total polynomial order, 1 to 12.
     chips : tuple of Chip
     unit : str
         Unit of u and v.
@@ -334,7 +334,7 @@ class DistortionModel(EffectiveCoefficients):
     def to_dict(self) -> dict[str, Any]:
         """Structure as JSON-able data, for files."""
         values = {one.name: getattr(self, one.name) for one in fields(self) if one.init}
-        return json.loads(json.dumps(values, default=_plain))
+        return _plain(values)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> DistortionModel:
@@ -365,5 +365,11 @@ class DistortionModel(EffectiveCoefficients):
 
 
 def _plain(value: Any) -> Any:
-    """Dataclass as a dict, and a number of numpy as one of Python."""
-    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value.item()
+    """A value as JSON has it: mappings, lists, numbers and texts."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(one) for one in value]
+    return value.item() if isinstance(value, np.generic) else value

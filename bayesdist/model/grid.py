@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
+from bayesdist.memory import require_memory
 
 __all__ = [
     "DEFAULT_GRID",
@@ -19,6 +20,7 @@ __all__ = [
 Float = NDArray[np.float64]
 
 DEFAULT_GRID = (33, 17)
+BYTES_OF_POINT = 500  # at least: its position, the polynomial there, and some draws
 
 
 def grid_pixels(size: tuple[float, float], grid: tuple[int, int]) -> tuple[Float, Float]:
@@ -33,6 +35,12 @@ def grid_pixels(size: tuple[float, float], grid: tuple[int, int]) -> tuple[Float
             do="give two whole numbers of at least 2, points on x and on y",
         )
     nx, ny = (int(n) for n in grid)
+    require_memory(
+        BYTES_OF_POINT * nx * ny,
+        f"the grid of {nx} x {ny} positions",
+        where="assess.grid",
+        do="give fewer points",
+    )
     return np.linspace(1.0, size[0], nx), np.linspace(1.0, size[1], ny)
 
 

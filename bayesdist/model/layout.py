@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
@@ -242,12 +243,13 @@ class ParameterLayout:
                 for i, j in self.bases[0].terms:
                     name = f"{prefix[chip.number]}{axis}_{i}_{j}"
                     out.append(Parameter(name, self.unit, "polynomial", chip.number, axis, i, j))
+        time = self.time
+        drifts = () if time is None else tuple(product(time.terms, time.value_names()))
         for chip in self.chips:
-            for axis, i, j in self.time.terms if self.time else ():
-                for value in self.time.value_names():  # type: ignore[union-attr]
-                    name = f"{prefix[chip.number]}tdd.{axis}_{i}_{j}.{value}"
-                    unit = f"{self.unit}/yr" if value.startswith("rate") else self.unit
-                    out.append(Parameter(name, unit, "tdd", chip.number, axis, i, j))
+            for (axis, i, j), value in drifts:
+                name = f"{prefix[chip.number]}tdd.{axis}_{i}_{j}.{value}"
+                unit = f"{self.unit}/yr" if value.startswith("rate") else self.unit
+                out.append(Parameter(name, unit, "tdd", chip.number, axis, i, j))
         owner = dict(
             zip(
                 self._own_names,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import pkgutil
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from importlib import import_module
 
@@ -131,6 +132,15 @@ def build(
     """Files of a format, built and not written; values that the format cannot hold are refused."""
     one = format_of(key)
     assert one.build is not None
+    if calibration.model.order > one.highest_order:
+        raise InputError(
+            f"the order is {calibration.model.order}, and polynomials of {one.title} go "
+            f"up to order {one.highest_order}",
+            where=f"products.{key}",
+            do=f"convert the run with --order {one.highest_order}, or choose another format",
+        )
+    if one.holds_tables and not calibration.before:
+        calibration = replace(calibration, before=options.tables)
     return one.build(calibration, settings, options)
 
 

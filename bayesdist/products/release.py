@@ -16,7 +16,7 @@ from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.orientation import oriented
 from bayesdist.calibration.plane import Orientation
 from bayesdist.errors import InputError
-from bayesdist.files import made_folder
+from bayesdist.files import made_folder, path_within
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products.formats.idctab.build import idctab_from_solution
 from bayesdist.products.formats.idctab.drift import Loss, storable
@@ -173,7 +173,9 @@ def write_release(
         )
 
     folder = made_folder(folder)
-    idctabs = {period: folder / f"{name}_{period}_idc.fits" for period in made}
+    idctabs = {
+        period: path_within(folder, f"{name}_{period}_idc.fits", where="name") for period in made
+    }
     for period_name, path in idctabs.items():
         write_idctab(made[period_name], path)
     first = periods[0]
@@ -186,7 +188,7 @@ def write_release(
     detector_tables = [t for t in tables if not t.filter]
     d2im = None
     if detector_tables:
-        d2im = folder / f"{name}_d2i.fits"
+        d2im = path_within(folder, f"{name}_d2i.fits", where="name")
         columns, lines = next(iter(calibrations.values())).model.chips[0].size
         size = (int(columns), int(lines))
         write_d2im(
@@ -194,7 +196,7 @@ def write_release(
         )
     npol = {}
     for filter in dict.fromkeys(t.filter for t in tables if t.filter):
-        npol[filter] = folder / f"{name}_{filter.lower()}_npl.fits"
+        npol[filter] = path_within(folder, f"{name}_{filter.lower()}_npl.fits", where="filter")
         write_npol(
             [t for t in tables if t.filter == filter],
             npol[filter],

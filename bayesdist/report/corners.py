@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,13 +34,26 @@ class Column:
     draws: Float
 
 
+def _corner() -> Callable[..., Figure]:
+    """The function of the library, which is imported here, as it takes seconds."""
+    with warnings.catch_warnings():
+        # it imports arviz where that is installed, which then announces its own future
+        warnings.simplefilter("ignore", FutureWarning)
+        try:
+            from corner import corner
+        except OSError:  # arviz notes in the user's home when it did so
+            sys.modules["arviz"] = None  # type: ignore[assignment]
+            try:
+                from corner import corner
+            finally:
+                del sys.modules["arviz"]
+    found: Callable[..., Figure] = corner
+    return found
+
+
 def corner_figure(columns: Sequence[Column]) -> Figure:
     """Corner plot of draws of quantities that are never negative, at 1 and 2 sigma."""
-    with warnings.catch_warnings():
-        # corner imports arviz where it is installed, which then announces its own future
-        warnings.simplefilter("ignore", FutureWarning)
-        from corner import corner  # here, as it takes seconds
-
+    corner = _corner()
     n = len(columns)
     raw = np.stack([c.draws for c in columns], axis=-1)
     ranges = _ranges(raw)

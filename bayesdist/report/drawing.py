@@ -21,6 +21,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.spines import Spine
 from matplotlib.transforms import Bbox
+from numpy.typing import NDArray
 from PIL import Image
 
 from bayesdist.files import atomic_path, made_folder
@@ -30,6 +31,7 @@ from bayesdist.report.style import figure_style, plain_ticks
 
 __all__ = [
     "DPI",
+    "MARGIN",
     "Drawing",
     "draw_all",
     "png_of",
@@ -40,8 +42,10 @@ __all__ = [
 
 log = logging.getLogger("bayesdist")
 
+Pixels = NDArray[np.uint8]  # (rows, columns, colours), rows from the top
+
 DPI = 150
-PAD = 0.05  # inches around the drawing
+MARGIN = 8  # pixels around the drawing
 MIN_FIGURES_SHARED = 20  # fewer are drawn sooner than another process has started
 
 _received: list[Any] = []  # of a process that draws for another one
@@ -63,9 +67,9 @@ class Drawing:
 @figure_style()  # mathematical text and ticks read the settings only when drawn
 def render(plot: Plot, *, pdf: bool = False, svg: bool = False) -> Drawing:
     """Figure as PNG, and as PDF and SVG with text as letters; equal figures give equal files."""
-    canvas, box = _laid_out(plot.figure)
+    pixels, box = _laid_out(plot.figure)
     return Drawing(
-        _png(plot.figure, canvas, box),
+        _png(pixels),
         _pdf(plot.figure, box) if pdf else None,
         plot.title,
         plot.text,
@@ -115,11 +119,14 @@ def _drawn(item: Item, pdf: bool) -> Drawing:
 @figure_style()
 def png_of(figure: Figure) -> bytes:
     """PNG file of 256 colours of a figure: a third of the size, without a visible difference."""
-    return _png(figure, *_laid_out(figure))
+    return _png(_laid_out(figure)[0])
 
 
-def _laid_out(figure: Figure) -> tuple[FigureCanvasAgg, Bbox]:
-    """Area of a figure that is drawn on, in inches, with room around it, after its only layout."""
+def _laid_out(figure: Figure) -> tuple[Pixels, Bbox]:
+    """Pixels and box (inches) of the area of a figure that is drawn on, with room around it.
+
+    The figure is laid out and drawn once; a second time where artists lie outside the page as well.
+    """
     plain_ticks(figure)
     for ax in figure.axes:
         for spine in ax.spines.values():
@@ -129,17 +136,40 @@ def _laid_out(figure: Figure) -> tuple[FigureCanvasAgg, Bbox]:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     _settle(figure)
-    return canvas, figure.get_tightbbox().padded(PAD)
-
-
-def _png(figure: Figure, canvas: FigureCanvasAgg, box: Bbox) -> bytes:
-    page = Bbox.from_bounds(0, 0, *figure.get_size_inches())
-    if not (page.contains(*box.min) and page.contains(*box.max)):  # artists outside as well
+    page = np.asarray(canvas.buffer_rgba())
+    edges = _inked(page)
+    if edges is None:
+        box = figure.get_tightbbox().padded(MARGIN / DPI)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=DPI, bbox_inches=box)
-        image = Image.open(buffer).convert("RGB")
-    else:
-        image = Image.fromarray(_cut(np.asarray(canvas.buffer_rgba()), box))
+        return np.asarray(Image.open(buffer).convert("RGB")), box
+    top, bottom, left, right = edges
+    area = np.empty((bottom - top + 2 * MARGIN, right - left + 2 * MARGIN, 3), np.uint8)
+    area[:] = page[0, 0, :3]
+    area[MARGIN:-MARGIN, MARGIN:-MARGIN] = page[top:bottom, left:right, :3]
+    drawn = Bbox([[left, len(page) - bottom], [right, len(page) - top]]).padded(MARGIN)
+    return area, Bbox(drawn.get_points() / DPI)
+
+
+def _inked(page: Pixels) -> tuple[int, int, int, int] | None:
+    """First and last rows and columns that are drawn on; None for those of the page's own edge.
+
+    Measured on the page, as asking all artists for their extents takes as long as laying them out.
+    """
+    colors = page.view(np.uint32)[..., 0]
+    drawn = colors != colors[0, 0]
+    out = []
+    for axis in (1, 0):
+        (where,) = np.nonzero(drawn.any(axis=axis))
+        if not where.size or where[0] == 0 or where[-1] == drawn.shape[1 - axis] - 1:
+            return None
+        out += [int(where[0]), int(where[-1]) + 1]
+    top, bottom, left, right = out
+    return top, bottom, left, right
+
+
+def _png(pixels: Pixels) -> bytes:
+    image = Image.fromarray(pixels)
     few = image.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     buffer = io.BytesIO()
     few.save(buffer, format="png", dpi=(DPI, DPI))
@@ -164,14 +194,6 @@ def _settle(figure: Figure) -> None:
     """Fix all positions; an engine, even 'none', would have each file drawn twice."""
     with rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
         figure.set_layout_engine(None)
-
-
-def _cut(pixels: np.ndarray, box: Bbox) -> np.ndarray:
-    """Part (rows, columns, 3) of a canvas; rows run from the top."""
-    height, width = pixels.shape[:2]
-    left, right = np.clip(np.rint(DPI * box.intervalx).astype(int), 0, width)
-    top, bottom = np.clip(height - np.rint(DPI * box.intervaly[::-1]).astype(int), 0, height)
-    return np.ascontiguousarray(pixels[top:bottom, left:right, :3])
 
 
 def save_figures(figures: Mapping[str, Figure], folder: str | os.PathLike[str]) -> tuple[Path, ...]:

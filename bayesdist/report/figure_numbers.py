@@ -81,8 +81,9 @@ def _of_collection(one: Any) -> tuple[str, Iterable[Sequence[float]]]:
             (*xy, level) for level, path in lines for xy in np.asarray(path.vertices)
         )
     if isinstance(one, LineCollection):
-        ends = (s for s in one.get_segments() if len(s) == 2)
-        return "segment", ((*first, *last) for first, last in ends)
+        ends = np.array([p.vertices for p in one.get_paths() if len(p.vertices) == 2])
+        whole = np.isfinite(ends).all(axis=(1, 2)) if ends.size else []
+        return "segment", ends.reshape(-1, 4)[whole]
     if isinstance(one, PathCollection | PolyCollection):
         at, values = np.asarray(one.get_offsets(), float), one.get_array()
         if values is not None and len(np.ravel(values)) == len(at):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import re
 import struct
 from collections.abc import Iterable, Mapping, Sequence
@@ -33,6 +34,11 @@ class Picture:
     width: float  # inches, at which its letters have the size they were set in
     words: Drawing  # title, text and text alternative
     printed: bool = True  # True where it is on paper
+
+    @property
+    def hundredths(self) -> int:
+        """Width in hundredths of an inch, by which the style sheet knows it."""
+        return round(100 * self.width)
 
 
 @dataclass(frozen=True)
@@ -116,7 +122,9 @@ def template(name: str, package: str = REPORT) -> jinja2.Template:
     environment.filters["css"] = _css
     environment.filters["base64"] = _base64
     environment.globals["explanation_of"] = explanation_of
+    environment.globals["policy"] = _policy
     environment.globals["section_of"] = section_of
+    environment.globals["widths_of"] = _widths
     environment.tests["level"] = lambda value: isinstance(value, Level)
     return environment.get_template(name)
 
@@ -152,6 +160,29 @@ def _markdown(value: object) -> str:
     if isinstance(value, Level):
         return {"pass": "pass", "warn": "**warn**", "fail": "**FAIL**", "note": MISSING}[value]
     return str(value).translate(_SPECIAL)
+
+
+def _policy(style: str, script: str) -> str:
+    """What a page may do: apply its one style sheet, run its one script, show pictures in it."""
+    allowed = {"default": "'none'", "img": "data:", "style": _hash(style)}
+    if script:
+        allowed["script"] = _hash(script)
+    fetched = "; ".join(f"{kind}-src {source}" for kind, source in allowed.items())
+    return f"{fetched}; base-uri 'none'; form-action 'none'"
+
+
+def _hash(text: str) -> str:
+    """Text of an element as a policy names it, once it has been typeset for the page."""
+    digest = hashlib.sha256(str(_typeset(text)).encode("utf-8")).digest()
+    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+
+
+def _widths(parts: Iterable[Part]) -> list[int]:
+    """Widths of all pictures of some sections, each once."""
+    found: set[int] = set()
+    for part in parts:
+        found.update((picture.hundredths for picture in part.pictures), _widths(part.parts))
+    return sorted(found)
 
 
 def _base64(value: str) -> str:

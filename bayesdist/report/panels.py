@@ -85,18 +85,16 @@ class ChipPanels(Panels):
 
 
 class ArrayPanels(Panels):
-    """Panels of several arrays, equally wide, each in its own pixels, in so many columns at most.
+    """Panels of several arrays, equally wide, each in its own pixels, in two columns.
 
     `sizes` are columns and rows by the array's name; `colorbar` leaves room for one common colour
     bar.
     """
 
     @figure_style()
-    def __init__(
-        self, sizes: Mapping[str, Size], *, columns: int = 2, colorbar: bool = False
-    ) -> None:
+    def __init__(self, sizes: Mapping[str, Size], *, colorbar: bool = False) -> None:
         self.sizes = tuple(sizes.values())
-        columns = min(columns, len(sizes))
+        columns = min(2, len(sizes))
         rows = -(-len(sizes) // columns)
         width = WIDTH if columns > 1 else 0.66 * WIDTH
         panel = (width - 0.75 - 0.5 * (columns - 1) - (0.8 if colorbar else 0.0)) / columns
@@ -187,7 +185,8 @@ def chip_axes(ax: Axes, size: Size, *, margin: float = 0.0) -> None:
 def _label_edges(ax: Axes) -> None:
     """Label axes that are at the edge because there is no chip beyond them."""
     spec = ax.get_subplotspec()
-    assert spec is not None
+    if spec is None:
+        return
     others = [o.get_subplotspec() for o in ax.figure.axes if o is not ax]
     here = spec.rowspan.start, spec.colspan.start
     places = [(o.rowspan.start, o.colspan.start) for o in others if o is not None]

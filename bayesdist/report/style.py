@@ -74,6 +74,7 @@ _RC: Any = {
     "font.size": 8.5,
     "axes.titlesize": 8.5,
     "axes.titlelocation": "left",
+    "axes.titley": 1.0,  # else all ticks are measured again in case that some are above the panel
     "axes.labelsize": 8.5,
     "axes.linewidth": 0.7,
     "axes.edgecolor": INK,
@@ -179,9 +180,9 @@ def plain_ticks(figure: Figure) -> None:
                 elif type(now) is LogFormatterSciNotation:
                     put(
                         _Powers(
-                            now._base,  # type: ignore[attr-defined]
+                            now._base,  # type: ignore[attr-defined]  # it has no getter
                             labelOnlyBase=now.labelOnlyBase,
                             minor_thresholds=now.minor_thresholds,
-                            linthresh=now._linthresh,  # type: ignore[attr-defined]
+                            linthresh=now._linthresh,  # type: ignore[attr-defined]  # nor this
                         )
                     )

@@ -318,7 +318,7 @@ def test_input_that_changed_since_the_run_began(begun, tmp_path, stars):
     for stage in ("sample", "assess", "report"):
         refused(tmp_path, "stage", stage, begun, words=words)
     (tmp_path / "job" / "stars.ecsv").unlink()
-    refused(tmp_path, "stage", "sample", begun, words=["stars.ecsv", "cannot be read"])
+    refused(tmp_path, "stage", "sample", begun, words=["stars.ecsv", "does not exist"])
 
 
 def test_a_configuration_that_was_edited_in_the_run(begun, tmp_path):
@@ -395,7 +395,7 @@ def test_a_damaged_fit(begun, tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (None, ["req.toml", "cannot be read"]),
+        (None, ["req.toml", "does not exist"]),
         ("", ["req.toml: holds no settings; give it [[requirement]] blocks"]),
         ("# later\n", ["req.toml: holds no settings"]),
         ("requirement = []", ["requirement"]),

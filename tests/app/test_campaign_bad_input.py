@@ -16,10 +16,10 @@ from bayesdist.app.campaign.input_validation import frames_not_set, shear_warnin
 from bayesdist.app.results import results_of
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches
-from bayesdist.data.tables.files import read_table
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import fit_linear, load_fit
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.reading.tables import read_table
 from tests.app.damaged import CONFIG, ONE, Campaign, masked, scattered, setting
 from tests.app.support import cli, good, one_sentence, refused, summary_of
 

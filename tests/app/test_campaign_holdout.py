@@ -20,8 +20,8 @@ from bayesdist.app.results import open_results, results_of
 from bayesdist.app.run import make_stages
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import read_matches
-from bayesdist.data.tables.files import read_table
 from bayesdist.infer import load_fit
+from bayesdist.reading.tables import read_table
 from tests.app.support import cli, good, one_sentence, refused, summary_of
 
 N, LATER = 14, 3  # exposures, and how many of them the release does not see

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from bayesdist.app.config import load_config
+from bayesdist.app.kind import kind_of
 from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.kinds.stars import (
     fit_stars,

@@ -198,7 +198,7 @@ def test_what_cannot_be_planned_is_refused(job, tmp_path):
     file, out, _ = job
     refused(tmp_path, "plan", file, words=["not a run", "bayesdist plan-dither"])
     refused(out, "plan-dither", file, "-o", out, words=["holds other files"])
-    refused(tmp_path, "plan-dither", tmp_path / "none.toml", words=["cannot be read"])
+    refused(tmp_path, "plan-dither", tmp_path / "none.toml", words=["does not exist"])
 
 
 def test_the_page_documents_every_key_and_its_example_is_sound(tmp_path):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import shutil
+import socket
 from pathlib import Path
 
 import pytest
@@ -13,6 +13,7 @@ import pytest
 from bayesdist.app.config import KINDS, load_config
 from bayesdist.app.store import Made
 from bayesdist.app.store.keys import digest_of
+from bayesdist.app.store.lock import locked
 from bayesdist.app.store.made_from import (
     LATER,
     LIMITS,
@@ -146,13 +147,10 @@ def test_a_run_that_was_moved_is_the_same(finished, run, tmp_path):
 
 
 def test_two_processes_do_not_work_on_one_run(finished, run, tmp_path):
-    folder = os.open(run, os.O_RDONLY)
-    fcntl.flock(folder, fcntl.LOCK_EX)
-    try:
+    with locked(run):
+        mine = f"process {os.getpid()} on {socket.gethostname()} since "
         for arguments in (("run", finished.config, "-o", run, "--resume"), ("stage", "fit", run)):
-            refused(tmp_path, *arguments, words=("another process", str(run)))
-    finally:
-        os.close(folder)
+            refused(tmp_path, *arguments, words=("another process", mine, str(run)))
     assert cli("stage", "export", run).code == 0
 
 

@@ -96,3 +96,9 @@ def test_stars_on_a_line_leave_the_detector_to_others():
     """Such data are refused elsewhere; here they must not fail."""
     x = np.linspace(1.0, 1016.0, 200)
     assert covered(x, 0.5 * x).gap >= 0.0
+
+
+def test_a_gap_is_no_alarm_where_an_earlier_calibration_has_the_rest(rng):
+    x, y = even(rng, 400, 0.5)
+    assert covered(x, y).significant and not covered(x, y, known=True).significant
+    assert covered(x, y, known=True).gap == covered(x, y).gap

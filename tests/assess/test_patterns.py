@@ -20,20 +20,14 @@ from bayesdist.assess.planning.words import lacking
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal import self_calibrate
 from bayesdist.model import Chip
-from bayesdist.simulate.dithers import (
-    dither_pattern,
-    dithered_model,
-    simulate_dithers,
-    sky_seen,
-    smooth_distortion,
-    stars_on_detector,
-)
+from bayesdist.simulate.dithers import dither_pattern, dithered_model, sky_seen, stars_on_detector
 from bayesdist.simulate.patterns import (
     DitherPattern,
     flat_coefficients,
     grid_offsets,
     rolls_in_turn,
 )
+from tests.dithered_fields import simulate_dithers, smooth_distortion
 from tests.infer.selfcal.fields import aligned
 
 SIZE = (1024.0, 1024.0)

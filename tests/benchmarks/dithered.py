@@ -14,12 +14,8 @@ from astropy.wcs import WCS
 from numpy.typing import NDArray
 
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.simulate.dithers import (
-    DitheredField,
-    dither_pattern,
-    simulate_dithers,
-    smooth_distortion,
-)
+from bayesdist.simulate.dithers import dither_pattern
+from tests.dithered_fields import DitheredField, simulate_dithers, smooth_distortion
 
 __all__ = [
     "BRIGHT",

@@ -45,7 +45,8 @@ def _calibrated(exposures: int, stars: int, order: int) -> dict[str, Any]:
     from bayesdist.infer.selfcal import sample_selfcal, self_calibrate
     from bayesdist.infer.selfcal.catalogue import star_catalogue
     from bayesdist.model import Chip
-    from bayesdist.simulate.dithers import dither_pattern, simulate_dithers, smooth_distortion
+    from bayesdist.simulate.dithers import dither_pattern
+    from tests.dithered_fields import simulate_dithers, smooth_distortion
 
     rng = np.random.default_rng(1)
     chips = tuple(Chip(n, f"WFC{n}", (4096.0, 2048.0), (2048.0, 1024.0)) for n in (1, 2))

@@ -13,8 +13,9 @@ from astropy.table import Table
 from bayesdist.data import ReadOptions, matches_from_table, open_matches, read_matches
 from bayesdist.data.reading.chips import numbered
 from bayesdist.data.tables.names import ALIASES
-from bayesdist.data.tables.text import is_text_table
 from bayesdist.errors import InputError
+from bayesdist.reading.tables import read_table
+from bayesdist.reading.text_tables import is_text_table
 
 
 def stars(n=6, **more):
@@ -150,3 +151,26 @@ def test_the_documentation_lists_every_name():
         assert re.search(rf"\b{key}\b", page), key
         for name in names:
             assert f"`{name}`" in page, name
+
+
+ALLSTAR = """ NL    NX    NY  LOWBAD HIGHBAD  THRESH     AP1  PH/ADU  RNOISE    FRAD
+  1  1000   800   -50.0 32000.0   10.00    3.00    2.00    3.00     9.0
+
+      1   512.250   17.500   15.123    0.010   100.00      4.     1.00    0.010
+     23     3.125  799.875   18.000    0.050   101.00      7.     0.98   -0.020
+"""
+
+
+def test_a_list_of_allstar(tmp_path):
+    """Columns of its manual: id, x, y, magnitude and error, sky, iterations, chi, sharp."""
+    path = tmp_path / "field.als"
+    path.write_text(ALLSTAR)
+    found = read_table(path)
+    assert found.colnames[:5] == ["id", "x", "y", "mag", "mag_err"]
+    assert list(found["x"]) == [512.25, 3.125] and list(found["mag_err"]) == [0.01, 0.05]
+    path.write_text(ALLSTAR.replace("   -0.020", ""))
+    with pytest.raises(InputError, match=r"field\.als, row 2: has 8 numbers"):
+        read_table(path)
+    path.write_text(ALLSTAR.replace("  1  1000", "  2  1000"))
+    with pytest.raises(InputError, match="aperture photometry"):
+        read_table(path)

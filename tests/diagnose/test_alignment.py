@@ -13,10 +13,7 @@ from bayesdist.diagnose.residuals import (
     STATISTICS,
     BinValues,
     band_bins,
-    band_to_band_table,
     bin_row,
-    fitting_table,
-    multiframe_table,
     pair_row,
     pair_statistics,
     pattern_changes,
@@ -38,6 +35,11 @@ from bayesdist.missions.wise.assess.published import (
     TABLE_C_1,
     noise_of_bins,
     printed_rows,
+)
+from bayesdist.missions.wise.assess.tables import (
+    band_to_band_table,
+    fitting_table,
+    multiframe_table,
 )
 from bayesdist.missions.wise.published import SAMPLE_SIZES
 from bayesdist.missions.wise.simulate import simulate_wise

@@ -12,7 +12,7 @@ from bayesdist.diagnose.selfcal.misfit import _shifts, dithered_misfit
 from bayesdist.diagnose.selfcal.scores import taken_by_stars
 from bayesdist.infer.selfcal import self_calibrate
 from bayesdist.infer.selfcal.elimination import memberships
-from bayesdist.simulate.dithers import simulate_dithers, smooth_distortion
+from tests.dithered_fields import simulate_dithers, smooth_distortion
 from tests.infer.selfcal.fields import SIZE, chips, field
 
 

@@ -49,13 +49,18 @@ def spread_draws(posterior, n: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 
 
 def stein_pulls(
-    density: Callable[[], None], draws: Mapping[str, np.ndarray], *, at_once: int = 100
+    density: Callable[[], None],
+    draws: Mapping[str, np.ndarray],
+    *,
+    beside: Mapping[str, np.ndarray] | None = None,
+    at_once: int = 100,
 ) -> np.ndarray:
-    """Pulls (p, 1 + p) of Stein's identities, of independent draws (n, ...) of all p parameters.
+    """Pulls (p, 1 + p) of Stein's identities, of independent draws (n, ...) of p parameters.
 
     Where draws x have a density whose logarithm has the gradient g, the mean of g is 0, and that
     of (x - mean) g' is -1: with the precision of n draws that shows wrong means, variances and
-    correlations, and asks for no other sampler.
+    correlations, and asks for no other sampler.  Other parameters of the density, `beside` (n, ...)
+    these, need draws as well, and no identities.
     """
     import jax
     from jax.flatten_util import ravel_pytree
@@ -65,9 +70,15 @@ def stein_pulls(
     flat = [np.asarray(rows).reshape(len(rows), -1) for _, rows in sorted(draws.items())]
     x = np.concatenate(flat, axis=1)
     unravel = ravel_pytree(start)[1]
-    gradient = jax.jit(jax.vmap(jax.grad(lambda v: log_density(density, (), {}, unravel(v))[0])))
-    chunks = np.split(x[: len(x) // at_once * at_once], len(x) // at_once)
-    g = np.concatenate([np.asarray(gradient(chunk)) for chunk in chunks])
+
+    def log_of(v, others):
+        return log_density(density, (), {}, unravel(v) | others)[0]
+
+    gradient = jax.jit(jax.vmap(jax.grad(log_of)))
+    chunks = [slice(k, k + at_once) for k in range(0, len(x) - at_once + 1, at_once)]
+    others = [{name: rows[some] for name, rows in (beside or {}).items()} for some in chunks]
+    g = [gradient(x[some], other) for some, other in zip(chunks, others, strict=True)]
+    g = np.concatenate([np.asarray(one) for one in g])
     # uncorrelated coordinates of unit variance
     x = x[: len(g)]
     root = np.linalg.cholesky(np.cov(x.T))

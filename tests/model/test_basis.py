@@ -9,7 +9,7 @@ from numpy.polynomial import legendre, polynomial
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis, polynomial_terms
 
-ORDERS = range(1, 10)
+ORDERS = range(1, 13)
 SIZE, REFERENCE = (4096.0, 2048.0), (2048.0, 1024.0)  # ACS/WFC
 
 
@@ -41,7 +41,7 @@ def test_terms_are_numbered_as_in_isr_2015_06():
 @pytest.mark.parametrize("order", ORDERS)
 def test_terms_are_all_powers_up_to_the_order_once(order):
     basis = basis_of(order)
-    every = {(i, j) for i in range(10) for j in range(10) if i + j <= order}
+    every = {(i, j) for i in range(13) for j in range(13) if i + j <= order}
     assert len(basis.terms) == len(every) == basis.n_terms
     assert set(basis.terms) == every
 
@@ -87,11 +87,13 @@ def test_monomial_form_has_the_same_values(order, reference):
     coef = rng.standard_normal((3, basis.n_terms))
     values = coef @ basis.evaluate(x, y).T
     dx, dy = x - reference[0], y - reference[1]
+    # the power coefficients of P_n add up to (1 + sqrt 2)^n at most: so much is rounded on the way
+    rounding = 1e-13 + 1e-16 * (1 + np.sqrt(2)) ** order
     for row, monomial in zip(values, basis.to_monomials(coef), strict=True):
         powers = polynomial.polyval2d(dx, dy, as_grid(basis.terms, monomial))
         # a reference pixel in the corner makes the monomials cancel: digits are lost there
         scale = np.abs(monomial) @ np.abs([dx**i * dy**j for i, j in basis.terms])
-        np.testing.assert_array_less(np.abs(powers - row), 1e-14 * scale + 1e-13)
+        np.testing.assert_array_less(np.abs(powers - row), 1e-14 * scale + rounding)
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -126,7 +128,7 @@ def test_from_monomials_is_the_inverse(order):
         )
 
 
-@pytest.mark.parametrize("order", [1, 4, 9])
+@pytest.mark.parametrize("order", [1, 4, 9, 12])
 def test_covariance_of_monomials_gives_the_same_variance_of_positions(order):
     """The variance of the polynomial's value does not depend on the form it is written in."""
     rng = np.random.default_rng(order)
@@ -154,9 +156,9 @@ def test_condition_numbers_are_those_that_made_us_choose_legendre():
     assert np.linalg.cond(basis.evaluate(x, y)) < 10
 
 
-@pytest.mark.parametrize("order", [0, 10, -1])
-def test_order_outside_1_to_9_is_refused(order):
-    with pytest.raises(InputError, match=f"order is {order}.*from 1 to 9"):
+@pytest.mark.parametrize("order", [0, 13, -1])
+def test_order_outside_1_to_12_is_refused(order):
+    with pytest.raises(InputError, match=f"order is {order}.*from 1 to 12"):
         PolynomialBasis(order, SIZE, REFERENCE)
 
 

@@ -13,15 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from bayesdist.calibration.calibration import calibration_of
-from bayesdist.calibration.rotation import coefficient_map, pixel_matrix, rotated
+from bayesdist.calibration.rotation import coefficient_map, pixel_matrix
 from bayesdist.errors import InputError
-from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products import lint_sip, read_sip, sip_from_solution, sip_header, write_sip
 from bayesdist.products.formats.sip.rotate import rotated_sip
 
-from .support import StandIn, astropy_wcs, random_pixels, some_covariance, some_solution
+from .support import astropy_wcs, random_pixels, some_solution
 
 # coefficient at R = 0, and what stands there at R = 90, 180, 270
 APPENDIX_A = """
@@ -279,73 +277,3 @@ def test_orders_that_differ_go_with_their_axes() -> None:
     w = M @ np.stack([x - sip.crpix[0], y - sip.crpix[1]])
     after = free.forward(*(w + np.array(free.crpix)[:, None]))
     assert_allclose(np.stack(after), M @ np.stack(sip.forward(x, y)), atol=1e-9)
-
-
-# -- solutions ------------------------------------------------------------------------------------
-
-
-def two_chips() -> StandIn:
-    rng = np.random.default_rng(2)
-    chips = (
-        Chip(1, "A", (1200.0, 900.0), (610.3, 444.7)),
-        Chip(2, "B", (700.0, 1000.0), (350.5, 500.5)),
-    )
-    model = DistortionModel(4, chips, "pix")
-    n = model.n_params
-    return StandIn(model, rng.normal(size=n), some_covariance(n, 0.1, rng))
-
-
-@pytest.mark.parametrize("mirror", [False, True])
-@pytest.mark.parametrize("degrees", [*QUARTERS, 33.3])
-def test_a_turned_solution_predicts_turned_positions(degrees: float, mirror: bool) -> None:
-    source, origin = two_chips(), (3.0, -2.0)
-    turned = rotated(calibration_of(source), degrees, mirror=mirror, origin=origin).solution
-    M = pixel_matrix(degrees, mirror=mirror)
-    for old, new in zip(source.model.chips, turned.model.chips, strict=True):
-        x, y = random_pixels(old.size, 200)
-        w = M @ np.stack([x - old.reference_pixel[0], y - old.reference_pixel[1]])
-        x_new, y_new = w + np.array(new.reference_pixel)[:, None]
-        if degrees in QUARTERS:
-            by_hand = moved_pixels(x, y, old.size, degrees, mirror)
-            assert_allclose((x_new, y_new), by_hand, atol=1e-9)
-        for axis, values in enumerate((x_new, y_new)):
-            assert values.min() >= 0.5 - 1e-9 and values.max() <= new.size[axis] + 0.5 + 1e-9
-        before = source.model.predict(source.mean, x, y, chip=old.number)
-        after = turned.model.predict(turned.mean, x_new, y_new, chip=new.number)
-        assert_allclose(after - origin, (before - origin) @ M.T, atol=1e-9)
-
-
-def test_covariance_turns_as_draws_do() -> None:
-    source = two_chips()
-    turned = rotated(calibration_of(source), 33.3, mirror=True).solution
-    # by the error field: Cov(M f) = M Cov(f) M^T at every pixel
-    M = pixel_matrix(33.3, mirror=True)
-    old, new = source.model.chips[0], turned.model.chips[0]
-    x, y = random_pixels(old.size, 30)
-    w = M @ np.stack([x - old.reference_pixel[0], y - old.reference_pixel[1]])
-    at = w + np.array(new.reference_pixel)[:, None]
-    rows_old = source.model.predict(np.eye(source.model.n_params), x, y, chip=1)
-    rows_new = turned.model.predict(np.eye(turned.model.n_params), *at, chip=1)
-    cov_old = np.einsum("dna,de,enb->nab", rows_old, source.cov, rows_old)
-    cov_new = np.einsum("dna,de,enb->nab", rows_new, turned.cov, rows_new)
-    assert_allclose(cov_new, M @ cov_old @ M.T, rtol=1e-9, atol=1e-12)
-    # a draw of one is the turned draw of the other
-    a, b = (s.draws(3, np.random.default_rng(1)) for s in (source, turned))
-    field = source.model.predict(a, x, y, chip=1)
-    assert_allclose(turned.model.predict(b, *at, chip=1), field @ M.T, atol=1e-9)
-
-
-def test_quarter_turns_of_a_solution_only_move_numbers() -> None:
-    source = two_chips()
-    turned = rotated(calibration_of(source), 90).solution
-    assert np.array_equal(np.sort(np.abs(turned.mean)), np.sort(np.abs(source.mean)))
-    assert np.array_equal(np.sort(np.diag(turned.cov)), np.sort(np.diag(source.cov)))
-    assert turned.model.chips[0].size == (900.0, 1200.0)
-
-
-def test_what_cannot_be_turned_is_refused() -> None:
-    source = two_chips()
-    model = replace(source.model, time=TimeDependence((("u", 1, 0),), (2004.5,)))
-    n = model.n_params
-    with pytest.raises(InputError, match="depends on time"):
-        rotated(calibration_of(StandIn(model, np.zeros(n), np.eye(n))), 90)

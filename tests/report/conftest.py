@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 
 from bayesdist.report.context import ReportInput
@@ -52,3 +54,29 @@ def page(converged, drawings) -> str:
 def bad_page(not_converged, drawings) -> str:
     # the pictures are those of the other run: only the words are looked at
     return render_report(not_converged, drawings)
+
+
+OPTIONS = (
+    "--headless=new --no-sandbox --disable-gpu --no-first-run --disable-background-networking"
+    " --disable-component-update --disable-sync --disable-dev-shm-usage"
+).split()
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    """Chromium without a window, with its log and what it asks for."""
+    selenium = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    driver = shutil.which("chromedriver")
+    if not chromium or not driver:
+        pytest.skip("there is no chromium with its driver")
+    options = selenium.ChromeOptions()
+    options.binary_location = chromium
+    for one in (*OPTIONS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
+        options.add_argument(one)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    found = selenium.Chrome(options=options, service=selenium.ChromeService(driver))
+    found.get("about:blank")
+    found.get_log("performance")  # what the browser's own first page asked for
+    yield found
+    found.quit()

@@ -6,7 +6,6 @@ Truth is `place_budget` and the rows of `budget.ecsv`, which know nothing of the
 from __future__ import annotations
 
 import re
-import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -28,20 +27,8 @@ from tests.budgets import detector_budget
 from .plots import drawings_of, plots_of
 from .runs import TERMS, report_input
 
-selenium = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-DRIVER = shutil.which("chromedriver")
-pytestmark = [
-    pytest.mark.skipif(not CHROMIUM, reason="there is no chromium"),
-    pytest.mark.skipif(not DRIVER, reason="there is no chromedriver"),
-]
-
 GRID, DRAWS, SCALE = (9, 7), 400, 2757.0
 YEARS = (2009.5, 2020.5)
-OPTIONS = (
-    "--headless=new --no-sandbox --disable-gpu --no-first-run --disable-background-networking"
-    " --disable-component-update --disable-sync --disable-dev-shm-usage"
-).split()
 
 
 @pytest.fixture(scope="module")
@@ -83,20 +70,6 @@ def plane(x, y, chip, epoch):
     """What a file is off by: bilinear in the pixel and linear in time, as the page has it."""
     drift = 1e-6 * (epoch - 1990.0) * (x + 3000.0)
     return np.stack([drift, (-1) ** chip * 1e-5 * (y + 500.0)], axis=-1)
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    options = selenium.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for one in (*OPTIONS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
-        options.add_argument(one)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    driver = selenium.Chrome(options=options, service=selenium.ChromeService(DRIVER))
-    driver.get("about:blank")
-    driver.get_log("performance")  # what the browser's own first page asked for
-    yield driver
-    driver.quit()
 
 
 @pytest.fixture(scope="module")

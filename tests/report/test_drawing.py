@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from bayesdist.report import drawing
-from bayesdist.report.drawing import DPI, PAD, png_of, render
+from bayesdist.report.drawing import DPI, MARGIN, png_of, render
 from bayesdist.report.page import picture_of
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections import REPORT
@@ -42,7 +42,7 @@ def square(x: float, y: float, side: float) -> Figure:
 def test_a_picture_is_cut_to_what_is_drawn_and_no_more(at):
     """Inside the page or beyond its edge: the square of one inch and its margin."""
     image = pixels(png_of(square(*at, 0.5)))
-    side = DPI * (1.0 + 2 * PAD)
+    side = DPI + 2 * MARGIN
     assert np.abs(np.array(image.shape[:2]) - side).max() <= 2
     dark = (image < 50).all(axis=2)
     assert dark.sum() == pytest.approx(DPI**2, rel=0.03)
@@ -62,7 +62,9 @@ def test_what_is_printed_is_drawn_in_vectors():
     assert first == second
     tree = ElementTree.fromstring(first.svg)
     # in points: the square and its margin
-    assert float(tree.get("width").removesuffix("pt")) == pytest.approx(72 * (1 + 2 * PAD), abs=1)
+    assert float(tree.get("width").removesuffix("pt")) == pytest.approx(
+        72 * (1 + 2 * MARGIN / DPI), abs=1
+    )
     assert not render(Plot(square(0.1, 0.1, 0.5), "", "", "")).svg
     shown, plain = (picture_of("square", one) for one in (first, replace(first, svg="")))
     assert (shown.kind, plain.kind) == ("svg+xml", "png") and shown.width == plain.width

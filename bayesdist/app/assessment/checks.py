@@ -7,8 +7,8 @@ from typing import Any
 
 from bayesdist.app.campaign.checks import campaign_checks, campaign_remarks
 from bayesdist.app.config import CATALOGUE_WORDS, Config
+from bayesdist.app.kind import kind_of
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.matches.added_errors import knows_circle
 from bayesdist.assess.checks import catalogue_checks, matching_checks, time_checks
 from bayesdist.assess.units import pixel_doubt
@@ -19,7 +19,7 @@ from bayesdist.infer import Posterior
 from bayesdist.infer.checks import fit_checks, sampling_checks
 from bayesdist.limits import CHI2_TOO_LARGE
 
-__all__ = ["frames_doubt", "in_circle", "provenance_notes", "run_checks"]
+__all__ = ["frames_doubt", "in_circle", "run_checks"]
 
 
 def run_checks(
@@ -100,13 +100,3 @@ def frames_doubt(data: FitData, majority: str, config: Config) -> str:
     if not large or config.data is None or data.better_frames is None:
         return ""
     return f"the exposures lie differently: {data.better_frames.sentence}"
-
-
-def provenance_notes(posterior: Posterior, gauge: str) -> dict[str, bool | str]:
-    """Notes on the draws and the gauge for the head of a file."""
-    label = posterior.approximation
-    return {
-        "converged": posterior.convergence.converged,
-        **({"posterior": label} if label else {}),
-        **({"gauge": gauge} if gauge else {}),
-    }

@@ -11,8 +11,8 @@ from bayesdist.app.assessment.holdout import predictive_of_run
 from bayesdist.app.assessment.periods import period_settings
 from bayesdist.app.assessment.settings import assessment_rng, evaluation_settings
 from bayesdist.app.config import Config
+from bayesdist.app.kind import kind_of
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.kind import kind_of
 from bayesdist.diagnose.diagnostics import Diagnostics, diagnose, diagnose_fit, hold_out
 from bayesdist.infer import Posterior
 
@@ -54,7 +54,7 @@ def diagnose_run(posterior: Posterior, data: FitData, config: Config, base: Path
 
 def diagnose_fit_of_run(data: FitData, config: Config) -> Diagnostics:
     """Diagnostics of a fit alone."""
-    options = _of_kind(data, config)
+    options = _of_kind(data, config) | {"known": data.fitted.priors.joint is not None}
     return diagnose_fit(data.fit, None, data.stars, data.shards, data.sample, **options)
 
 

@@ -10,11 +10,11 @@ from bayesdist.app.config.campaign import CampaignBlock
 from bayesdist.app.kinds.matched import columns_by_code
 from bayesdist.data import ExposureLog, ReferenceCatalog, catalog_from_table
 from bayesdist.data.sky.tangent import mean_direction, tangent_plane
-from bayesdist.data.tables.files import read_table
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.products import IdcTab
 from bayesdist.products.formats.idctab.hst import parity_of
+from bayesdist.reading.tables import read_table
 
 __all__ = ["errors_by_star", "parities_of", "read_campaign_catalog"]
 

@@ -10,10 +10,10 @@ import numpy as np
 from bayesdist.app.campaign.gap import gap_priors, with_gap
 from bayesdist.app.campaign.input_validation import frames_not_set
 from bayesdist.app.campaign.inputs import Inputs
+from bayesdist.app.campaign.linear_terms import FIXED, line_sections
 from bayesdist.app.campaign.matched import CampaignMatched
 from bayesdist.app.campaign.reference import rate_priors
 from bayesdist.app.campaign.tables import fit_tables, scatter_by_magnitude, tables_section
-from bayesdist.app.exposures.linear_terms import FIXED, line_sections
 from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.exposures import ExposureScatter
 from bayesdist.app.kinds.fitted import Fitted

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.inputs import Inputs
-from bayesdist.app.campaign.reference import free_rates, rehearse_references
+from bayesdist.app.campaign.reference import rehearse_references
 from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.kinds.star_lists import refuse_other_chips
 from bayesdist.data.holdout import refuse_strangers
@@ -86,7 +86,7 @@ def refuse_unsound(inputs: Inputs) -> None:
             where="campaign",
             do="widen mag, saturation or q_max, or correct the columns that they go by",
         )
-    refuse_few(inputs.log.values("epoch"), config.time() if free_rates(config) else None)
+    refuse_few(inputs.log.values("epoch"), config.time() if config.has_free_rates else None)
     _refuse_periods(config.products.release, config.time())
     held = config.holdout
     if held is not None and not isinstance(held.exposures, int):

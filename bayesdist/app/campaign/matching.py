@@ -12,7 +12,6 @@ from bayesdist.app.campaign.catalogue import parities_of
 from bayesdist.app.campaign.input_validation import input_warnings, refuse_few, shear_warnings
 from bayesdist.app.campaign.inputs import Inputs
 from bayesdist.app.campaign.matched import CampaignMatched, matched_campaign
-from bayesdist.app.campaign.reference import free_rates
 from bayesdist.app.kinds.star_lists import StarLists, positions_by_chip, start_of
 from bayesdist.data import (
     Detections,
@@ -74,7 +73,7 @@ def match_lists(inputs: Inputs) -> CampaignMatched:
     if matched.held is not None:
         _refuse_bare(matched.stars, config.chips(), "what is not held out")
         some = inputs.log.select(names=matched.stars.exposure_names)
-        refuse_few(some.values("epoch"), config.time() if free_rates(config) else None)
+        refuse_few(some.values("epoch"), config.time() if config.has_free_rates else None)
     _log(matched, int(table["detected"].sum()))
     return matched
 

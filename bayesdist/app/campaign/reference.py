@@ -7,7 +7,7 @@ from pathlib import Path
 from bayesdist.app.campaign.gap import with_gap
 from bayesdist.app.config import Config
 from bayesdist.app.config.model import TablesBlock
-from bayesdist.app.config.other_runs import FREE, TABLES, rates_file, tables_file
+from bayesdist.app.config.other_runs import TABLES, rates_file, tables_file
 from bayesdist.app.kinds.table_file import read_tables
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Posterior, load_posterior
@@ -16,7 +16,6 @@ from bayesdist.model import Chip, DistortionModel, LookupTable
 from bayesdist.products import read_d2im
 
 __all__ = [
-    "free_rates",
     "held_tables",
     "rate_priors",
     "rehearse_references",
@@ -59,11 +58,6 @@ def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tupl
     return tuple(sorted(ours, key=lambda table: table.chip))
 
 
-def free_rates(config: Config) -> bool:
-    """Boolean: the drift is that of this run's own exposures."""
-    return config.model.tdd is None or config.model.tdd.rates == FREE
-
-
 def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianPriors | None:
     """Priors on the drift of a model from the posterior of another run; None where it is free.
 
@@ -74,7 +68,7 @@ def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianP
         units, drifting terms, or reference dates.
     """
     tdd, chip = config.model.tdd, config.chips()[0].number
-    if tdd is None or free_rates(config):
+    if tdd is None or config.has_free_rates:
         return None
     path = rates_file(base / tdd.rates)
     posterior: Posterior = load_posterior(path)
@@ -101,6 +95,6 @@ def rehearse_references(config: Config, unit: str, base: Path) -> None:
     """
     chips = config.chips()
     held_tables(config.tables, chips, base)
-    if not free_rates(config):
+    if not config.has_free_rates:
         model = with_gap(DistortionModel(config.model.order, chips, unit, config.time()))
         rate_priors(config, model, base)

@@ -10,11 +10,11 @@ from bayesdist.app.campaign.inputs import Inputs
 from bayesdist.app.campaign.matched import affine_model_of
 from bayesdist.app.config import CampaignConfig
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.results import Results
 from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches
 from bayesdist.data.preparing import motion_error_line
+from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
 from bayesdist.infer import GaussianPriors, LinearFit, Posterior, fit_linear
 from bayesdist.infer.equations.scaled import one_thread
@@ -22,6 +22,7 @@ from bayesdist.infer.linear import Rejection
 from bayesdist.infer.nodes import corrected_matches, inside_chips, pixel_shifts
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import outline_pixels
+from bayesdist.reading.tables import read_ecsv
 from bayesdist.report.campaign import (
     CampaignResults,
     CatalogStars,
@@ -42,32 +43,43 @@ HELD_BY_PRIOR = 0.99  # of the prior's sigma: what narrows it by less is no meas
 WIDEST_CELL = 8  # cells of this many times the size, however few stars there are
 
 
-def campaign_results(results: Results) -> CampaignResults:
+def campaign_results(
+    run: RunDirectory,
+    inputs: Inputs,
+    data: FitData,
+    posterior: Posterior,
+    overlap: OverlapTest | None,
+) -> CampaignResults:
     """Content that a campaign adds to the report of its run.
 
     Parameters
     ----------
-    results : Results
-        Of a run that has been assessed.
+    run : RunDirectory
+        That has been assessed.
+    inputs : Inputs
+    data : FitData
+    posterior : Posterior
+        As it was sampled.
+    overlap : OverlapDifferences or None
+        Of stars in several exposures.
     """
-    run, config, fitted = results.run, results.config, results.fitted
-    matched, matching = results.matched, Table.read(run / "matching.ecsv")
-    inputs: Inputs = results.inputs
+    model, fitted, matched = posterior.model, data.fitted, data.matched
+    matching = read_ecsv(run / "matching.ecsv")
     return CampaignResults(
         summary=dict(run.summary),
-        config=as_json(config.model_dump(exclude_none=True)),
+        config=as_json(run.config.model_dump(exclude_none=True)),
         filter=matched.filter,
         matching=matching,
-        chips=tuple(results.posterior.model.chips),
-        unit=results.posterior.model.unit,
+        chips=tuple(model.chips),
+        unit=model.unit,
         catalog=_catalog_stars(inputs, matching),
         centroids=fitted.errors.by_magnitude,
         detections=_detections(inputs),
-        footprints=_footprints(results.posterior, inputs, matched.mirrored),
-        residuals=_residuals(results.data, inputs.config),
+        footprints=_footprints(posterior, inputs, matched.mirrored),
+        residuals=_residuals(data, inputs.config),
         tables=fitted.tables.tables,
         series=_series(run, fitted.linear.model, matching),
-        overlap=results.diagnostics.overlap,
+        overlap=overlap,
         held=held_parameters(fitted.linear, fitted.priors),
     )
 
@@ -220,7 +232,7 @@ def _series(run: RunDirectory, model: DistortionModel, matching: Table) -> Linea
     time = model.time
     if time is None or "time_dependence" not in run.summary:
         return None
-    exposures = Table.read(run / "series.ecsv")
+    exposures = read_ecsv(run / "series.ecsv")
     place = {str(name): k for k, name in enumerate(matching["exposure"])}
     order = [place[str(name)] for name in exposures["exposure"]]
     vafactor, pa_v3 = (
@@ -229,7 +241,7 @@ def _series(run: RunDirectory, model: DistortionModel, matching: Table) -> Linea
     )
     return LinearSeries(
         exposures=exposures,
-        drift=Table.read(run / "drift.ecsv"),
+        drift=read_ecsv(run / "drift.ecsv"),
         vafactor=vafactor,
         pa_v3=pa_v3,
         breaks=tuple(time.breaks),

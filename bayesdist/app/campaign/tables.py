@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +35,6 @@ from bayesdist.model.grid import grid_pixels, mesh
 __all__ = ["FittedTables", "fit_tables", "scatter_by_magnitude", "tables_section"]
 
 Float = NDArray[np.float64]
-ErrorsAt = Callable[[Float, Float, int], Float]  # of positions (n, 2), at pixels of a chip
 
 log = logging.getLogger("bayesdist")
 
@@ -73,7 +73,7 @@ def fit_tables(matched: CampaignMatched) -> FittedTables:
         fit, _, errors = scatter_by_magnitude(placed, model, matched.inputs)
         pairs = matched.stars.with_errors(errors)
         between = measured_between(pairs, fit, held, filter=filter, fitted=False)
-        of_nodes = _on_the_grid(model, grid, _errors_of(held, fit))
+        of_nodes = _on_the_grid(held, fit, "", grid, partial(_held_variance, held))
         return FittedTables(_stored(held, of_nodes, between))
     pairs = _with_errors(matched, held)
     found = fit_with_tables(
@@ -86,11 +86,8 @@ def fit_tables(matched: CampaignMatched) -> FittedTables:
         max_iterations=block.max_iterations,
         report=_log_iteration,
     )
-
-    def by_covariance(x: Float, y: Float, chip: int) -> Float:
-        return found.table_sigma(x, y, chip=chip)
-
-    errors_at = by_covariance if found.posteriors else _errors_of(found.tables, found.solution)
+    known = bool(found.posteriors)
+    variance = found.shift_variance if known else partial(_held_variance, found.tables)
     between = measured_between(
         pairs,
         found.solution,
@@ -99,7 +96,7 @@ def fit_tables(matched: CampaignMatched) -> FittedTables:
         posteriors=found.posteriors,
         mixture=found.mixture,
     )
-    of_nodes = _on_the_grid(model, grid, errors_at)
+    of_nodes = _on_the_grid(found.tables, found.solution, found.filter, grid, variance)
     return FittedTables(_stored(found.tables, of_nodes, between), found)
 
 
@@ -159,26 +156,29 @@ def _log_iteration(one: Iteration) -> None:
 
 
 def _on_the_grid(
-    model: DistortionModel, grid: tuple[int, int], errors_at: ErrorsAt
+    tables: Sequence[LookupTable],
+    fit: LinearFit,
+    filter: str,
+    grid: tuple[int, int],
+    variance: Callable[..., Float],
 ) -> dict[int, Float]:
-    """Errors (ny, nx, 2) of positions on the grid of the assessment, by chip."""
+    """Errors (ny, nx, 2) of positions on the grid of the assessment, by chip.
+
+    `variance`: of the tables' shift (n, 2) at pixels x and y of a `chip`.
+    """
     out = {}
-    for chip in model.chips:
+    for chip in fit.model.chips:
         x, y = mesh(*grid_pixels(chip.size, grid))
-        out[chip.number] = errors_at(x, y, chip.number).reshape(grid[1], grid[0], 2)
+        px, py = corrected(tables, x, y, chip=chip.number, filter=filter)
+        J = fit.model.slopes(fit.mean, px, py, chip=chip.number)
+        sigma = np.sqrt(np.einsum("nab,nb->na", J**2, variance(x, y, chip=chip.number)))
+        out[chip.number] = sigma.reshape(grid[1], grid[0], 2)
     return out
 
 
-def _errors_of(tables: tuple[LookupTable, ...], fit: LinearFit) -> ErrorsAt:
-    """Errors of positions (n, 2) by those of tables that have no covariance, or are held."""
-
-    def errors_at(x: Float, y: Float, chip: int) -> Float:
-        px, py = corrected(tables, x, y, chip=chip)
-        J = fit.model.slopes(fit.mean, px, py, chip=chip)
-        sigma = held_sigma(tables, x, y, chip=chip)
-        return np.asarray(np.sqrt(np.einsum("nab,nb->na", J**2, sigma**2)))
-
-    return errors_at
+def _held_variance(tables: Sequence[LookupTable], x: Float, y: Float, *, chip: int) -> Float:
+    """Variance (n, 2) of the shift by tables that have no covariance, or are held."""
+    return held_sigma(tables, x, y, chip=chip) ** 2
 
 
 def _warnings(config: Config, found: FittedTables) -> Iterator[str]:

@@ -53,19 +53,49 @@ def inspect(file: str) -> None:
     help="Output pixel of the zero point.",
 )
 @click.option("--vafactor", type=float, default=1.0, metavar="V", help="VAFACTOR of the exposure.")
+@click.option("--sky", is_flag=True, help="To the sky: ra, dec with all errors that FILE carries.")
+@click.option(
+    "--point", nargs=2, type=float, metavar="RA DEC", help="With --sky: position of u, v = 0."
+)
+@click.option(
+    "--centroids", nargs=2, metavar="SX SY", help="With --sky: columns of the errors of x, y."
+)
+@click.option("--joint", is_flag=True, help="With --sky: the covariance of all stars, in FITS.")
+@click.option(
+    "--pixel-origin",
+    type=click.Choice(["0", "1"]),
+    default="1",
+    help="With --sky: coordinate of the first pixel's centre.",
+)
 @click.option("--image", metavar="FLT", help="A calibrated image whose pixels these are.")
 @click.option("--ltv", nargs=2, type=float, metavar="LTV1 LTV2", help="LTV keywords of a subarray.")
 @click.option("--corner", nargs=2, type=float, metavar="X Y", help="First pixel of a subarray.")
 @force
 def apply(file: str, table: str, output: str, **options: Any) -> None:
-    """Transform pixels to the undistorted frame, or back.
+    """Transform pixels to the undistorted frame, or back, or to the sky.
 
     FILE is an IDCTAB, a run, or any file that 'compare' takes; TABLE has columns x, y, chip, or
     x_out, y_out for the inverse.
     """
-    from bayesdist.app.commands.on_files.apply import apply_to_table
+    own = {key: options.pop(key) for key in ("point", "centroids", "joint")}
+    origin = float(options.pop("pixel_origin"))
+    if not options.pop("sky"):
+        from bayesdist.app.commands.on_files.apply import apply_to_table
 
-    click.echo(apply_to_table(file, table, output, **options))
+        given = next((key for key, value in own.items() if value), None)
+        if given is not None or origin != 1.0:
+            raise click.UsageError(f"--{given or 'pixel-origin'} goes with --sky.")
+        click.echo(apply_to_table(file, table, output, **options))
+        return
+    from bayesdist.app.commands.on_files.sky import sky_to_table
+
+    shared = ("columns", "chip", "filter", "epoch", "size", "force")
+    kept = {key: options.pop(key) for key in shared}
+    plain = {"method": "newton", "vafactor": 1.0}
+    other = next((k for k, v in options.items() if v and v != plain.get(k)), None)
+    if other is not None:
+        raise click.UsageError(f"--{other} does not go with --sky.")
+    click.echo(sky_to_table(file, table, output, pixel_origin=origin, **own, **kept))
 
 
 @command()

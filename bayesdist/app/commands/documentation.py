@@ -10,6 +10,7 @@ import click
 import bayesdist.version
 from bayesdist.app.commands.options import command
 from bayesdist.errors import InputError
+from bayesdist.reading.regular import read_text
 
 __all__ = ["docs"]
 
@@ -34,7 +35,7 @@ def docs(page: str | None) -> None:
             f"the documentation has no page {page!r}",
             do=f"give {near[0]!r}" if near else "list all pages with 'bayesdist docs'",
         )
-    click.echo_via_pager(pages[name].read_text(encoding="utf-8"))
+    click.echo_via_pager(read_text(pages[name]))
 
 
 def _pages() -> dict[str, Path]:
@@ -47,4 +48,4 @@ def _pages() -> dict[str, Path]:
 
 
 def _title(path: Path) -> str:
-    return path.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ")
+    return read_text(path).partition("\n")[0].lstrip("# ")

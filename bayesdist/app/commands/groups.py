@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import click
 
@@ -22,8 +23,8 @@ class LazyGroup(click.Group):
     lazy : mapping of str to str
     """
 
-    def __init__(self, name: str, *, help: str, lazy: Mapping[str, str], **options: object) -> None:
-        super().__init__(name, help=help, **options)  # type: ignore[arg-type]
+    def __init__(self, name: str, *, help: str, lazy: Mapping[str, str], **options: Any) -> None:
+        super().__init__(name, help=help, **options)
         self._lazy = lazy
 
     def list_commands(self, ctx: click.Context) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, PositiveFloat, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from bayesdist.app.config.section import Section, Unit
+from bayesdist.app.config.section import Epoch, Section, Unit
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.assess.terms.forms import GIVEN
 from bayesdist.assess.terms.given import TERM_KINDS
@@ -25,6 +25,7 @@ __all__ = [
 ]
 
 Probability = Annotated[float, Field(gt=0, lt=1)]
+GridPoints = Annotated[int, Field(ge=2, le=10_000)]  # more than a detector has pixels says nothing
 
 # by which a row of the budget says that it is the error of the reference catalogue
 CATALOGUE_WORDS = ("catalog", "reference")
@@ -52,11 +53,11 @@ def require_own_names(block: str, names: Sequence[str]) -> None:
 class Assess(Section):
     """Where and when errors are assessed."""
 
-    epoch: float | None = None
-    grid: tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]] = (33, 17)
-    draws: Annotated[int, Field(ge=100)] = 4000
+    epoch: Epoch | None = None
+    grid: tuple[GridPoints, GridPoints] = (33, 17)
+    draws: Annotated[int, Field(ge=100, le=1_000_000)] = 4000
     exposure: Literal["mean", "single"] = "mean"
-    years_ahead: Annotated[float, Field(ge=0)] = 10.0
+    years_ahead: Annotated[float, Field(ge=0, le=100)] = 10.0
 
 
 class BudgetBlock(Section):
@@ -131,10 +132,10 @@ class RequirementBlock(Section):
     limit: PositiveFloat
     unit: Unit = "pix"
     probability: Probability = 0.95
-    epoch: float | None = None
+    epoch: Epoch | None = None
     chip: int | None = None
     region: str | list[tuple[float, float]] = "whole"
-    epochs: tuple[float, float] | None = None
+    epochs: tuple[Epoch, Epoch] | None = None
     relative: bool = False
     separation: PositiveFloat | None = None
     magnitude: float | None = None

@@ -18,7 +18,7 @@ from bayesdist.app.config.model import CampaignModel, PriorBlock, TablesBlock
 from bayesdist.app.config.other_runs import FREE, rates_file, tables_file
 from bayesdist.app.config.products import CampaignProducts
 from bayesdist.app.config.run import RunConfig
-from bayesdist.app.config.section import Section, Unit
+from bayesdist.app.config.section import Epoch, Section, Unit
 
 __all__ = ["CampaignBlock", "CampaignConfig", "StarListsBlock"]
 
@@ -47,7 +47,7 @@ class CampaignBlock(StarListsBlock):
     initial_distortion: str
     catalog_columns: dict[str, str] | None = None
     unit: Unit | None = None
-    catalogue_epoch: float | None = None
+    catalogue_epoch: Epoch | None = None
     parity: Literal["auto", "direct", "mirrored"] = "auto"
     filter: str | None = None
     radius: PositiveFloat | None = None
@@ -62,6 +62,7 @@ class CampaignConfig(RunConfig):
     selfcal: ClassVar[None] = None
     periods: ClassVar[None] = None
     prior: ClassVar[tuple[PriorBlock, ...]] = ()
+    prior_calibration: ClassVar[None] = None
 
     campaign: CampaignBlock
     tables: TablesBlock = TablesBlock()

@@ -21,12 +21,18 @@ from pydantic import (
 )
 
 from bayesdist.app.config.fit import ComputeBlock, Fit, HoldoutBlock, Outliers, Sampler
-from bayesdist.app.config.model import MatchedModel, PriorBlock, TablesBlock
+from bayesdist.app.config.model import (
+    MatchedModel,
+    PriorBlock,
+    PriorCalibrationBlock,
+    TablesBlock,
+)
+from bayesdist.app.config.other_runs import calibration_file
 from bayesdist.app.config.products import MatchedProducts
 from bayesdist.app.config.run import RunConfig
-from bayesdist.app.config.section import Section, Unit
+from bayesdist.app.config.section import Epoch, RightAscensionDeclination, Section, Unit
 from bayesdist.data import FORMATS
-from bayesdist.data.reading.formats import mission_formats
+from bayesdist.data.formats.files import mission_formats
 from bayesdist.data.tables.units import length_advice
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.period_dates import check_periods, mjd_periods
@@ -44,9 +50,9 @@ class Data(Section):
     unit: Unit | None = None
     sigma: Literal["columns", "by_magnitude"] | PositiveFloat = "columns"
     pixel_origin: Literal[0, 1] | None = None
-    tangent_point: tuple[float, float] | None = None
-    epoch: float | str | None = None
-    catalogue_epoch: float | None = None
+    tangent_point: RightAscensionDeclination | None = None
+    epoch: Epoch | str | None = None
+    catalogue_epoch: Epoch | None = None
     not_finite: Literal["refuse", "reject"] = "refuse"
     simulated: bool = False
 
@@ -154,11 +160,17 @@ class MatchesConfig(RunConfig):
     periods: Periods | None = None
     holdout: HoldoutBlock | None = None
     prior: list[PriorBlock] = Field(default_factory=list)
+    prior_calibration: PriorCalibrationBlock | None = None
     products: MatchedProducts = MatchedProducts()
 
     def named_files(self, base: Path) -> Path | list[Path]:
         """The files of matches; one path where one name is given."""
         return self.data.paths(base)
+
+    def files_of_priors(self, base: Path) -> list[Path]:
+        """The file of the earlier calibration, where one is the prior."""
+        block = self.prior_calibration
+        return [] if block is None else [calibration_file(base / block.source)]
 
     def of_order(self, order: int) -> Self:
         """This configuration with polynomials of another order, without priors and extra weights.
@@ -166,7 +178,19 @@ class MatchesConfig(RunConfig):
         Names of priors may be those of parameters that another order does not have.
         """
         fit = self.fit.model_copy(update={"radial_weight": 1.0})
-        return super().of_order(order).model_copy(update={"prior": [], "fit": fit})
+        return (
+            super()
+            .of_order(order)
+            .model_copy(update={"prior": [], "prior_calibration": None, "fit": fit})
+        )
+
+    @model_validator(mode="after")
+    def _one_prior_each(self) -> MatchesConfig:
+        names = [one.parameter for one in self.prior]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"two [[prior]] blocks are of {twice!r}; give each parameter one")
+        return self
 
     @model_validator(mode="after")
     def _one_array(self) -> MatchesConfig:
@@ -197,6 +221,15 @@ class MatchesConfig(RunConfig):
     def _matched_in_a_circle(self) -> MatchesConfig:
         if self.data.has_nominal:
             self.refuse_circle()
+        return self
+
+    @model_validator(mode="after")
+    def _priors_with_plain_weights(self) -> MatchesConfig:
+        if self.prior_calibration is not None and self.fit.radial_weight != 1.0:
+            raise ValueError(
+                "fit.radial_weight counts stars for more than they are, and the calibration of "
+                "[prior_calibration] for what it is; leave one of the two out"
+            )
         return self
 
     @model_validator(mode="after")

@@ -50,6 +50,8 @@ INSTEAD = {
     ("selfcal", "outliers.match_radius"): "set selfcal.match_radius",
     ("selfcal", "products.wise_meta"): "ask for sip or idctab",
     ("campaign", "model.frames"): "leave it out: a campaign has frames of its own",
+    ("selfcal", "prior_calibration"): "set selfcal.initial_distortion, which is where it begins",
+    ("campaign", "prior_calibration"): "leave it out: the scatter of the exposures is their prior",
     ("campaign", "prior"): "leave it out: the scatter of the exposures is their prior",
 }
 

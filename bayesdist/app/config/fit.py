@@ -44,8 +44,8 @@ class HoldoutBlock(Section):
 
 
 class _Fit(Section):
-    clip_chi2: PositiveFloat = 25.0
-    clip_abs: PositiveFloat = 2.0
+    clip_chi2: Annotated[float, Field(gt=0, le=1e9)] = 25.0
+    clip_abs: Annotated[float, Field(gt=0, le=1e9)] = 2.0
     skew: bool = False
 
 
@@ -126,11 +126,11 @@ class Outliers(_Mixture):
 
 class _Sampler(Section):
     seed: Annotated[int, Field(ge=0)] = 1
-    ensembles: Annotated[int, Field(ge=2)] = 4
+    ensembles: Annotated[int, Field(ge=2, le=1000)] = 4
     target_ess: PositiveFloat = 400.0
     target_rhat: Annotated[float, Field(gt=1)] = 1.01
-    max_steps: PositiveInt = 20_000
-    checkpoint_every: PositiveInt = 200
+    max_steps: Annotated[int, Field(ge=1, le=100_000_000)] = 20_000
+    checkpoint_every: Annotated[int, Field(ge=1, le=100_000_000)] = 200
 
 
 class Sampler(_Sampler):
@@ -138,7 +138,7 @@ class Sampler(_Sampler):
 
     method: Literal["exact", "certified"] = "exact"
     second_stage: Literal["auto", "always", "never"] = "auto"
-    walkers: PositiveInt | None = None
+    walkers: Annotated[int, Field(ge=1, le=100_000)] | None = None
 
 
 class SelfcalSampler(_Sampler):

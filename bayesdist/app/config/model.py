@@ -7,23 +7,25 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, PositiveFloat
 
 from bayesdist.app.config.detector import Pair
-from bayesdist.app.config.section import Section
+from bayesdist.app.config.section import Epoch, Section
 from bayesdist.model import FRAME_KINDS, TimeDependence
+from bayesdist.model.basis import MAX_ORDER
 
 __all__ = [
     "CampaignModel",
     "MatchedModel",
     "Polynomials",
     "PriorBlock",
+    "PriorCalibrationBlock",
     "SelfcalModel",
     "TablesBlock",
 ]
 
 
 class _Drift(Section):
-    epoch0: float | list[float]
+    epoch0: Epoch | list[Epoch]
     terms: list[tuple[Literal["u", "v"], Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]]
-    breaks: list[float] = Field(default_factory=list)
+    breaks: list[Epoch] = Field(default_factory=list)
 
     def time(self) -> TimeDependence | None:
         """Time dependence of the model; None without terms."""
@@ -48,14 +50,14 @@ class CampaignTdd(_Drift):
 class Polynomials(Section):
     """Order of the polynomials, and where they are centred."""
 
-    order: Annotated[int, Field(ge=1, le=9)]
+    order: Annotated[int, Field(ge=1, le=MAX_ORDER)]
     reference_pixel: Pair | None = None
 
 
 class MatchedModel(Polynomials):
     """Structure of the distortion model, with the frames of the exposures."""
 
-    frames: Literal[FRAME_KINDS] = "none"  # type: ignore[valid-type]
+    frames: Literal[FRAME_KINDS] = "none"  # type: ignore[valid-type]  # names of the model
     tdd: Tdd | None = None
 
 
@@ -81,6 +83,18 @@ class PriorBlock(Section):
     parameter: str
     mean: float
     sigma: PositiveFloat
+
+
+class PriorCalibrationBlock(Section):
+    """An earlier calibration of the detector, which is the prior of this one."""
+
+    source: str
+    frame: Literal["none", "shift", "shift_rotation", "shift_rotation_scale", "affine"] | None = (
+        None
+    )
+    filter: str | None = None
+    epoch: float | None = None
+    change_pix: Annotated[float, Field(ge=0)] = 0.0
 
 
 class TablesBlock(Section):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from bayesdist.errors import InputError
 
-__all__ = ["FREE", "POSTERIOR", "TABLES", "rates_file", "tables_file"]
+__all__ = ["FREE", "POSTERIOR", "TABLES", "calibration_file", "rates_file", "tables_file"]
 
 FREE = "free"  # rates that no other run says anything of
 TABLES, POSTERIOR = "tables.h5", "posterior.nc"
@@ -32,6 +32,17 @@ def rates_file(folder: Path) -> Path:
         For a folder that is no finished run.
     """
     return _file_of_run(folder, POSTERIOR, "model.tdd.rates")
+
+
+def calibration_file(path: Path) -> Path:
+    """File of an earlier calibration: one of any format as it is named, or a run's posterior.
+
+    Raises
+    ------
+    InputError
+        For a folder that is no finished run.
+    """
+    return path if path.is_file() else _file_of_run(path, POSTERIOR, "prior_calibration.source")
 
 
 def _file_of_run(folder: Path, name: str, key: str) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import Field, PositiveFloat, create_model, model_validator
+from pydantic import AfterValidator, Field, PositiveFloat, create_model, model_validator
 
 from bayesdist.app.config.section import Section
 from bayesdist.data.tables.column import year_of
@@ -18,10 +18,22 @@ __all__ = ["CampaignProducts", "MatchedProducts", "Products", "ReleaseBlock", "S
 _USEAFTER = ("%b %d %Y %H:%M:%S", "%b %d %Y")  # as reference files of HST have it
 
 
+def _as_part(name: str) -> str:
+    """A part of the name of a file, which leads into no other folder."""
+    if not name or not name.isprintable() or {*name} & {*"/\\"}:
+        raise ValueError(
+            f"{name!r} cannot be part of the name of a file; give letters without slashes"
+        )
+    return name
+
+
+FileNamePart = Annotated[str, AfterValidator(_as_part)]
+
+
 class PeriodBlock(Section):
     """The years that one IDCTAB serves, and the segment of the drift that it holds."""
 
-    name: str
+    name: FileNamePart
     years: tuple[float, float]
     segment: Annotated[int, Field(ge=0)] = 0
     useafter: str | None = None
@@ -31,7 +43,7 @@ class PeriodBlock(Section):
 class ReleaseBlock(Section):
     """IDCTABs, D2IMFILE and NPOLFILE, along V2 and V3 as an existing IDCTAB lies."""
 
-    name: str
+    name: FileNamePart
     reference: str
     period: Annotated[list[PeriodBlock], Field(min_length=1)]
     instrument: str = "ACS"

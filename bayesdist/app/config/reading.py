@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import tomllib
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,6 +16,8 @@ from bayesdist.app.config.kinds import CONFIG, KINDS, Config
 from bayesdist.app.config.section import Section
 from bayesdist.assess import Requirement
 from bayesdist.errors import ConfigError, InputError
+from bayesdist.reading.documents import toml_of
+from bayesdist.reading.regular import MOST_TEXT, read_text
 
 __all__ = [
     "config_of_record",
@@ -25,6 +27,10 @@ __all__ = [
     "parse_config",
     "validated",
 ]
+
+
+# numbers of configurations: in all units beyond whatever is meant, and far from overflow
+LEAST, MOST, MOST_WHOLE = 1e-20, 1e15, 2**63 - 1
 
 
 class _RequirementFile(Section):
@@ -92,13 +98,9 @@ def load_requirements(path: str | Path) -> tuple[Requirement, ...]:
 def load_text(path: str | Path) -> str:
     """Text of a file as it stands, with its line ends."""
     try:
-        with Path(path).open(encoding="utf-8", newline="") as stream:
-            return stream.read()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise ConfigError(
-            f"cannot be read ({reason})", where=str(path), do="check the path and the file"
-        ) from error
+        return read_text(path, most=MOST_TEXT)
+    except InputError as error:
+        raise ConfigError(error.cause, where=error.where, do=error.do) from error
 
 
 def validated(kind: type[Section], text: str, where: str, *, begin: str) -> Any:
@@ -119,14 +121,33 @@ def validated(kind: type[Section], text: str, where: str, *, begin: str) -> Any:
 def _settings(text: str, where: str, *, begin: str) -> dict[str, Any]:
     """Settings of a TOML text, of which there have to be some."""
     try:
-        raw = tomllib.loads(text.removeprefix("\ufeff"))
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(
-            f"is not valid TOML ({error})", where=where, do="correct it there"
-        ) from error
+        raw = toml_of(text.removeprefix("\ufeff"), where)
+    except InputError as error:
+        raise ConfigError(error.cause, where=error.where, do=error.do) from error
     if not raw:
         raise ConfigError("holds no settings", where=where, do=begin)
+    for key, value in _numbers(raw, ""):
+        large = MOST_WHOLE if isinstance(value, int) else MOST
+        if abs(value) > large or 0 < abs(value) < LEAST:
+            said = str(value) if len(str(value)) < 30 else f"{str(value)[:20]}..."
+            raise ConfigError(
+                f"{said} is no plausible number",
+                where=f"{where}: {key}",
+                do=f"give one between {LEAST:g} and {large:g}",
+            )
     return raw
+
+
+def _numbers(tree: Any, key: str) -> Iterator[tuple[str, int | float]]:
+    """Numbers of a tree that are finite, with their keys."""
+    if isinstance(tree, dict):
+        for name, inner in tree.items():
+            yield from _numbers(inner, f"{key}.{name}" if key else name)
+    elif isinstance(tree, list):
+        for k, inner in enumerate(tree, 1):
+            yield from _numbers(inner, f"{key}[{k}]")
+    elif isinstance(tree, int) or (isinstance(tree, float) and math.isfinite(tree)):
+        yield key, tree
 
 
 def _validated(

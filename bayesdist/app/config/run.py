@@ -25,6 +25,7 @@ from bayesdist.app.config.fit import (
     SelfcalSampler,
 )
 from bayesdist.app.config.model import CampaignModel, MatchedModel, SelfcalModel
+from bayesdist.app.config.other_runs import FREE
 from bayesdist.app.config.products import Products
 from bayesdist.app.config.section import Section
 from bayesdist.assess import Requirement, UserTerm
@@ -104,6 +105,10 @@ class RunConfig(Section):
         others = named if isinstance(named, list) else [named]
         return [path for path in found if path not in others]
 
+    def files_of_priors(self, base: Path) -> list[Path]:  # noqa: ARG002 - of one kind of run
+        """Files of earlier calibrations that are priors of this one."""
+        return []
+
     def of_order(self, order: int) -> Self:
         """This configuration with polynomials of another order."""
         return self.model_copy(update={"model": self.model.model_copy(update={"order": order})})
@@ -115,6 +120,11 @@ class RunConfig(Section):
     def time(self) -> TimeDependence | None:
         """Time dependence of the model."""
         return None if self.model.tdd is None else self.model.tdd.time()
+
+    @property
+    def has_free_rates(self) -> bool:
+        """Boolean: the drift is that of this run's own exposures."""
+        return self.model.tdd is None or self.model.tdd.rates == FREE
 
     def mixture(self) -> OutlierMixture:
         """The outlier mixture."""

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["Section", "Unit"]
+__all__ = ["Epoch", "RightAscensionDeclination", "Section", "Unit"]
 
 Unit = Literal["pix", "arcsec", "mas", "deg"]
+Epoch = Annotated[float, Field(ge=1800, le=2200)]  # decimal years; others are days, or slips
+RightAscensionDeclination = tuple[  # degrees
+    Annotated[float, Field(ge=-180, le=360)], Annotated[float, Field(ge=-90, le=90)]
+]
 
 
 class Section(BaseModel):

@@ -14,7 +14,7 @@ from bayesdist.app.config.model import PriorBlock, SelfcalModel, TablesBlock
 from bayesdist.app.config.other_runs import POSTERIOR
 from bayesdist.app.config.products import SelfcalProducts
 from bayesdist.app.config.run import RunConfig
-from bayesdist.app.config.section import Section, Unit
+from bayesdist.app.config.section import Epoch, Section, Unit
 from bayesdist.infer import OutlierMixture
 
 __all__ = [
@@ -83,7 +83,7 @@ class ReferenceBlock(Section):
     catalog: str
     columns: dict[str, str] | None = None
     unit: Unit | None = None
-    epoch: float | None = None
+    epoch: Epoch | None = None
     tangent_point: tuple[float, float] | None = None
     radius: PositiveFloat = 2.0
 
@@ -119,6 +119,7 @@ class SelfcalConfig(RunConfig):
     compute: ClassVar[ComputeBlock] = ComputeBlock()
     periods: ClassVar[None] = None
     holdout: ClassVar[None] = None
+    prior_calibration: ClassVar[None] = None
 
     selfcal: SelfcalBlock
     gauge: GaugeBlock = GaugeBlock()

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.errors import read_magnitude_errors
-from bayesdist.app.kinds.fitted import required
-from bayesdist.app.results import Results
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.fitted import Fitted, required
+from bayesdist.app.store.inputs import input_name
 from bayesdist.app.store.rundir import PAIRS, RunDirectory, part_files
 from bayesdist.data import Matches, read_matches
 from bayesdist.errors import InputError
@@ -50,13 +51,19 @@ class NewExposures:
     left_out: tuple[str, ...]
 
 
-def read_new_exposures(release: Results, new: Path) -> NewExposures:
+def read_new_exposures(
+    release: RunDirectory, released: Posterior, fitted: Fitted, new: Path
+) -> NewExposures:
     """Matched pairs of new exposures: those of another run, or a table.
 
     Parameters
     ----------
-    release : Results
+    release : RunDirectory
         Of a campaign.
+    released : Posterior
+        Its solution, with all errors.
+    fitted : Fitted
+        Its fit.
     new : Path
         Run directory of a campaign whose stage 'match' has been run, or pairs in a file or folder
         as a run keeps them.
@@ -67,7 +74,6 @@ def read_new_exposures(release: Results, new: Path) -> NewExposures:
         For star lists, which have to be matched first; pairs in another unit or filter, without
         epochs, or without a way to errors; when all exposures are those of the release.
     """
-    released = release.solution
     run = RunDirectory(new) if (new / "run.json").exists() else None
     pairs = _pairs(run, new, released.model.unit)
     where = ", ".join(pairs.sources)
@@ -85,7 +91,7 @@ def read_new_exposures(release: Results, new: Path) -> NewExposures:
         )
     pairs = pairs.select(fresh)
     pairs = pairs.with_exposure_names(pairs.exposures)
-    placed, errors = release.fitted.placed(pairs), release.fitted.errors.by_magnitude
+    placed, errors = fitted.placed(pairs), fitted.errors.by_magnitude
     if run is not None:
         errors = read_magnitude_errors(run.path) or errors
     if placed.mag is not None and errors is not None:
@@ -94,19 +100,20 @@ def read_new_exposures(release: Results, new: Path) -> NewExposures:
         released,
         placed,
         _catalogue_errors(pairs),
-        run is not None and _catalogue_of(run) == _catalogue_of(release.run),
+        run is not None and _catalogue_of(run) == _catalogue_of(release),
         left_out,
     )
 
 
-def fit_exposures_of(release: Results, new: NewExposures) -> NewFit:
+def fit_exposures_of(data: FitData, config: Config, new: NewExposures) -> NewFit:
     """The new exposures fitted by themselves, deviating as those of the release scatter.
 
     What a star's error in the catalogue does to all its exposures is added, and where the release
     has the same catalogue, what it did to the release is taken into account.
+
+    `data`, `config`: of the release.
     """
-    config = release.config
-    scatter = required(release.fitted.scatter, "joint fit of exposures")
+    scatter = required(data.fitted.scatter, "joint fit of exposures")
     found = fit_new(
         new.released,
         new.matches,
@@ -118,7 +125,7 @@ def fit_exposures_of(release: Results, new: NewExposures) -> NewFit:
         return found
     released = None
     if new.same_catalogue:
-        released = (release.fit, release.data.stars)
+        released = (data.fit, data.stars)
     return with_star_errors_of(new.errors, found, new.matches, released)
 
 
@@ -171,5 +178,5 @@ def _catalogue_of(run: RunDirectory) -> str | None:
     block, base = run.config.campaign, Path(run.facts["base"])
     if block is None:
         return None
-    found: str | None = run.facts["inputs"].get(str(base / block.catalog))
+    found: str | None = run.facts["inputs"].get(input_name(base / block.catalog, base))
     return found

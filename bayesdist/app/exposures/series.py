@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.campaign.reference import free_rates
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fitted import Fitted, required
 from bayesdist.app.store.rundir import RunDirectory
@@ -43,7 +42,7 @@ def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> No
     try:
         posterior = fit_series(series, trend, seed=seed, max_sweeps=MAX_SWEEPS)
     except DegenerateError as error:
-        if free_rates(config):
+        if config.has_free_rates:
             raise
         log.info("diagnose: no drift from these exposures alone: %s", error.cause)
         return

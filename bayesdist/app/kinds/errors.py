@@ -12,6 +12,8 @@ from bayesdist.app.tables.output import write_table
 from bayesdist.data.added_errors import AddedErrors
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import Matches
+from bayesdist.reading.faults import restoring
+from bayesdist.reading.tables import read_ecsv
 
 __all__ = ["QUOTED", "ErrorLaw", "read_magnitude_errors"]
 
@@ -66,5 +68,6 @@ def read_magnitude_errors(folder: Path) -> MagnitudeErrors | None:
     path = folder / MAGNITUDE_ERRORS
     if not path.exists():
         return None
-    table = Table.read(path)
-    return MagnitudeErrors(**{name: np.asarray(table[name]) for name in COLUMNS})
+    with restoring(path, "a table of errors by magnitude", do="run the stage 'fit' again"):
+        table = read_ecsv(path)
+        return MagnitudeErrors(**{name: np.asarray(table[name], float) for name in COLUMNS})

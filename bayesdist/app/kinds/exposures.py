@@ -12,6 +12,7 @@ from bayesdist.infer import GaussianPriors, Posterior
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.series import Series
+from bayesdist.reading.faults import restoring
 
 __all__ = ["ExposureScatter", "read_hierarchy", "read_series", "write_hierarchy", "write_series"]
 
@@ -66,10 +67,12 @@ def read_hierarchy(folder: Path) -> tuple[ExposureScatter, GaussianPriors]:
     InputError
         For a missing or damaged file.
     """
-    arrays = read_arrays(folder / HIERARCHY, "", do=FIT_AGAIN)
-    kinds = tuple(str(t, "utf-8") for t in arrays["kinds"])
-    scatter = ExposureScatter(kinds, arrays["tau_draws"], Settling.from_arrays(arrays))
-    return scatter, GaussianPriors(arrays["prior_centre"], arrays["prior_precision"])
+    path = folder / HIERARCHY
+    arrays = read_arrays(path, "", do=FIT_AGAIN)
+    with restoring(path, "the variation of exposures", do=FIT_AGAIN):
+        kinds = tuple(str(t, "utf-8") for t in arrays["kinds"])
+        scatter = ExposureScatter(kinds, arrays["tau_draws"], Settling.from_arrays(arrays))
+        return scatter, GaussianPriors(arrays["prior_centre"], arrays["prior_precision"])
 
 
 def write_series(folder: Path, series: Series) -> None:
@@ -88,7 +91,9 @@ def read_series(folder: Path) -> Series:
     InputError
         For a missing or damaged file.
     """
-    arrays = read_arrays(folder / TERMS, "", do=FIT_AGAIN)
-    names, labels = (tuple(str(t, "utf-8") for t in arrays[key]) for key in ("names", "labels"))
-    values = arrays["epoch"], arrays["values"], arrays["cov"]
-    return Series(*values, labels, names, source="exposures")
+    path = folder / TERMS
+    arrays = read_arrays(path, "", do=FIT_AGAIN)
+    with restoring(path, "a series of exposures", do=FIT_AGAIN):
+        names, labels = (tuple(str(t, "utf-8") for t in arrays[key]) for key in ("names", "labels"))
+        values = arrays["epoch"], arrays["values"], arrays["cov"]
+        return Series(*values, labels, names, source="exposures")

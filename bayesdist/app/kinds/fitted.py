@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,20 +19,22 @@ from bayesdist.app.kinds.exposures import (
     write_hierarchy,
     write_series,
 )
+from bayesdist.app.kinds.solved import SelfCalibrated
 from bayesdist.app.kinds.table_file import StoredLookupTables, read_tables, write_tables
 from bayesdist.app.matches.added_errors import grouped_errors_of
-from bayesdist.app.selfcal.solved import SelfCalibrated
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, LinearFit, load_fit, save_fit
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
+from bayesdist.infer.equations.priors import JointPrior
 from bayesdist.infer.nodes import corrected_matches, inside_chips, on_the_chips
+from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.series import Series
 from bayesdist.model import DistortionModel
 
 __all__ = ["Fitted", "load_fitted", "required"]
 
-FIT, TABLES = "fit.nc", "tables.h5"
+FIT, TABLES, PRIOR = "fit.nc", "tables.h5", "prior.h5"
 
 SECTIONS = (  # of summary.json, which only the making of the fit knows
     *("gauge", "lines", "tables", "scatter"),
@@ -76,6 +78,11 @@ class Fitted:
     solved: SelfCalibrated | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def gauge_words(self) -> str:
+        """In which gauge the products stand, as a sentence; empty where that is no question."""
+        return "" if self.solved is None else self.solved.gauge_words
+
     def placed(self, stars: Matches) -> Matches:
         """Stars at the pixels that the tables move them to, on their chips, with quoted errors.
 
@@ -100,6 +107,10 @@ class Fitted:
         save_fit(self.linear, folder / FIT)
         if self.scatter is not None:
             write_hierarchy(folder, self.scatter, self.priors)
+        if self.priors.joint is not None:
+            joint = self.priors.joint
+            arrays = {"centre": joint.centre, "precision": joint.precision}
+            write_arrays(folder / PRIOR, "", arrays | {"rank": np.array([joint.rank])})
         if self.alone is not None:
             write_series(folder, self.alone)
         if self.solved is not None:
@@ -137,6 +148,10 @@ def load_fitted(
     linear, known = load_fit(folder / FIT), summary.get("fit", {})
     grouped = grouped_errors_of(known.get("added_errors"))
     scatter, own_priors = read_hierarchy(folder) if joint else (None, priors(linear.model))
+    if (folder / PRIOR).exists():
+        arrays = read_arrays(folder / PRIOR, "", do=FIT_AGAIN)
+        earlier = JointPrior(arrays["centre"], arrays["precision"], int(arrays["rank"][0]))
+        own_priors = replace(own_priors, joint=earlier)
     return Fitted(
         linear,
         ErrorLaw(

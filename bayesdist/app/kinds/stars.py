@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from bayesdist.app.config import Config, MatchesConfig
+from bayesdist.app.kinds.earlier import earlier_calibration
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
@@ -16,9 +19,11 @@ from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.kinds.split import set_aside
 from bayesdist.app.matches.added_errors import compared_errors, knows_circle
+from bayesdist.app.matches.plausibility import doubts_on_stars
 from bayesdist.app.matches.reading import check_chips
 from bayesdist.app.matches.sources import read_configured
 from bayesdist.assess import SAMPLE
+from bayesdist.calibration.prior import CalibrationPrior
 from bayesdist.data import Matches
 from bayesdist.diagnose.residuals.quoted import error_scale
 from bayesdist.errors import ConfigError, DegenerateError, NotSettledError
@@ -45,6 +50,8 @@ __all__ = [
     "sample_stars",
     "shards_of",
 ]
+
+log = logging.getLogger("bayesdist")
 
 SAMPLING = 1  # of the random streams that follow from the one seed: that of the stage 'sample'
 
@@ -101,13 +108,21 @@ def model_of(stars: Matches, config: Config) -> DistortionModel:
     )
 
 
-def fit_stars(matched: Matched, config: Config, *, reader: StarReader | None = None) -> Fitted:
+def fit_stars(
+    matched: Matched,
+    config: Config,
+    base: Path = Path(),
+    *,
+    reader: StarReader | None = None,
+) -> Fitted:
     """The linear fit of matched stars, with the errors that its residuals ask for.
 
     Parameters
     ----------
     matched : Matched
     config : Config
+    base : Path
+        That the file of an earlier calibration is relative to.
     reader : StarReader, optional
         Has the stars in the end, for the passes that follow.
 
@@ -118,10 +133,12 @@ def fit_stars(matched: Matched, config: Config, *, reader: StarReader | None = N
     """
     if reader is None:
         with closing(StarReader(config.resources())) as reader:
-            return fit_stars(matched, config, reader=reader)
+            return fit_stars(matched, config, base, reader=reader)
     model = model_of(matched.stars, config)
+    doubts_on_stars(matched.stars, model, config)  # refuses what cannot be meant
+    earlier = earlier_calibration(model, config, base)
     try:
-        return _fitted(matched.stars, model, config, reader)
+        return _fitted(matched.stars, model, config, reader, earlier)
     except (DegenerateError, NotSettledError) as error:
         better = frames_that_help(matched.stars.sample(SAMPLE), model)
         if better is None:
@@ -129,22 +146,45 @@ def fit_stars(matched: Matched, config: Config, *, reader: StarReader | None = N
         raise type(error)(error.cause, where=error.where, do=better.sentence) from error
 
 
-def _fitted(stars: Matches, model: DistortionModel, config: Config, reader: StarReader) -> Fitted:
+def _fitted(
+    stars: Matches,
+    model: DistortionModel,
+    config: Config,
+    reader: StarReader,
+    earlier: CalibrationPrior | None,
+) -> Fitted:
     """The fit with errors by magnitude, or with the quoted ones as far as they will do."""
     priors = priors_of(model, config)
     rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs, config.fit.radial_weight)
-    if config.data is not None and config.data.sigma == "by_magnitude":
-        linear, _, by_magnitude = fit_by_magnitude(
-            stars, model, rejection=rejection, priors=priors, compute=reader.compute
+    by_magnitude = config.data is not None and config.data.sigma == "by_magnitude"
+
+    def begun(priors: GaussianPriors) -> tuple[LinearFit, ErrorLaw]:
+        """First fit, with errors by magnitude or those that are quoted."""
+        if by_magnitude:
+            linear, _, errors = fit_by_magnitude(
+                stars, model, rejection=rejection, priors=priors, compute=reader.compute
+            )
+            return linear, ErrorLaw(by_magnitude=errors)
+        shards = shards_of(stars, model, config, QUOTED, reader)
+        return fit_linear(shards, model, rejection=rejection, priors=priors), QUOTED
+
+    if earlier is not None:
+        loose = replace(priors, joint=earlier.loose().joint)
+        # the covariance turns with the frame, which a first fit finds
+        turned = earlier.about(begun(loose)[0].mean) if earlier.turns else loose
+        priors = replace(priors, joint=turned.joint)
+        log.info(
+            "fit: the prior is %s, in %d of %d directions",
+            *(earlier.name, priors.n_informative, model.n_params),
         )
-        return Fitted(linear, ErrorLaw(by_magnitude=by_magnitude), priors)
 
     def fitted(errors: ErrorLaw) -> LinearFit:
         shards = shards_of(stars, model, config, errors, reader)
         return fit_linear(shards, model, rejection=rejection, priors=priors)
 
-    errors = QUOTED
-    linear = fitted(errors)
+    linear, errors = begun(priors)
+    if by_magnitude:
+        return Fitted(linear, errors, priors)
     factor = error_scale(linear, reader.sample(stars, errors))
     if factor != 1.0:
         errors = ErrorLaw(factor)

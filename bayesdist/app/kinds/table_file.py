@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.model import LookupTable
+from bayesdist.reading.faults import restoring
 
 __all__ = ["StoredLookupTables", "read_tables", "write_tables"]
 
@@ -74,6 +75,12 @@ def read_tables(path: Path, *, do: str) -> StoredLookupTables:
     if not path.exists():
         return StoredLookupTables()
     arrays = read_arrays(path, "", do=do)
+    with restoring(path, "a file of look-up tables", do=do):
+        return _restored(arrays)
+
+
+def _restored(arrays: Mapping[str, NDArray[Any]]) -> StoredLookupTables:
+    """Tables from the arrays of their file."""
     of_all = [name.removesuffix("values") for name in arrays if name.endswith(".values")]
     tables = []
     # the detector's before those of filters, and chips by their numbers

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from bayesdist.app.config import ChipBlock, Data
 from bayesdist.app.matches.reading import load_matches, reading_options
@@ -45,7 +45,8 @@ class MatchSource:
     Parameters
     ----------
     read : callable
-        Of paths, the section [data] and columns and rows of the detector: the matches in memory.
+        Of paths, the section [data] as the mission has it, and columns and rows of the detector:
+        the matches in memory.
     input_of : callable
         Of the folder of a run: its `RunInput`.
     template : callable
@@ -53,7 +54,7 @@ class MatchSource:
         template of a configuration; None where the files are of another format.
     """
 
-    read: Callable[[Paths, Data, tuple[float, float]], Matches]
+    read: Callable[[Paths, Any, tuple[float, float]], Matches]
     input_of: Callable[[RunDirectory], RunInput]
     template: Callable[[str | Path], Template | None]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +12,14 @@ from bayesdist.app.assessment.error_terms import published_tables
 from bayesdist.app.config import Config
 from bayesdist.app.exposures.release_files import write_files
 from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.app.products.made_files import ProductInput, made_files
+from bayesdist.app.products.made_files import ProductInput, further_errors, made_files
 from bayesdist.app.products.sky_closure import sky_closure
 from bayesdist.assess.budget.budget import with_product
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.diagnose.residuals.sample import StarSample
-from bayesdist.files import atomic_path
+from bayesdist.files import atomic_path, path_within
 from bayesdist.limits import FILE_ERROR
-from bayesdist.products.registry import lint
+from bayesdist.products.registry import format_of, lint
 
 __all__ = ["export_files"]
 
@@ -47,9 +48,11 @@ def export_files(
         tables = published_tables(fitted.tables, held=held)
         number, solutions = config.chips()[0].number, {product.filter: product.solution}
         products += write_files(release, number, base, folder, solutions, tables)
-    for files in made_files(product, config).values():
+    product = replace(product, further=further_errors(budget))
+    for key, files in made_files(product, config).items():
+        left_out = _left_out(key, product)
         for built in files:
-            path = folder / built.file_name
+            path = path_within(folder, built.file_name, where="products")
             with atomic_path(path) as temporary:
                 temporary.write_bytes(built.content)
             entry: dict[str, Any] = {"path": built.file_name, "kind": built.kind}
@@ -63,10 +66,23 @@ def export_files(
                     entry["sky"] = sky.summary
                     log.log(sky.level, "export: %s: %s", path.name, sky.sentence)
                     findings += sky.findings
+            for warning in (*built.warnings, *left_out):
+                log.warning("export: WARNING: %s: %s", path.name, warning)
+                findings.append(f"warning: {warning}")
             products.append(entry | dict(built.summary) | {"findings": findings})
     for one in products:
         _compare(one, budget)
     return products
+
+
+def _left_out(key: str, product: ProductInput) -> tuple[str, ...]:
+    """Warning on the look-up tables of a run that a format has no room for."""
+    if not product.tables or format_of(key).holds_tables:
+        return ()
+    return (
+        "the look-up tables of the run are not in this file, as its row 'forward' in the error "
+        "budget says; jwst, roman, cpdis and stdgdc hold them",
+    )
 
 
 def _compare(product: dict[str, Any], budget: Sequence[dict[str, Any]]) -> None:

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from bayesdist.app.assessment.settings import assessment_epoch
+from bayesdist.app.campaign.aberration import ABERRATION
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.assess.budget.budget import TOTAL
 from bayesdist.assess.error_model import solution_with_errors
+from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE_IN_FIT
+from bayesdist.assess.terms.forms import PRODUCT
+from bayesdist.assess.terms.parameters import CATALOGUE, MOTIONS
+from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
 from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.calibration.further import FurtherError
 from bayesdist.calibration.plane import Plane
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
@@ -20,12 +29,19 @@ from bayesdist.products.registry import build
 
 __all__ = [
     "ProductInput",
+    "further_errors",
     "ingredients",
     "made_files",
     "product_input",
     "product_of",
     "solution_of",
 ]
+
+# rows of a budget that the covariance of the exported solution holds, or another row
+IN_COVARIANCE = (
+    *(COEFFICIENTS, TIME_DEPENDENCE, EXPOSURE_FRAME, STRUCTURE_IN_FIT, DEVIATIONS),
+    *(CATALOGUE, MOTIONS, ABERRATION),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +69,8 @@ class ProductInput:
     filter : str
     aligned : bool
         The user of a file fits shift and rotation of an exposure.
+    further : tuple of FurtherError
+        Errors of positions that the covariance does not hold; once the budget is known.
     """
 
     solution: Solution
@@ -66,6 +84,22 @@ class ProductInput:
     tables: tuple[LookupTable, ...] = ()
     filter: str = ""
     aligned: bool = False
+    further: tuple[FurtherError, ...] = ()
+
+
+def further_errors(budget: Sequence[Mapping[str, Any]]) -> tuple[FurtherError, ...]:
+    """Rows of a budget of errors that the covariance of the exported solution does not hold."""
+    return tuple(
+        FurtherError(
+            str(row["name"]),
+            str(row["kind"]),
+            float(row["u"]),
+            float(row["v"]),
+            str(row.get("source", "")),
+        )
+        for row in budget
+        if row["name"] not in IN_COVARIANCE and row["kind"] not in (PRODUCT, TOTAL)
+    )
 
 
 def product_input(solution: Solution, data: FitData, config: Config, source: str) -> ProductInput:
@@ -80,7 +114,7 @@ def product_input(solution: Solution, data: FitData, config: Config, source: str
         None if mas is None else mas / 1000,
         data.matched.tangent_point,
         model.exposures[0] if several else "",
-        "" if fitted.solved is None else fitted.solved.gauge_words,
+        fitted.gauge_words,
         fitted.tables.tables,
         data.matched.filter,
         fitted.scatter is not None,
@@ -118,6 +152,13 @@ def ingredients(product: ProductInput) -> tuple[Calibration, BuildOptions]:
         # for which exposure a file is right on the sky, where they differ
         note = f"On the sky it is exposure {product.exposure}: others have frames of their own."
         plane = Plane("sky", point=point, note=note if product.exposure else "")
-    found = calibration_of(product.solution, product.source, plane=plane, detector=product.detector)
-    found = replace(found, notes=(product.gauge,) if product.gauge else ())
+    found = calibration_of(
+        product.solution,
+        product.source,
+        plane=plane,
+        detector=product.detector,
+        filter=product.filter,
+    )
+    notes = (product.gauge,) if product.gauge else ()
+    found = replace(found, notes=notes, further=product.further)
     return found, BuildOptions(product.epoch, product.scale_arcsec, product.tables)

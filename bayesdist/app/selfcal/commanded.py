@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.tables.column import SourceColumn
-from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import find_columns
 from bayesdist.data.tables.units import conversion
 from bayesdist.errors import InputError
+from bayesdist.reading.tables import read_table
 
 __all__ = ["Commanded", "read_commanded"]
 

@@ -21,6 +21,8 @@ from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal.elimination import Mixture
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import DistortionModel
+from bayesdist.reading.documents import json_of
+from bayesdist.reading.faults import restoring
 
 __all__ = ["SelfcalMatched", "load_matched_selfcal", "selfcal_matched"]
 
@@ -93,15 +95,18 @@ def load_matched_selfcal(
         For a missing or damaged file.
     """
     arrays = read_arrays(folder / DETECTIONS, "", ARRAYS, do="run the stage 'match' again")
-    model = DistortionModel.from_dict(json.loads(arrays["model"].astype(np.uint8).tobytes()))
-    detections = replace(
-        inputs.detections,
-        x=arrays["x"],
-        y=arrays["y"],
-        star=arrays["star"].astype(np.int64),
-        sigma=arrays["sigma"],
-    )
-    mixture = Mixture(*(float(value) for value in arrays["mixture"]))
+    path = folder / DETECTIONS
+    with restoring(path, "a file of detections", do="run the stage 'match' again"):
+        text = arrays["model"].astype(np.uint8).tobytes().decode()
+        model = DistortionModel.from_dict(json_of(text, str(path)))
+        detections = replace(
+            inputs.detections,
+            x=arrays["x"],
+            y=arrays["y"],
+            star=arrays["star"].astype(np.int64),
+            sigma=arrays["sigma"],
+        )
+        mixture = Mixture(*(float(value) for value in arrays["mixture"]))
     first = arrays["theta"], arrays["stars"], mixture
     return selfcal_matched(inputs, detections, model, first, facts=summary.get("selfcal", {}))
 

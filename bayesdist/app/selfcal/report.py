@@ -3,39 +3,47 @@
 from __future__ import annotations
 
 import numpy as np
-from astropy.table import Table
 
-from bayesdist.app.kinds.fitted import required
-from bayesdist.app.results import Results
+from bayesdist.app.kinds.fitted import Fitted, required
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.infer import Posterior
 from bayesdist.model.grid import outline_pixels
+from bayesdist.reading.tables import read_ecsv
 from bayesdist.report.context import SelfcalResults
 
 __all__ = ["selfcal_results"]
 
 
-def selfcal_results(results: Results) -> SelfcalResults:
+def selfcal_results(
+    run: RunDirectory, fitted: Fitted, posterior: Posterior, epoch: float | None
+) -> SelfcalResults:
     """Content that a self-calibration adds to the report of its run.
 
     Parameters
     ----------
-    results : Results
-        Of a run that has been assessed.
+    run : RunDirectory
+        That has been assessed.
+    fitted : Fitted
+    posterior : Posterior
+        As it was sampled.
+    epoch : float or None
+        Of the assessment, decimal years.
     """
-    run, model, theta = results.run, results.fit.model, results.posterior.mean
-    solved = required(results.fitted.solved, "solution of detections")
+    model, theta = fitted.linear.model, posterior.mean
+    solved = required(fitted.solved, "solution of detections")
     outlines = []
     for e in range(len(model.exposures)):
         for chip in model.chips:
             x, y = outline_pixels(chip.size)
-            when = None if model.time is None else np.full(len(x), results.epoch)
+            when = None if model.time is None else np.full(len(x), epoch)
             place = {"exposure": np.full(len(x), e), "chip": chip.number, "epoch": when}
             outlines.append(model.predict(theta, x, y, **place))
     names = model.names
     return SelfcalResults(
         words=solved.gauge_words,
-        gauge=Table.read(run / "gauge.ecsv"),
-        matching=Table.read(run / "matching.ecsv"),
-        stars=Table.read(run / "stars.ecsv"),
+        gauge=read_ecsv(run / "gauge.ecsv"),
+        matching=read_ecsv(run / "matching.ecsv"),
+        stars=read_ecsv(run / "stars.ecsv"),
         outlines=tuple(outlines),
         held=tuple(names[k] for k in solved.gauge.held),
         summary=run.summary["selfcal"],

@@ -3,74 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.app.kinds.solved import SOLUTION, SelfCalibrated
 from bayesdist.app.selfcal.gauge import fixed_by, gauge_table, gauge_words
 from bayesdist.app.selfcal.matched import SelfcalMatched
 from bayesdist.app.selfcal.matches import matches_of
-from bayesdist.app.tables.output import write_table
-from bayesdist.data import ReferenceCatalog
-from bayesdist.data.matches import Matches
-from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
-from bayesdist.infer.selfcal import Gauge, SelfCalibrationMode
+from bayesdist.infer.sampler.checkpoints import read_arrays
+from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.selfcal.elimination import Mixture, expand
 from bayesdist.infer.selfcal.gauge import Decision
 from bayesdist.infer.selfcal.mode import gauge_of
 from bayesdist.model import DistortionModel
 
-__all__ = ["SelfCalibrated", "arrays_of", "read_solution", "solved_of"]
+__all__ = ["arrays_of", "read_solution", "solved_of"]
 
 Float = NDArray[np.float64]
 
-SOLUTION, GAUGE = "solution.h5", "gauge.ecsv"
 ARRAYS = ("theta", "stars", "mixture", "held", "n_free", "reference")
 RELINEARISED = 3  # times a problem is linearised anew about a solution that is read
-
-
-@dataclass(frozen=True, eq=False)
-class SelfCalibrated:
-    """The mode of a self-calibration, with its gauge and matches.
-
-    Parameters
-    ----------
-    mode : SelfCalibrationMode
-    gauge : Gauge
-        What the detections leave free, and what fixes it.
-    fixed : mapping of str to str
-        What fixes each property of the solution.
-    matches : Matches
-        Detections beside their stars.
-    arrays : mapping
-        From which the solution is made again.
-    contradictions : tuple of str
-        Where what is known beside the detections does not go with them, as sentences.
-    references : ReferenceCatalog or None
-        Stars that a catalogue has, too.
-    """
-
-    mode: SelfCalibrationMode
-    gauge: Gauge
-    fixed: Mapping[str, str]
-    matches: Matches
-    arrays: Mapping[str, NDArray[Any]]
-    contradictions: tuple[str, ...] = ()
-    references: ReferenceCatalog | None = None
-
-    @property
-    def gauge_words(self) -> str:
-        """In which gauge the solution stands, as a sentence."""
-        return gauge_words(self.gauge, self.fixed, self.mode.problem.model)
-
-    def save(self, folder: Path) -> None:
-        """Write the files of a run's folder that belong to it."""
-        write_arrays(folder / SOLUTION, "", self.arrays)
-        table = gauge_table(self.gauge, self.fixed, self.mode.problem.model)
-        write_table(table, folder / GAUGE)
 
 
 def arrays_of(solution: SelfCalibrationMode, reference: Float) -> dict[str, NDArray[Any]]:
@@ -123,11 +78,13 @@ def solved_of(
         Decision(n_null, n_open, held),
     )
     gauge = gauge_of(problem, theta, known(theta), solution)
-    places = solution.stars
+    fixed, places = fixed_by(gauge, solution, known), solution.stars
     return SelfCalibrated(
         solution,
         gauge,
-        fixed_by(gauge, solution, known),
+        fixed,
+        gauge_words(gauge, fixed, model),
+        gauge_table(gauge, fixed, model),
         matches_of(problem, places, matched.detections, inputs, matched.unused),
         arrays,
         tuple(known.contradictions(theta)),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,12 +12,11 @@ from astropy.table import Column, Table
 from astropy.units import Unit
 from numpy.typing import NDArray
 
-from bayesdist.app.assessment.checks import provenance_notes
-from bayesdist.app.kinds.fitted import required
-from bayesdist.app.results import Results
+from bayesdist.app.kinds.solved import SelfCalibrated
 from bayesdist.app.tables.output import write_table
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.storage.write import write_columns
+from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.infer.selfcal import SelfCalibrationMode, StarCatalogue, star_catalogue
 
 __all__ = ["FLAGS", "star_table", "write_stars"]
@@ -31,23 +32,35 @@ MIN_MEMBERS = 2 / 3  # of the detections, below which a star is doubtful
 PARQUET_FROM = 100_000  # stars, above which there is a Parquet file beside the table
 
 
-def write_stars(results: Results) -> dict[str, Any]:
+def write_stars(
+    folder: Path,
+    solved: SelfCalibrated,
+    correlated: Discrepancy | None,
+    notes: Mapping[str, Any],
+) -> dict[str, Any]:
     """Write stars.ecsv, and of many stars stars.parquet.
+
+    Parameters
+    ----------
+    folder : Path
+    solved : SelfCalibrated
+    correlated : Discrepancy or None
+        Whose covariance of the parameters the stars share.
+    notes : mapping
+        Meta data of the table.
 
     Returns
     -------
     dict
         For summary.json.
     """
-    solved = required(results.fitted.solved, "solution of detections")
     solution, references = solved.mode, solved.references
-    correlated = results.diagnostics.correlated
     cov = None if correlated is None else correlated.covariance
     found = star_catalogue(solution, cov)
     table = star_table(solution, found, solved.matches.mag, references)
-    table.meta |= provenance_notes(results.posterior, results.gauge_words)
-    write_table(table, results.run / "stars.ecsv")
-    path = results.run / "stars.parquet"
+    table.meta |= notes
+    write_table(table, folder / "stars.ecsv")
+    path = folder / "stars.parquet"
     path.unlink(missing_ok=True)
     if len(table) > PARQUET_FROM:
         columns = {name: np.asarray(table[name]) for name in table.colnames}

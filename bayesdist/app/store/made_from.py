@@ -8,6 +8,7 @@ from typing import Any
 
 from bayesdist.app.config import Config
 from bayesdist.app.store import Adjustable, Made, Stage, as_json, differences
+from bayesdist.app.store.inputs import input_name
 from bayesdist.version import __version__
 
 __all__ = [
@@ -80,7 +81,8 @@ def made_from_of(
     solution, limits, later = settings_of(config)
     own = [as_json(vars(one)) for one in config.requirements()]
     later["requirement"] = facts.get("requirements", own)
-    of_products = {str(one) for one in config.files_of_products(Path(facts["base"]))}
+    base = Path(facts["base"])
+    of_products = {input_name(one, base) for one in config.files_of_products(base)}
     inputs = {k: v for k, v in facts["inputs"].items() if k not in of_products}
     if stage in ("match", "fit"):
         return solution, {"inputs": inputs}, *before.values()

@@ -10,13 +10,16 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from bayesdist.app.store.keys import digest_of
+from bayesdist.app.summary import Sections
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path, sha256_of
+from bayesdist.reading.documents import model_of, read_json
 from bayesdist.version import __version__
 
 __all__ = ["SCHEMA", "Artefact", "FileMark", "Record", "as_json", "versions", "write_json"]
@@ -57,6 +60,63 @@ def versions() -> dict[str, str]:
     out["bayesdist"] = __version__  # also where it runs from a source tree
     out |= {name: metadata.version(name) for name in PACKAGES}
     return out
+
+
+class _Part(BaseModel):
+    """A part of run.json; numbers are no texts in it."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+
+class _Head(_Part):
+    """What every version of the package writes into run.json."""
+
+    model_config = ConfigDict(extra="allow")
+    schema_: int = Field(alias="schema")
+    versions: dict[str, str] = Field(default_factory=dict)
+
+
+class _FileMark(_Part):
+    size: Annotated[int, Field(ge=0)]
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class _Artefact(_Part):
+    key: str
+    parts: dict[str, Any]
+    files: dict[str, _FileMark]
+    sections: Sections
+
+
+class _StageNote(_Part):
+    wall_s: float
+    ended: str
+
+
+class _UnderWay(_Part):
+    stage: str
+    files: list[str]
+
+
+class _Whole(_Head):
+    """Content of run.json."""
+
+    artefacts: dict[str, _Artefact]
+    stages: dict[str, _StageNote]
+    under_way: _UnderWay | None
+    checkpoints: dict[str, str]
+    # facts of runs; a store by itself has none
+    config: dict[str, Any] = Field(default_factory=dict)
+    base: str = ""
+    base_from_run: str = ""
+    inputs: dict[str, str] = Field(default_factory=dict)
+    seed: int = 0
+    command: str = ""
+    created: str = ""
+    requirements: list[dict[str, Any]] = Field(default_factory=list)
+
+
+_HEAD, _WHOLE = TypeAdapter(_Head), TypeAdapter(_Whole)
 
 
 @dataclass(frozen=True)
@@ -133,25 +193,29 @@ class Record:
     @classmethod
     def read(cls, path: Path) -> Record:
         """Content of a run.json; InputError where it cannot be read or has another schema."""
-        try:
-            facts = json.loads(path.read_text(encoding="utf-8"))
-            schema = facts.pop("schema")
-            if schema == SCHEMA:
-                found = facts.pop("artefacts")
-                artefacts = {name: Artefact.from_json(one) for name, one in found.items()}
-                rest = {key: facts.pop(key) for key in ("stages", "under_way", "checkpoints")}
-                return cls(facts, artefacts, **rest)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        do = "restore it, or choose another folder"
+        facts = read_json(path, do=do)
+        head = model_of(_HEAD, facts, str(path), do=do)
+        if head.schema_ != SCHEMA:
             raise InputError(
-                "cannot be read", where=str(path), do="restore it, or choose another folder"
-            ) from error
-        made_by = facts.get("versions", {}).get("bayesdist", "another version")
-        raise InputError(
-            f"is a run of schema {schema}, which the bayesdist that made it ({made_by}) reads, and "
-            f"this one reads schema {SCHEMA}",
-            where=str(path),
-            do="use that version, or choose another folder",
-        )
+                f"is a run of schema {head.schema_}, which the bayesdist that made it "
+                f"({head.versions.get('bayesdist', 'another version')}) reads, and this one reads "
+                f"schema {SCHEMA}",
+                where=str(path),
+                do="use that version, or choose another folder",
+            )
+        model_of(_WHOLE, facts, str(path), do=do)
+        found = facts.pop("artefacts")
+        artefacts = {name: Artefact.from_json(one) for name, one in found.items()}
+        rest = {key: facts.pop(key) for key in ("stages", "under_way", "checkpoints")}
+        del facts["schema"]
+        return cls(facts, artefacts, **rest)
+
+    @property
+    def file_names(self) -> set[str]:
+        """Files that stages have written, or may have."""
+        found = {name for one in self.artefacts.values() for name in one.files}
+        return found.union((self.under_way or {}).get("files", ()))
 
     def begins_file(self, name: str) -> bool:
         """Note that the stage under way writes a file; False where that is known."""

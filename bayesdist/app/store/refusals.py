@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.app.config import Config, load_config, load_text, parse_config
+from bayesdist.app.store.inputs import input_name
 from bayesdist.app.store.keys import shown
+from bayesdist.app.store.lock import LOCK
 from bayesdist.app.store.made_from import changes, is_adjustable, with_seed
 from bayesdist.errors import InputError
 from bayesdist.files import is_leftover
@@ -40,7 +42,7 @@ def refuse_foreign_files(folder: Path, text: str) -> None:
     """
     if not folder.is_dir():
         return
-    names = {path.name for path in folder.iterdir() if not is_leftover(path.name)}
+    names = {path.name for path in folder.iterdir() if not is_leftover(path.name)} - {LOCK}
     if "config.toml" in names and load_text(folder / "config.toml") == text:
         names.remove("config.toml")
     if names:
@@ -81,9 +83,10 @@ def refuse_another_solution(
                 where=str(path),
                 do="resume with the old value, or start again with --force",
             )
-    of_products = {str(one) for one in config.files_of_products(base.resolve())}
-    of_products |= {str(one) for one in known.files_of_products(Path(record["base"]))}
-    refuse_other_inputs(record["inputs"], inputs, but=of_products)
+    base, before = base.resolve(), Path(record["base"])
+    of_products = {input_name(one, base) for one in config.files_of_products(base)}
+    of_products |= {input_name(one, before) for one in known.files_of_products(before)}
+    refuse_other_inputs(record["inputs"], inputs, base, but=of_products)
 
 
 def refuse_edited(folder: Path, known: Config) -> None:
@@ -105,13 +108,13 @@ def refuse_edited(folder: Path, known: Config) -> None:
 
 
 def refuse_other_inputs(
-    known: Mapping[str, str], now: Mapping[str, str], but: Collection[str] = ()
+    known: Mapping[str, str], now: Mapping[str, str], base: Path, but: Collection[str] = ()
 ) -> None:
-    """Refuse inputs that are not those of the record, but for some."""
+    """Refuse inputs that are not those of the record, but for some; `base` is where they are."""
     for name in sorted((known.keys() | now.keys()) - set(but)):
         if known.get(name) != now.get(name):
             raise InputError(
                 "this input changed since the run began",
-                where=name,
+                where=str(base / name),
                 do="restore it, or start again with --force",
             )

@@ -14,6 +14,7 @@ from bayesdist.app.config import (
     load_config,
 )
 from bayesdist.app.store import Made, Record, RunStore, as_json, versions
+from bayesdist.app.store.inputs import base_of, hashes_of, places_of
 from bayesdist.app.store.made_from import STAGES, changes, made_from_of, with_seed
 from bayesdist.app.store.refusals import (
     refuse_another_solution,
@@ -24,9 +25,8 @@ from bayesdist.app.store.refusals import (
 )
 from bayesdist.app.summary import head_of
 from bayesdist.assess import Requirement
-from bayesdist.data import input_files
 from bayesdist.errors import ConfigError, InputError
-from bayesdist.files import atomic_path, made_folder, remove_leftovers, sha256_of
+from bayesdist.files import atomic_path, made_folder, remove_leftovers
 
 __all__ = ["PAIRS", "RunDirectory", "part_files"]
 
@@ -51,7 +51,7 @@ class RunDirectory(RunStore):
     def __init__(self, path: str | Path) -> None:
         super().__init__(Path(path), STAGES, head_of)
         self._text = ""  # of a planned run's configuration
-        self._adopted: tuple[Config, str, dict[str, str]] | None = None
+        self._adopted: tuple[Config, str, dict[str, Any]] | None = None
 
     def __truediv__(self, name: str) -> Path:
         return self.path / name
@@ -98,7 +98,7 @@ class RunDirectory(RunStore):
         if run.path.exists() and not run.path.is_dir():
             raise InputError("is a file, not a folder", where=str(path), do="choose another folder")
         refuse_inside_input(run.path, config, base)
-        inputs = _hashes(config, base)
+        inputs = hashes_of(config, base)
         if run.is_initialized and not force:
             if not resume:
                 raise InputError(
@@ -107,7 +107,7 @@ class RunDirectory(RunStore):
                     do="resume it with --resume, replace it with --force, or choose another folder",
                 )
             refuse_another_solution(run.path, run.config, run.facts, config, base, inputs, seed)
-            run._adopted = config, text, inputs
+            run._adopted = config, text, {"inputs": inputs, **places_of(base, run.path)}
             return run
         if run.is_initialized:
             run.record  # noqa: B018 - refuse to replace what nobody can tell from other files
@@ -115,7 +115,7 @@ class RunDirectory(RunStore):
             refuse_foreign_files(run.path, text)
         facts = {
             "config": with_seed(config, seed).model_dump(),
-            "base": str(base.resolve()),
+            **places_of(base, run.path),
             "inputs": inputs,
             "seed": config.sampler.seed if seed is None else seed,
             "versions": versions(),
@@ -156,12 +156,12 @@ class RunDirectory(RunStore):
         """Take over what a resumed run was given in another way, and put summary.json right."""
         remove_leftovers(self.path)
         if self._adopted is not None:
-            config, text, inputs = self._adopted
+            config, text, found = self._adopted
             record, known = self.record, self.config
             changed = {key for key, *_ in changes(known, with_seed(config, known.sampler.seed))}
-            if changed or inputs != record.facts["inputs"]:
+            if changed or record.facts != record.facts | found:
                 config = with_seed(config, known.sampler.seed)
-                record.facts |= {"config": as_json(config.model_dump()), "inputs": inputs}
+                record.facts |= {"config": as_json(config.model_dump()), **found}
                 if any(key.startswith("requirement") for key in changed):
                     record.facts.pop("requirements", None)
                 self._write_text(text)
@@ -185,8 +185,9 @@ class RunDirectory(RunStore):
         run = cls(path)
         if run.is_initialized:
             refuse_edited(run.path, run.config)
-            now = _hashes(run.config, Path(run.facts["base"]))
-            refuse_other_inputs(run.facts["inputs"], now)
+            facts = run.facts
+            now = hashes_of(run.config, run.base, Path(facts["base"]))
+            refuse_other_inputs(facts["inputs"], now, run.base)
             return run
         if (run / "config.toml").exists():
             config, text = load_config(run / "config.toml")
@@ -214,7 +215,24 @@ class RunDirectory(RunStore):
     @property
     def facts(self) -> dict[str, Any]:
         """Facts that the run is made from: configuration, inputs, seed, versions."""
-        return self.record.facts
+        facts = self.record.facts
+        for name in ("config", "base", "inputs", "seed", "versions", "created"):
+            if name not in facts:
+                raise InputError(
+                    f"lacks {name!r}",
+                    where=str(self / "run.json"),
+                    do="restore it, or choose another folder",
+                )
+        return facts
+
+    @property
+    def base(self) -> Path:
+        """Folder that inputs are relative to.
+
+        It is found from the run as it was when that began, if inputs are there: a run may have been
+        moved together with them.  Else it is where it was.
+        """
+        return base_of(self.facts, self.path)
 
     def note(self, **facts: Any) -> None:
         """Add facts to run.json."""
@@ -275,33 +293,42 @@ class RunDirectory(RunStore):
             facts = facts | {"requirements": [as_json(vars(one)) for one in requirements]}
         return made_from_of(stage, self._standing(stage), self.config, facts)
 
-    def require(self, stage: str, needs: Sequence[str], *, thorough: bool = False) -> None:
-        """Refuse a stage, or another command, whose predecessors do not stand.
-
-        A `thorough` check looks at the content of their files, not just at their sizes.
-        """
+    def require(self, stage: str, needs: Sequence[str]) -> None:
+        """Refuse a stage, or another command, whose predecessors do not stand."""
         for earlier in needs:
             do = f"run 'bayesdist stage {earlier} {self.path}'"
-            artefact = self.record.artefacts.get(earlier)
-            if artefact is None:
+            if earlier not in self.record.artefacts:
                 raise InputError(
                     f"'{stage}' needs stage '{earlier}', which has not been run",
                     where=str(self.path),
                     do=f"{do} first",
                 )
-            harmed = self.harmed(artefact, thorough=thorough)
-            if harmed:
-                raise InputError(
-                    f"is not as stage '{earlier}' wrote it",
-                    where=str(self / harmed),
-                    do=f"{do} again",
-                )
+            self.refuse_damaged(earlier)
             if not self.done(earlier):
                 raise InputError(
                     f"'{stage}' needs stage '{earlier}', which was made from something else",
                     where=str(self.path),
                     do=f"{do} again",
                 )
+
+    def damage(self, stage: str) -> tuple[str, str] | None:
+        """A file that is not as a stage wrote it, and what is wrong with it; None without one."""
+        artefact = self.record.artefacts.get(stage)
+        name = "" if artefact is None else self.harmed(artefact, thorough=True)
+        if not name:
+            return None
+        is_there = (self / name).is_file()
+        return name, f"is {'not as' if is_there else 'gone, not as'} stage '{stage}' wrote it"
+
+    def refuse_damaged(self, stage: str) -> None:
+        """Refuse to go by files that are not as their stage wrote them."""
+        damage = self.damage(stage)
+        if damage is not None:
+            raise InputError(
+                damage[1],
+                where=str(self / damage[0]),
+                do=f"restore it, or run 'bayesdist stage {stage} {self.path}' again",
+            )
 
     @contextmanager
     def judged_by(self, requirements: Sequence[Requirement]) -> Iterator[None]:
@@ -325,9 +352,3 @@ class RunDirectory(RunStore):
         pairs = part_files(self / PAIRS)
         names = [path.relative_to(self.path).as_posix() for path in pairs]
         super().clear(*others, "config.toml", "bayesdist.log", *names)
-
-
-def _hashes(config: Config, base: Path) -> dict[str, str]:
-    """SHA-256 of every file that the configuration names, by its absolute path."""
-    named, others = config.named_files(base.resolve()), config.files_of_products(base.resolve())
-    return {str(f): sha256_of(f) for f in [*input_files(named), *others]}

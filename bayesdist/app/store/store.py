@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatch
@@ -14,6 +13,7 @@ from time import monotonic
 from typing import Any, Generic, TypeVar
 
 from bayesdist.app.store.keys import Adjustable, canonical, difference, digest_of
+from bayesdist.app.store.lock import locked
 from bayesdist.app.store.record import (
     SCHEMA,
     Artefact,
@@ -23,17 +23,12 @@ from bayesdist.app.store.record import (
     json_text,
     write_json,
 )
-from bayesdist.errors import InputError
-from bayesdist.files import is_leftover, made_folder, remove_leftovers, watched_writes
+from bayesdist.files import is_leftover, path_within, remove_leftovers, watched_writes
+from bayesdist.reading.regular import read_bytes
 
 __all__ = ["Made", "RunStore", "Stage"]
 
 T = TypeVar("T")
-
-try:
-    import fcntl
-except ImportError:  # systems that know no such locks
-    fcntl = None  # type: ignore[assignment]
 
 RECORD, SUMMARY = "run.json", "summary.json"
 
@@ -100,6 +95,7 @@ class RunStore:
     ) -> None:
         self.path, self.stages, self.head = path, stages, head
         self._planned: Record | None = None
+        self._known: dict[str, tuple[tuple[int, ...], FileMark]] = {}  # by name, of files as read
         # of the stage that is being made here
         self._making = ""
         self._sections: dict[str, Any] = {}
@@ -110,7 +106,12 @@ class RunStore:
     @property
     def record(self) -> Record:
         """Content of run.json, or of what it will be."""
-        return self._planned or Record.read(self.path / RECORD)
+        if self._planned is not None:
+            return self._planned
+        record = Record.read(self.path / RECORD)
+        for name in record.file_names:
+            path_within(self.path, name, where=str(self.path / RECORD))
+        return record
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -155,32 +156,21 @@ class RunStore:
             path = self.path / name
             if not path.is_file() or path.stat().st_size != mark.size:
                 return name
-            if thorough and FileMark.of(path) != mark:
+            if thorough and self._mark(name) != mark:
                 return name
         return ""
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
+    def _mark(self, name: str) -> FileMark:
+        """Mark of a file, which is read once while its times stay as they are."""
+        status = (self.path / name).stat()
+        now = status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+        if self._known.get(name, ((), None))[0] != now:
+            self._known[name] = now, FileMark.of(self.path / name)
+        return self._known[name][1]
+
+    def locked(self) -> AbstractContextManager[None]:
         """Keep other processes from writing into the folder; the lock dies with the process."""
-        made_folder(self.path)
-        if fcntl is None:
-            yield
-            return
-        held = os.open(self.path, os.O_RDONLY)
-        try:
-            try:
-                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise InputError(
-                    "another process is at work on this run",
-                    where=str(self.path),
-                    do="wait until it has ended, or choose another folder",
-                ) from error
-            except OSError as error:  # file systems that know no locks
-                log.debug("%s cannot be locked: %s", self.path, error)
-            yield
-        finally:
-            os.close(held)
+        return locked(self.path)
 
     # -- making -----------------------------------------------------------------------------------
 
@@ -345,7 +335,7 @@ class RunStore:
             return
         content = {"schema": SCHEMA, **self.head(record.facts), **sections}
         text = json_text(content)
-        if not path.is_file() or path.read_bytes() != text.encode():
+        if not path.is_file() or read_bytes(path) != text.encode():
             write_json(path, content)
 
     # -- removing ---------------------------------------------------------------------------------
@@ -365,7 +355,7 @@ class RunStore:
         others = {one for artefact in record.artefacts.values() for one in artefact.files}
         folders = set()
         for name in set(names) - others:
-            path = self.path / name
+            path = path_within(self.path, name, where=str(self.path), links=True)
             path.unlink(missing_ok=True)
             folders.add(path.parent)
         for folder in folders - {self.path}:

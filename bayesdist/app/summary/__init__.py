@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from bayesdist.app.summary.model import Summary, head_of, schema_text
+from bayesdist.app.summary.model import Sections, Summary, head_of, schema_text
 
-__all__ = ["Summary", "head_of", "schema_text"]
+__all__ = ["Sections", "Summary", "head_of", "schema_text"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -24,7 +24,7 @@ from bayesdist.app.summary.rows import (
     ValidityRow,
 )
 
-__all__ = ["Summary", "head_of", "schema_text"]
+__all__ = ["Sections", "Summary", "head_of", "schema_text"]
 
 
 class Data(Part):
@@ -36,7 +36,9 @@ class Data(Part):
     rejected: dict[str, int] = Field(description="rows by reason")
     n_exposures: int
     sources: list[str]
-    tangent_point: list[float] | None = Field(description="RA and Dec in degrees")
+    tangent_point: Annotated[list[float], Field(min_length=2, max_length=2)] | None = Field(
+        description="RA and Dec in degrees"
+    )
 
 
 class Fit(Part):
@@ -132,6 +134,12 @@ class Periods(Part):
     first_vs_last: dict[str, Any]
 
 
+class Warned(Part):
+    """A section with warnings."""
+
+    warnings: list[str] = Field(default_factory=list)
+
+
 class Verdict(Part):
     """The worst of all checks, requirements and validity periods, in words."""
 
@@ -139,18 +147,11 @@ class Verdict(Part):
     headline: str
 
 
-class Summary(Part):
-    """Content of summary.json: what the stages that have ended found."""
+class Sections(Part):
+    """What the stages that have ended found, section by section."""
 
-    schema_: Literal[2] = Field(alias="schema")
-    bayesdist: str = Field(description="version of the package")
-    kind: Literal["data", "campaign", "selfcal"] = Field(description="what the run begins with")
-    detector: str = Field(description="name of detector or chips, and filter of a campaign")
-    began: str = Field(description="when the run began, UTC")
-    simulated: bool = Field(description="the input is simulated, as the configuration has it")
-
-    matching: dict[str, Any] | None = Field(None, description="of a campaign")
-    selfcal: dict[str, Any] | None = Field(None, description="of a self-calibration")
+    matching: Warned | None = Field(None, description="of a campaign")
+    selfcal: Warned | None = Field(None, description="of a self-calibration")
     data: Data | None = None
     fit: Fit | None = None
     outliers: Outliers | None = None
@@ -168,6 +169,25 @@ class Summary(Part):
     products: list[ProductRow] | None = None
     figures: list[str] | None = None
     verdict: Verdict | None = Field(None, description="headline of the report")
+    gauge: dict[str, Any] | None = Field(None, description="exposures: what holds the solution")
+    lines: list[dict[str, Any]] | None = Field(None, description="linear terms against time")
+    tables: Warned | None = Field(None, description="look-up tables")
+    scatter: dict[str, Any] | None = Field(None, description="variation from exposure to exposure")
+    deviations: Warned | None = Field(None, description="exposures that deviate")
+    exposures_skipped: dict[str, Any] | None = None
+    exposures_outlying: list[Any] | None = None
+    time_dependence: Warned | None = Field(None, description="linear terms, exposure by exposure")
+
+
+class Summary(Sections):
+    """Content of summary.json: the run as a whole, and what the stages that have ended found."""
+
+    schema_: Literal[2] = Field(alias="schema")
+    bayesdist: str = Field(description="version of the package")
+    kind: Literal["data", "campaign", "selfcal"] = Field(description="what the run begins with")
+    detector: str = Field(description="name of detector or chips, and filter of a campaign")
+    began: str = Field(description="when the run began, UTC")
+    simulated: bool = Field(description="the input is simulated, as the configuration has it")
 
 
 def head_of(facts: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,10 +14,11 @@ from bayesdist.diagnose.correlated.storage import discrepancy_from_arrays, discr
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.diagnose.score.result import ScoreTest
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.catalogue.star_errors import StarCovariance
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
+from bayesdist.reading.faults import restoring
 from bayesdist.records import record_from_arrays, record_to_arrays
 
 __all__ = ["fingerprint_of", "load_diagnostics", "write_diagnostics"]
@@ -42,8 +43,8 @@ def write_diagnostics(
 ) -> None:
     """Write diagnostics of a fit and a posterior, and their sections of summary.json."""
     fingerprint = fingerprint_of(fit, posterior)
-    assert found.correlated is not None
-    arrays, facts = discrepancy_to_arrays(found.correlated)
+    correlated = required(found.correlated, "correlated errors are diagnosed of a posterior only")
+    arrays, facts = discrepancy_to_arrays(correlated)
     write_arrays(run / CORRELATED, fingerprint, arrays)
     if found.catalogue is not None:
         _save_catalogue(run, fingerprint, found.catalogue)
@@ -72,16 +73,20 @@ def load_diagnostics(run: RunDirectory, fit: LinearFit, posterior: Posterior) ->
     if not facts or not (run / OTHERS).exists():
         return None
     try:
-        others = record_from_arrays(read_arrays(run / OTHERS, fingerprint, do=""))
+        found = read_arrays(run / OTHERS, fingerprint, do="")
         arrays = read_arrays(run / CORRELATED, fingerprint, do="")
     except InputError:
         return None
-    correlated = discrepancy_from_arrays(posterior.model, arrays)
-    return replace(
-        others,
-        correlated=replace(correlated, facts=facts),
-        catalogue=_load_catalogue(run, fingerprint),
-    )
+    again = f"run 'bayesdist stage diagnose {run.path}' again"
+    with restoring(run / OTHERS, "diagnostics", do=again):
+        others = record_from_arrays(found, Diagnostics)
+    with restoring(run / CORRELATED, "correlated errors", do=again):
+        correlated = discrepancy_from_arrays(posterior.model, arrays)
+        return replace(
+            others,
+            correlated=replace(correlated, facts=facts),
+            catalogue=_load_catalogue(run, fingerprint),
+        )
 
 
 def _save_catalogue(run: RunDirectory, fingerprint: str, stars: StarCovariance) -> None:

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.assessment.checks import provenance_notes
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.diagnostics_files import fingerprint_of
 from bayesdist.app.tables.margins import margin_rows, margin_table
-from bayesdist.app.tables.output import write_table
+from bayesdist.app.tables.output import provenance_notes, write_table
 from bayesdist.assess import Margin
 from bayesdist.assess.budget.budget import ErrorBudget
 from bayesdist.assess.coefficients import coefficient_table
@@ -24,6 +23,7 @@ from bayesdist.checks import warnings_of
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.products.maps_file import write_maps
+from bayesdist.reading.faults import restoring
 from bayesdist.records import record_from_arrays, record_to_arrays
 
 __all__ = ["load_evaluation", "save_margins", "validity_rows", "write_evaluation"]
@@ -87,8 +87,9 @@ def load_evaluation(run: RunDirectory, fit: LinearFit, posterior: Posterior) -> 
     """The evaluation of a fit and a posterior; InputError where there is none of just these."""
     again = f"run 'bayesdist stage evaluate {run.path}' again"
     arrays = read_arrays(run / FILE, fingerprint_of(fit, posterior), do=again)
-    found: Evaluation = record_from_arrays(arrays)
-    return found
+    with restoring(run / FILE, "an evaluation", do=again):
+        found: Evaluation = record_from_arrays(arrays, Evaluation)
+        return found
 
 
 def _write(run: RunDirectory, fit: LinearFit, posterior: Posterior, found: Evaluation) -> None:

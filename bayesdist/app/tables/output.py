@@ -15,8 +15,15 @@ from astropy.table import Table
 from bayesdist.app.store import versions, write_json
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
+from bayesdist.infer import Posterior
 
-__all__ = ["atomic_directory", "record_folder", "refuse_existing", "write_table"]
+__all__ = [
+    "atomic_directory",
+    "provenance_notes",
+    "record_folder",
+    "refuse_existing",
+    "write_table",
+]
 
 
 def refuse_existing(path: Path, force: bool) -> None:
@@ -34,6 +41,16 @@ def write_table(table: Table, path: Path) -> None:
     """Write a table as ECSV, whole or not at all."""
     with atomic_path(path) as temporary:
         table.write(temporary, format="ascii.ecsv")
+
+
+def provenance_notes(posterior: Posterior, gauge: str) -> dict[str, bool | str]:
+    """Notes on the draws and the gauge for the head of a file."""
+    label = posterior.approximation
+    return {
+        "converged": posterior.convergence.converged,
+        **({"posterior": label} if label else {}),
+        **({"gauge": gauge} if gauge else {}),
+    }
 
 
 SCHEMA = 1  # of records of commands

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
-from bayesdist.assess.requirements.verdict import effective_draws
 from bayesdist.assess.terms.forms import PRODUCT
 
 __all__ = ["TOTAL", "BudgetTerm", "ErrorBudget", "budget_of", "place_budget", "with_product"]
@@ -213,7 +212,7 @@ def budget_of(errors: DrawnErrors, domain: EvaluationDomain) -> ErrorBudget:
 
     InputError for a missing epoch, and a magnitude where no errors by magnitude are known.
     """
-    monte_carlo = (2.0 * effective_draws(errors.solution, errors.n_draws)) ** -0.5
+    monte_carlo = (2.0 * errors.n_effective) ** -0.5
     fields = errors.at(domain)
     terms: list[tuple[bool, BudgetTerm]] = []
     products = []

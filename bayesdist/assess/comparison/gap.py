@@ -39,6 +39,7 @@ Float = NDArray[np.float64]
 class ChipPair:
     """Two chips of one calibration in one plane."""
 
+    chips: tuple[int, int]  # numbers of the reference chip and of the other one
     reference: ChipMap  # of one order, in one system of u, v
     other: ChipMap
     # (4 K, 4 K), joint covariance of their coefficients: u and v of the reference chip, then of the
@@ -75,7 +76,7 @@ def pair_of_chips(
     """
     maps = calibration.at(epoch, origin="stated")
     cov = calibration.joint_covariance((reference, other), epoch, origin="stated")
-    return ChipPair(maps[reference], maps[other], cov)
+    return ChipPair((reference, other), maps[reference], maps[other], cov)
 
 
 def gap_difference(a: ChipPair, b: ChipPair) -> GapDifference:
@@ -116,12 +117,11 @@ def gap_difference(a: ChipPair, b: ChipPair) -> GapDifference:
         for pair, by in ((a, estimate), (b, estimate @ change))
         if pair.cov is not None
     ]
-    assert a.other.chip is not None
-    assert a.reference.chip is not None
+    reference, other = a.chips
     cov = sum(errors[1:], errors[0]) if errors else None
     return GapDifference(
-        a.other.chip,
-        a.reference.chip,
+        other,
+        reference,
         values,
         cov,
         None if cov is None else _test(values, cov, errors, (a, b), bases[1]),

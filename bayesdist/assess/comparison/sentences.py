@@ -152,13 +152,12 @@ def gap_verdict(gap: GapDifference) -> str:
 def gap_lines(gap: GapDifference) -> list[str]:
     """Lines below this verdict: A minus B, the reference chips laid on each other."""
     sigma = [None] * 4 if gap.sigma is None else gap.sigma.tolist()
-    shift_x, shift_y, scale, turn = zip(gap.values.tolist(), sigma, strict=True)
-    degrees = [None if part is None else float(np.degrees(part)) for part in turn]
-    assert degrees[0] is not None
+    shift_x, shift_y, scale, (turn, error) = zip(gap.values.tolist(), sigma, strict=True)
+    in_degrees = None if error is None else float(np.degrees(error))
     return [
         f"  shift in x  {_measured(*shift_x)} pix",
         f"  shift in y  {_measured(*shift_y)} pix",
-        f"  rotation    {_measured(degrees[0], degrees[1])} deg",
+        f"  rotation    {_measured(float(np.degrees(turn)), in_degrees)} deg",
         f"  scale - 1   {_measured(*scale)}",
     ]
 

@@ -158,9 +158,7 @@ class PlannedPattern:
         """
         solution = self.solution
         model, gauge = solution.model, solution.gauge
-        cov = solution.up_to(gauge.null)
-        assert cov is not None  # what is open is free
-        variance = np.diag(cov)
+        variance = np.diag(solution.up_to(gauge.null))
         terms = np.array(model.basis().terms)
         mean_square = 1.0 / np.prod(2 * terms + 1, axis=1)
         degree = terms.sum(axis=1)
@@ -258,10 +256,9 @@ def _columns(move: dict[str, Float], *names: str) -> Float:
 
 
 def _maps(solution: ExpectedSolution, directions: Float) -> tuple[UncertaintyMap, ...] | None:
-    cov = solution.up_to(directions)
-    if cov is None:
+    if not solution.bounded_by(directions):
         return None
-    seen = replace(solution, cov=cov)
+    seen = replace(solution, cov=solution.up_to(directions))
     return tuple(uncertainty_map(seen, chip=chip.number) for chip in solution.model.chips)
 
 

@@ -13,7 +13,7 @@ from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.error_model import error_model
 from bayesdist.assess.requirements.reduction import RequiredReduction, required_reduction
 from bayesdist.assess.requirements.requirement import Requirement
-from bayesdist.assess.requirements.verdict import counting_error, effective_draws, verdict_of
+from bayesdist.assess.requirements.verdict import counting_error, verdict_of
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.units import convert, pixel_scale_of
@@ -233,7 +233,7 @@ def judge(
             ) from None
 
     doubts = doubts_of(checks)
-    n_effective = effective_draws(errors.solution, errors.n_draws)
+    n_effective = errors.n_effective
     varying = [t.rows[0].name for t in errors.terms if getattr(t, "varies", False)]
     margins = []
     for r, case in zip(requirements, cases, strict=True):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from bayesdist.assess.requirements.regions import (
+from bayesdist.assess.regions import (
     WHOLE,
     Region,
     check_region,
@@ -15,10 +15,9 @@ from bayesdist.assess.requirements.regions import (
 from bayesdist.assess.statistics import STATISTICS
 from bayesdist.assess.units import UNITS
 from bayesdist.diagnose.residuals.coverage import Coverage
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, require_known
 from bayesdist.limits import BEYOND_STARS
 from bayesdist.model.grid import grid_pixels, mesh
-from bayesdist.names import require_known
 
 __all__ = ["Requirement"]
 

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.requirements.margins import domains_of
 from bayesdist.assess.requirements.requirement import Requirement
-from bayesdist.assess.requirements.verdict import effective_draws
 from bayesdist.assess.units import convert
 from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.model.grid import DEFAULT_GRID
@@ -98,7 +97,7 @@ def validity_period(
     """
     at = np.asarray(epochs, float)
     factor = convert(1.0, errors.unit, requirement.unit, pixel_scale, where=requirement.where)
-    n = effective_draws(errors.solution, errors.n_draws)
+    n = errors.n_effective
     here = replace(requirement, epoch=float(at[0]), epochs=None)
     (domain,) = domains_of(here, errors.solution.model, grid)
     found = errors.over_epochs(domain, [float(epoch) for epoch in at], [requirement.statistic])

@@ -2,35 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 from scipy.stats import beta
 
 from bayesdist.checks import LARGER, Check, doubts_of
 from bayesdist.diagnose.significance import clopper_pearson
-from bayesdist.infer.solution import Solution
 from bayesdist.limits import CONFIDENCE
 
-__all__ = ["counting_error", "effective_draws", "verdict_of"]
-
-
-def effective_draws(solution: Solution, n_draws: int) -> float:
-    """Independent draws that are worth as much as n draws of the solution.
-
-    Drawing n rows from a chain worth `ess` independent samples adds the chain's own Monte-Carlo
-    variance to that of the drawing: 1 / n_eff = 1 / n + 1 / ess.
-
-    `solution`: draws of a fit are independent; a posterior is worth the smaller of its bulk and
-    tail effective sample sizes (a probability far from a half is a matter of the tails). The result
-    is at least 1.
-    """
-    convergence = solution.convergence
-    if convergence is None:
-        return float(n_draws)
-    sizes = [convergence.ess_bulk_min, convergence.ess_tail_min]
-    ess = 1.0 if any(math.isnan(s) for s in sizes) else max(min(sizes), 1.0)
-    return max(1.0 / (1.0 / n_draws + 1.0 / ess), 1.0)
+__all__ = ["counting_error", "verdict_of"]
 
 
 def counting_error(fraction: float, n: float) -> float:

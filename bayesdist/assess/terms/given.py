@@ -21,10 +21,9 @@ from bayesdist.assess.terms.forms import (
 )
 from bayesdist.assess.units import UNITS, convert
 from bayesdist.data.magnitude_errors import MagnitudeErrors
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, require_known
 from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
-from bayesdist.names import require_known
 
 __all__ = ["CENTROID", "TERM_KINDS", "Centroids", "SmoothTerm", "UserTerm", "said_by_user"]
 

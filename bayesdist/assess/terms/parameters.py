@@ -19,12 +19,11 @@ from bayesdist.assess.terms.forms import (
     Row,
     Together,
 )
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, require_known
 from bayesdist.infer.catalogue.star_errors import StarCovariance
 from bayesdist.infer.solution import Solution
 from bayesdist.mission import load_object, missions
 from bayesdist.model import DistortionModel
-from bayesdist.names import require_known
 
 __all__ = [
     "CATALOGUE",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import (
     Image,
     PolynomialField,
+    Polynomials,
     Row,
     TogetherField,
     polynomial_errors,
@@ -77,13 +78,11 @@ class SolutionDraws:
     of: SolutionErrors
     theta: Float
     shown: Float
-    catalogue: tuple[Any, ...] = ()
+    catalogue: tuple[Polynomials, ...] = ()
 
     def on(self, domain: EvaluationDomain, image: Image) -> TogetherField:
         """The errors at the positions of a domain."""
-        exact = self.of.without is None
-        shown = self.of.solution if exact else self.of.without
-        assert shown is not None
+        exact, shown = self.of.without is None, self.of.without or self.of.solution
         parts = _parts(shown, self.shown, domain.epoch, image.exposure)
         fields = [
             # rows of another solution cannot be taken off the draws of this one
@@ -116,8 +115,7 @@ def _parts(
         gauge = place_of(model, epoch=epoch, chip=chip)
         return gauge.polynomial(theta) - gauge.polynomial(mean) - static(chip)
 
-    def frame(chip: int) -> Float:
-        assert exposure is not None
+    def frame(exposure: NDArray[np.int64], chip: int) -> Float:
         out = np.zeros((len(theta), 2, model.n_terms))
         for e in np.unique(exposure):
             rows = np.flatnonzero(exposure == e)
@@ -133,7 +131,7 @@ def _parts(
     if model.time is not None:
         out[TIME_DEPENDENCE] = drift
     if exposure is not None:
-        out[EXPOSURE_FRAME] = frame
+        out[EXPOSURE_FRAME] = partial(frame, exposure)
     return out
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bayesdist.data.columns.labels import LABELS_OF_CODES, Labels, merged_counts
 from bayesdist.data.tables.checks import (
+    COMPLETED,
     absent,
     check_values,
     columns_of,
@@ -55,17 +56,17 @@ class MatchColumns:
     epoch: Float | None = None
     mag: Float | None = None
     colour: Float | None = None
-    exposure: Int = None  # type: ignore[assignment]
+    exposure: Int = COMPLETED
     exposure_names: tuple[str, ...] = ("1",)
-    chip: Int = None  # type: ignore[assignment]
+    chip: Int = COMPLETED
     chip_numbers: tuple[int, ...] = (1,)
-    filter: Int = None  # type: ignore[assignment]
+    filter: Int = COMPLETED
     filter_names: tuple[str, ...] = ("",)
     star: Int | None = None
-    row: Int = None  # type: ignore[assignment]
-    source: Int = None  # type: ignore[assignment]
+    row: Int = COMPLETED
+    source: Int = COMPLETED
     sources: tuple[str, ...] = ("table",)
-    n_rows: int = None  # type: ignore[assignment]
+    n_rows: int = COMPLETED
     rejected: Mapping[str, int] = field(default_factory=dict)
     tangent_point: tuple[float, float] | None = None
     u_nominal: Float | None = None

@@ -1,1 +1,1 @@
-"""Formats of star lists and matches of other programs."""
+"""Which files a path names and which format they have; formats of other programs."""

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
-from bayesdist.data.tables.files import read_lines
 from bayesdist.errors import FormatError
+from bayesdist.reading.regular import read_lines
 
 __all__ = ["Hst1passList", "is_hst1pass", "is_matchup", "read_hst1pass", "read_matchup"]
 

@@ -272,7 +272,7 @@ def _table(
     filters, filter_names = encoded(np.array([log[one.name].filter for one in lists]))
     files, sources = encoded(np.array([one.source for one in lists]))
     chip, chip_numbers = encoded(joined([one.chip for one in lists]), ordered=True)
-    with_mag = all(one.mag is not None for one in lists)
+    mags = [one.mag for one in lists if one.mag is not None]
     unmatched = sum(one.detected - sum(one.rejected.values()) - one.matched for one in reports)
     rejected = merged_counts([one.rejected for one in reports])
     if unmatched:
@@ -291,7 +291,7 @@ def _table(
         **sigmas,
         unit=catalog.unit,
         epoch=np.array([log[one.name].epoch for one in lists])[each],
-        mag=joined([one.mag for one in lists]) if with_mag else None,  # type: ignore[misc]
+        mag=joined(mags) if len(mags) == len(lists) else None,
         exposure=each,
         exposure_names=tuple(one.name for one in lists),
         chip=chip,

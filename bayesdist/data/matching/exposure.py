@@ -23,7 +23,12 @@ from bayesdist.data.matching.pairs import (
 )
 from bayesdist.data.matching.reports import ExposureReport
 from bayesdist.data.matching.search_radius import SearchRadius, search_radius
-from bayesdist.data.matching.similarity import PatternIndex, find_similarity, grown_map
+from bayesdist.data.matching.similarity import (
+    PatternIndex,
+    Similarity,
+    find_similarity,
+    grown_map,
+)
 from bayesdist.data.matching.smooth_map import smooth_map
 from bayesdist.errors import InputError
 
@@ -252,22 +257,22 @@ def _by_patterns(
     The good detections are tried first; where they are not recognised, all are, for the catalogue
     may hold stars that are saturated in the exposure.
     """
-    found = None
-    tries = [good] if good.all() else [good, np.ones(len(stars), bool)]
-    for which in tries:
-        try:
-            found = find_similarity(
-                plane[which],
-                patterns,
-                mag=None if stars.mag is None else stars.mag[which],
-                source=source,
-                reference_name=catalog.source,
-            )
-            break
-        except InputError:
-            if which is tries[-1]:
-                raise
-    assert found is not None
+
+    def recognised(which: Bool) -> Similarity:
+        return find_similarity(
+            plane[which],
+            patterns,
+            mag=None if stars.mag is None else stars.mag[which],
+            source=source,
+            reference_name=catalog.source,
+        )
+
+    try:
+        found = recognised(good)
+    except InputError:
+        if good.all():
+            raise
+        found = recognised(np.ones(len(stars), bool))
     # a similarity is good in the middle: the map grows outwards from there with the bright stars
     rows = np.flatnonzero(good)
     if stars.mag is not None:

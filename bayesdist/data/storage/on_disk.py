@@ -20,8 +20,8 @@ from bayesdist.data import batches
 from bayesdist.data.columns.checked import COLUMNS, POSITIONS, SIGMAS
 from bayesdist.data.columns.joining import joined_columns
 from bayesdist.data.columns.labels import LABELS_OF_CODES, Labels
+from bayesdist.data.formats.files import exposure_names, input_files
 from bayesdist.data.matches import Matches
-from bayesdist.data.reading.formats import exposure_names, input_files
 from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
 from bayesdist.data.storage.stored import StoredFile, scan, stored_file, tangent_point_of
 from bayesdist.data.tables.parquet import describe_part

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bayesdist.errors import InputError
 
 __all__ = [
+    "COMPLETED",
     "NOT_FINITE",
     "absent",
     "check_columns",
@@ -26,6 +27,7 @@ __all__ = [
 Bool = NDArray[np.bool_]
 
 NOT_FINITE = ("refuse", "reject")
+COMPLETED: Any = None  # default of what a table of columns fills in itself: then it is there
 
 
 def one_length(

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.tables.column import EncodedColumn, Place
-from bayesdist.data.tables.files import naming_faults, parquet_column, parquet_units
 from bayesdist.errors import InputError
+from bayesdist.reading.faults import naming_faults
+from bayesdist.reading.parquet import open_parquet, parquet_column, parquet_units
 
 if TYPE_CHECKING:
     import pyarrow
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 __all__ = ["ParquetPart", "RowBlock", "describe_part"]
 
 _BATCH = 65_536  # rows decoded at a time
-_BUFFER = 2**18  # bytes: without a buffer, Arrow loads the columns of a whole row group
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,16 +213,8 @@ def _opened(
     path: Path, name: str, as_codes: Collection[str] = ()
 ) -> Iterator[pyarrow.parquet.ParquetFile]:
     """Open file of which only the part being decoded is held in memory."""
-    import pyarrow.parquet
-
     with naming_faults(Path(name)):
-        stored = pyarrow.parquet.ParquetFile(
-            path,
-            read_dictionary=sorted(as_codes) or None,
-            pre_buffer=False,
-            buffer_size=_BUFFER,
-            page_checksum_verification=True,
-        )
+        stored = open_parquet(path, as_codes)
     with stored:
         yield stored
 

@@ -115,7 +115,7 @@ class Information:
     def precision(self) -> Float:
         """Information (D, D) of all parameters with their priors."""
         matrix = self._assembled([cells.curvature for cells in self.groups()])
-        return matrix + np.diag(self.priors.precision)
+        return matrix + self.priors.information(len(self.theta))
 
     @cached_property
     def covariance(self) -> Float:
@@ -157,5 +157,5 @@ class Information:
         for cells in self.groups():
             free = 1 - self.leverage(cells)
             weights.append(cells.squares / (free[:, :, None] * free[:, None, :]))
-        meat = self._assembled(weights) + np.diag(self.priors.precision)
+        meat = self._assembled(weights) + self.priors.information(len(self.theta))
         return np.asarray(self.covariance @ meat @ self.covariance)

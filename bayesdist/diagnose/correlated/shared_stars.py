@@ -66,9 +66,8 @@ def shared_stars(
     The table has codes of the stars; `median` is that of the half-Cauchy prior of w, in the unit of
     u, v.
     """
-    assert table.star is not None
     stars, order = prepare(model, table)
-    code = table.star[order]
+    code = table.column("star")[order]
     n_matches = np.bincount(code)
     repeated = n_matches > 1
     if repeated.sum() < 2:

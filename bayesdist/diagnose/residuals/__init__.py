@@ -12,19 +12,11 @@ from bayesdist.diagnose.residuals.binned import (
 from bayesdist.diagnose.residuals.changes import PatternChange, pattern_changes
 from bayesdist.diagnose.residuals.pairs import pair_statistics
 from bayesdist.diagnose.residuals.rows import STATISTICS, StatisticsRow, bin_row, pair_row
-from bayesdist.diagnose.residuals.tables import (
-    WISE_ARCSEC,
-    StatisticsTable,
-    band_to_band_table,
-    fitting_table,
-    multiframe_table,
-    period_table,
-)
+from bayesdist.diagnose.residuals.tables import StatisticsTable, period_table
 
 __all__ = [
     "BAND_AXES",
     "STATISTICS",
-    "WISE_ARCSEC",
     "BinValues",
     "BinnedResiduals",
     "BinnedSums",
@@ -32,12 +24,9 @@ __all__ = [
     "StatisticsRow",
     "StatisticsTable",
     "band_bins",
-    "band_to_band_table",
     "bin_row",
     "binned_residuals",
     "binned_sums",
-    "fitting_table",
-    "multiframe_table",
     "pair_row",
     "pair_statistics",
     "pattern_changes",

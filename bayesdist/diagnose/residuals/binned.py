@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.errors import InputError
-from bayesdist.names import require_known
+from bayesdist.errors import InputError, require_known
 
 __all__ = [
     "BAND_AXES",
@@ -242,9 +241,9 @@ def binned_sums(
         raise InputError("positions, residuals and weights differ in length")
     if w is not None and (not (w >= 0).all() or not np.isfinite(w).all()):
         raise InputError("weights must be finite and not negative", where="weights")
-    out: BinnedSums | None = None
-    # a block at a time: its scratch arrays stay in the cache, however many stars there are
-    for start in range(0, max(len(columns[0]), 1), _BLOCK):
+
+    def sums_from(start: int) -> BinnedSums:
+        """Sums of one block: its scratch arrays stay in the cache, however many stars there are."""
         rows = slice(start, start + _BLOCK)
         block = [a[rows] for a in columns]
         here = None if w is None else w[rows]
@@ -254,9 +253,11 @@ def binned_sums(
             raise InputError(
                 "a position or residual is not finite", do="give that star the weight 0"
             )
-        sums = _block_sums(block, here, int(nx), int(ny), (float(size[0]), float(size[1])))
-        out = sums if out is None else out + sums
-    assert out is not None
+        return _block_sums(block, here, int(nx), int(ny), (float(size[0]), float(size[1])))
+
+    out = sums_from(0)
+    for start in range(_BLOCK, len(columns[0]), _BLOCK):
+        out = out + sums_from(start)
     return out
 
 

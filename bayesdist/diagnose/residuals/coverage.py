@@ -33,12 +33,15 @@ class Coverage:
     several: bool  # whether the detector has other chips beside it
     sides: Float  # (m, 3) (a, b, c) with a x + b y + c the distance beyond a side of the area
     gap: float  # fraction of the chip's area beyond it
+    known: bool  # whether an earlier calibration, which is the prior, has the rest
     by_chance: float  # the gap that as many stars leave on average when they are scattered evenly
 
     @property
     def significant(self) -> bool:
         """True where so much is missing that the corners or edges are extrapolated."""
-        return self.gap > max(UNCOVERED.value, UNCOVERED_BY_CHANCE.value * self.by_chance)
+        return not self.known and self.gap > max(
+            UNCOVERED.value, UNCOVERED_BY_CHANCE.value * self.by_chance
+        )
 
     @property
     def sentence(self) -> str:
@@ -67,14 +70,17 @@ class Coverage:
         return np.asarray((self.sides @ np.stack([x, y, np.ones_like(x)])).max(axis=0))
 
 
-def coverage_of(sums: BinnedSums, corners: Float, chip: Chip, *, several: bool = False) -> Coverage:
+def coverage_of(
+    sums: BinnedSums, corners: Float, chip: Chip, *, several: bool = False, known: bool = False
+) -> Coverage:
     """The area of a chip that its stars cover.
 
     It lies within the hull of all stars, and within that of the cells that hold more than strays:
     a few false matches in the corners cover nothing.
 
     `sums` are those of the stars used, `corners` (m, 2) the vertices of the convex hull of all
-    stars (`ChipSurvey.corners`); `several` chips make the detector, or one.
+    stars (`ChipSurvey.corners`); `several` chips make the detector, or one; with `known` an earlier
+    calibration says where no stars are.
 
     The gap that n even stars leave in a rectangle is (8/3) ln n / n of its area (Renyi & Sulanke
     1963, Z. Wahrscheinlichkeitstheorie 2, 75).
@@ -96,7 +102,7 @@ def coverage_of(sums: BinnedSums, corners: Float, chip: Chip, *, several: bool =
     x, y = mesh(*(s * length + 0.5 for s, length in zip(step, size, strict=True)))
     beyond = (sides @ np.stack([x, y, np.ones_like(x)])).max(axis=0) > 0
     chance = 8 / 3 * np.log(max(n, 2)) / max(n, 2)
-    return Coverage(chip, several, sides, float(beyond.mean()), float(chance))
+    return Coverage(chip, several, sides, float(beyond.mean()), known, float(chance))
 
 
 def _sides(points: Float) -> Float:

@@ -1,36 +1,21 @@
-"""Tables 5-1, 5-2, 5-3 and C-1 of WSDC D-T033, each statistic with its error."""
+"""Tables of statistics of binned residuals, each with its error, as WSDC D-T033 has them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import combinations, product
 
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.diagnose.residuals.binned import BAND_AXES, BinnedSums, BinValues
-from bayesdist.diagnose.residuals.rows import (
-    STATISTICS,
-    StatisticsRow,
-    bin_row,
-    pair_row,
-)
+from bayesdist.diagnose.residuals.binned import BAND_AXES, BinnedSums
+from bayesdist.diagnose.residuals.rows import STATISTICS, StatisticsRow, bin_row
 
-__all__ = [
-    "WISE_ARCSEC",
-    "StatisticsTable",
-    "band_to_band_table",
-    "fitting_table",
-    "multiframe_table",
-    "period_table",
-]
+__all__ = ["StatisticsTable", "period_table"]
 
 _HEADS = dict(
     zip(STATISTICS, ("Mean", "Sigma", "Min", "Max", "Median", "1%-tile", "99%-tile"), strict=True)
 )
-_AXES = BAND_AXES[:2]
-WISE_ARCSEC = {"W1": 2.75, "W2": 2.75, "W3": 2.75, "W4": 5.5}  # per pixel; W4 is binned 2 x 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,80 +59,6 @@ class StatisticsTable:
         return out
 
 
-def fitting_table(
-    bands: Mapping[str, BinnedSums], *, rng: np.random.Generator, absorbed: int = 1
-) -> StatisticsTable:
-    """Table 5-1: residuals of the fit in bins, in pixels.
-
-    Bands are in the order of the table, `rng` is for the errors. `absorbed` are the coefficients of
-    one axis that the fit took out of the residuals: 15 at order 4; 1 where the residuals are of a
-    model that was not fitted to these stars. Raises DegenerateError when too few bins of a band
-    hold two stars.
-    """
-    rows = tuple(
-        # the scatter of single stars is not what the coefficients are fitted to
-        bin_row(
-            f"{name}/{axis}",
-            band.values(axis),
-            absorbed=1 if axis == "radial" else absorbed,
-            rng=rng,
-        )
-        for name, band in bands.items()
-        for axis in BAND_AXES
-    )
-    return StatisticsTable("Distortion fitting residuals", "Band/Axis", "pix", rows)
-
-
-def band_to_band_table(
-    bands: Mapping[str, BinnedSums],
-    *,
-    rng: np.random.Generator,
-    absorbed: int = 1,
-    arcsec: Mapping[str, float] = WISE_ARCSEC,
-) -> StatisticsTable:
-    """Table 5-2: differences of two bands bin by bin, in arcsec.
-
-    Errors of two bands count as independent.  Where both use the same catalogue stars in the same
-    frames they are not: the catalogue's errors cancel in the difference, its noise is smaller than
-    said here, and its noise-free part larger.
-
-    As `fitting_table`, of two bands or more; the bins of all are as many and cover the same field,
-    `arcsec` are those per pixel of each band.
-    """
-    values = _in_arcsec(bands, arcsec)
-    rows = tuple(
-        bin_row(
-            f"{later}-{earlier}/{axis}",
-            values[later, axis].minus(values[earlier, axis]),
-            absorbed=absorbed,
-            rng=rng,
-        )
-        for earlier, later, axis in _two_bands(bands)
-    )
-    title = "Single-frameset band-to-band alignment residuals"
-    return StatisticsTable(title, "Bands/Axis", "arcsec", rows)
-
-
-def multiframe_table(
-    bands: Mapping[str, BinnedSums],
-    *,
-    rng: np.random.Generator,
-    absorbed: int = 1,
-    arcsec: Mapping[str, float] = WISE_ARCSEC,
-) -> StatisticsTable:
-    """Table 5-3: differences over all pairs of bins, in arcsec.
-
-    As `band_to_band_table`, of one band or more.
-    """
-    values = _in_arcsec(bands, arcsec)
-    rows = tuple(
-        pair_row(f"{name}/{axis}", values[name, axis], absorbed=absorbed, rng=rng)
-        for name, axis in values
-    )
-    title = "In-band multiframe alignment residuals"
-    return StatisticsTable(title, "Band/Axis", "arcsec", rows)
-
-
 def period_table(
     periods: Mapping[str, BinnedSums],
     *,
@@ -158,7 +69,10 @@ def period_table(
     """Table C-1: residuals of one band in several periods, in arcsec.
 
     Periods are in the order of the table, the combined one among them, all against the combined
-    model; `absorbed` is by the name of the period where it differs. Others as of `fitting_table`.
+    model; `rng` is for the errors. `absorbed` are the coefficients of one axis that the fit took
+    out of the residuals, by the name of the period where it differs; 1 where the residuals are of
+    a model that was not fitted to these stars. Raises DegenerateError when too few bins of a
+    period hold two stars.
     """
     rows = tuple(
         bin_row(
@@ -167,23 +81,7 @@ def period_table(
             absorbed=absorbed if isinstance(absorbed, int) else absorbed[name],
             rng=rng,
         )
-        for axis in _AXES
+        for axis in BAND_AXES[:2]
         for name, bins in periods.items()
     )
     return StatisticsTable("Residuals by period", "Period/Axis", "arcsec", rows)
-
-
-def _two_bands(bands: Iterable[str]) -> Iterator[tuple[str, str, str]]:
-    """Iterator over every band with every later one, on each axis."""
-    for (earlier, later), axis in product(combinations(bands, 2), _AXES):
-        yield earlier, later, axis
-
-
-def _in_arcsec(
-    bands: Mapping[str, BinnedSums], arcsec: Mapping[str, float]
-) -> dict[tuple[str, str], BinValues]:
-    return {
-        (name, axis): band.values(axis).scaled(arcsec[name])
-        for name, band in bands.items()
-        for axis in _AXES
-    }

@@ -92,7 +92,7 @@ class _Meat:
             F = projection.functions.polynomials(block.rows)
             psi = projection.star_scores(F, block, projection.through(block, np.eye(G)))
             add_over(by_star, sample.star[block.rows], psi)
-        total = by_star.T @ by_star + np.diag(projection.precision[:G])
+        total = by_star.T @ by_star + projection.precision
         for one in projection.exposures.values():
             gain = one.gain[:, :G]
             total += gain.T @ (one.precision[:, None] * gain)

@@ -88,7 +88,7 @@ def gap_test(projection: Projection) -> Outcome | None:
     model = sample.model
     if len(model.chips) == 1 or sample.epoch is None or np.ptp(sample.epoch) < SHORTEST:
         return None
-    exposures = list(_exposures(projection))
+    exposures = list(_exposures(projection, sample.epoch))
     lines = [
         line
         for chip in range(1, len(model.chips))
@@ -134,7 +134,7 @@ def _drifts(projection: Projection, chip: int, way: int) -> bool:
         return False
     first = model.tdd_slice(model.chips[chip].number).start
     first += model.time.terms.index(term) * model.time.n_values
-    return bool(projection.precision[first] == 0)
+    return bool(projection.precision[first, first] == 0)
 
 
 def visit_codes(epoch: Float) -> Int:
@@ -200,14 +200,14 @@ def _of_stars(some: list[_Exposure], at: list[tuple[int, int]], pull: Float) -> 
     return max(float(squares_over(star, psi)[0] - (psi**2).sum()), 0.0)
 
 
-def _exposures(projection: Projection) -> Iterator[_Exposure]:
+def _exposures(projection: Projection, epoch: Float) -> Iterator[_Exposure]:
     """Iterator over the exposures with stars enough on the first chip and on another."""
     for blocks in projection.sample.blocks_by("exposure"):
-        if one := _exposure(projection, blocks):
+        if one := _exposure(projection, epoch, blocks):
             yield one
 
 
-def _exposure(projection: Projection, blocks: list[Block]) -> _Exposure | None:
+def _exposure(projection: Projection, epoch: Float, blocks: list[Block]) -> _Exposure | None:
     sample = projection.sample
     number: dict[int, int] = {}
     for block in blocks:
@@ -238,9 +238,8 @@ def _exposure(projection: Projection, blocks: list[Block]) -> _Exposure | None:
     # what stars have in common beyond what the exposures have
     psi = sum(F[axis] * (g[axis] - HF[axis] @ step)[:, None] for axis in (0, 1))
     by_star = (psi @ inverse[:, own]).reshape(len(at), len(chips), 3)
-    assert sample.epoch is not None
     return _Exposure(
-        float(sample.epoch[at[0]]),
+        float(epoch[at[0]]),
         tuple(chips),
         value,
         np.diag(inverse)[own].reshape(len(chips), 3) * projection.score_ratio,

@@ -54,7 +54,7 @@ class Projection:
     # eliminated
     information: Float
     score: Float  # (G + q,)
-    precision: Float  # (D,) of the priors
+    precision: Float  # (G, G) of the priors of the global parameters
     theta: Float  # (D,) where the scores were taken
 
     @property
@@ -181,8 +181,8 @@ class Projection:
 
     def prior_meat(self, which: Int) -> Float:
         """Covariance (n, n) that priors give to the scores of regressors, as data of their own."""
-        G, nuisance = self.n_global, self.nuisance[:, which]
-        out = nuisance.T @ (self.precision[:G, None] * nuisance)
+        nuisance = self.nuisance[:, which]
+        out = nuisance.T @ self.precision @ nuisance
         for one in self.exposures.values():
             follows = self._following(one, which)
             out += follows.T @ (one.precision[:, None] * follows)
@@ -214,7 +214,8 @@ def _summed(functions: Functions, theta: Float, priors: GaussianPriors) -> Proje
     m = G + 2 * (L - K) * chips
     pull = priors.pull(theta)
     information, score = np.zeros((m, m)), np.zeros(m)
-    information[np.arange(G), np.arange(G)] = priors.precision[:G]
+    of_priors = priors.information(G)
+    information[:G, :G] = of_priors
     score[:G] = pull[:G]
     exposures: dict[int, Eliminated] = {}
     for blocks in sample.blocks_by("frame_exposure"):
@@ -250,7 +251,7 @@ def _summed(functions: Functions, theta: Float, priors: GaussianPriors) -> Proje
             exposures[blocks[0].frame_exposure] = Eliminated(
                 index, inverse, gain, own, priors.precision[index]
             )
-    out = Projection(functions, exposures, information, score, priors.precision, theta)
+    out = Projection(functions, exposures, information, score, of_priors, theta)
     out.root  # noqa: B018 - raises here, where there is another way
     return out
 

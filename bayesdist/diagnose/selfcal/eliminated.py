@@ -117,8 +117,9 @@ class Columns:
 
     @cached_property
     def centre(self) -> Float:
-        """Mean position of all exposures along the axes of the polynomials."""
-        assert self.deviations is not None
+        """Mean position of the exposures along the axes of the polynomials; 0 if none deviate."""
+        if self.deviations is None:
+            return np.zeros(2)
         p, out = self.problem, []
         phi = np.zeros((1, p.model.n_terms))
         phi[0, 0] = 1.0

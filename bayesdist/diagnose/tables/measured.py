@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,20 +103,23 @@ def _taken(
     posterior: TablePosterior | None, tables: Sequence[LookupTable], chip: Chip, fitted: bool
 ) -> Callable[[Float, Float], Float]:
     """Variance (n, 2) that tables and polynomial have taken of the residuals at pixels (n,)."""
-
-    def of_posterior(x: Float, y: Float) -> Float:
-        assert posterior is not None
-        out = posterior.position_sigma(x, y, refitted=True) ** 2
-        phi = posterior.grid.basis.evaluate(*_on(chip, x, y))
-        for a, axis in enumerate(posterior.axes):
-            out[:, a] += ((phi @ axis.sums.polynomial_root) ** 2).sum(axis=1)
-        return out
+    if posterior is not None:
+        return partial(_of_posterior, posterior, chip)
 
     def of_nodes(x: Float, y: Float) -> Float:
         variance = held_sigma(tables[-1:], x, y, chip=chip.number) ** 2
         return variance if fitted else -variance
 
-    return of_nodes if posterior is None else of_posterior
+    return of_nodes
+
+
+def _of_posterior(posterior: TablePosterior, chip: Chip, x: Float, y: Float) -> Float:
+    """Variance (n, 2) of a posterior with that of its polynomial."""
+    out = posterior.position_sigma(x, y, refitted=True) ** 2
+    phi = posterior.grid.basis.evaluate(*_on(chip, x, y))
+    for a, axis in enumerate(posterior.axes):
+        out[:, a] += ((phi @ axis.sums.polynomial_root) ** 2).sum(axis=1)
+    return out
 
 
 def _on(chip: Chip, x: Float, y: Float) -> tuple[Float, Float]:

@@ -70,15 +70,13 @@ class ChangeDate:
     p_scatter: float  # probability of a larger scatter
 
 
-def period_scores(
-    new: NewFit, change: Change, matches: Matches, *, most: int = MOST_PERIODS
-) -> tuple[PeriodScore, ...]:
+def period_scores(new: NewFit, change: Change, matches: Matches) -> tuple[PeriodScore, ...]:
     """Scores of each period in the order of time, from one pass over the data in chunks.
 
-    `matches` are those of `new`, with epochs; where they have no more than `most` dates, each date
-    is a period.
+    `matches` are those of `new`, with epochs; where they have no more than `MOST_PERIODS` dates,
+    each date is a period.
     """
-    edges = _edges(matches, most)
+    edges = _edges(matches)
     held: dict[int, tuple[NormalEquations, float, float, int]] = {}
     constants = new.target.hyper.constants(new.psi[None, new.target.n_theta :])
     for table in matches.batches():
@@ -93,13 +91,13 @@ def period_scores(
     )
 
 
-def _edges(matches: Matches, most: int) -> Float:
+def _edges(matches: Matches) -> Float:
     """Dates at which a new period begins."""
     epoch = matches.sample(1_000_000).column("epoch")
     dates, counts = np.unique(epoch, return_counts=True)
-    if len(dates) <= most:
+    if len(dates) <= MOST_PERIODS:
         return dates[1:]
-    period = (np.cumsum(counts) - counts) * most // counts.sum()
+    period = (np.cumsum(counts) - counts) * MOST_PERIODS // counts.sum()
     return dates[np.flatnonzero(np.diff(period)) + 1]
 
 

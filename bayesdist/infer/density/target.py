@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +19,29 @@ from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.model import DistortionModel
 
-__all__ = ["Target"]
+__all__ = ["Density", "Target"]
 
 Float = NDArray[np.float64]
 
 SCRATCH = 32_000_000  # bytes of effective coefficients in memory at a time
+
+
+class Density(Protocol):
+    """A density that is sampled, of psi = (theta, hyperparameters)."""
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters that are no hyperparameters."""
+        ...
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of psi."""
+        ...
+
+    def log_density(self, psi: Float) -> Float:
+        """Log density of points (n, D); minus infinity outside the support."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

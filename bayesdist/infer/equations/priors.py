@@ -13,24 +13,45 @@ from bayesdist.errors import InputError
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.model import DistortionModel
 
-__all__ = ["GaussianPriors", "Prior"]
+__all__ = ["GaussianPriors", "JointPrior", "Prior"]
 
 Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
+class JointPrior:
+    """Gaussian prior of the first entries of theta with their correlations.
+
+    Parameters
+    ----------
+    centre : ndarray, shape (G,)
+    precision : ndarray, shape (G, G)
+        Inverse covariance; it may leave directions flat.
+    rank : int
+        Number of directions that are not flat.
+    """
+
+    centre: Float
+    precision: Float
+    rank: int
+
+
+@dataclass(frozen=True, eq=False)
 class GaussianPriors:
-    """Independent Gaussian priors on entries of theta.
+    """Gaussian priors on entries of theta: independent ones, and a joint one of the first entries.
 
     Parameters
     ----------
     centre : ndarray, shape (D,)
     precision : ndarray, shape (D,)
         Inverse variances; 0 is a flat prior.
+    joint : JointPrior, optional
+        Of the polynomials and their drift.
     """
 
     centre: Float
     precision: Float
+    joint: JointPrior | None = None
 
     @classmethod
     def none(cls, model: DistortionModel) -> GaussianPriors:
@@ -63,27 +84,45 @@ class GaussianPriors:
 
     @property
     def n_informative(self) -> int:
-        """Number of parameters that have a prior."""
-        return int((self.precision > 0).sum())
+        """Number of directions in which a prior is not flat."""
+        joint = 0 if self.joint is None else self.joint.rank
+        return int((self.precision > 0).sum()) + joint
 
     def pull(self, theta: Float) -> Float:
         """Gradient of the log prior."""
-        return self.precision * (self.centre - theta)
+        out = self.precision * (self.centre - theta)
+        if self.joint is not None:
+            G = len(self.joint.centre)
+            out[:G] += self.joint.precision @ (self.joint.centre - theta[:G])
+        return out
 
     def log_density(self, theta: Float) -> Float:
         """Log prior of parameter vectors (..., D), up to a constant."""
-        return -0.5 * ((theta - self.centre) ** 2 * self.precision).sum(axis=-1)
+        out = -0.5 * ((theta - self.centre) ** 2 * self.precision).sum(axis=-1)
+        if self.joint is not None:
+            d = theta[..., : len(self.joint.centre)] - self.joint.centre
+            out = out - 0.5 * np.einsum("...d,...d->...", d @ self.joint.precision, d)
+        return np.asarray(out)
 
     def about(self, theta: Float) -> Prior:
         """Priors as one of all parameters, about theta (D,)."""
-        return Prior(theta, np.diag(self.precision), self.pull(theta))
+        return Prior(theta, self.information(len(self.precision)), self.pull(theta))
+
+    def information(self, n: int) -> Float:
+        """Precision (n, n) of the first entries of theta."""
+        out = np.diag(self.precision[:n])
+        if self.joint is not None:
+            G = len(self.joint.centre)
+            out[:G, :G] += self.joint.precision[:n, :n]
+        return out
 
     def matrix(self, model: DistortionModel, n_tail: int = 0) -> Arrow:
-        """The priors' precision as a diagonal arrow."""
+        """The priors' precision as an arrow without edges."""
         n, q, g = len(model.local_blocks), model.n_frame, model.n_global
         local = self.precision[g:].reshape(n, q) if n else np.zeros((0, q))
         blocks = np.einsum("nq,qr->nqr", local, np.eye(q))
-        border = np.diag(np.concatenate([self.precision[:g], np.zeros(n_tail)]))
+        border = np.zeros((g + n_tail, g + n_tail))
+        border[:g, :g] = self.information(g)
         return Arrow(border, np.zeros((n, g + n_tail, q)), blocks, n_tail)
 
 

@@ -137,11 +137,14 @@ def _reason(
     )
 
 
-def check_coverage(model: DistortionModel, survey: Survey, n_priors: int = 0) -> None:
+def check_coverage(
+    model: DistortionModel, survey: Survey, n_priors: int = 0, *, known: bool = False
+) -> None:
     """Raise DegenerateError for data that cannot determine the model, with the plain reason.
 
     That is: fewer numbers than parameters (each of `n_priors` priors is a number more), too few
-    stars in an exposure, stars on a line, or stars in one corner of a chip.
+    stars in an exposure, stars on a line, or stars in one corner of a chip.  Where the polynomials
+    are `known` from an earlier calibration, stars may lie anywhere on a chip.
     """
     n = survey.n
     if 2 * n + n_priors < model.n_params:
@@ -171,6 +174,8 @@ def check_coverage(model: DistortionModel, survey: Survey, n_priors: int = 0) ->
                 where=where,
                 do="correct detector.size, the columns or data.pixel_origin, or leave the row out",
             )
+        if known:
+            continue
         a, b, aa, ab, bb = found.sums / found.n
         spread = np.linalg.eigvalsh([[aa - a * a, ab - a * b], [ab - a * b, bb - b * b]])
         # variances: they lose half of the digits

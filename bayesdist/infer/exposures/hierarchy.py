@@ -208,7 +208,6 @@ def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -
     alone = replace(bare_model(model), chips=(model.chips[model.chip_code(chip)],), time=None)
     table = Matches.concatenate(parts)
     gauge = reference_gauge(fit_linear(table, alone), chip).gauge
-    assert gauge is not None
     return replace(model, gauge="held", held=(*gauge.shift, -gauge.rotation), origin=(0.0, 0.0))
 
 

@@ -65,7 +65,6 @@ def with_drift_of(
     own = without_frames(solution)
     model = own.model
     gauge = reference_gauge(solution, chip).gauge
-    assert gauge is not None
     there, matrix = _in_gauge(reference, model, chip, gauge.rotation)
     k = model.n_polynomial
     cov = np.asarray(own.cov, float)

@@ -112,16 +112,14 @@ def fit_with_tables(
     x, y = lower.x, lower.y
     tables: dict[int, LookupTable] = {}
     posteriors: dict[int, TablePosterior] = {}
-    mixture: ResidualMixture | None = None
     progress: list[Iteration] = []
 
-    def solved(moved: Matches, pixel: float) -> LinearFit:
+    def solved(moved: Matches, mixture: ResidualMixture, pixel: float) -> LinearFit:
         """Polynomial fit for fixed tables; `pixel` is the size of one in u, v."""
-        if mixture is not None:
-            jitter = np.full(len(x), mixture.jitter)
-            for number, posterior in posteriors.items():
-                jitter[numbers == number] = posterior.jitter
-            moved = _with_memberships(moved, mixture, jitter * pixel)
+        jitter = np.full(len(x), mixture.jitter)
+        for number, posterior in posteriors.items():
+            jitter[numbers == number] = posterior.jitter
+        moved = _with_memberships(moved, mixture, jitter * pixel)
         return fit_linear(on_the_chips(moved, model), model)
 
     def new_table(chip: int, rows: NDArray[np.bool_], shift: Float, variance: Float) -> LookupTable:
@@ -152,9 +150,9 @@ def fit_with_tables(
         )
         return posteriors[chip].table
 
-    moved, own, pixel = lower, np.zeros((len(x), 2)), 1.0
+    moved, own = lower, np.zeros((len(x), 2))
+    solution = fit_linear(on_the_chips(moved, model), model)
     for number in range(1, max_iterations + 1):
-        solution = solved(moved, pixel)
         pixel = model.pixel_size(solution.mean)
         shifts = pixel_shifts(solution, moved)
         mixture = fit_mixture(shifts.shift, shifts.variance)
@@ -174,7 +172,6 @@ def fit_with_tables(
             Iteration(
                 number=number,
                 moved=float(np.abs(difference).max()),
-                moved_rms=float(np.sqrt((difference**2).mean())),
                 rms=rms,
                 false_fraction=mixture.fraction,
             )
@@ -182,12 +179,12 @@ def fit_with_tables(
         if report is not None:
             report(progress[-1])
         moved = matches.with_columns(x=x + own[:, 0], y=y + own[:, 1])
+        solution = solved(moved, mixture, pixel)
         if progress[-1].moved < tolerance:
             break
-    assert mixture is not None
     return TableFit(
         filter=filter,
-        solution=solved(moved, pixel),
+        solution=solution,
         beneath=tuple(beneath),
         fitted=tuple(posteriors.get(c, tables[c]) for c in chips),
         mixture=mixture,

@@ -36,6 +36,7 @@ EMPTY = 1e-8
 TILE = 16  # nodes: the search starts on independent tiles of the chip
 LOG_LENGTH = (np.log(2.0), 1.0)  # prior of log(length / step): mean, standard deviation
 SETTLED = 0.02  # gain in log density at which the search stops
+UNKNOWN = np.diag([0.04, 0.04])  # of log amplitude and log length, before the first differences
 RULED_OUT = 10.0  # a smoothness so much worse on the tiles is not tried again
 
 
@@ -219,15 +220,15 @@ def _bounds(evidence: Evidence) -> list[tuple[float, float]]:
 
 
 def _summit(
-    density: Callable[[Float], float], start: Float, *, covariance: Float | None = None
+    density: Callable[[Float], float], start: Float, *, covariance: Float = UNKNOWN
 ) -> tuple[Float, Float, float]:
     """Maximum of a smooth function of two variables, the covariance there, and its value.
 
-    Newton's method on differences, of half a standard error where that is known: a few steps from a
-    good start, and the curvature is obtained too.
+    Newton's method on differences of half a standard error: a few steps from a good start, and the
+    curvature is obtained too.
     """
     x = np.asarray(start, float)
-    h = np.full(2, 0.1) if covariance is None else _widths(covariance)
+    h = _widths(covariance)
     for _ in range(8):
         f = density(x)
         ends = np.array([[density(x + s * h[k] * np.eye(2)[k]) for s in (1, -1)] for k in (0, 1)])
@@ -246,7 +247,6 @@ def _summit(
         if gain < SETTLED:
             break
         h = _widths(covariance)
-    assert covariance is not None
     return x, covariance, f + min(gain, 1.0)
 
 

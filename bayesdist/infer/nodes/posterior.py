@@ -1,4 +1,4 @@
-"""Posterior of a look-up table: node values, their covariance, draws, errors in between."""
+"""Posterior of a look-up table: node values, their covariance, errors in between."""
 
 from __future__ import annotations
 
@@ -92,14 +92,6 @@ class TablePosterior:
     def cov(self) -> Float:
         """Covariance (2, n_nodes, n_nodes) of the node values, square pixels."""
         return np.stack([axis.cov for axis in self.axes])
-
-    def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Node values (n, 2, ny, nx) from the posterior, pixels."""
-        planes = []
-        for axis in self.axes:
-            xi = rng.standard_normal((n, axis.root.shape[1]))
-            planes.append((axis.mean + xi @ axis.root.T).reshape(n, *self.grid.shape))
-        return np.stack(planes, axis=1)
 
     def position_sigma(self, x: ArrayLike, y: ArrayLike, *, refitted: bool = False) -> Float:
         """Standard error of the interpolated shift.

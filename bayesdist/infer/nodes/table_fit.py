@@ -1,10 +1,9 @@
-"""Polynomial and look-up tables of one filter: corrected pixels, positions, and their errors."""
+"""Polynomial and look-up tables of one filter: corrected pixels, and their errors."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +20,7 @@ __all__ = ["Iteration", "TableFit", "held_sigma", "table_of"]
 
 Float = NDArray[np.float64]
 
-BLOCK = 1024  # positions whose derivatives are in memory at once
+BLOCK = 1024  # positions whose rows over all nodes are in memory at once
 
 
 @dataclass(frozen=True)
@@ -32,8 +31,8 @@ class Iteration:
     ----------
     number : int
         From 1.
-    moved, moved_rms : float
-        Largest and rms change of a node, pixels.
+    moved : float
+        Largest change of a node, pixels.
     rms : float
         Rms residual of an axis before the new tables, stars weighted by their probability of being
         true matches, pixels.
@@ -43,7 +42,6 @@ class Iteration:
 
     number: int
     moved: float
-    moved_rms: float
     rms: float
     false_fraction: float
 
@@ -108,96 +106,25 @@ class TableFit:
         """
         return on_the_chips(corrected_matches(self.tables, matches), self.solution.model)
 
-    def predict(
-        self,
-        x: ArrayLike,
-        y: ArrayLike,
-        *,
-        chip: int,
-        epoch: ArrayLike | None = None,
-        exposure: ArrayLike | None = None,
-    ) -> Float:
-        """Positions (u, v) of raw pixels: tables, then polynomial.
+    def shift_variance(self, x: ArrayLike, y: ArrayLike, *, chip: int) -> Float:
+        """Variance of the tables' shift, less what the polynomial follows.
+
+        The formal covariance of the fit is that of the polynomial for fixed tables; with this
+        variance, projected by the slopes of the polynomial, it adds up to that of the joint
+        solution.  The error of the detector's table counts in another filter only as far as that
+        filter's own table does not absorb it; the polynomial is not assumed to follow plain tables
+        beneath (`held_sigma`).
 
         Parameters
         ----------
         x, y : array_like, shape (N,)
-            FITS 1-based pixels.
+            FITS 1-based raw pixels.
         chip : int
-        epoch, exposure : array_like, optional
-            As in `DistortionModel.predict`.
 
         Returns
         -------
         ndarray, shape (N, 2)
-        """
-        px, py = self._pixels(x, y, chip)
-        return self.solution.model.predict(
-            self.solution.mean, px, py, epoch=epoch, exposure=exposure, chip=chip
-        )
-
-    def position_sigma(
-        self,
-        x: ArrayLike,
-        y: ArrayLike,
-        *,
-        chip: int,
-        epoch: ArrayLike | None = None,
-        exposure: ArrayLike | None = None,
-    ) -> Float:
-        """Standard error of a position: polynomial with all its terms, and tables.
-
-        Parameters
-        ----------
-        x, y, chip, epoch, exposure
-            As in `predict`.
-
-        Returns
-        -------
-        ndarray, shape (N, 2)
-            In the unit of u, v.
-
-        Raises
-        ------
-        InputError
-            For binned tables, whose nodes have no covariance.
-
-        Notes
-        -----
-        The formal covariance of the fit is that of the polynomial for fixed tables.  The tables
-        contribute the part of their errors that is left after the polynomial has followed them, so
-        that the sum is the variance of the joint solution.  The error of the detector's table
-        counts in another filter only as far as that filter's own table does not absorb it.
-        """
-        model, mean, cov = self.solution.model, self.solution.mean, self.solution.cov
-        x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.asarray(y, float))
-        out = self.table_sigma(x, y, chip=chip, epoch=epoch, exposure=exposure) ** 2
-        for rows, of in _blocks(len(x), chip, epoch, exposure):
-            D = model.jacobian(mean, *self._pixels(x[rows], y[rows], chip), **of)
-            out[rows] += np.einsum("nap,pq,naq->na", D, cov, D, optimize=True)
-        return np.sqrt(out)
-
-    def table_sigma(
-        self,
-        x: ArrayLike,
-        y: ArrayLike,
-        *,
-        chip: int,
-        epoch: ArrayLike | None = None,
-        exposure: ArrayLike | None = None,
-    ) -> Float:
-        """Standard error of a position by those of the tables alone.
-
-        Parameters
-        ----------
-        x, y, chip, epoch, exposure
-            As in `predict`.
-
-        Returns
-        -------
-        ndarray, shape (N, 2)
-            In the unit of u, v: the part left after the polynomial has followed the tables.  It
-            is not assumed to follow plain tables beneath (`held_sigma`).
+            Square pixels.
 
         Raises
         ------
@@ -206,17 +133,8 @@ class TableFit:
         """
         x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.asarray(y, float))
         own = self._posterior(chip)
-        out = np.empty((len(x), 2))
-        for rows, of in _blocks(len(x), chip, epoch, exposure):
-            pixels = self._pixels(x[rows], y[rows], chip)
-            J = self.solution.model.slopes(self.solution.mean, *pixels, **of)
-            table = self._table_variance(own, x[rows], y[rows], chip)
-            out[rows] = np.sqrt(np.einsum("nab,nb->na", J**2, table))
-        return out
-
-    def _pixels(self, x: ArrayLike, y: ArrayLike, chip: int) -> tuple[Float, Float]:
-        """Raw pixels (N,) as all tables have corrected them."""
-        return corrected(self.tables, x, y, chip=chip, filter=self.filter)
+        blocks = [slice(start, start + BLOCK) for start in range(0, len(x), BLOCK)]
+        return np.concatenate([self._variance(own, x[rows], y[rows], chip) for rows in blocks])
 
     def _posterior(self, chip: int) -> TablePosterior:
         """Posterior of the fitted table of a chip."""
@@ -232,7 +150,7 @@ class TableFit:
             do=f"there are those for {', '.join(str(p.table.chip) for p in self.posteriors)}",
         )
 
-    def _table_variance(self, own: TablePosterior, x: Float, y: Float, chip: int) -> Float:
+    def _variance(self, own: TablePosterior, x: Float, y: Float, chip: int) -> Float:
         """Variance (N, 2) of the tables' shift where the polynomial follows, square pixels."""
         lower = next((one for one in self.beneath if table_of(one).chip == chip), None)
         if lower is None:
@@ -262,21 +180,3 @@ def held_sigma(tables: Sequence[LookupTable], x: ArrayLike, y: ArrayLike, *, chi
         if table.chip == chip and table.sigma is not None:
             return LookupTable(chip, table.sigma, "", table.first, table.step).evaluate(x, y)
     return np.zeros((len(x), 2))
-
-
-def _blocks(
-    n: int, chip: int, epoch: ArrayLike | None, exposure: ArrayLike | None
-) -> Iterator[tuple[slice, dict[str, Any]]]:
-    """Chunks of n positions, with the arguments of `DistortionModel.predict` for each."""
-    dates = None if epoch is None else np.broadcast_to(np.asarray(epoch, float), (n,))
-    frames = None if exposure is None else np.broadcast_to(np.asarray(exposure), (n,))
-    for start in range(0, n, BLOCK):
-        rows = slice(start, start + BLOCK)
-        yield (
-            rows,
-            {
-                "epoch": None if dates is None else dates[rows],
-                "exposure": None if frames is None else frames[rows],
-                "chip": chip,
-            },
-        )

@@ -28,7 +28,7 @@ from bayesdist.infer.density.importance import (
     warmup_steps,
 )
 from bayesdist.infer.density.proposal import Proposal
-from bayesdist.infer.density.target import Target
+from bayesdist.infer.density.target import Density
 from bayesdist.infer.posterior import SamplerInfo
 from bayesdist.infer.sampler.checkpoints import Block, Walkers
 from bayesdist.infer.sampler.ensembles import Ensembles, Whitening
@@ -172,7 +172,7 @@ class _History:
         )
 
 
-def run_chains(target: Target, proposal: Proposal, settings: Settings) -> Chains:
+def run_chains(target: Density, proposal: Proposal, settings: Settings) -> Chains:
     """Sample until the targets are met or the steps are used up.
 
     DegenerateError when hardly a proposal falls inside the support; InputError for checkpoints that
@@ -202,22 +202,21 @@ def run_chains(target: Target, proposal: Proposal, settings: Settings) -> Chains
             return chains
         plan = _plan(target, quality, s)
     if not plan.coupled:
-        chains, passes, steps = _state_dependent(target, start(plan), s, quality, passes, steps)
-        if chains is not None:
-            return chains
+        moved, mixes = _state_dependent(target, start(plan), s, quality, passes, steps)
+        if mixes:
+            return moved
+        passes, steps = moved.passes, moved.steps
         plan = plan_moves(0.0, np.inf, len(target.names), s.n_stars, s.walkers)
-    chains, *_ = _state_dependent(target, start(plan), s, quality, passes, steps)
-    assert chains is not None
-    return chains
+    return _state_dependent(target, start(plan), s, quality, passes, steps)[0]
 
 
-def _plan(target: Target, quality: Quality, s: Settings) -> Plan:
+def _plan(target: Density, quality: Quality, s: Settings) -> Plan:
     q, n_proposals = quality, len(quality.log_weights) + quality.n_outside
     return plan_moves(q.efficiency, q.k, len(target.names), s.n_stars, s.walkers, n_proposals)
 
 
 def _drawn_ahead(
-    target: Target, runs: Ensembles, s: Settings, passes: int
+    target: Density, runs: Ensembles, s: Settings, passes: int
 ) -> tuple[Chains | None, Quality, int, int]:
     """Chains by pure independence, or None when the proposal is worse than the pilot showed.
 
@@ -266,11 +265,11 @@ def _distrusted(verdict: Convergence, quality: Quality) -> Convergence:
 
 
 def _state_dependent(
-    target: Target, runs: Ensembles, s: Settings, quality: Quality, passes: int, begin: int
-) -> tuple[Chains | None, int, int]:
-    """Chains by moves that are evaluated one by one, or None when Crank-Nicolson moves do not mix.
+    target: Density, runs: Ensembles, s: Settings, quality: Quality, passes: int, begin: int
+) -> tuple[Chains, bool]:
+    """Chains by moves that are evaluated one by one, and whether Crank-Nicolson moves mix.
 
-    The first half of the steps is warm-up.  Also the passes and steps made.
+    The first half of the steps is warm-up.
     """
     if s.max_steps - begin < 10 * runs.plan.thin:  # too few steps to leave any out
         runs = replace(runs, plan=replace(runs.plan, thin=1))
@@ -292,13 +291,13 @@ def _state_dependent(
             break
         ess = min(verdict.ess_bulk_min, verdict.ess_tail_min)
         if trial and ess < DRAWS_PER_WALKER.value * total:
-            return None, passes, span.end
+            return history.chains(warmup, verdict, passes), False
         wanted = next_check(made, verdict, s.n_stars, total)
-    return history.chains(warmup, verdict, passes), passes, history.end
+    return history.chains(warmup, verdict, passes), True
 
 
 def _verdict(
-    target: Target, history: _History, warmup: int, quality: Quality, limits: Limits
+    target: Density, history: _History, warmup: int, quality: Quality, limits: Limits
 ) -> Convergence:
     return diagnose(
         history.after(warmup)[0],

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
+from bayesdist.reading.faults import restoring
+from bayesdist.reading.hdf5 import hdf5_arrays
 
 __all__ = ["Block", "Walkers", "block_path", "read_arrays", "write_arrays"]
 
@@ -51,12 +53,13 @@ def read_arrays(
     data or settings.
     """
     try:
-        with h5py.File(path, "r") as file:
-            known = file.attrs["fingerprint"]
-            arrays = {name: file[name][...] for name in names or file}
-    except (OSError, KeyError) as error:
+        arrays, marks = hdf5_arrays(path, names)
+        known = marks["fingerprint"]
+    except InputError as error:
+        raise InputError(error.cause, where=error.where, do=do) from error
+    except Exception as error:  # HDF5 raises errors of all kinds on damaged files
         raise InputError("the checkpoint cannot be read", where=str(path), do=do) from error
-    if known != fingerprint:
+    if not isinstance(known, str) or known != fingerprint:
         raise InputError(
             "the checkpoints belong to other data or settings",
             where=str(path.parent),
@@ -106,10 +109,12 @@ class Block:
         """Block from a file; InputError when it cannot be read, or has another mark."""
         do = "delete it and resume: its steps are run again"
         stored = read_arrays(path, mark, (*BLOCK_ARRAYS, *END_ARRAYS), do=do)
-        log_q, keys, (position, has_gauss, gauss) = (stored.pop(name) for name in END_ARRAYS)
-        random = ("MT19937", keys, int(position), int(has_gauss), float(gauss))
-        end = Walkers(stored["coords"][-1], stored["log_prob"][-1], log_q, random)
-        return cls(**stored, end=end)
+        with restoring(path, "a checkpoint", do=do):
+            log_q, keys, (position, has_gauss, gauss) = (stored.pop(name) for name in END_ARRAYS)
+            random = ("MT19937", keys, int(position), int(has_gauss), float(gauss))
+            np.random.RandomState().set_state(random)  # refuses what is no such state
+            end = Walkers(stored["coords"][-1], stored["log_prob"][-1], log_q, random)
+            return cls(**stored, end=end)
 
 
 def block_path(folder: Path, ensemble: int, end: int) -> Path:

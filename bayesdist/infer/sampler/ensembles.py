@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 from bayesdist.infer.density.proposal import Proposal
-from bayesdist.infer.density.target import Target
+from bayesdist.infer.density.target import Density
 from bayesdist.infer.equations.arrow import ArrowFactor
 from bayesdist.infer.sampler.checkpoints import Block, Walkers, block_path
 from bayesdist.infer.sampler.move_schedule import Plan, StepRange
@@ -50,7 +50,7 @@ class Whitening:
     scale: Float  # standard deviations (h,) of the hyperparameters
 
     @classmethod
-    def of(cls, target: Target, proposal: Proposal, draws: Float) -> Whitening:
+    def of(cls, target: Density, proposal: Proposal, draws: Float) -> Whitening:
         """Whitening by the proposal's best node, and by the hyperparameters of draws (n, D)."""
         n = target.n_theta
         factor = proposal.best.factor.matrix.without_tail().factor()
@@ -152,7 +152,7 @@ def _crank_nicolson(step: float) -> MHMove:
 class Ensembles:
     """Independent ensembles that advance block by block and write a file for each block."""
 
-    target: Target
+    target: Density
     proposal: Proposal
     pilot: ProposalBatch  # first proposals of each ensemble
     whitening: Whitening  # coordinates of moves that depend on the state

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.density.proposal import Proposal
-from bayesdist.infer.density.target import Target
+from bayesdist.infer.density.target import Density
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 
 __all__ = ["ProposalBatch", "draw_batch", "pilot_batch"]
@@ -58,7 +58,7 @@ class ProposalBatch:
 
 
 def draw_batch(
-    target: Target,
+    target: Density,
     proposal: Proposal,
     seeds: Sequence[int],
     key: tuple[int, ...],
@@ -87,7 +87,7 @@ def _drawn(proposal: Proposal, seeds: Sequence[int], key: tuple[int, ...], n: in
 
 
 def pilot_batch(
-    target: Target,
+    target: Density,
     proposal: Proposal,
     seeds: Sequence[int],
     n: int,

@@ -170,7 +170,10 @@ def _fingerprint(target: Target, *settings: object) -> str:
     digest = hashlib.sha256()
     digest.update("".join(target.shards.sum(_digest)).encode())
     digest.update(repr([(name, metadata.version(name)) for name in ENGINES]).encode())
-    digest.update(target.priors.centre.tobytes() + target.priors.precision.tobytes())
+    priors = target.priors
+    digest.update(priors.centre.tobytes() + priors.precision.tobytes())
+    if priors.joint is not None:
+        digest.update(priors.joint.centre.tobytes() + priors.joint.precision.tobytes())
     digest.update(repr((target.model.to_dict(), target.mixture, settings, FORMAT)).encode())
     return digest.hexdigest()
 

@@ -160,12 +160,11 @@ def self_calibrate(
         )
         last = radius <= match_radius
         if measured:
-            detections, errors = _with_errors(detections, mode)
+            sigma, errors = _errors_of(detections, mode)
+            detections = replace(detections, sigma=sigma)
         few = max(MAX_CHANGED * len(detections), MIN_CHANGED)
         if last and before is not None and _changed(before, friends) <= few:
             if measured:  # with the errors of this iteration
-                sigma = detections.sigma
-                assert sigma is not None
                 problem = replace(mode.problem, var=sigma[mode.problem.rows] ** 2)
                 mode = solve_in_gauge(
                     problem,
@@ -205,17 +204,16 @@ def _still(problem: Problem, mode: SelfCalibrationMode) -> Mixture | None:
     return mode.mixture if same and problem.n_star == 2 else None
 
 
-def _with_errors(
+def _errors_of(
     detections: Detections, mode: SelfCalibrationMode
-) -> tuple[Detections, tuple[Float, Float]]:
-    """Detections with errors by magnitude, or one for all."""
+) -> tuple[Float, tuple[Float, Float]]:
+    """Errors (N,) by magnitude, or one for all; and the magnitudes and errors of the line."""
     problem = mode.problem
     mag = np.zeros(len(detections)) if detections.mag is None else detections.mag
     middles, sigma = scatter_by_magnitude(
         problem, mode.theta, mode.mixture, mode.stars, mag[problem.rows]
     )
-    of_each = np.exp(np.interp(mag, middles, np.log(sigma)))
-    return replace(detections, sigma=of_each), (middles, sigma)
+    return np.exp(np.interp(mag, middles, np.log(sigma))), (middles, sigma)
 
 
 def _changed(before: Friends, after: Friends) -> int:

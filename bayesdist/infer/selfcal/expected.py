@@ -42,18 +42,21 @@ class ExpectedSolution(Solution):
         """Parameter vectors (n, D)."""
         return np.asarray(rng.multivariate_normal(self.mean, self.cov, n, method="eigh"))
 
-    def up_to(self, directions: Float) -> Float | None:
+    def up_to(self, directions: Float) -> Float:
         """Covariance (D, D) without the errors along directions (D, d), as of `gauge_free_matrix`.
 
-        None where other directions are open than these: then nothing bounds the errors.
+        No number of it means anything unless these directions bound the errors.
         """
         S = gauge_free_matrix(self.model, self.mean, directions)
-        open_ = self.gauge.open
-        if open_.shape[1] and _largest(S @ open_, self.model) > BOUNDED * _largest(
-            open_, self.model
-        ):
-            return None
         return np.asarray(S @ self.cov @ S.T)
+
+    def bounded_by(self, directions: Float) -> bool:
+        """Boolean: no directions are open but these (D, d); else nothing bounds the errors."""
+        free, model = self.gauge.open, self.model
+        if not free.shape[1]:
+            return True
+        left = gauge_free_matrix(model, self.mean, directions) @ free
+        return _largest(left, model) <= BOUNDED * _largest(free, model)
 
 
 def _largest(change: Float, model: DistortionModel) -> float:

@@ -170,7 +170,7 @@ def sample_selfcal(
         fingerprint=_fingerprint(solution, target.mixture, seed, ensembles, checkpoint_every),
         progress=progress,
     )
-    chains = run_chains(target, proposal, settings)  # type: ignore[arg-type]
+    chains = run_chains(target, proposal, settings)
     problem, draws, n = solution.problem, chains.draws, target.n_theta
     member = memberships(problem, solution.theta, solution.mixture, solution.stars)
     posterior = Posterior(

@@ -74,12 +74,6 @@ class Drift:
         factor = np.linalg.cholesky(self.kernel(self.knots, self.knots))
         return np.linalg.solve(factor, self.kernel(self.knots, places)).T
 
-    def unseen(self, epoch: ArrayLike) -> Float:
-        """Variance (E,) of the process about that mean, of unit amplitude."""
-        places = (np.asarray(epoch, float) - self.origin) / self.years
-        total = np.abs(places) ** 3 if self.smooth else np.abs(places)
-        return np.maximum(total - (self.columns(epoch) ** 2).sum(axis=1), 0.0)
-
 
 @dataclass(frozen=True, eq=False)
 class Design:

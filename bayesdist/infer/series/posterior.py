@@ -12,7 +12,6 @@ from scipy.stats import chi2 as chi_squared
 from bayesdist.errors import InputError
 from bayesdist.infer.convergence import Convergence
 from bayesdist.infer.series.chains import Draws, Engine
-from bayesdist.infer.series.correlated import Correlated, Shared
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.problem import State
 from bayesdist.infer.series.series import Series
@@ -184,11 +183,6 @@ class SeriesPosterior:
         """Outlier probability (E,) of each exposure."""
         return self.raw.outlier_probability
 
-    @property
-    def outlier_fraction(self) -> Float:
-        """Draws (n,) of the fraction of outliers."""
-        return self.raw.fraction.ravel()
-
     @cached_property
     def group_offset(self) -> Float:
         """Draws (n, G - 1, k) of each further group's offset."""
@@ -241,10 +235,8 @@ class SeriesPosterior:
 
     # -- prediction -------------------------------------------------------------------------------
 
-    def predict(
-        self, epoch: ArrayLike, *, group: str | None = None, extrapolate: bool = False
-    ) -> Prediction:
-        """Coefficients at any epoch.
+    def predict(self, epoch: ArrayLike, *, group: str | None = None) -> Prediction:
+        """Coefficients at epochs from the first to the last exposure.
 
         Parameters
         ----------
@@ -252,9 +244,6 @@ class SeriesPosterior:
             Decimal years.
         group : str, optional
             The group with most exposures by default.
-        extrapolate : bool
-            Allow epochs before the first and after the last exposure.  Correlated
-            deviations of successive exposures are part of these predictions: see `Correlated`.
 
         Returns
         -------
@@ -266,123 +255,22 @@ class SeriesPosterior:
             For an epoch outside every segment, and an unknown group.
         """
         t = np.atleast_1d(np.asarray(epoch, float))
-        trend = self._trend_draws(t, group, extrapolate)
+        trend = self._trend_draws(t, group)
         mean = trend.mean(axis=0)
         off = trend - mean
         cov = np.einsum("nmi,nmj->mij", off, off) / (len(off) - 1)
-        if self.design.drift:
-            power = (self._amplitude**2).mean(axis=0)
-            cov = cov + self._unseen(t)[:, None, None] * np.diag(power)
-        cov_new = cov + self.scatter.mean(axis=0)
-        beyond = self._outside(t) & (self.design.drift is None)
-        if beyond.any():
-            shared, unit = self._shared(t[beyond], group), self.series.spread
-            mean[beyond] = self.series.centre + np.stack([s.mean for s in shared], axis=1) * unit
-            sd = np.sqrt(np.stack([s.variance for s in shared], axis=1)) * unit
-            own = np.sqrt([float(s.weight @ s.own) for s in shared]) * unit
-            cov[beyond] = sd[:, :, None] * self._common * sd[:, None]
-            cov_new[beyond] = cov[beyond] + own[:, None] * self._common * own
-        return Prediction(t, mean, cov, cov_new)
+        return Prediction(t, mean, cov, cov + self.scatter.mean(axis=0))
 
-    def _outside(self, t: Float) -> NDArray[np.bool_]:
-        """Boolean mask (M,) of epochs outside the series."""
-        first, last = self.series.span
-        return (t < first) | (t > last)
-
-    def _unseen(self, t: Float) -> Float:
-        """Variance (M,) of the random part outside the series, of unit amplitude."""
-        assert self.design.drift is not None
-        return np.where(self._outside(t), self.design.drift.unseen(t), 0.0)
-
-    @property
-    def _amplitude(self) -> Float:
-        """Draws (n, k) of the amplitude of the random part."""
-        return self.raw.drift.reshape(-1, self.series.n_coefficients) * self.series.spread
-
-    @property
-    def _common(self) -> Float:
-        """Correlation (k, k) of the coefficients in their scatter."""
-        scatter = self.scatter.mean(axis=0)
-        sigma = np.sqrt(np.diag(scatter))
-        return np.asarray(scatter / (sigma[:, None] * sigma))
-
-    def _shared(self, t: Float, group: str | None) -> list[Shared]:
-        """Coefficients at epochs (M,) with correlated deviations, in units of the spread."""
-        series, design = self.series, self.design
-        breaks = np.median(self._breaks, axis=0, keepdims=True)
-        code = np.full(len(t), series.group_names.index(group) if group is not None else 0)
-        here = design.matrix(series.epoch, series.group_code, breaks)[0]
-        there = design.matrix(t, code, breaks)[0]
-        y = (series.values - series.centre) / series.spread
-        # a single exposure that lies off gives no information: its error is as much wider as that
-        # is probable.  Where its neighbours do so too, the deviation is common to them
-        order = np.argsort(series.epoch, kind="stable")
-        p = np.concatenate([[0.0], self.outlier_probability[order], [0.0]])
-        off = np.empty(len(series))
-        off[order] = np.minimum(p[1:-1] * (1 - np.maximum(p[:-2], p[2:])), 0.999)
-        out = []
-        for j in range(series.n_coefficients):
-            noise = series.cov[:, j, j] / series.spread[j] ** 2
-            noise = noise + off / (1 - off) * (1 + noise)
-            out.append(Correlated.of(series.epoch, y[:, j], noise, here).predict(t, there))
-        return out
-
-    def new_exposures(
-        self,
-        epoch: ArrayLike,
-        rng: np.random.Generator,
-        *,
-        cov: Float | None = None,
-        group: str | None = None,
-        extrapolate: bool = False,
-    ) -> Float:
-        """Draws (n, M, k) of the coefficients of new exposures, outliers included.
-
-        Parameters
-        ----------
-        epoch : array_like, shape (M,)
-        rng : numpy.random.Generator
-        cov : ndarray, shape (M, k, k), optional
-            Their formal covariance; none by default.
-        group, extrapolate
-            As for `predict`.
-        """
-        t = np.atleast_1d(np.asarray(epoch, float))
-        trend = self._trend_draws(t, group, extrapolate)
-        n, m, k = trend.shape
-        if self.design.drift:
-            size = np.sqrt(self._unseen(t))[:, None] * self._amplitude[:, None]
-            trend = trend + size * rng.standard_normal(trend.shape)
-        total = np.broadcast_to(self.scatter[:, None], (n, m, k, k)).copy()
-        beyond = self._outside(t) & (self.design.drift is None)
-        if beyond.any():
-            root = np.linalg.cholesky(self._common)
-            white = rng.standard_normal((n, int(beyond.sum()), k)) @ root.T
-            own = np.empty((n, k))
-            for j, one in enumerate(self._shared(t[beyond], group)):
-                which = one.drawn(n, rng)
-                value = one.means[which] + np.sqrt(one.variances[which]) * white[..., j]
-                trend[:, beyond, j] = self.series.centre[j] + value * self.series.spread[j]
-                own[:, j] = np.sqrt(one.own[which]) * self.series.spread[j]
-            total[:, beyond] = (own[:, :, None] * self._common * own[:, None])[:, None]
-        total = total + (0.0 if cov is None else np.asarray(cov, float))
-        unit = self.series.spread
-        factor = np.linalg.cholesky(total / (unit[:, None] * unit))
-        noise = unit * (factor @ rng.standard_normal((n, m, k, 1)))[..., 0]
-        off = rng.random((n, m)) < self.outlier_fraction[:, None]
-        stretch = np.where(off, np.sqrt(self.raw.kappa2.ravel())[:, None], 1.0)
-        return trend + stretch[..., None] * noise
-
-    def _trend_draws(self, t: Float, group: str | None, extrapolate: bool) -> Float:
+    def _trend_draws(self, t: Float, group: str | None) -> Float:
         """Draws (n, M, k) of the trend."""
         first, last = self.series.span
-        outside = ~((t >= first) & (t <= last)) if not extrapolate else ~np.isfinite(t)
+        outside = ~((t >= first) & (t <= last))
         if outside.any():
             raise InputError(
                 f"epoch {t[int(np.argmax(outside))]:g} lies outside every segment: the exposures "
                 f"are of {first:.2f} to {last:.2f}",
                 where=self.series.source,
-                do="give another epoch, or ask for extrapolation",
+                do="give another epoch",
             )
         names = self.series.group_names
         if group is not None and group not in names:

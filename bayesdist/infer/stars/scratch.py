@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import tempfile
 import weakref
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,8 +25,8 @@ class Store:
 
     def __init__(self, budget: float) -> None:
         self._left = budget
-        self._kept: list[tuple[Stars, int | None]] = []
-        self._file: IO[bytes] | None = None
+        self._kept: list[tuple[Stars, tuple[io.FileIO, int] | None]] = []
+        self._file: io.FileIO | None = None
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -42,7 +43,7 @@ class Store:
                 # without a name: it disappears with the process, however that ends
                 self._file = tempfile.TemporaryFile(buffering=0, prefix="bayesdist-")  # noqa: SIM115
                 self._closed = weakref.finalize(self, self._file.close)
-            place = self._file.seek(0, 2)
+            place = (self._file, self._file.seek(0, 2))
             for column in (*stars.columns, *stars.offsets):
                 _write(self._file, np.ascontiguousarray(column).view(np.uint8).data)
         except OSError as error:
@@ -65,17 +66,16 @@ class Store:
 
     def __iter__(self) -> Iterator[Stars]:
         for stars, place in self._kept:
-            yield stars if place is None else self._restored(stars, place)
+            yield stars if place is None else self._restored(stars, *place)
 
-    def _restored(self, frame: Stars, place: int) -> Stars:
-        assert self._file is not None
+    def _restored(self, frame: Stars, file: io.FileIO, place: int) -> Stars:
         n = int(frame.starts[-1])
         names = COLUMNS + OFFSETS[: len(frame.offsets)]
         columns = np.empty((len(names), n))
-        self._file.seek(place)
+        file.seek(place)
         view, done = columns.ravel().view(np.uint8).data, 0
         while done < len(view):
-            got = self._file.readinto(view[done:])  # type: ignore[attr-defined]
+            got = file.readinto(view[done:])
             if not got:
                 raise InputError("the scratch file has become shorter", do="start again")
             done += got
@@ -85,7 +85,7 @@ class Store:
         return stars
 
 
-def _write(file: IO[bytes], view: memoryview) -> None:
+def _write(file: io.FileIO, view: memoryview) -> None:
     """Write all of it: a disk that is nearly full takes a part, and refuses only the next one."""
     while len(view):
         view = view[file.write(view) :]

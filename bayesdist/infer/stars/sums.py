@@ -32,9 +32,11 @@ class Sums:
         """Sum over the stars of both; ValueError for sums that refer to different things."""
         out: dict[str, Any] = {}
         rows: Rows = ()
-        if (groups := getattr(self, "groups", None)) is not None:
-            out["groups"], rows = _merged(groups, other.groups)  # type: ignore[attr-defined]
-        for name in (one.name for one in fields(self) if one.name not in out):  # type: ignore[arg-type]
+        mine: Any = self  # dataclasses, which may have groups
+        theirs: Any = other
+        if getattr(mine, "groups", None) is not None:
+            out["groups"], rows = _merged(mine.groups, theirs.groups)
+        for name in (one.name for one in fields(mine) if one.name not in out):
             a, b = getattr(self, name), getattr(other, name)
             if name in self.SAME:
                 if np.any(a != b):

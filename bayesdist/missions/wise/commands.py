@@ -19,13 +19,19 @@ from bayesdist.app.commands.options import (
 
 @command()
 @click.option("-o", "--output", default="bayesdist-demo", metavar="DIR")
+@click.option(
+    "--as",
+    "format",
+    type=click.Choice(["jwst", "roman", "tpv"]),
+    help="Write the result in this format, too.",
+)
 @click.option("--force", is_flag=True, help="Replace an earlier demo.")
 @click.pass_obj
-def demo(line: str, output: str, force: bool) -> None:
+def demo(line: str, output: str, format: str | None, force: bool) -> None:
     """Calibrate simulated data and compare with the truth."""
     from bayesdist.missions.wise.demo import demo as simulated_and_run
 
-    click.echo(simulated_and_run(output, force=force, command=line))
+    click.echo(simulated_and_run(output, format=format, force=force, command=line))
 
 
 @command()

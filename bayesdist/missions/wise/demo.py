@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from astropy.table import QTable
 
+from bayesdist.app.commands.on_files.convert import convert
 from bayesdist.app.results import results_of
 from bayesdist.app.run import run
 from bayesdist.app.screen import number, table_text
@@ -19,10 +21,27 @@ from bayesdist.infer import LinearFit, Posterior
 from bayesdist.missions.wise.simulate import simulate_wise
 from bayesdist.simulate import Truth
 
-__all__ = ["demo", "write_simulation"]
+__all__ = ["FILES", "SCALES", "demo", "write_simulation"]
 
 SEED = 20110201  # the date of the report that the coefficients come from
 N_STARS = 6000
+SCALES = {"jwst": 0.0656, "roman": 0.1075, "tpv": 2.75}  # arcsec in a pixel, as of a detector
+
+_PLACED = {
+    "useafter": "2026-01-01T00:00:00",
+    "pedigree": "DUMMY",
+    "author": "bayesdist demo",
+    "v2ref": 0.0,
+    "v3ref": 0.0,
+    "v3idlyangle": 0.0,
+}
+# formats of `--as`, with settings of each: whose detector this is not
+FILES: dict[str, dict[str, Any]] = {
+    "jwst": {"instrument": "NIRISS", "detector": "NIS", "filter": "CLEAR", "pupil": "F200W"}
+    | _PLACED,
+    "roman": {"detector": "WFI01", "optical_element": "F158"} | _PLACED,
+    "tpv": {"crval": [150.0, 2.2]},
+}
 
 _CONFIG = """\
 # Matched WISE {band} and 2MASS positions, simulated from the published distortion
@@ -100,14 +119,17 @@ def write_simulation(folder: Path, matches: Matches, truth: Truth, band: str) ->
         temporary.write_text(_CONFIG.format(band=band), encoding="utf-8")
 
 
-def demo(folder: str | Path, *, force: bool = False, command: str = "") -> str:
+def demo(
+    folder: str | Path, *, format: str | None = None, force: bool = False, command: str = ""
+) -> str:
     """Simulate, calibrate, and compare with the truth.
 
-    `folder`: holds ``input/`` and ``run/`` afterwards. `force`: replace an earlier demo. `command`:
-    for the record. Returns the text to print.
+    `folder`: holds ``input/`` and ``run/`` afterwards. `format`: one of FILES, in which the result
+    is written into ``file/``, too. `force`: replace an earlier demo. `command`: for the record.
+    Returns the text to print.
     """
     folder = Path(folder)
-    known = {"input", "run"}
+    known = {"input", "run", "file"}
     if folder.is_dir() and {p.name for p in folder.iterdir()} - known:
         raise InputError("the folder holds other files", where=str(folder), do="choose another one")
     if (folder / "run").exists() and not force:
@@ -120,7 +142,20 @@ def demo(folder: str | Path, *, force: bool = False, command: str = "") -> str:
     finished = RunDirectory.open(folder / "run")
     results = results_of(finished)
     against = _against_truth(results.posterior, results.fit, truth)
-    return f"{against}\n\n{results_text(finished)}"
+    text = f"{against}\n\n{results_text(finished)}"
+    if format is None:
+        return text
+    written = convert(
+        folder / "run",
+        format,
+        folder / "file",
+        options=[f"{key}={value}" for key, value in FILES[format].items()],
+        scale=SCALES[format],
+        force=force,
+    )
+    return (
+        f"{text}\n\n{written}\n  its scale, names and position in the focal plane are placeholders"
+    )
 
 
 def _against_truth(posterior: Posterior, fit: LinearFit, truth: Truth) -> str:

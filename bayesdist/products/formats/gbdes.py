@@ -101,7 +101,7 @@ def _parse(content: Content) -> GbdesParameters | None:
     # of thousands of columns the names stand anywhere in the end of a Parquet file
     if content.path is None or not all(name.encode() in content.raw for name in _COLUMNS):
         return None
-    from bayesdist.data.tables.files import read_table  # slow to import
+    from bayesdist.reading.tables import read_table  # slow to import
 
     table = read_table(content.path)
     if not set(_COLUMNS) <= set(table.colnames):

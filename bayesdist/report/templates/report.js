@@ -39,10 +39,23 @@ const read = id => {
   return found ? JSON.parse(found.textContent, missing) : null;
 };
 
+const SVG = "http://www.w3.org/2000/svg";
+
+/** An element of a drawing with its attributes. */
+function drawn(tag, attributes, text = "") {
+  const element = document.createElementNS(SVG, tag);
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+  element.textContent = text;
+  return element;
+}
+
 /** An element with its attributes and what is in it. */
 function make(tag, attributes = {}, ...children) {
   const element = document.createElement(tag);
-  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (key === "style") element.style.cssText = value;  // the page's policy knows no such attribute
+    else element.setAttribute(key, value);
+  }
   element.append(...children);
   return element;
 }
@@ -79,9 +92,9 @@ class ChipMaps {
         width: wide, height: Math.max(4, Math.round(wide * chip.size[1] / chip.size[0])),
         role: "img", "aria-label": `${name}, ${chip.name}`,
       });
-      const marks = document.createElementNS("http://www.w3.org/2000/svg", "svg");
-      marks.setAttribute("viewBox", `0.5 0.5 ${chip.size[0]} ${chip.size[1]}`);
-      marks.setAttribute("aria-hidden", "true");
+      const marks = drawn("svg", {
+        viewBox: `0.5 0.5 ${chip.size[0]} ${chip.size[1]}`, "aria-hidden": "true",
+      });
       const frame = make("div", { class: "chip" }, canvas, marks);
       if (chosen) {
         frame.tabIndex = 0;
@@ -157,11 +170,11 @@ class ChipMaps {
       });
       context.putImageData(image, 0, 0);
       const radius = 0.018 * Math.max(...chip.size);
-      svg.innerHTML = this.marks.filter(m => m.chip === k).map(m => {
-        const place = `cx="${m.x}" cy="${chip.size[1] + 1 - m.y}"`;
-        return `<circle ${place} r="${radius}" class="halo"/><circle ${place} r="${radius}" class="ring"/>`
-          + `<text x="${m.x}" y="${chip.size[1] + 1 - m.y - 1.5 * radius}" font-size="${2.6 * radius}">${m.label}</text>`;
-      }).join("");
+      svg.replaceChildren(...this.marks.filter(m => m.chip === k).flatMap(m => {
+        const place = { cx: m.x, cy: chip.size[1] + 1 - m.y, r: radius };
+        return [drawn("circle", { ...place, class: "halo" }), drawn("circle", { ...place, class: "ring" }),
+          drawn("text", { x: place.cx, y: place.cy - 1.5 * radius, "font-size": 2.6 * radius }, m.label)];
+      }));
     });
   }
 }

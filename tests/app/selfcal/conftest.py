@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from bayesdist.simulate.dithers import DitheredField
 from tests.app.selfcal.support import list_table, small, write_selfcal
 from tests.app.support import Result, good
+from tests.dithered_fields import DitheredField
 
 PRODUCTS = {"sip": {}, "idctab": {"instrument": "ACS", "detector": "SBC"}}
 ROLLS = {"three rolls": (0, 60, 130), "one roll": (0, 0, 0)}

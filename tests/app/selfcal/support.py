@@ -11,8 +11,8 @@ from astropy.table import Table
 from bayesdist.app.config import load_config
 from bayesdist.app.results import Results
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.simulate.dithers import DitheredField
 from tests.app.support import after_stages, write_config
+from tests.dithered_fields import DitheredField
 from tests.infer.selfcal.fields import SIZE, field
 
 SCALE_MAS = 50.0

@@ -8,9 +8,9 @@ from astropy.table import Table, vstack
 
 from bayesdist.app.selfcal.matching import refuse_unconnected
 from bayesdist.errors import InputError
-from bayesdist.simulate.dithers import simulate_dithers, smooth_distortion
 from tests.app.selfcal.support import list_table, small, write_selfcal
 from tests.app.support import cli, one_sentence, refused
+from tests.dithered_fields import simulate_dithers, smooth_distortion
 from tests.infer.selfcal.fields import SIZE, chips
 
 SBC = {"instrument": "ACS", "detector": "SBC"}

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gamma, kv
 
-from bayesdist.infer.nodes import Matern, NodeGrid
-from bayesdist.model import Chip
+from bayesdist.infer.nodes import Matern, NodeGrid, TableFit
+from bayesdist.model import Chip, corrected
 from tests.infer.support import legendre_design
 
 SIZE = (640.0, 512.0)
@@ -111,3 +111,24 @@ def joint_solution(x, y, r, variance, priors, order: int = ORDER, step=STEP) -> 
         covs.append(np.linalg.inv(H))
         means.append(covs[-1] @ (D.T @ (w * r[:, a])))
     return Joint(np.stack(means, axis=1), np.stack(covs), order, step)
+
+
+def predict(fit: TableFit, x, y, *, chip: int, **where) -> np.ndarray:
+    """Positions (u, v) of raw pixels: tables, then polynomial."""
+    px, py = corrected(fit.tables, x, y, chip=chip, filter=fit.filter)
+    return fit.solution.model.predict(fit.solution.mean, px, py, chip=chip, **where)
+
+
+def table_sigma(fit: TableFit, x, y, *, chip: int, **where) -> np.ndarray:
+    """Standard error of (u, v) by the tables alone."""
+    px, py = corrected(fit.tables, x, y, chip=chip, filter=fit.filter)
+    J = fit.solution.model.slopes(fit.solution.mean, px, py, chip=chip, **where)
+    return np.sqrt(np.einsum("nab,nb->na", J**2, fit.shift_variance(x, y, chip=chip)))
+
+
+def position_sigma(fit: TableFit, x, y, *, chip: int, **where) -> np.ndarray:
+    """Standard error of (u, v): polynomial with all its terms, and tables."""
+    px, py = corrected(fit.tables, x, y, chip=chip, filter=fit.filter)
+    D = fit.solution.model.jacobian(fit.solution.mean, px, py, chip=chip, **where)
+    formal = np.einsum("nap,pq,naq->na", D, fit.solution.cov, D, optimize=True)
+    return np.sqrt(table_sigma(fit, x, y, chip=chip, **where) ** 2 + formal)

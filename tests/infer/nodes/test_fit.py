@@ -26,6 +26,8 @@ from tests.infer.nodes.support import (
     node_pixels,
     pattern,
     places,
+    position_sigma,
+    predict,
     projector,
 )
 from tests.infer.nodes.test_pixels import turned_by
@@ -119,9 +121,9 @@ def test_it_ends_at_the_exact_joint_solution(rng, gradient):
 
     px, py = places(rng, 300)
     shift, sigma = joint.at(px, py)
-    got = fit.predict(px, py, chip=1) - model.predict(theta, px, py)
+    got = predict(fit, px, py, chip=1) - model.predict(theta, px, py)
     assert np.abs((got - shift) / sigma).max() < 0.02
-    np.testing.assert_allclose(fit.position_sigma(px, py, chip=1), sigma, rtol=0.01)
+    np.testing.assert_allclose(position_sigma(fit, px, py, chip=1), sigma, rtol=0.01)
 
 
 def test_with_drift_and_frames_the_sum_is_nearly_exact(rng):
@@ -176,9 +178,9 @@ def test_with_drift_and_frames_the_sum_is_nearly_exact(rng):
         where = {"epoch": date, "exposure": 0}
         rows = design(px, py, **where)
         sigma = np.sqrt(np.einsum("nap,pq,naq->na", rows, cov, rows, optimize=True))
-        ratio = fit.position_sigma(px, py, chip=1, **where) / sigma
+        ratio = position_sigma(fit, px, py, chip=1, **where) / sigma
         assert np.median(np.abs(ratio - 1)) < 0.01 and np.abs(ratio - 1).max() < 0.05
-        got = fit.predict(px, py, chip=1, **where) - model.predict(theta, px, py, **where)
+        got = predict(fit, px, py, chip=1, **where) - model.predict(theta, px, py, **where)
         assert np.abs((got - rows @ mean) / sigma).max() < 0.05
 
 
@@ -243,8 +245,8 @@ def test_two_chips_and_turned_exposures(rng):
         assert 0.8 < (pull**2).mean() < 1.25
     where, there = places(rng, 400), {"exposure": 2, "chip": 2}
     true = model.predict(theta, *corrected(truth, *where, chip=2), **there)
-    error = fit.predict(*where, **there) - true
-    sigma_uv = fit.position_sigma(*where, **there)
+    error = predict(fit, *where, **there) - true
+    sigma_uv = position_sigma(fit, *where, **there)
     assert 0.7 < ((error / sigma_uv) ** 2).mean() < 1.4
     assert sigma_uv.max() < 0.05 * NOISE
 
@@ -301,8 +303,8 @@ def test_filters_have_their_own_polynomial_and_table(rng):
         true = model.predict(
             theta, *corrected([detector, own], px, py, chip=1, filter="blue"), exposure=2
         )
-        errors.append(fit.predict(px, py, chip=1) - true)
-        sigmas.append(fit.position_sigma(px, py, chip=1))
+        errors.append(predict(fit, px, py, chip=1) - true)
+        sigmas.append(position_sigma(fit, px, py, chip=1))
         for found, stars in ((base, red), (fit, blue)):
             moved = found.corrected(stars)
             want = np.array(corrected(found.tables, x, y, chip=1, filter=found.filter))
@@ -345,10 +347,10 @@ def test_wrong_input_is_named(rng):
         fit_with_tables(both, model, **OPTIONS)
     fit = fit_with_tables(matches, model, method="binned", **OPTIONS)
     with pytest.raises(InputError, match="no covariance of their nodes"):
-        fit.position_sigma(x, y, chip=1)
+        fit.shift_variance(x, y, chip=1)
     field = fit_with_tables(matches, model, max_iterations=1, **OPTIONS)
     with pytest.raises(InputError, match="no table for chip 2"):
-        field.table_sigma(x, y, chip=2)
+        field.shift_variance(x, y, chip=2)
 
 
 def test_a_filter_without_the_exposure_that_holds_the_gauge_is_refused(rng):

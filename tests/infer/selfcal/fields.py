@@ -6,7 +6,8 @@ import numpy as np
 
 from bayesdist.infer.selfcal.problem import prepare
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.simulate.dithers import dither_pattern, simulate_dithers, smooth_distortion
+from bayesdist.simulate.dithers import dither_pattern
+from tests.dithered_fields import simulate_dithers, smooth_distortion
 
 SIZE = (1024.0, 1024.0)
 

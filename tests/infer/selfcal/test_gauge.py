@@ -61,7 +61,7 @@ def test_moves_of_the_sky_change_no_residual():
 
 
 def test_without_dithers_the_distortion_itself_is_free():
-    from bayesdist.simulate.dithers import simulate_dithers, smooth_distortion
+    from tests.dithered_fields import simulate_dithers, smooth_distortion
     from tests.infer.selfcal.fields import chips
 
     rng = np.random.default_rng(3)

@@ -28,11 +28,11 @@ def one(seed: int) -> dict[str, np.ndarray]:
             out[f"covered {name} {level}"] = (low <= true) & (true <= high)
     out["scatter"] = posterior.scatter_sigma.mean(axis=0) / SCATTER
     # a new campaign of the same truth: what its exposures that do not lie off show
-    later = campaign(seed + 10_000)
-    prediction = posterior.predict(later.series.epoch, extrapolate=True)
-    good = ~later.off
-    sd = np.sqrt(prediction.sigma_new**2 + later.series.sigma**2)
-    z = ((later.series.values - prediction.mean) / sd)[good]
+    later, (first, last) = campaign(seed + 10_000), truth.series.span
+    good = ~later.off & (later.series.epoch >= first) & (later.series.epoch <= last)
+    new = later.series.take(good)
+    prediction = posterior.predict(new.epoch)
+    z = (new.values - prediction.mean) / np.sqrt(prediction.sigma_new**2 + new.sigma**2)
     out["new 1"], out["new 2"] = (np.abs(z) < 1).mean(), (np.abs(z) < 2).mean()
     for name, weighted in (("plain", False), ("formal", True)):
         lines = straight_lines(truth.series, LINES, weighted=weighted)

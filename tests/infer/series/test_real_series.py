@@ -183,30 +183,3 @@ def test_a_step_put_into_real_scatter_is_found(decam, full):
         assert low - 0.02 < date < high + 0.02 and high - low < 1.0
         level, _ = found.change()
         assert level.value[0] == pytest.approx(size, abs=size / 3)
-
-
-def second_half(series: Series, kind: str) -> np.ndarray:
-    """Predictive probability of less than measured, of the later half from the earlier one."""
-    order = np.argsort(series.epoch, kind="stable")
-    first, later = series.take(order[: len(order) // 2]), series.take(order[len(order) // 2 :])
-    draws = fit_series(first, TrendModel(kind)).new_exposures(
-        later.epoch, np.random.default_rng(3), cov=later.cov, extrapolate=True
-    )
-    return (draws < later.values).mean(axis=0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["constant", "line"])
-def test_second_halves_of_real_series_are_covered(decam, tess, kind, full, capsys):
-    """Successive dates are correlated: 0.61/0.85 and 0.39/0.68 were covered without that."""
-    if not full and kind != "line":
-        pytest.skip("lines are run: set BAYESDIST_FULL=1")
-    measured = [s.take(np.array(s.names, int) <= LAST_MEASURED) for s in some(tess, full, 3)]
-    for label, series in (("DECam", some(decam, full, 5)), ("TESS", measured)):
-        rank = np.concatenate([second_half(one, kind).ravel() for one in series])
-        inside = [(np.abs(rank - 0.5) < level / 2).mean() for level in (0.683, 0.95)]
-        with capsys.disabled():
-            print(f"\n{label}, {kind}: second halves covered {inside[0]:.3f} and {inside[1]:.3f}")
-        # whole halves deviate together: the series are the independent items
-        assert inside[0] == pytest.approx(0.683, abs=0.15)
-        assert inside[1] == pytest.approx(0.95, abs=0.05)

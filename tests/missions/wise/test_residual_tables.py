@@ -12,16 +12,18 @@ import pytest
 from scipy.stats import chi2
 
 from bayesdist.diagnose.residuals import (
-    WISE_ARCSEC,
     band_bins,
-    band_to_band_table,
-    fitting_table,
-    multiframe_table,
     pattern_changes,
     period_table,
 )
 from bayesdist.infer import Rejection, fit_linear, load
 from bayesdist.missions.wise.assess.histograms import band_sums
+from bayesdist.missions.wise.assess.tables import (
+    WISE_ARCSEC,
+    band_to_band_table,
+    fitting_table,
+    multiframe_table,
+)
 from bayesdist.missions.wise.published import RESIDUAL_SIGMAS, WISE_BANDS
 from bayesdist.missions.wise.simulate import wise_set
 

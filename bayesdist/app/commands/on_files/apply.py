@@ -27,8 +27,8 @@ from bayesdist.calibration.apply import (
 )
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.inverse import fitted_inverse
-from bayesdist.data.tables.files import read_table
 from bayesdist.errors import InputError
+from bayesdist.reading.tables import read_table
 
 __all__ = ["METHODS", "apply_to_table"]
 

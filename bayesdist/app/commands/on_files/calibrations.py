@@ -6,19 +6,25 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from pydantic import TypeAdapter
 
+from bayesdist.app.products.made_files import further_errors
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.summary import Summary
 from bayesdist.calibration.calibration import Calibration, calibration_of
-from bayesdist.calibration.plane import ARCSEC
+from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.calibration.subarray import Subarray, subarray_at_corner, subarrays_of_image
 from bayesdist.errors import InputError
-from bayesdist.infer import load_fit, load_posterior
+from bayesdist.infer import LinearFit, load_fit, load_posterior
 from bayesdist.infer.solution import Solution
 from bayesdist.products.formats.common.content import read_hdus
 from bayesdist.products.registry import read_calibration
+from bayesdist.reading.documents import read_json_as
 
-__all__ = ["calibration_at", "images_of", "notes_of", "solution_at"]
+__all__ = ["calibration_at", "images_of", "notes_of", "on_the_sky", "solution_at"]
+
+_SUMMARY = TypeAdapter(Summary)
 
 
 def calibration_at(
@@ -59,6 +65,9 @@ def calibration_at(
         found = read_calibration(path, filter=filter, size=size)
     else:
         found = calibration_of(solution, str(path), scale=_scale_of_run(path, solution))
+        summary = _summary_of(path)
+        budget = [] if summary is None else summary.budget or []
+        found = replace(found, further=further_errors([row.model_dump() for row in budget]))
     if scale is None:
         return found
     if not (np.isfinite(scale) and scale > 0):
@@ -75,12 +84,19 @@ def solution_at(path: Path) -> Solution | None:
     if path.is_dir():
         if (path / "posterior.nc").exists() or not (path / "fit.nc").exists():
             return _as_assessed(path)
-        return load_fit(path / "fit.nc")
+        return _fit_at(path / "fit.nc")
     if path.suffix != ".nc":
         return None
     if path.name == "fit.nc":
-        return load_fit(path)
+        return _fit_at(path)
     return _as_assessed(path.parent) if path.name == "posterior.nc" else load_posterior(path)
+
+
+def _fit_at(path: Path) -> LinearFit:
+    """The fit of a file, which is as it was written where it is that of a run."""
+    if (path.parent / "run.json").exists():
+        RunDirectory(path.parent).refuse_damaged("fit")
+    return load_fit(path)
 
 
 def _as_assessed(folder: Path) -> Solution:
@@ -89,6 +105,24 @@ def _as_assessed(folder: Path) -> Solution:
         return load_posterior(folder)
     with open_results(RunDirectory(folder)) as results:
         return results.solution
+
+
+def on_the_sky(path: Path, found: Calibration) -> Calibration:
+    """Calibration of a run about the point where its stars touch the sky, where they do."""
+    summary = _summary_of(path)
+    point = None if summary is None or summary.data is None else summary.data.tangent_point
+    if point is None or found.plane.kind != "free":
+        return found
+    return replace(found, plane=Plane("sky", point=(point[0], point[1])))
+
+
+def _summary_of(path: Path) -> Summary | None:
+    """Summary of the run that a file or folder is of; None where it is of none."""
+    home = path if path.is_dir() else path.parent
+    summary = home / "summary.json"
+    if not (home / "run.json").exists() or not summary.exists():
+        return None
+    return read_json_as(_SUMMARY, summary, do="resume the run, which writes it again")
 
 
 def _scale_of_run(path: Path, solution: Solution) -> tuple[float, str] | None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import date, time
@@ -14,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from bayesdist.app.commands.on_files.calibrations import calibration_at
+from bayesdist.app.commands.on_files.calibrations import calibration_at, on_the_sky
 from bayesdist.app.screen import number as digits
 from bayesdist.app.tables.output import refuse_existing
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.inverse import detector_grid
-from bayesdist.calibration.plane import ARCSEC, Plane
+from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky.tangent import sky_of_plane
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
@@ -32,6 +30,7 @@ from bayesdist.products.formats.common.document import (
     FormatSettings,
 )
 from bayesdist.products.registry import build, format_of, open_document, product_settings
+from bayesdist.reading.documents import toml_of
 
 __all__ = ["convert"]
 
@@ -67,7 +66,7 @@ def convert(
     """
     target = format_of(to)
     settings = _settings(to, product_settings()[to], options)
-    found = _on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
+    found = on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
     source = found if chip is None else found.only(chip, epoch)
     at = None
     if source.model.time is not None:
@@ -81,21 +80,10 @@ def convert(
     lines = [f"{', '.join(str(p) for p in places)}: by {source.name}"]
     back = _read_back(held, filter, made.model.chips[0].size)
     lines += [f"  {note}" for note in notes]
+    lines += [f"  warning: {w}" for w in dict.fromkeys(w for one in built for w in one.warnings)]
     used = _read_back(held, filter, made.model.chips[0].size, as_used=True)
     lines += [f"  {line}" for line in _losses(source, back, used, at, scale)]
     return "\n".join(lines)
-
-
-def _on_the_sky(path: Path, found: Calibration) -> Calibration:
-    """Calibration of a run about the point where its stars touch the sky, where they do."""
-    home = path if path.is_dir() else path.parent
-    summary = home / "summary.json"
-    if found.plane.kind != "free" or not (home / "run.json").exists() or not summary.exists():
-        return found
-    point = json.loads(summary.read_text(encoding="utf-8"))["data"].get("tangent_point")
-    if point is None:
-        return found
-    return replace(found, plane=Plane("sky", point=(float(point[0]), float(point[1]))))
 
 
 def _settings(to: str, kind: type[FormatSettings], options: Sequence[str]) -> FormatSettings:
@@ -105,8 +93,8 @@ def _settings(to: str, kind: type[FormatSettings], options: Sequence[str]) -> Fo
         if not mark or not key.strip():
             raise InputError(f"{text!r} is not KEY=VALUE", where="--option", do="write it so")
         try:
-            found = tomllib.loads(f"x = {value}")["x"]
-        except tomllib.TOMLDecodeError:
+            found = toml_of(f"x = {value}", "--option")["x"]
+        except InputError:
             found = value.strip()
         # settings have dates as text
         values[key.strip()] = value.strip() if isinstance(found, (date, time)) else found

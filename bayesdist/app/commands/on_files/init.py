@@ -16,8 +16,8 @@ from bayesdist.app.matches.reading import load_matches
 from bayesdist.app.matches.sources import mission_template
 from bayesdist.app.tables.output import refuse_existing
 from bayesdist.data import FORMATS, Matches
-from bayesdist.data.reading.formats import mission_formats
-from bayesdist.data.reading.layout import TableLayout, table_layout
+from bayesdist.data.formats.files import mission_formats
+from bayesdist.data.formats.layout import TableLayout, table_layout
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 
@@ -30,6 +30,8 @@ LIKE_PIXELS = (0.5, 2.0)
 DEGREES = 1e-3  # below it is the degree: pixels of more than 3.6 arcsec are rare
 MAS = 20.0
 
+_NOT_FINITE = ("value is nan", "value is inf", "value is -inf")
+
 _GUESSED_UNIT = "unit = {unit:22s}# GUESSED: the table does not say\n"
 
 _TEMPLATE = """\
@@ -38,10 +40,10 @@ _TEMPLATE = """\
 [data]
 matches = {matches}
 {format}{columns}{unit_line}sigma = {sigma}
-
+{not_finite}
 {detector}
 [model]
-order = {order}                       # 1 to 9
+order = {order}                       # 1 to 12
 {reference}# of each exposure: none | shift | shift_rotation | shift_rotation_scale | affine
 frames = "{frames}"
 # [model.tdd]                   # terms that drift with time: axis, power of x, power of y
@@ -91,6 +93,10 @@ sip = {{}}                        # inverse_order, linear = "cd" | "sip", crval
 # idctab = {{instrument = "ACS", detector = "WFC"}}
 """
 
+_REJECT = """\
+not_finite = "reject"           # some values are NaN or infinite: such rows are left out
+"""
+
 _AUTO = """\
 # format = "auto"               # {formats}
 """
@@ -137,7 +143,7 @@ def init(
     own = mission_template(matches) if columns is None else None
     n, values = _of_matches(matches, columns, size) if own is None else own
     order = 4 if n >= 300 else 3 if n >= 100 else 2
-    text = _TEMPLATE.format(matches=relative, order=order, **values)
+    text = _TEMPLATE.format(matches=relative, order=order, **{"not_finite": ""} | values)
     parse_config(text, str(path))
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -148,7 +154,14 @@ def _of_matches(
     matches: str | Path, columns: Mapping[str, str] | None, size: tuple[int, int] | None
 ) -> tuple[int, dict[str, object]]:
     """Number of matches of a table, and what it puts into the template."""
-    table, unit_line, sigma, read_sigma = _read(matches, columns)
+    not_finite = ""
+    try:
+        table, unit_line, sigma, read_sigma = _read(matches, columns)
+    except InputError as error:
+        if not error.cause.startswith(_NOT_FINITE):
+            raise
+        table, unit_line, sigma, read_sigma = _read(matches, columns, not_finite="reject")
+        not_finite = _REJECT
     layout = table_layout(matches, columns, read_sigma=read_sigma)
     chips = {n: _size(*reach, size) for n, reach in _reach(table).items()}
     several = len(chips) > 1
@@ -163,6 +176,7 @@ def _of_matches(
         "columns": column_lines(layout, columns),
         "unit_line": unit_line,
         "sigma": sigma,
+        "not_finite": not_finite,
         "detector": "\n".join(blocks) if several else _DETECTOR.format(name=name, **first),
         "reference": "" if several else _CENTRE.format(**first),
         "frames": "shift_rotation_scale" if len(table.exposure_names) > 1 else "none",
@@ -176,16 +190,18 @@ def _chip_names(matches: Matches) -> tuple[str, ...]:
     return matches.chip_names or tuple(f"chip {number}" for number in matches.chip_numbers)
 
 
-def _read(matches: str | Path, columns: Mapping[str, str] | None) -> tuple[Matches, str, str, bool]:
+def _read(
+    matches: str | Path, columns: Mapping[str, str] | None, **options: str
+) -> tuple[Matches, str, str, bool]:
     """Matches, the line about their unit, where errors come from, and whether columns are read."""
     unit, line = None, ""
     sigma: float | str = "columns"
     while True:
         try:
-            table = load_matches(matches, columns=columns, sigma=sigma, unit=unit)
+            table = load_matches(matches, columns=columns, sigma=sigma, unit=unit, **options)
         except InputError as error:
             if error.cause == "has no unit" and unit is None:
-                table = load_matches(matches, columns=columns, sigma=1.0, unit="pix")
+                table = load_matches(matches, columns=columns, sigma=1.0, unit="pix", **options)
                 unit = _guessed_unit(table, table_layout(matches, columns))
                 line = _GUESSED_UNIT.format(unit=quoted(unit))
             elif error.cause == "holds no errors of the positions" and sigma == "columns":

@@ -9,7 +9,7 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from bayesdist.data import Matches
-from bayesdist.data.reading.layout import TableLayout
+from bayesdist.data.formats.layout import TableLayout
 from bayesdist.model.basis import polynomial_terms
 
 __all__ = ["column_lines", "guessed_sigma", "quoted"]

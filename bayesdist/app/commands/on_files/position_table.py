@@ -20,6 +20,7 @@ __all__ = [
     "check_output",
     "chip_numbers",
     "position_column",
+    "refuse_columns",
     "write_positions",
 ]
 
@@ -97,6 +98,15 @@ def add_positions(table: Table, at: Positions, names: tuple[str, str], where: st
         new[f"corr_{x}_{y}"] = at.correlation
     if names != OUT and "chip" not in table.colnames:
         new["chip"] = at.chip
+    refuse_columns(table, list(new), where)
+    for name, values in new.items():
+        table[name] = values
+        if name.startswith(("sigma", *names)):
+            table[name].unit = "pix"
+
+
+def refuse_columns(table: Table, new: Sequence[str], where: str) -> None:
+    """Refuse names of new columns that a table has already."""
     taken = [name for name in new if name in table.colnames]
     if taken:
         raise InputError(
@@ -104,16 +114,12 @@ def add_positions(table: Table, at: Positions, names: tuple[str, str], where: st
             where=where,
             do="rename or drop it",
         )
-    for name, values in new.items():
-        table[name] = values
-        if name.startswith(("sigma", *names)):
-            table[name].unit = "pix"
 
 
 def write_positions(table: Table, output: Path) -> None:
     """Write a table in the format of its extension, whole or not at all."""
     kind = _FORMATS[output.suffix.lower()]
     if kind == "fits":  # whose header has short names and takes no lists
-        table.meta = {k.upper()[:8]: v for k, v in table.meta.items() if k != "origin"}
+        table.meta = {k.upper()[:8]: v for k, v in table.meta.items() if not isinstance(v, list)}
     with atomic_path(output) as temporary:
         table.write(temporary, format=kind)

@@ -11,6 +11,7 @@ from bayesdist.app.assessment.settings import idle_dates
 from bayesdist.app.config import Config, load_config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.matches.added_errors import grouping_sentence
+from bayesdist.app.matches.plausibility import doubts_on_stars
 from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results, open_results
 from bayesdist.app.screen import number
@@ -78,6 +79,7 @@ def _lines(results: Results) -> Iterator[str]:
     idle = idle_dates(config, config.requirements())
     scaled = data.error_scale_sentence
     for text in (
+        *doubts_on_stars(data.stars, model, config),
         *warnings_of(results.checks),
         *([idle] if idle else []),
         *([scaled] if scaled else []),

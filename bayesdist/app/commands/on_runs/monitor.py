@@ -88,8 +88,8 @@ def _fitted(
     """Release, new matches and their fit, and the exposures that the release has seen."""
     if config.campaign is not None:
         release = results_of(run)
-        exposures = read_new_exposures(release, new)
-        found = fit_exposures_of(release, exposures)
+        exposures = read_new_exposures(run, release.solution, release.fitted, new)
+        found = fit_exposures_of(release.data, config, exposures)
         return exposures.released, exposures.matches, found, exposures.left_out
     posterior = results_of(run).solution
     matches = _new_matches(run, config, new)

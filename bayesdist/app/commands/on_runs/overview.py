@@ -42,6 +42,9 @@ def _row(run: RunDirectory, output: Path) -> OverviewRow:
     until, is_open = _validity(summary.get("validity_periods") or [])
     found, fit = summary.get("map"), summary.get("fit")
     verdict = summary.get("verdict") or {"level": "note", "headline": NO_VERDICT}
+    damage = next(filter(None, map(run.damage, run.record.artefacts)), None)
+    if damage is not None:  # what is recorded is of other files
+        verdict = {"level": "fail", "headline": " ".join(damage)}
     return OverviewRow(
         name=run.path.as_posix(),
         link=_link(run / "report.html", output),

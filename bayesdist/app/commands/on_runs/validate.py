@@ -32,7 +32,7 @@ def validate(run: str | Path, requirements: str | Path) -> tuple[str, bool]:
         with _named_after(requirements, asked):
             margins = margins_of(results, asked)
             periods = validity_periods_of(results, asked)
-        fit, posterior, gauge = results.fit, results.posterior, results.gauge_words
+        fit, posterior, gauge = results.fit, results.posterior, results.fitted.gauge_words
         with directory.locked(), directory.judged_by(asked):
             save_margins(directory, fit, posterior, gauge, margins, periods)
         report = directory / "report.html"

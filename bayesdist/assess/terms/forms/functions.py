@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.terms.forms.rows import ErrorField, Image, Row, Scale
+from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 
 __all__ = ["FunctionField", "Functions"]
@@ -80,7 +80,7 @@ class Functions:
 
 
 @dataclass(frozen=True, eq=False)
-class FunctionField(ErrorField):
+class FunctionField(DrawnField):
     """Sums of functions at the positions of a domain."""
 
     of: Functions

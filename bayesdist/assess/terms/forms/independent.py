@@ -60,10 +60,6 @@ class NoiseField(ErrorField):
     of: Independent
     sigma: Float | None
 
-    def errors(self, draws: slice, scale: Scale) -> None:
-        """None: the noise of all terms is drawn together."""
-        return
-
     def squares(self) -> dict[str, Float]:
         """Mean squares of the row, if there is one."""
         return super().squares() if self.rows else {}
@@ -120,10 +116,6 @@ class KnownField(ErrorField):
     rows: tuple[Row, ...]
     domain: EvaluationDomain
     shift: Float
-
-    def errors(self, draws: slice, scale: Scale) -> None:
-        """None: no error."""
-        return
 
     def squares(self) -> dict[str, Float]:
         """Squares of the displacements, or of their differences."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.solution import place_of
-from bayesdist.assess.terms.forms.rows import ErrorField, Image, Row, Scale
+from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
 from bayesdist.calibration.chip_map import position_moments
 from bayesdist.model import DistortionModel
 
@@ -135,7 +135,7 @@ class Polynomials:
 
 
 @dataclass(frozen=True, eq=False)
-class PolynomialField(ErrorField):
+class PolynomialField(DrawnField):
     """Errors that are polynomials of the pixel."""
 
     rows: tuple[Row, ...]  # one, or none for a sum of rows

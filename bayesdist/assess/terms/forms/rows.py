@@ -23,6 +23,7 @@ __all__ = [
     "MEASURED",
     "PRODUCT",
     "PUBLISHED",
+    "DrawnField",
     "ErrorDraws",
     "ErrorField",
     "ErrorTerm",
@@ -131,31 +132,19 @@ class ErrorField(ABC):
         @property
         def rows(self) -> tuple[Row, ...]: ...
 
-        @property
-        def n_draws(self) -> int: ...
-
     @property
     def uniform(self) -> bool:
         """True if the error is the same at all positions."""
         return False
-
-    @property
-    def n_different(self) -> int:
-        """Draws after which they are the first ones again."""
-        return self.n_draws
-
-    @abstractmethod
-    def errors(self, draws: slice, scale: Scale) -> Float | None:
-        """Errors (d, N, 2) of some draws, rows multiplied by factors; None where all is noise."""
 
     def squares(self) -> dict[str, Float]:
         """Mean squares (P, 2) of each row: at positions, or of the differences of pairs."""
         (row,) = self.rows
         return {row.name: self.total()}
 
+    @abstractmethod
     def total(self) -> Float:
         """Mean squares (P, 2) of all rows together."""
-        return self.by_draws(slice(0, self.n_different))
 
     def noise(self, scale: Scale) -> Iterator[Noise]:
         """Parts that are independent from position to position, rows multiplied by factors."""
@@ -169,13 +158,34 @@ class ErrorField(ABC):
         """True if a row is an error of parameters."""
         return False
 
+
+class DrawnField(ErrorField):
+    """Errors that are the same at all positions of a draw, or vary over them as it says."""
+
+    if TYPE_CHECKING:
+
+        @property
+        def n_draws(self) -> int: ...
+
+    @property
+    def n_different(self) -> int:
+        """Draws after which they are the first ones again."""
+        return self.n_draws
+
+    @abstractmethod
+    def errors(self, draws: slice, scale: Scale) -> Float:
+        """Errors (d, N, 2) of some draws, rows multiplied by factors."""
+
+    def total(self) -> Float:
+        """Mean squares (P, 2) of all rows together."""
+        return self.by_draws(slice(0, self.n_different))
+
     def by_draws(self, draws: slice) -> Float:
         """Mean squares (P, 2) over some draws, evaluated in blocks."""
         pairs, total, n = self.domain.pairs(), 0.0, draws.stop - draws.start
         step = max(1, BLOCK // max(self.domain.size, 1))
         for start in range(draws.start, draws.stop, step):
             errors = self.errors(slice(start, min(start + step, draws.stop)), {})
-            assert errors is not None
             if pairs is not None:
                 errors = errors[:, pairs[1]] - errors[:, pairs[0]]
             total = total + np.einsum("dna,dna->na", errors, errors)

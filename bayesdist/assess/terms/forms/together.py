@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.terms.forms.rows import ErrorDraws, ErrorField, Image, Row, Scale
+from bayesdist.assess.terms.forms.functions import Functions
+from bayesdist.assess.terms.forms.polynomials import Polynomials
+from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
 
 __all__ = ["Together", "TogetherField"]
 
@@ -32,7 +34,7 @@ class Together:
         Whether the last row counts as much as the joint error has beyond the other rows.
     """
 
-    draws: tuple[ErrorDraws, ...]
+    draws: tuple[Polynomials | Functions, ...]
     remainder: bool = False
 
     def on(self, domain: EvaluationDomain, image: Image) -> TogetherField:
@@ -42,12 +44,12 @@ class Together:
 
 
 @dataclass(frozen=True, eq=False)
-class TogetherField(ErrorField):
+class TogetherField(DrawnField):
     """Rows of one term at the positions of a domain."""
 
     domain: EvaluationDomain
-    parts: tuple[ErrorField, ...]
-    whole: ErrorField | None = None  # the joint error, where it is more than the sum of the rows
+    parts: tuple[DrawnField, ...]
+    whole: DrawnField | None = None  # the joint error, where it is more than the sum of the rows
     remainder: bool = False  # as of `Together`
 
     @property
@@ -61,25 +63,25 @@ class TogetherField(ErrorField):
         return self.parts[0].n_draws
 
     @cached_property
-    def summed(self) -> tuple[ErrorField, ...]:
+    def summed(self) -> tuple[DrawnField, ...]:
         """Fields whose sum is the joint error."""
         return self._added if self.whole is None else (self.whole,)
 
     @cached_property
-    def _added(self) -> tuple[ErrorField, ...]:
+    def _added(self) -> tuple[DrawnField, ...]:
         """Parts that are in the total."""
         return tuple(p for p in self.parts if all(row.in_total for row in p.rows))
 
     def errors(self, draws: slice, scale: Scale = {}) -> Float:  # noqa: B006
         """The joint error (d, N, 2), each row multiplied by its factor."""
         if self.whole is None:
-            out = np.asarray(sum(_not_noise(part.errors(draws, scale)) for part in self._added))
+            out = np.asarray(sum(part.errors(draws, scale) for part in self._added))
         else:
-            out = _not_noise(self.whole.errors(draws, {}))
+            out = self.whole.errors(draws, {})
             for part in self._added:
                 sizes = [scale[row.name] for row in part.rows if row.name in scale]
                 if sizes:
-                    out = out - (1.0 - sizes[0]) * _not_noise(part.errors(draws, {}))
+                    out = out - (1.0 - sizes[0]) * part.errors(draws, {})
         factor = self._factor(scale)
         return out if factor is None else factor * out
 
@@ -130,11 +132,5 @@ class TogetherField(ErrorField):
         """As of the row's own form."""
         return self._part(name).of_parameters(name)
 
-    def _part(self, name: str) -> ErrorField:
+    def _part(self, name: str) -> DrawnField:
         return next(p for p in self.parts if name in [row.name for row in p.rows])
-
-
-def _not_noise(errors: Float | None) -> Float:
-    """Errors of a part; of what is independent from position to position there is no joint one."""
-    assert errors is not None
-    return errors

@@ -10,13 +10,14 @@ from astropy.table import Table
 
 from bayesdist.data.exposures import ExposureLog
 from bayesdist.data.storage.write import write_columns
-from bayesdist.data.tables.files import naming_faults, read_table
 from bayesdist.files import atomic_path
 from bayesdist.missions.acs.simulate.pointings import AcsFrames
 from bayesdist.missions.acs.simulate.stars import TrueStars
 from bayesdist.missions.acs.simulate.truth import LINEAR_TERMS, AcsTruth, DetectionTruth
 from bayesdist.model import DistortionModel
 from bayesdist.model.lookup import LookupTable
+from bayesdist.reading.faults import naming_faults
+from bayesdist.reading.tables import read_table
 
 __all__ = ["read_truth", "write_truth"]
 

@@ -11,8 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from bayesdist.diagnose.residuals.tables import WISE_ARCSEC
 from bayesdist.missions.wise.assess.published import PrintedRow
+from bayesdist.missions.wise.assess.tables import WISE_ARCSEC
 
 __all__ = ["contradictions_across", "contradictions_within"]
 

@@ -7,19 +7,18 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from bayesdist.assess import uncertainty_map
-from bayesdist.diagnose.residuals import (
-    BinnedSums,
-    StatisticsTable,
-    band_to_band_table,
-    fitting_table,
-    multiframe_table,
-)
+from bayesdist.diagnose.residuals import BinnedSums, StatisticsTable
 from bayesdist.missions.wise.assess.account import PRINTED_BINS, accounts, partition_parts
 from bayesdist.missions.wise.assess.distortion_field import DistortionField, field_of_solution
 from bayesdist.missions.wise.assess.histograms import band_sums
 from bayesdist.missions.wise.assess.published import implied_sigma
 from bayesdist.missions.wise.assess.residual_correlation import residual_correlation
 from bayesdist.missions.wise.assess.residual_structure import residual_partition
+from bayesdist.missions.wise.assess.tables import (
+    band_to_band_table,
+    fitting_table,
+    multiframe_table,
+)
 from bayesdist.missions.wise.bands.context import BandResult, BandsInput, Printed
 from bayesdist.missions.wise.bands.inputs import BandRun
 from bayesdist.missions.wise.bands.optical import OpticalModel

@@ -13,7 +13,6 @@ from bayesdist.app.screen import table_text
 from bayesdist.app.tables.output import record_folder, write_table
 from bayesdist.data.detections import Detections
 from bayesdist.data.tables.column import SourceColumn
-from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bands.optical import optical_models
@@ -24,6 +23,7 @@ from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
 from bayesdist.missions.wise.pairs.write import write_rvb
 from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.reading.tables import read_table
 
 __all__ = ["bring_up_files"]
 

@@ -27,6 +27,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
+BINS = 12  # of the coverage, on each axis
 FIRST_ORDER = 2  # polynomial order of the first fit; each round may take one order more
 GROWS = 0.01  # fraction of the bins by which the coverage must rise to count as growing
 SETTLED = 0.005  # fraction of the radius in the centre by which the model may still change
@@ -82,7 +83,7 @@ class BringUp:
         Matches fitted in the last round; exposures are the frames.
     index, reference_index : ndarray of int, shape (n_believed,)
         Rows of these matches in the two lists.
-    covered : ndarray of bool, shape (bins, bins)
+    covered : ndarray of bool, shape (BINS, BINS)
         Bins [iy, ix] of the detector that are covered in the last round.
     settled : bool
         True if the last fit changed the model no more.
@@ -122,8 +123,6 @@ def bring_up(
     start: Float | None = None,
     *,
     acceptance: RadialLimit,
-    bins: int = 12,
-    rejection: Rejection = DEFAULT_REJECTION,
     max_rounds: int = 30,
 ) -> BringUp:
     """Match and fit in turn until the whole detector is covered and the model changes no more.
@@ -143,10 +142,6 @@ def bring_up(
         First guess; without one, the detections' pixels are taken as undistorted positions.
     acceptance : RadialLimit
         Of the first rounds.  The radius in the centre must allow for the offset there.
-    bins : int
-        On each axis, for the coverage.
-    rejection : Rejection
-        As of `fit_linear`; the extra weight in the corners ends with the larger radius there.
     max_rounds : int
 
     Returns
@@ -175,9 +170,10 @@ def bring_up(
             where="start",
             do="give the parameters of this model",
         )
-    field = Field(detections, reference, model, bins)
+    field = Field(detections, reference, model, BINS)
     theta = None if start is None else np.asarray(start, float)
     rounds: list[Round] = []
+    rejection = DEFAULT_REJECTION  # with extra weight in the corners, as long as the radius has
     rule, order, settled = acceptance, min(FIRST_ORDER, model.order), False
     while True:
         found = field.match(theta, rule, len(rounds) + 1)
@@ -204,7 +200,7 @@ def bring_up(
         )
         still = moved < SETTLED * acceptance.centre
         if fit is not None:
-            covered = found.covered.reshape(bins, bins)
+            covered = found.covered.reshape(BINS, BINS)
             return BringUp(
                 tuple(rounds), fit, matches, found.index, found.partner, covered, settled and still
             )

@@ -11,14 +11,14 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.data.batches import BATCH
-from bayesdist.data.reading.formats import input_files
+from bayesdist.data.formats.files import input_files
 from bayesdist.data.tables.column import Place, SourceColumn, row_number
-from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import BASIC, find_columns
 from bayesdist.data.tables.parquet import ParquetPart, describe_part
 from bayesdist.data.tables.quantities import Columns
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.published import WISE_BANDS
+from bayesdist.reading.tables import read_table
 
 __all__ = [
     "IPAC",

@@ -8,7 +8,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from bayesdist.app.config import Data
 from bayesdist.app.matches.reading import is_large
 from bayesdist.app.matches.sources import MatchSource
 from bayesdist.app.store.rundir import PAIRS, RunDirectory, part_files
@@ -36,6 +35,8 @@ class RvbInput:
     """
 
     run: RunDirectory
+    data: RvbData
+    size: tuple[float, float]  # columns and rows of the detector
     _scratch: TemporaryDirectory[str] | None = None
     _counts: Mapping[str, Any] | None = None
 
@@ -45,8 +46,8 @@ class RvbInput:
         InputError for all that is wrong with files and selection, and a detector that is not the
         band's.
         """
-        data, size = self._settings
-        path = self.run.config.named_files(Path(self.run.facts["base"]))
+        data, size = self.data, self.size
+        path = self.run.config.named_files(self.run.base)
         options = _options(data, size)
         if not is_large(path):
             return load_rvb(path, data, size)
@@ -61,14 +62,6 @@ class RvbInput:
                     _require_array(band or data.band, size)
                 return opened
         return self._written(SelectedPairs(lambda: stream_rvb(path, **options), data.rvb, size))
-
-    @property
-    def _settings(self) -> tuple[RvbData, tuple[float, float]]:
-        """Section [data], and columns and rows of the detector."""
-        config = self.run.config
-        assert isinstance(config.data, RvbData)
-        assert config.detector.size is not None
-        return config.data, config.detector.size
 
     def _written(self, selected: SelectedPairs) -> Matches:
         """The pairs as a table of matches, in the run's folder if it may be."""
@@ -87,11 +80,10 @@ class RvbInput:
                 do="choose a folder that you may write to",
             ) from error
         folder = Path(self._scratch.name) / PAIRS
-        _, size = self._settings
 
         def tables() -> Iterator[Matches]:
             for pairs in selected:
-                _require_array(pairs.band, size)
+                _require_array(pairs.band, self.size)
                 yield pairs.matches
 
         write_partitioned(tables(), folder)
@@ -102,7 +94,7 @@ class RvbInput:
         return self._opened(folder, self._counts)
 
     def _opened(self, folder: Path, counts: Mapping[str, Any]) -> Matches:
-        options = _options(*self._settings)
+        options = _options(self.data, self.size)
         # a number has been written into the columns
         sigma = options["sigma"] if options["sigma"] == "by_magnitude" else "columns"
         opened = open_matches(folder, unit=options["unit"], sigma=sigma)
@@ -140,14 +132,13 @@ class RvbInput:
 
 
 def load_rvb(
-    path: str | Path | Sequence[str | Path], data: Data, size: tuple[float, float]
+    path: str | Path | Sequence[str | Path], data: RvbData, size: tuple[float, float]
 ) -> Matches:
     """RvB pairs in memory, as a configuration reads and selects them.
 
     `size`: columns and rows of the detector. InputError for all that is wrong with files and
     selection, and a detector that is not the band's.
     """
-    assert isinstance(data, RvbData)
     if data.band is not None:
         _require_array(data.band, size)
     batches = list(stream_rvb(path, **_options(data, size)))
@@ -180,4 +171,10 @@ def _require_array(label: str | None, size: tuple[float, float]) -> None:
         )
 
 
-SOURCE = MatchSource(read=load_rvb, input_of=RvbInput, template=rvb_template)
+def rvb_input(run: RunDirectory) -> RvbInput:
+    """The pairs of a run, whose configuration has the sections of this format."""
+    config: Any = run.config
+    return RvbInput(run, config.data, config.detector.size)
+
+
+SOURCE = MatchSource(read=load_rvb, input_of=rvb_input, template=rvb_template)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from bayesdist.app.commands.on_files.init_columns import column_lines
 from bayesdist.data import input_files
-from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs.files import (
@@ -17,6 +16,7 @@ from bayesdist.missions.wise.pairs.files import (
 )
 from bayesdist.missions.wise.pairs.read import rvb_bands, stream_rvb
 from bayesdist.missions.wise.published import WISE_ARRAYS
+from bayesdist.reading.tables import read_table
 
 __all__ = ["rvb_template"]
 

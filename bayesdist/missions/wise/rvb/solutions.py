@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.data.tables.column import SourceColumn
-from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs.files import RVB_ALIASES
 from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform
+from bayesdist.reading.tables import read_table
 
 __all__ = ["SOLUTION_ALIASES", "read_solutions"]
 

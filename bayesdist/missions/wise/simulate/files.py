@@ -15,6 +15,7 @@ from astropy.table import Table
 from bayesdist.data.storage.write import write_columns
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path, made_folder
+from bayesdist.missions.wise.simulate.pattern import PartitionPattern
 from bayesdist.missions.wise.simulate.sets import PairChunk, WiseSet
 
 __all__ = ["write_wise_set"]
@@ -138,16 +139,14 @@ def _write_truth(one: WiseSet, n_false: int, folder: Path) -> None:
     }
     tables = {f"{one.band.lower()}.ecsv": table}
     if one.pattern is not None:
-        tables[f"{one.band.lower()}_pattern.ecsv"] = _pattern_table(one)
+        tables[f"{one.band.lower()}_pattern.ecsv"] = _pattern_table(one.pattern)
     for name, each in tables.items():
         with atomic_path(folder / name) as temporary:
             each.write(temporary, format="ascii.ecsv")
 
 
-def _pattern_table(one: WiseSet) -> Table:
+def _pattern_table(pattern: PartitionPattern) -> Table:
     """Table of the axes and blocks; the polynomial that is subtracted is in the meta-data."""
-    pattern = one.pattern
-    assert pattern is not None
     axis, row, column = (index.ravel() for index in np.indices(pattern.local.shape[:3]))
     table = Table(
         {

@@ -13,7 +13,6 @@ import io
 import os
 import re
 import warnings
-import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,15 +23,16 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from bayesdist.errors import BayesdistError, FormatError, InputError
+from bayesdist.errors import BayesdistError, FormatError
 from bayesdist.files import atomic_path
 from bayesdist.products.formats.common.cards import card_images, header_of
+from bayesdist.reading.faults import reason_of
+from bayesdist.reading.fits import HDU_STARTS, RECORD, data_size, open_fits, padded
+from bayesdist.reading.regular import read_bytes
+from bayesdist.reading.unpacked import unpacked
 
 __all__ = ["Content", "Hdu", "hdus_of", "read_content", "read_hdus", "readable", "write_hdus"]
 
-RECORD = 2880  # bytes
-LARGEST = 2**32  # bytes: a compressed file may not grow beyond
-_STARTS = (b"SIMPLE  =", b"XTENSION=")
 _CARD = re.compile(r"[A-Z0-9_-]{1,8} *=|(COMMENT|HISTORY| {8})")
 
 
@@ -65,9 +65,7 @@ class Hdu:
     def to_bytes(self) -> bytes:
         """Header and data, each padded to whole records."""
         head = "".join([*self.cards, "END".ljust(80)]).encode("latin-1")
-        return head.ljust(_padded(len(head)), b" ") + self.data.ljust(
-            _padded(len(self.data)), b"\0"
-        )
+        return head.ljust(padded(len(head)), b" ") + self.data.ljust(padded(len(self.data)), b"\0")
 
     @cached_property
     def rows(self) -> NDArray[np.void]:
@@ -113,7 +111,7 @@ class Content:
     @property
     def is_fits(self) -> bool:
         """True where it begins as a FITS file, or as an HDU of one."""
-        return self.raw[:9] in _STARTS and b"\n" not in self.raw[:81]
+        return self.raw[:9] in HDU_STARTS and b"\n" not in self.raw[:81]
 
     @cached_property
     def text(self) -> str:
@@ -139,7 +137,7 @@ class Content:
     def whole(self) -> tuple[Hdu, ...]:
         """HDUs of a FITS file that is whole; FormatError when it is none, truncated or damaged."""
         hdus = self.hdus if self.is_fits else ()
-        if not hdus or self.raw[:9] != _STARTS[0]:
+        if not hdus or self.raw[:9] != HDU_STARTS[0]:
             raise FormatError("is no FITS file", where=self.name, do="check the file")
         end = sum(len(hdu.to_bytes()) for hdu in hdus)
         broken = any(hdu.state != "whole" for hdu in hdus)
@@ -174,8 +172,8 @@ class Content:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
-                return fits.open(io.BytesIO(self.raw), memmap=False, lazy_load_hdus=False)
-            except (OSError, ValueError, fits.VerifyError):
+                return open_fits(self.raw, self.name)
+            except (FormatError, OSError, ValueError, fits.VerifyError):
                 return None
 
 
@@ -188,9 +186,11 @@ def readable(where: str) -> Iterator[None]:
             yield
     except BayesdistError:
         raise
-    except (fits.VerifyError, ValueError, KeyError, IndexError, TypeError, OSError) as error:
+    except Exception as error:  # libraries raise all kinds on values that no file should have
         raise FormatError(
-            f"is not a header that can be read ({error})", where=where, do="check the file"
+            f"is not a header that can be read ({reason_of(error)})",
+            where=where,
+            do="check the file",
         ) from error
 
 
@@ -198,28 +198,9 @@ def read_content(path: str | os.PathLike[str]) -> Content:
     """Content of a file, decompressed where gzip has compressed it.
 
     InputError when the file cannot be read, FormatError when it is a broken gzip file, or one that
-    grows beyond 4 GiB.
+    grows beyond what is plausible.
     """
-    where = str(path)
-    try:
-        raw = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(
-            f"cannot be read ({error.strerror or error})", where=where, do="check the path"
-        ) from error
-    if raw[:2] == b"\x1f\x8b":
-        try:
-            with gzip.GzipFile(fileobj=io.BytesIO(raw)) as stream:
-                raw = stream.read(LARGEST + 1)
-        except (EOFError, OSError, zlib.error) as error:
-            raise FormatError(
-                f"is a broken gzip file ({error})", where=where, do="fetch the file again"
-            ) from error
-        if len(raw) > LARGEST:
-            raise FormatError(
-                f"holds more than {LARGEST} bytes", where=where, do="decompress it first"
-            )
-    return Content(where, raw, Path(path))
+    return Content(str(path), unpacked(read_bytes(path), str(path)), Path(path))
 
 
 def read_hdus(path: str | os.PathLike[str]) -> tuple[Hdu, ...]:
@@ -246,7 +227,7 @@ def write_hdus(hdus: Iterable[Hdu], path: str | os.PathLike[str]) -> None:
 def _walked(raw: bytes) -> Iterable[Hdu]:
     """HDUs one after the other, with their data between them or not."""
     number, at = 0, 0
-    while raw[at : at + 9] in _STARTS:
+    while raw[at : at + 9] in HDU_STARTS:
         cards, after = list[str](), at
         while after < len(raw):
             card = raw[after : after + 80].decode("latin-1")
@@ -254,29 +235,11 @@ def _walked(raw: bytes) -> Iterable[Hdu]:
             if card[:8].rstrip() == "END":
                 break
             cards.append(card.ljust(80))
-        begin = at + _padded(after - at)
-        size = _data_size(header_of(cards))
-        state, at = "whole", begin + _padded(size)
-        if begin + size > len(raw):
-            follows = raw[begin : begin + 9] == _STARTS[1]
+        begin = at + padded(after - at)
+        size = data_size(header_of(cards))
+        state, at = "whole", begin + padded(size or 0)
+        if size is None or begin + size > len(raw):
+            follows = raw[begin : begin + 9] == HDU_STARTS[1]
             state, at = ("none", begin) if follows or len(raw) <= begin else ("cut", len(raw))
         yield Hdu(tuple(cards), raw[begin:at], number, state)
         number += 1
-
-
-def _data_size(header: fits.Header) -> int:
-    """Bytes of data that a header announces (FITS 4.0, section 4.4.1)."""
-    try:
-        sides = [int(header[f"NAXIS{k + 1}"]) for k in range(int(header.get("NAXIS", 0)))]
-        bits, groups = abs(int(header["BITPIX"])), int(header.get("GCOUNT", 1))
-        more = int(header.get("PCOUNT", 0))
-    except (KeyError, TypeError, ValueError, fits.VerifyError):
-        return 0
-    n = 1 if sides else 0
-    for side in sides:
-        n *= side
-    return bits // 8 * groups * (more + n)
-
-
-def _padded(n: int) -> int:
-    return -(-n // RECORD) * RECORD

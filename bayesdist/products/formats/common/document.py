@@ -15,6 +15,7 @@ from astropy.io import fits
 from pydantic import BaseModel, ConfigDict
 
 from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.plausible import refuse_senseless
 from bayesdist.errors import InputError
 from bayesdist.model import LookupTable
 from bayesdist.model.basis import MAX_ORDER
@@ -137,6 +138,7 @@ class Built:
     made: Any  # source of the content, in the terms of its format
     chip: int | None = None  # of a file of one chip
     summary: Mapping[str, Any] = field(default_factory=dict)  # further entries of summary.json
+    warnings: tuple[str, ...] = ()  # on what programs will make of it, for the terminal
 
 
 @dataclass(frozen=True)
@@ -230,4 +232,6 @@ class Document:
                 do="give an IDCTAB, a SIP header, WISE meta-data, or a run directory",
             )
         with readable(self.name):
-            return self.format.calibration(self.holds, self.name, choice)
+            found = self.format.calibration(self.holds, self.name, choice)
+            refuse_senseless(found)
+            return found

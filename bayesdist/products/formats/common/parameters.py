@@ -7,19 +7,22 @@ next to a text file that names it.  With X = (2 x - (NX + 1)) / NX, and Y alike,
 
     u = sum VALUE P_I(X) P_J(Y)    over the rows of its CHIP whose AXIS is 'u',
 
-and COV is the row of the covariance matrix, in the order of the rows.  Look-up tables are not part
-of it: they stand in the file beside.
+and COV is the row of the covariance matrix, in the order of the rows.  Errors of positions that it
+does not hold stand in the header, each with BDNAMEn, BDKINDn and standard deviations BDSIGUn and
+BDSIGVn of u and v.  Look-up tables are not part of it: they stand in the file beside.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
 from bayesdist.calibration.calibration import Calibration, GaussianSolution
+from bayesdist.calibration.further import further_from
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError
@@ -44,6 +47,8 @@ AGREE = 1e-6  # pixels by which numbers that were printed may differ from the pa
 _GRID = 33  # points of each axis over which two calibrations are compared
 _PLANES = ("free", "sky", "detector", "aperture")
 _ERRORS = ("covariance", "sigma", "none")
+# cards of the errors that COV does not hold, which are numbered
+_FURTHER = {"name": "NAME", "kind": "KIND", "u": "SIGU", "v": "SIGV", "source": "FROM"}
 
 
 def parameters_hdu(calibration: Calibration, epoch: float | None = None) -> fits.BinTableHDU:
@@ -84,6 +89,12 @@ def parameters_hdu(calibration: Calibration, epoch: float | None = None) -> fits
     for keyword, text in (("DETECTOR", calibration.detector), ("FILTER", calibration.filter)):
         if text:
             header[keyword] = text
+    for k, row in enumerate(calibration.further, start=1):
+        header[f"BDNAME{k}"] = row.name
+        header[f"BDKIND{k}"] = row.kind
+        header[f"BDSIGU{k}"] = row.u, "standard deviation of u"
+        header[f"BDSIGV{k}"] = row.v, "standard deviation of v"
+        header[f"BDFROM{k}"] = row.source
     header.add_comment("u = sum VALUE P_I(X) P_J(Y), P Legendre, X = (2 x - (NX + 1)) / NX")
     return hdu
 
@@ -140,7 +151,18 @@ def stored_calibration(hdu: Hdu, name: str) -> Calibration:
         numbered=bool(header.get("BDNUMB", True)),
         scale=scale,
         scale_from="" if scale is None else EXTENSION,
+        further=further_from(_further(header), where),
     )
+
+
+def _further(header: fits.Header) -> list[dict[str, Any]]:
+    """Errors beside the covariance, by their cards."""
+    out: list[dict[str, Any]] = []
+    while f"BDNAME{len(out) + 1}" in header:
+        k = len(out) + 1
+        cards = {key: f"BD{name}{k}" for key, name in _FURTHER.items()}
+        out.append({key: header[card] for key, card in cards.items() if card in header})
+    return out
 
 
 def largest_difference(a: Calibration, b: Calibration) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of_maps
+from bayesdist.calibration.further import further_from, further_records, scaled
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import Chip, DistortionModel, LookupTable
@@ -78,6 +79,7 @@ def at_date(
         numbered=calibration.numbered,
         before=tuple(t for t in tables if t.filter in ("", calibration.filter)),
         notes=calibration.notes,
+        further=scaled(calibration.further, factor),
     )
     model = replace(made.model, chips=(known,))
     solution = replace(made.solution, model=model)  # type: ignore[type-var]
@@ -137,6 +139,8 @@ def record_of(
     }
     if closure is not None:
         record["inverse"] = {"closure_pix": float(closure)}
+    if calibration.further:
+        record["further_errors"] = further_records(calibration.further)
     if calibration.errors != "none":
         record["covariance"] = np.array(calibration.solution.cov, float)
     return record
@@ -225,6 +229,7 @@ def calibration_from(
         numbered=chip["number"] is not None,
         before=tables,
         notes=_notes(record["provenance"]),
+        further=further_from(record.get("further_errors", ()), where),
     )
 
 

@@ -19,9 +19,11 @@ from bayesdist.calibration.calibration import Calibration, GaussianSolution, cal
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.inverse import ExplicitInverse
 from bayesdist.calibration.plane import Plane
+from bayesdist.errors import FormatError
 from bayesdist.products.formats.common.coefficients import idctab_column
 from bayesdist.products.formats.idctab.drift import RATES
 from bayesdist.products.formats.idctab.hst import parity_of
+from bayesdist.products.formats.idctab.plausible import refuse_implausible
 from bayesdist.products.formats.idctab.table import FILTER_COLUMNS, IdcTab
 
 __all__ = ["idctab_calibration"]
@@ -38,7 +40,10 @@ def idctab_calibration(tab: IdcTab, filter: str | None = None) -> Calibration:
     of an unknown detector.
     """
     names = None if filter is None else [part.strip() for part in filter.split(",")]
+    if not len(tab.rows):
+        raise FormatError("has no rows", where=tab.name, do="fetch it again")
     numbers = tab.chips
+    refuse_implausible(tab, [tab.row(number, names) for number in numbers])
     parity = parity_of(tab.instrument, tab.detector) if len(numbers) > 1 else (1, 1)
     base = tab.rows[tab.row(numbers[0], names)]
     maps = {}

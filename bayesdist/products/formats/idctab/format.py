@@ -16,7 +16,7 @@ from bayesdist.products.formats.common.document import (
 from bayesdist.products.formats.idctab.build import idctab_from_solution
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
 from bayesdist.products.formats.idctab.lint import lint_idctab
-from bayesdist.products.formats.idctab.table import IdcTab
+from bayesdist.products.formats.idctab.table import HIGHEST, IdcTab
 from bayesdist.products.formats.idctab.text import describe_idctab
 
 __all__ = ["FORMAT", "Settings"]
@@ -72,4 +72,5 @@ FORMAT = Format(
     _calibration,
     Settings,
     _build,
+    highest_order=HIGHEST,
 )

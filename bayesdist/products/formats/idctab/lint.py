@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from bayesdist.errors import InputError
 from bayesdist.products.formats.common.coefficients import idctab_column, idctab_powers
 from bayesdist.products.formats.common.document import Finding, missing_identity, repeated_values
 from bayesdist.products.formats.idctab.hst import parity_of
+from bayesdist.products.formats.idctab.plausible import implausible, rows_text
 from bayesdist.products.formats.idctab.table import FILTER_COLUMNS, IdcTab
 
 __all__ = ["lint_idctab"]
@@ -22,7 +23,7 @@ _SCALE_RATIO = 1.25
 
 def lint_idctab(tab: IdcTab) -> tuple[Finding, ...]:
     """Findings in an IDCTAB; those of many rows are gathered in one."""
-    finite = _not_finite(tab)
+    finite = [*_not_finite(tab), *implausible(tab)]
     return (
         *finite,
         *_header(tab),
@@ -31,21 +32,13 @@ def lint_idctab(tab: IdcTab) -> tuple[Finding, ...]:
     )
 
 
-def _rows(indices: Iterable[int]) -> str:
-    """Row numbers from 1, the first few of them by name."""
-    numbers = [int(k) + 1 for k in indices]
-    shown = ", ".join(map(str, numbers[:3]))
-    more = f" and {len(numbers) - 3} more" if len(numbers) > 3 else ""
-    return f"row{'s' if len(numbers) > 1 else ''} {shown}{more}"
-
-
 def _not_finite(tab: IdcTab) -> list[Finding]:
     out = []
     for name in tab.columns:
         column = tab.rows[name]
         if column.dtype.kind == "f" and not np.isfinite(column).all():
             bad = np.flatnonzero(~np.isfinite(column))
-            out.append(Finding("error", f"{_rows(bad)}, column {name}", "not a finite number"))
+            out.append(Finding("error", f"{rows_text(bad)}, column {name}", "not a finite number"))
     return out
 
 
@@ -112,7 +105,9 @@ def _table(tab: IdcTab) -> Iterator[Finding]:
         outside = np.flatnonzero((ref < 0.5) | (ref > n + 0.5))
         if outside.size:
             yield Finding(
-                "warning", f"{_rows(outside)}, column {axis}REF", f"lies outside 1 .. {axis}SIZE"
+                "warning",
+                f"{rows_text(outside)}, column {axis}REF",
+                f"lies outside 1 .. {axis}SIZE",
             )
     unused = [c for p in tab.prefixes if (c := f"{p}00") in columns and rows[c].any()]
     if unused:
@@ -160,12 +155,12 @@ def _repeated_rows(tab: IdcTab) -> Iterator[Finding]:
         extra = sorted(k for g in differ for k in g[1:])
         yield Finding(
             "warning",
-            _rows(extra),
+            rows_text(extra),
             "a row before has the same chip and filters with other values: stwcs takes the first",
         )
     if len(same) > len(differ):
         extra = sorted(k for g in same if g not in differ for k in g[1:])
-        yield Finding("note", _rows(extra), "repeats a row before it")
+        yield Finding("note", rows_text(extra), "repeats a row before it")
 
 
 def _coefficients(tab: IdcTab) -> Iterator[Finding]:
@@ -209,7 +204,7 @@ def _coefficients(tab: IdcTab) -> Iterator[Finding]:
     )
     for level, bad, column, message in checks:
         if bad.any():
-            yield Finding(level, f"{_rows(forward[bad])}, column {column}", message)
+            yield Finding(level, f"{rows_text(forward[bad])}, column {column}", message)
     yield from _repeated_values(tab)
 
 
@@ -230,7 +225,7 @@ def _repeated_values(tab: IdcTab) -> Iterator[Finding]:
         if all(name[2] == "1" for name in group if len(name) == 4):
             continue
         yield Finding(
-            "warning", f"{_rows(rows)}, columns {', '.join(group)}",
+            "warning", f"{rows_text(rows)}, columns {', '.join(group)}",
             "the same value: one may have been copied over the other",
         )  # fmt: skip
 
@@ -249,12 +244,12 @@ def _chips(tab: IdcTab) -> Iterator[Finding]:
     )
     if (difference == 0).any():
         yield Finding(
-            "error", f"{_rows(upper[difference == 0])}, column V3REF",
+            "error", f"{rows_text(upper[difference == 0])}, column V3REF",
             "is that of chip 2: the chips are laid one over the other",
         )  # fmt: skip
     if (difference > 0).any():
         yield Finding(
-            "warning", f"{_rows(upper[difference > 0])}, column V3REF",
+            "warning", f"{rows_text(upper[difference > 0])}, column V3REF",
             "parity: chip 1 lies at higher V3 than chip 2, which is the wrong way round",
         )  # fmt: skip
 

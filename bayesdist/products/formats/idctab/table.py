@@ -35,11 +35,12 @@ from bayesdist.products.formats.common.content import Hdu, read_hdus, write_hdus
 from bayesdist.products.formats.idctab.drift import drift, scheme_of
 from bayesdist.products.formats.idctab.hst import serves
 
-__all__ = ["FILTER_COLUMNS", "IdcTab", "read_idctab", "write_idctab"]
+__all__ = ["FILTER_COLUMNS", "HIGHEST", "IdcTab", "read_idctab", "write_idctab"]
 
 Float = NDArray[np.float64]
 
 FILTER_COLUMNS = ("FILTER1", "FILTER2", "FILTER", "OPT_ELEM")
+HIGHEST = 9  # order: CX and CY have one digit for each power
 # The chip to whose zero point stwcs refers both chips of ACS/WFC and of WFC3/UVIS.
 _REFERENCE = 2
 _ANY_CHIP = -999  # stwcs lets such a row serve every chip
@@ -88,9 +89,11 @@ class IdcTab:
                     "is missing", where=f"{self.name}, keyword {keyword}", do="add the keyword"
                 )
         order = header["NORDER"]
-        if isinstance(order, bool) or not isinstance(order, int) or not 1 <= order <= 9:
+        if isinstance(order, bool) or not isinstance(order, int) or not 1 <= order <= HIGHEST:
             raise FormatError(
-                f"is {order!r}", where=f"{self.name}, keyword NORDER", do="give an order of 1 to 9"
+                f"is {order!r}",
+                where=f"{self.name}, keyword NORDER",
+                do=f"give an order of 1 to {HIGHEST}",
             )
         if len(self.hdus) < 2:
             raise FormatError("has no table in HDU 1", where=self.name, do="check the file")

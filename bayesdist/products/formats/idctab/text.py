@@ -7,6 +7,7 @@ import numpy as np
 from bayesdist.products.formats.common.coefficients import idctab_column, largest_magnitude
 from bayesdist.products.formats.common.document import finding_lines, identity_lines
 from bayesdist.products.formats.idctab.lint import lint_idctab
+from bayesdist.products.formats.idctab.plausible import LIMITS
 from bayesdist.products.formats.idctab.table import FILTER_COLUMNS, IdcTab
 
 __all__ = ["describe_idctab"]
@@ -89,12 +90,14 @@ def _non_linear(tab: IdcTab, row: int) -> str:
     """Largest terms above order 1, in pixels of SCALE, of Xc and Yc."""
     record = tab.rows[row]
     scale = float(record["SCALE"])
-    if scale == 0 or not np.isfinite(scale):
-        return "?"
     x_range, y_range = (
         (1 - float(record[f"{a}REF"]), float(record[f"{a}SIZE"]) - float(record[f"{a}REF"]))
         for a in "XY"
     )
+    if scale == 0 or not np.isfinite([scale, *x_range, *y_range]).all():
+        return "?"
+    if not all(1 <= float(record[f"{a}SIZE"]) <= LIMITS[f"{a}SIZE"][1] for a in "XY"):
+        return "?"
     out = []
     for values in tab.coefficients_of_row(row):
         terms = {t: c for t, c in zip(tab.terms, values.tolist(), strict=True) if sum(t) > 1}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap, Monomials
 from bayesdist.calibration.inverse import fit_inverse
-from bayesdist.model.basis import MAX_ORDER, polynomial_terms
+from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.formats.common.coefficients import require_regular
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import BuildOptions
@@ -67,7 +67,7 @@ def siaf_files(
     known = one.chip(chip, origin="stated")
     poly = known.monomials()
     require_regular(poly.linear, chip)
-    rows_order = min(max(order or 0, known.basis.order), MAX_ORDER)
+    rows_order = max(order or 0, known.basis.order)
     columns = [*_forward(poly), *_inverse(known, rows_order)]
     date = options.epoch if calibration.model.time is not None else None
     name = f"siaf_distortion_{aperture}.txt".lower()

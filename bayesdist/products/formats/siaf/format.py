@@ -21,6 +21,7 @@ from bayesdist.products.formats.common.document import (
 from bayesdist.products.formats.common.read_back import ReadBack, of_chips
 from bayesdist.products.formats.siaf.lint import lint_siaf
 from bayesdist.products.formats.siaf.table import (
+    HIGHEST,
     SiafTable,
     holds_table,
     siaf_calibration,
@@ -38,7 +39,7 @@ class Settings(FormatSettings):
     """Configuration of a SIAF table of coefficients."""
 
     aperture: str | None = None  # by default the names of the chips, or of the detector
-    order: Annotated[int, Field(ge=1, le=9)] | None = None
+    order: Annotated[int, Field(ge=1, le=HIGHEST)] | None = None
 
 
 def _parse(content: Content) -> SiafTable | None:
@@ -99,4 +100,5 @@ FORMAT = Format(
     Settings,
     _build,
     _read_back,
+    highest_order=HIGHEST,
 )

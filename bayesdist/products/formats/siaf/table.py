@@ -9,7 +9,6 @@ pixel: ours state them in comments.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -24,16 +23,17 @@ from bayesdist.calibration.chip_map import fitted_map
 from bayesdist.calibration.inverse import ExplicitInverse, detector_grid
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError, InputError
-from bayesdist.model.basis import MAX_ORDER
 from bayesdist.products.formats.common.coefficients import Coefficients, evaluate
 from bayesdist.products.formats.common.content import Content, read_content
 from bayesdist.products.formats.common.document import Choice, MissingSizeError
 from bayesdist.products.formats.common.read_back import ReadBack
 from bayesdist.products.formats.common.record import calibration_from
+from bayesdist.reading.documents import json_of
 
 __all__ = [
     "AGREEMENT",
     "COLUMNS",
+    "HIGHEST",
     "KEYWORDS",
     "NAMES",
     "SIDE",
@@ -52,6 +52,7 @@ Float = NDArray[np.float64]
 NAMES = ("Sci2IdlX", "Sci2IdlY", "Idl2SciX", "Idl2SciY")
 COLUMNS = ("AperName", "siaf_index", "exponent_x", "exponent_y", *NAMES)
 KEYWORDS = ("XSciSize", "YSciSize", "XSciRef", "YSciRef")
+HIGHEST = 9  # order: powers have one digit each in siaf_index
 SIDE = "siaf_covariance"  # first key of a side file
 AGREEMENT = 1e-6  # pixels: as far as table and side file may differ
 _STATED = re.compile(r"#\s*(XSciSize|YSciSize|XSciRef|YSciRef)\s*=\s*(\S+)")
@@ -210,9 +211,9 @@ def table_of(content: Content) -> SiafTable:
 def _row(cells: Mapping[str, str], number: int, where: str) -> Row:
     i, j = (_number(cells[key], where) for key in COLUMNS[2:4])
     values = [_number(cells[key], where) for key in NAMES]
-    if not (i.is_integer() and j.is_integer() and i >= 0 and j >= 0 and i + j <= MAX_ORDER):
+    if not (i.is_integer() and j.is_integer() and i >= 0 and j >= 0 and i + j <= HIGHEST):
         raise FormatError(
-            f"the powers are {i:g} and {j:g}", where=where, do=f"give 0 to {MAX_ORDER} in all"
+            f"the powers are {i:g} and {j:g}", where=where, do=f"give 0 to {HIGHEST} in all"
         )
     return Row(
         number,
@@ -240,8 +241,8 @@ def record_beside(name: str) -> Mapping[str, Any] | None:
 
 def _record_of_side(content: Content) -> Mapping[str, Any]:
     try:
-        record = json.loads(content.text)["bayesdist"]
-    except (ValueError, KeyError, TypeError) as error:
+        record = json_of(content.text, content.name)["bayesdist"]
+    except (FormatError, KeyError, TypeError) as error:
         raise FormatError(
             f"is no side file of a SIAF table ({error})",
             where=content.name,

@@ -28,7 +28,7 @@ from bayesdist.products.formats.common.coefficients import (
     require_regular,
 )
 from bayesdist.products.formats.sip.families import offset_ranges
-from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader, worst_closure
+from bayesdist.products.formats.sip.header import LINEAR_AXES, SIP_ORDERS, SipHeader, worst_closure
 
 __all__ = ["sip_from_solution"]
 
@@ -45,6 +45,7 @@ def sip_from_solution(
     epoch: float | None = None,
     inverse_order: int | None = None,
     linear: str = "cd",
+    axes: str = "sky",
     crval: tuple[float, float] | None = None,
     tangent_point: tuple[float, float] | None = None,
     scale_arcsec: float | None = None,
@@ -71,6 +72,9 @@ def sip_from_solution(
         stands for the reference pixel.  'sip': the CD matrix is a pure scale, and A and B hold
         constant and linear terms too, relative to u = x and v = y in pixels, as the WISE pipeline
         has it (WSDC D-T033, Appendix B); CRVAL stands for `origin`.
+    axes : {'sky', 'linear'}
+        'linear', of u, v in pixels: CTYPE is no projection, CD is in pixels and CRVAL the (u, v) of
+        CRPIX, so that a program gives u, v and no sky.
     crval : tuple of float, optional
         Sky position that the header states, degrees.  With `tangent_point` that of the reference
         pixel by default, and CRPIX is the pixel of any other one that is given; where the solution
@@ -118,6 +122,7 @@ def sip_from_solution(
         tangent_point = calibration.plane.point
     model = calibration.model
     _check_options(model, linear, epoch, scale_arcsec, tangent_point, origin)
+    in_frame = _is_in_frame(axes, model, tangent_point, crval)
     number = calibration.numbers[0] if chip is None else chip
     one = calibration.chip(number, epoch, origin="stated")
     poly = one.monomials()
@@ -125,7 +130,7 @@ def sip_from_solution(
     unit_arcsec = ARCSEC[model.unit] if model.unit != "pix" else (scale_arcsec or 1.0)
     sky = None
     if tangent_point is not None:
-        sky = reprojected(one, unit_arcsec, tangent_point, crval, SIP_ORDERS[0])
+        sky = reprojected(one, unit_arcsec, tangent_point, crval, *SIP_ORDERS)
         poly, crval = sky.poly, sky.crval
     order = max(SIP_ORDERS[0], *(i + j for i, j in poly.terms))  # readers ignore order 1
     inverse = _inverse_order(inverse_order, order)
@@ -138,6 +143,8 @@ def sip_from_solution(
         cd = np.eye(2) * pixel * unit_arcsec / 3600.0
         offset = _origin(poly, model.unit) if origin is None else origin
         terms, sigma = _relative_to_identity(poly, pixel, offset)
+    if in_frame:
+        cd, crval = cd * 3600.0 / unit_arcsec, offset
     kept = [k for k, (i, j) in enumerate(poly.terms) if linear == "sip" or i + j >= 2]
     if sky is not None:
         offset = sky.offset
@@ -148,9 +155,14 @@ def sip_from_solution(
     if not kept:
         a = b = dict.fromkeys(((2, 0), (1, 1), (0, 2)), 0.0)
     cards = _cards(
-        number, linear, epoch if model.time is not None else None, model.unit, scale_arcsec
+        number,
+        linear,
+        epoch if model.time is not None else None,
+        "" if in_frame else model.unit,
+        scale_arcsec,
     )
-    cards += _sky_cards(tangent_point, crval)
+    if not in_frame:
+        cards += _sky_cards(tangent_point, crval)
     cards += (
         *wrapped_cards("COMMENT", filter(None, notes)),
         *convergence_cards(calibration.solution),
@@ -160,7 +172,7 @@ def sip_from_solution(
         crpix=poly.basis.reference_pixel,
         crval=(0.0, 0.0) if crval is None else (float(crval[0]), float(crval[1])),
         cd=cd,
-        ctype=("RA---TAN-SIP", "DEC--TAN-SIP"),
+        ctype=LINEAR_AXES if in_frame else ("RA---TAN-SIP", "DEC--TAN-SIP"),
         order=(order, order),
         a=a,
         b=b,
@@ -210,6 +222,28 @@ def _check_options(
             where="tangent_point",
             do="leave one of them out",
         )
+
+
+def _is_in_frame(
+    axes: str,
+    model: DistortionModel,
+    tangent_point: tuple[float, float] | None,
+    crval: tuple[float, float] | None,
+) -> bool:
+    """True for linear axes, after a check that u, v are pixels of a frame."""
+    if axes not in ("sky", "linear"):
+        raise InputError(
+            f"axes is {axes!r}", where="products.sip.axes", do="choose 'sky' or 'linear'"
+        )
+    if axes == "sky":
+        return False
+    if model.unit != "pix" or tangent_point is not None or crval is not None:
+        raise InputError(
+            "linear axes are those of u, v in pixels, and these are on the sky",
+            where="products.sip.axes",
+            do="leave axes out, or crval",
+        )
+    return True
 
 
 def _inverse_order(asked: int | None, order: int) -> int:
@@ -283,7 +317,7 @@ def _cards(
     unit: str,
     scale_arcsec: float | None,
 ) -> tuple[str, ...]:
-    """Cards of values that are no fields of a SipHeader."""
+    """Cards of values that are no fields of a SipHeader; the unit is empty for linear axes."""
     what = {
         "cd": "CD holds the linear terms; A and B begin at order 2.",
         "sip": "CD is a pure scale; A and B hold constant and linear terms.",
@@ -297,8 +331,8 @@ def _cards(
         cards.append(text_card("COMMENT", "The scale of CD is nominal: 1 arcsec per pixel."))
     cards += [
         number_card("WCSAXES", 2, "number of axes"),
-        text_card("CUNIT1", "deg"),
-        text_card("CUNIT2", "deg"),
+        text_card("CUNIT1", "deg" if unit else "pixel"),
+        text_card("CUNIT2", "deg" if unit else "pixel"),
         number_card("BDCHIP", chip, "chip number"),
     ]
     if epoch is not None:

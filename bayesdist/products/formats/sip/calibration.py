@@ -37,12 +37,14 @@ def sip_calibration(
             where=name,
             do="add NAXIS1 and NAXIS2 (or IMAGEW and IMAGEH), or compare it with a file that says",
         )
-    linear = np.eye(2) if pixels else 3600.0 * sip.cd
+    linear = np.eye(2) if pixels else sip.cd * (1.0 if sip.linear_axes else 3600.0)
 
     def positions(x: Float, y: Float) -> tuple[Float, Float]:
         if pixels:
             return sip.forward(x, y)
         xi, eta = sip.plane(x, y)
+        if sip.linear_axes:
+            return xi + sip.crval[0], eta + sip.crval[1]
         return 3600.0 * xi, 3600.0 * eta
 
     one = fitted_map(
@@ -51,15 +53,18 @@ def sip_calibration(
         order=max(sip.order) if min(sip.order) >= SIP_ORDERS[0] else 1,
         size=found,
         reference_pixel=sip.crpix,
-        unit="pix" if pixels else "arcsec",
+        unit="pix" if pixels or sip.linear_axes else "arcsec",
         monomial_cov=_variances(sip, linear),
     )
+    plane = Plane("detector") if pixels else Plane("sky", point=sip.crval)
+    if sip.linear_axes:
+        plane = Plane()
     return calibration_of_maps(
         {1: one},
         name,
         cov=one.cov,
         errors="sigma",
-        plane=Plane("detector") if pixels else Plane("sky", point=sip.crval),
+        plane=plane,
         numbered=False,
         notes=notes,
     )

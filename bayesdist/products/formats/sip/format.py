@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field
 
 from bayesdist.calibration.calibration import Calibration
@@ -20,7 +21,13 @@ from bayesdist.products.formats.common.document import (
 )
 from bayesdist.products.formats.common.read_back import ReadBack
 from bayesdist.products.formats.sip.calibration import sip_calibration
+from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
 from bayesdist.products.formats.sip.lint import lint_sip
+from bayesdist.products.formats.sip.parameters import (
+    side_file,
+    with_covariance,
+    with_side_file,
+)
 from bayesdist.products.formats.sip.read import holds_sip, sip_of
 from bayesdist.products.formats.sip.write import sip_text
 from bayesdist.products.formats.wcs.format import describe as describe_wcs
@@ -33,7 +40,9 @@ class Settings(FormatSettings):
 
     inverse_order: Annotated[int, Field(ge=2, le=9)] | None = None
     linear: Literal["cd", "sip"] = "cd"
+    axes: Literal["sky", "linear"] = "sky"
     crval: tuple[float, float] | None = None
+    parameters: bool = False  # whether a file with the covariance is written beside
 
 
 def _parse(content: Content) -> Content | None:
@@ -48,7 +57,8 @@ def _calibration(content: Content, name: str, choice: Choice) -> Calibration:
     sip = sip_of(content)
     stated = [k for k in ("D2IMDIS1", "D2IMDIS2", "CPDIS1", "CPDIS2") if k in header_of(sip.cards)]
     notes = (f"without the look-up tables of {', '.join(stated)}",) if stated else ()
-    return sip_calibration(sip, name, size=choice.size, notes=notes)
+    found = sip_calibration(sip, name, size=choice.size, notes=notes)
+    return found if choice.as_used else with_covariance(found, sip, content)
 
 
 def _read_back(
@@ -76,11 +86,41 @@ def _build(
             epoch=options.epoch,
             scale_arcsec=options.scale_arcsec,
             notes=notes,
-            **settings.model_dump(),
+            **settings.model_dump(exclude={"parameters"}),
         )
         name = f"sip_{number}.hdr" if len(calibration.numbers) > 1 else "sip.hdr"
+        if settings.parameters:
+            beside = side_file(calibration, number, options.epoch, name)
+            sip = with_side_file(sip, beside.file_name)
+            out.append(beside)
         summary = {"closure_pix": sip.closure, "a_dmax": sip.a_dmax, "b_dmax": sip.b_dmax}
-        out.append(Built(name, "SIP", sip_text(sip).encode("ascii"), sip, number, summary))
+        text = sip_text(sip).encode("ascii")
+        out.append(Built(name, "SIP", text, sip, number, summary, _warnings(sip, calibration)))
+    return tuple(out)
+
+
+def _warnings(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
+    """Warnings on what programs will make of a header that the solution does not say."""
+    out = []
+    if not sip.linear_axes and calibration.plane.point is None:
+        placed = "CRVAL is a placeholder" if sip.crval == (0.0, 0.0) else "CRVAL is as it was given"
+        mirrored = (
+            ", which makes the image a mirror of the sky" if np.linalg.det(sip.cd) > 0 else ""
+        )
+        other = ", or axes = 'linear'" if calibration.unit == "pix" else ""
+        out.append(
+            f"{placed}, and u is taken for east and v for north{mirrored}: set "
+            f"products.sip.crval{other}"
+        )
+    low = {k: c for terms in (sip.a, sip.b) for k, c in terms.items() if sum(k) < 2 and c}
+    if low:
+        out.append(
+            "A and B hold constant or linear terms, which astropy applies and stwcs and gwcs drop: "
+            "set products.sip.linear = 'cd' for those"
+            if any(sum(k) == 1 for k in low)
+            else "A_0_0 and B_0_0 hold what CRVAL leaves, which astropy applies and stwcs and gwcs "
+            "drop"
+        )
     return tuple(out)
 
 
@@ -95,4 +135,5 @@ FORMAT = Format(
     Settings,
     _build,
     _read_back,
+    highest_order=SIP_ORDERS[1],
 )

@@ -19,13 +19,14 @@ from bayesdist.calibration.inverse import detector_grid
 from bayesdist.errors import InputError
 from bayesdist.products.formats.common.coefficients import evaluate
 
-__all__ = ["SIP_ORDERS", "SipHeader", "worst_closure"]
+__all__ = ["LINEAR_AXES", "SIP_ORDERS", "SipHeader", "worst_closure"]
 
 Float = NDArray[np.float64]
 Terms = Mapping[tuple[int, int], float]
 
 # Programs ignore lower orders, and a keyword has room for one digit.
 SIP_ORDERS = (2, 9)
+LINEAR_AXES = ("U", "V")  # CTYPE of a frame of pixels, which no program takes for a sky
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +99,11 @@ class SipHeader:
     cards: tuple[str, ...] = ()
 
     @property
+    def linear_axes(self) -> bool:
+        """True for positions in a frame of pixels: `cd` is in these, and CRVAL is their (u, v)."""
+        return self.ctype == LINEAR_AXES
+
+    @property
     def a_dmax(self) -> float | None:
         """A_DMAX, pixels."""
         return self.dmax[0]
@@ -165,7 +171,7 @@ class SipHeader:
         )
 
     def plane(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
-        """Tangent-plane coordinates (xi, eta) of pixels about CRVAL, degrees.
+        """Coordinates (xi, eta) of pixels about CRVAL, degrees; with linear axes pixels.
 
         Parameters
         ----------

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from bayesdist.calibration.plausible import FAR
 from bayesdist.products.formats.common.coefficients import largest_magnitude, sip_keyword
 from bayesdist.products.formats.common.document import Finding
 from bayesdist.products.formats.sip.families import (
@@ -67,8 +68,19 @@ def lint_sip(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Findi
 
 
 def _frame(sip: SipHeader) -> Iterator[Finding]:
+    ra, dec = sip.crval
+    if not (abs(ra) <= 360 and abs(dec) <= 90):
+        yield Finding("error", "CRVAL1, CRVAL2", f"({ra:g}, {dec:g}) degrees lie on no sphere")
+    if not np.abs(sip.crpix).max() <= FAR:
+        yield Finding("error", "CRPIX1, CRPIX2", f"{sip.crpix[0]:g}, {sip.crpix[1]:g} is no pixel")
     if np.linalg.det(sip.cd) == 0:
         yield Finding("error", "CD", "the matrix is singular: no pixel has a position on the sky")
+    elif sip.linear_axes:
+        yield Finding(
+            "note", "CTYPE", "positions are u, v in a frame of pixels, and not the sky; astropy "
+            "applies A and B, and remarks that CTYPE does not end in -SIP",
+        )  # fmt: skip
+        return
     elif np.linalg.det(sip.cd) > 0:
         yield Finding(
             "note",

@@ -14,7 +14,7 @@ from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky.tangent import tangent_plane
 from bayesdist.products.formats.common.content import Content
-from bayesdist.products.formats.common.document import BuildOptions, Built
+from bayesdist.products.formats.common.document import PARAMETERS, BuildOptions, Built
 from bayesdist.products.formats.common.read_back import ReadBack
 from bayesdist.products.formats.sip.header import SipHeader
 from bayesdist.products.formats.sip.read import sip_of
@@ -45,6 +45,8 @@ def sip_positions(
         plane = tangent_plane(*sky_of_header(sip_header(sip), x, y), tangent_point)
         return np.stack(plane, axis=-1) / ARCSEC[unit]
     stated = like or sip
+    if stated.linear_axes:
+        return np.stack(sip.forward(x, y), axis=-1) @ stated.cd.T + stated.crval
     in_unit = 3600.0 / (ARCSEC[unit] if unit != "pix" else scale_arcsec or 1.0)
     offset = stated.offset or (0.0, 0.0)
     return np.stack(sip.forward(x, y), axis=-1) @ (in_unit * stated.cd).T + offset
@@ -65,9 +67,9 @@ def sip_read_back(
     headers = {
         one.chip: sip_of(Content(one.file_name, one.content))
         for one in files
-        if one.chip is not None
+        if one.chip is not None and one.kind != PARAMETERS
     }
-    names = ", ".join(one.file_name for one in files)
+    names = ", ".join(one.file_name for one in files if one.kind != PARAMETERS)
     point = calibration.plane.point
     return [headers_read_back(names, headers, calibration, options, tangent_point=point)]
 

@@ -16,12 +16,15 @@ __all__ = ["coefficient_lines", "sip_lines"]
 def sip_lines(sip: SipHeader, name: str) -> list[str]:
     """Lines of text on a header, but for its coefficients."""
     size = "unknown" if sip.size is None else f"{sip.size[0]} x {sip.size[1]} px"
+    scale, unit, place = np.sqrt(abs(np.linalg.det(sip.cd))), "px", "px"
+    if not sip.linear_axes:
+        scale, unit, place = 3600 * scale, "arcsec", "deg"
     lines = [
         f"{name}: SIP header, A_ORDER {sip.order[0]}, B_ORDER {sip.order[1]}, image size {size}",
         f"  CTYPE     {sip.ctype[0]}, {sip.ctype[1]}",
         f"  CRPIX     {sip.crpix[0]:.10g}, {sip.crpix[1]:.10g}",
-        f"  CRVAL     {sip.crval[0]:.10g}, {sip.crval[1]:.10g} deg",
-        f"  scale     {3600 * np.sqrt(abs(np.linalg.det(sip.cd))):.8g} arcsec/px",
+        f"  CRVAL     {sip.crval[0]:.10g}, {sip.crval[1]:.10g} {place}",
+        f"  scale     {scale:.8g} {unit}/px",
         f"  CD        {' '.join(f'{value:.10g}' for value in sip.cd.flat)}",
     ]
     if sip.offset is not None:

@@ -116,14 +116,17 @@ def _cards(sip: SipHeader) -> list[str]:
 def _keywords(sip: SipHeader) -> dict[str, tuple[float | int | str, str]]:
     """Keywords that the fields stand for, with value and comment, in the usual order."""
     out: dict[str, tuple[float | int | str, str]] = {}
+    unit, axes = "deg", "tangent plane with SIP"
+    if sip.linear_axes:
+        unit, axes = "pix", "frame of pixels, with SIP"
     for axis in (1, 2):
-        out[f"CTYPE{axis}"] = sip.ctype[axis - 1], "tangent plane with SIP"
+        out[f"CTYPE{axis}"] = sip.ctype[axis - 1], axes
     for axis in (1, 2):
         out[f"CRPIX{axis}"] = sip.crpix[axis - 1], "[pix] reference pixel"
     for axis in (1, 2):
-        out[f"CRVAL{axis}"] = sip.crval[axis - 1], "[deg] sky at the reference pixel"
+        out[f"CRVAL{axis}"] = sip.crval[axis - 1], f"[{unit}] position at the reference pixel"
     for k, keyword in enumerate(CD_KEYWORDS):
-        out[keyword] = float(sip.cd.flat[k]), "[deg/pix]"
+        out[keyword] = float(sip.cd.flat[k]), f"[{unit}/pix]"
     if sip.offset is not None:
         for keyword, value in zip(("BDU0", "BDV0"), sip.offset, strict=True):
             out[keyword] = value, "(u, v) of the model that CRVAL stands for"

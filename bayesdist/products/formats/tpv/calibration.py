@@ -10,7 +10,6 @@ from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.errors import FormatError, InputError
-from bayesdist.model.basis import MAX_ORDER
 from bayesdist.products.formats.common.document import MissingSizeError
 from bayesdist.products.formats.common.parameters import with_parameters
 from bayesdist.products.formats.tpv.head import TpvFile, TpvHead
@@ -19,6 +18,7 @@ __all__ = ["tpv_calibration"]
 
 Float = NDArray[np.float64]
 
+_RADIAL_ORDER = 9  # of the polynomial that stands for odd powers of r
 _EXACT = 1e-9  # pixels: below it a map is the polynomial that it was taken for
 
 
@@ -38,7 +38,7 @@ def tpv_calibration(
     """
     _check(file, name)
     maps, notes = {}, list[str]()
-    order = max(MAX_ORDER if head.radial else head.order for head in file.heads)
+    order = max(_RADIAL_ORDER if head.radial else head.order for head in file.heads)
     unit = str(file.heads[0].header.get("BDUNIT", "arcsec"))
     factor = 3600.0 / float(file.heads[0].header.get("BDARCS", ARCSEC.get(unit, 1.0)))
     for head in file.heads:

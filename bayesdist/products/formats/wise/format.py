@@ -153,4 +153,5 @@ FORMAT = Format(
     Settings,
     _build,
     _read_back,
+    highest_order=SIP_ORDERS[1],
 )

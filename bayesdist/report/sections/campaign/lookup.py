@@ -99,9 +99,11 @@ def table_residuals(r: ReportInput) -> Plot:
     fig = new_figure(WIDTH, 2.35 * len(chips) + 0.35)
     grid = fig.subplots(len(chips), 3, squeeze=False)
     for axes, chip in zip(grid, chips, strict=True):
-        assert chip.with_tables is not None
         name = chip.chip.name or f"chip {chip.chip.number}"
-        parts = ((chip.without, "without tables", WITHOUT), (chip.with_tables, "with", WITH))
+        parts = (
+            (chip.without, "without tables", WITHOUT),
+            (needed(chip.with_tables), "with", WITH),
+        )
         for ax, (residual, what, color) in zip(axes, parts, strict=False):
             _cloud(ax, residual * scale.factor, reach * scale.factor, color)
             ax.set_title(f"{name}, {what}")

@@ -92,7 +92,7 @@ def catalogue_errors(r: ReportInput) -> Plot:
     left.set_ylabel(rf"error of the position, $\sigma_{{uv}}$ [{catalog.unit}]")
     left.set_title("Positions")
     if catalog.sigma_motion is not None:
-        _motions(right, catalog)
+        _motions(right, catalog, catalog.sigma_motion)
     else:
         right.remove()
     for ax in fig.axes:
@@ -129,18 +129,17 @@ def catalogue_errors(r: ReportInput) -> Plot:
     )
 
 
-def _motions(ax: Axes, catalog: CatalogStars) -> None:
-    assert catalog.sigma_motion is not None
+def _motions(ax: Axes, catalog: CatalogStars, error: NDArray[np.float64]) -> None:
     good = np.ones(len(catalog.mag), bool)
     if catalog.limit is not None:
         mag, sigma = catalog.limit
-        good = catalog.sigma_motion <= np.exp(np.interp(catalog.mag, mag, np.log(sigma)))
-    ax.plot(catalog.mag[good], catalog.sigma_motion[good], ".", ms=1.2, color=_DOT, label="used")
+        good = error <= np.exp(np.interp(catalog.mag, mag, np.log(sigma)))
+    ax.plot(catalog.mag[good], error[good], ".", ms=1.2, color=_DOT, label="used")
     if catalog.limit is not None:
         bad = ~good
         ax.plot(
             catalog.mag[bad],
-            catalog.sigma_motion[bad],
+            error[bad],
             ".",
             ms=1.2,
             color=PALETTE["orange"],

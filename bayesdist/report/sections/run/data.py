@@ -140,10 +140,9 @@ def residuals_by_magnitude(r: ReportInput) -> Plot:
         text += f" {words.rows} lie between them{more}."
     if r.sample:
         text += f" Drawn from {r.sample}."
-    assert r.stars.table.mag is not None
     return Plot(
         _density(
-            r.stars.table.mag[known],
+            needed(r.stars.table.mag)[known],
             r.stars.residual[known],
             unit=r.unit,
             errors=r.magnitude_errors,

@@ -18,7 +18,7 @@ from bayesdist.report.arrows import (
     vector_map,
 )
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput
+from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.fields import Grid, contour_levels, scalar_map
 from bayesdist.report.panels import ChipPanels
 from bayesdist.report.registry import Plot
@@ -173,8 +173,7 @@ def _flow(r: ReportInput, vectors: Sequence[VectorMap]) -> Figure:
     panels.frame(reach + 0.02 * r.mosaic.longest_side)
     titles = []
     for k, (one, length) in enumerate(zip(chips, lengths, strict=True)):
-        assert one.ring is not None
-        x, y = one.ring
+        x, y = needed(one.ring)
         text = f"largest {size_of(length, digits=4)} at ({x:.0f}, {y:.0f})"
         titles.append(panels.title(k, text))
     vector_map(panels, chips, titles, magnification=M, key=nice_below(max(lengths) / 1.5))

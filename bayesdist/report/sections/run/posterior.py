@@ -53,6 +53,7 @@ Float = NDArray[np.float64]
 
 _MIXTURE_LABELS = {"f": "f", "j": "j", "s_out": r"$s_\mathrm{out}$"}
 _MAX_POINTS = 20_000  # draws that enter a corner plot
+N_SLOWEST = 4  # parameters whose ranks are shown
 _NAMED = 25  # coefficients that have room for their names
 RANK_BINS = 20
 _INDEPENDENCE = (
@@ -284,12 +285,10 @@ def rank_counts(draws: Float, bins: int) -> NDArray[np.int64]:
     return np.array([np.bincount(w, minlength=bins) for w in which.reshape(draws.shape)])
 
 
-def slowest_parameters(
-    posterior: Posterior, n: int = 4, *, without: Collection[str] = ()
-) -> tuple[str, ...]:
-    """Parameters of theta with the n fewest effective draws, but for those in `without`."""
+def slowest_parameters(posterior: Posterior, *, without: Collection[str] = ()) -> tuple[str, ...]:
+    """Parameters of theta with the fewest effective draws, but for those in `without`."""
     names = posterior.model.names
     known = dict(zip(posterior.convergence.names, posterior.convergence.ess_bulk, strict=True))
     ess = np.array([known.get(name, np.inf) for name in names], float)
     order = np.argsort(np.where(np.isfinite(ess), ess, -np.inf), kind="stable")
-    return tuple(names[k] for k in order if names[k] not in without)[:n]
+    return tuple(names[k] for k in order if names[k] not in without)[:N_SLOWEST]

@@ -11,7 +11,7 @@ from bayesdist.assess.circular import per_axis
 from bayesdist.checks import LEVELS, Check, warnings_of, worst
 from bayesdist.numbers import number, rounded, with_mas
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput
+from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.sections.run.margins import VERDICT_LEVELS
 from bayesdist.report.sections.run.validity import (
     epoch_clause,
@@ -97,7 +97,7 @@ def verdict(r: ReportInput) -> Verdict:
     groups = status_checks(r)
     numbers = (_margin_sentence(r), _accuracy_sentence(r))
     if r.provisional:
-        reasons = r.posterior.convergence.reasons  # type: ignore[union-attr]
+        reasons = needed(r.posterior).convergence.reasons
         why = f"Why: {'; '.join(reasons) or 'no reason was recorded'}."
         remarks = warnings_of(c for c in r.checks if c.name != "Converged")  # it says the same
         sentences = (why, *(f"{text}." for text in remarks), *numbers)

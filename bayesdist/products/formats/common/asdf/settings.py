@@ -29,4 +29,4 @@ class PlacedSettings(FormatSettings):
     v3ref: float | None = None
     v3idlyangle: float | None = None
     parity: Literal[-1, 1] | None = None
-    inverse_order: Annotated[int, Field(ge=1, le=9)] | None = None
+    inverse_order: Annotated[int, Field(ge=1, le=12)] | None = None

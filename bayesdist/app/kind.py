@@ -103,7 +103,7 @@ MATCHES = Kind(
     read=read_stars,
     refuse=lambda inputs, config, base: None,  # what is wrong shows in their fit
     match=lambda inputs, config, base: match_stars(inputs, config),
-    fit=lambda matched, config, base, reader: fit_stars(matched, config, reader=reader),
+    fit=lambda matched, config, base, reader: fit_stars(matched, config, base, reader=reader),
     sample=sample_stars,
     load_matched=lambda folder, inputs, config, base, summary: match_stars(inputs, config),
     load_fitted=lambda folder, matched, config, summary: load_fitted(

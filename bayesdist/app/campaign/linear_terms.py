@@ -16,10 +16,8 @@ def line_sections(solution: Solution, chip: int) -> dict[str, object]:
     return {"gauge": _gauge(view.gauge), "lines": _lines(view)}
 
 
-def _gauge(gauge: ReferenceGauge | None) -> dict[str, object] | None:
-    """Section 'gauge'; None for a solution in no gauge of its own."""
-    if gauge is None:
-        return None
+def _gauge(gauge: ReferenceGauge) -> dict[str, object]:
+    """Section 'gauge'."""
     return {
         "chip": gauge.chip,
         "fixed": list(FIXED),

@@ -12,10 +12,11 @@ from astropy.table import Table
 
 from bayesdist.data.formats.astrometrynet import is_astrometrynet
 from bayesdist.data.formats.hst1pass import is_hst1pass, is_matchup
-from bayesdist.data.tables.files import TABLE_SUFFIXES, is_binary, is_fits, read_lines, read_table
-from bayesdist.data.tables.text import is_text_table
 from bayesdist.errors import FormatError, InputError
 from bayesdist.mission import load_object, missions
+from bayesdist.reading.regular import read_lines
+from bayesdist.reading.tables import TABLE_SUFFIXES, is_binary, is_fits, read_table
+from bayesdist.reading.text_tables import is_text_table
 
 __all__ = [
     "FORMATS",

@@ -3,43 +3,34 @@
 from __future__ import annotations
 
 import csv
-import gzip
 import io
+import re
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy.io import fits
-from astropy.table import Column, MaskedColumn, Table, vstack
-from astropy.table.meta import get_header_from_yaml
+from astropy.table import Table, vstack
 
-from bayesdist.data.tables.text import is_text_table, parse_text_table
 from bayesdist.errors import FormatError, InputError
+from bayesdist.reading.faults import naming_faults
+from bayesdist.reading.fits import FITS_START, open_fits
+from bayesdist.reading.parquet import parquet_table
+from bayesdist.reading.regular import head_of, read_bytes, read_lines
+from bayesdist.reading.text_tables import is_text_table, parse_text_table, refuse_cut_end
+from bayesdist.reading.unpacked import unpacked
 
-if TYPE_CHECKING:
-    import pyarrow
+_COMMAS = re.compile(r"# delimiter: ['\"]?,")
 
-__all__ = [
-    "TABLE_SUFFIXES",
-    "is_binary",
-    "is_fits",
-    "naming_faults",
-    "parquet_column",
-    "parquet_units",
-    "read_lines",
-    "read_table",
-    "reading",
-]
-
-_FITS = b"SIMPLE  ="
+__all__ = ["TABLE_SUFFIXES", "is_binary", "is_fits", "read_ecsv", "read_table"]
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
+def _reading(path: Path) -> Iterator[None]:
     """Context of `naming_faults` in which the warnings of readers are silenced.
 
     Python keeps its rules for warnings once for all threads, so that several threads at a time must
@@ -51,46 +42,25 @@ def reading(path: Path) -> Iterator[None]:
         yield
 
 
-@contextmanager
-def naming_faults(path: Path, where: str = "") -> Iterator[None]:
-    """Turn any failure while a file is read into an error that names the file, or `where` in it.
+def _whole_lines(path: Path, mark: str) -> list[str]:
+    """Lines without their ends: as a list, for astropy takes a lone line for the name of a file.
 
-    Readers of damaged files raise exceptions of every kind, so all are caught; only our own pass as
-    they are.  InputError when the system refuses to read, FormatError when the content is not what
-    the format demands.
+    FormatError where the last one is cut.
     """
-    try:
-        yield
-    except InputError:
-        raise
-    except FileNotFoundError as error:
-        raise InputError("does not exist", where=str(path), do="check the path") from error
-    except (IsADirectoryError, PermissionError) as error:
-        raise InputError(
-            f"cannot be read ({error.strerror})", where=str(path), do="check the path"
-        ) from error
-    except Exception as error:
-        reason = next(iter(str(error).strip().splitlines()), "") or type(error).__name__
-        raise FormatError(
-            f"cannot be read as {path.suffix.lower() or 'a table'} ({reason[:160].rstrip('.')})",
-            where=where or str(path),
-            do="it may be truncated or of another format: fetch or write it again",
-        ) from error
+    lines = read_lines(path)
+    if lines and lines[0].startswith("# %ECSV"):
+        head = takewhile(lambda line: line.startswith("#"), lines)
+        mark = "," if any(_COMMAS.match(line) for line in head) else " "
+    bare = [line.rstrip("\r\n") for line in lines]
+    _refuse_short_rows(bare, mark, path)
+    refuse_cut_end(lines, mark, where=str(path))
+    return bare
 
 
-def read_lines(path: Path) -> list[str]:
-    """Lines of a text file, with their ends; a file that is unreadable or no text is refused."""
-    with reading(path), path.open(encoding="utf-8", newline="") as stream:
-        return stream.readlines()
-
-
-def _bare_lines(path: Path) -> list[str]:
-    """Lines without their ends: as a list, for astropy takes a lone line for the name of a file."""
-    return [line.rstrip("\r\n") for line in read_lines(path)]
-
-
-def _read_ecsv(path: Path) -> Table:
-    return Table.read(_bare_lines(path), format="ascii.ecsv")
+def read_ecsv(path: Path) -> Table:
+    """Table of an ECSV file; errors as of `read_table`."""
+    with _reading(path):
+        return Table.read(_whole_lines(path, " "), format="ascii.ecsv")
 
 
 def _read_text(path: Path) -> Table:
@@ -98,9 +68,7 @@ def _read_text(path: Path) -> Table:
 
 
 def _read_separated(path: Path, *, mark: str, format: str) -> Table:
-    lines = _bare_lines(path)
-    _refuse_short_rows(lines, mark, path)
-    return Table.read(lines, format=format, comment="#", guess=False)
+    return Table.read(_whole_lines(path, mark), format=format, comment="#", guess=False)
 
 
 def _refuse_short_rows(lines: list[str], mark: str, path: Path) -> None:
@@ -119,15 +87,20 @@ def _refuse_short_rows(lines: list[str], mark: str, path: Path) -> None:
 
 
 def _read_votable(path: Path) -> Table:
-    return Table.read(io.BytesIO(path.read_bytes()), format="votable")
+    raw = unpacked(read_bytes(path), str(path))
+    for announced in re.findall(rb"nrows\s*=\s*[\"'](\d+)", raw):
+        # room is made for so many rows before any is read; a row has a tag or a byte at least
+        if len(announced) > 12 or int(announced) > len(raw):
+            raise FormatError(
+                f"announces {announced[:20].decode()} rows in {len(raw)} bytes",
+                where=str(path),
+                do="fetch or write it again",
+            )
+    return Table.read(io.BytesIO(raw), format="votable")
 
 
 def _read_fits(path: Path) -> Table:
-    content = path.read_bytes()
-    if path.suffix.lower() == ".gz":
-        content = gzip.decompress(content)
-    # from memory: after a failure astropy leaves a file of its own open
-    with fits.open(io.BytesIO(content), memmap=False, lazy_load_hdus=False) as hdus:
+    with open_fits(unpacked(read_bytes(path), str(path)), str(path)) as hdus:
         tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)]
         objects = [hdu for hdu in tables if hdu.name == "LDAC_OBJECTS"]
         if objects:
@@ -157,46 +130,14 @@ def _ldac(hdus: fits.HDUList, objects: list[fits.BinTableHDU]) -> Table:
     return out
 
 
-def _read_parquet(path: Path) -> Table:
-    import pyarrow.parquet  # 0.1 s that other formats need not wait for
-
-    stored = pyarrow.parquet.ParquetFile(path)
-    units = parquet_units(stored.schema_arrow)
-    table = Table()
-    for name, column in zip(stored.schema_arrow.names, stored.read().columns, strict=True):
-        table[name] = parquet_column(column, units.get(name))
-    return table
-
-
-def parquet_column(values: pyarrow.ChunkedArray, unit: str | None) -> Column:
-    """A column of a Parquet file as one of an astropy Table; its nulls are masked."""
-    if values.null_count:
-        mask = values.is_null().to_numpy()
-        return MaskedColumn(values.to_numpy(), mask=mask, unit=unit)
-    return Column(values.to_numpy(), unit=unit)
-
-
-def parquet_units(schema: pyarrow.Schema) -> dict[str, str]:
-    """Units of columns: of each field's own metadata, or of the header that astropy stores."""
-    units: dict[str, str] = {}
-    header = (schema.metadata or {}).get(b"table_meta_yaml")
-    if header is not None:
-        described = get_header_from_yaml(header.decode().splitlines())["datatype"]
-        units = {one["name"]: str(one["unit"]) for one in described if one.get("unit")}
-    for one in schema:
-        if one.metadata and b"unit" in one.metadata:
-            units[one.name] = one.metadata[b"unit"].decode()
-    return units
-
-
 TABLE_SUFFIXES: dict[str, Callable[[Path], Table]] = {
-    ".ecsv": _read_ecsv,
+    ".ecsv": read_ecsv,
     ".csv": partial(_read_separated, mark=",", format="ascii.csv"),
     ".tsv": partial(_read_separated, mark="\t", format="ascii.tab"),
     ".fits": _read_fits,
     ".fit": _read_fits,
     ".ldac": _read_fits,
-    ".parquet": _read_parquet,
+    ".parquet": parquet_table,
     ".vot": _read_votable,
     ".xml": _read_votable,
     ".tbl": _read_text,
@@ -206,21 +147,13 @@ TABLE_SUFFIXES: dict[str, Callable[[Path], Table]] = {
 
 def is_binary(path: Path) -> bool:
     """True where a file is no text; a file that cannot be read is left to its reader."""
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(4096)
-    except OSError:
-        return False
-    return b"\0" in head or head.startswith(_FITS)
+    head = head_of(path)
+    return b"\0" in head or head.startswith(FITS_START)
 
 
 def is_fits(path: Path) -> bool:
     """True where a file begins as FITS does."""
-    try:
-        with path.open("rb") as stream:
-            return stream.read(len(_FITS)) == _FITS
-    except OSError:
-        return False
+    return head_of(path).startswith(FITS_START)
 
 
 def read_table(path: Path) -> Table:
@@ -242,5 +175,5 @@ def read_table(path: Path) -> Table:
             where=str(path),
             do=f"give a file that ends in {', '.join(TABLE_SUFFIXES)}, or set the format",
         )
-    with reading(path):
+    with _reading(path):
         return reader(path)

@@ -13,25 +13,26 @@ from astropy.table import Table
 
 from bayesdist.data.formats.astrometrynet import COLUMNS as CORR_COLUMNS
 from bayesdist.data.formats.astrometrynet import matches_from_corr
-from bayesdist.data.formats.hst1pass import is_matchup, read_hst1pass, read_matchup
-from bayesdist.data.matches import Matches
-from bayesdist.data.matching.table import match_table
-from bayesdist.data.reading.chips import numbered, text_labels
-from bayesdist.data.reading.formats import (
+from bayesdist.data.formats.files import (
     FORMATS,
     exposure_names,
     input_files,
     kind_of,
     mission_formats,
 )
+from bayesdist.data.formats.hst1pass import is_matchup, read_hst1pass, read_matchup
+from bayesdist.data.matches import Matches
+from bayesdist.data.matching.table import match_table
+from bayesdist.data.reading.chips import numbered, text_labels
 from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
 from bayesdist.data.reading.table import matches_from_table, sky_positions
 from bayesdist.data.sky.tangent import mean_direction
 from bayesdist.data.tables.checks import absent
 from bayesdist.data.tables.column import SourceColumn
-from bayesdist.data.tables.files import read_lines, read_table
 from bayesdist.data.tables.names import ALIASES, find_columns
 from bayesdist.errors import InputError
+from bayesdist.reading.regular import read_lines
+from bayesdist.reading.tables import read_table
 
 __all__ = ["read_matches"]
 

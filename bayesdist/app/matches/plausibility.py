@@ -1,0 +1,130 @@
+"""Stars, dates and errors that cannot be meant, and those that are worth a warning."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.app.config import Config
+from bayesdist.assess import SAMPLE
+from bayesdist.data import Matches
+from bayesdist.errors import InputError
+from bayesdist.model import DistortionModel, TimeDependence
+
+__all__ = ["doubts_on_stars", "refuse_empty_segments"]
+
+Float = NDArray[np.float64]
+
+OFF = 1e3  # factor on the scale by which u and v cannot be those of the detector
+ODD = 3.0  # factor that is worth a warning
+SMALLEST_ERROR = 1e-6  # pixels: no detector measures positions to that
+FEWEST = 10  # stars without which no scale can be told
+HALF_TURN = 180.0  # degrees: no plane of the sky reaches further
+IN_DEGREES = {"deg": 1.0, "arcsec": 1 / 3600, "mas": 1 / 3.6e6}
+YEARS = (1950.0, 2100.0)
+
+
+def doubts_on_stars(stars: Matches, model: DistortionModel, config: Config) -> list[str]:
+    """Sentences on what is odd about matched stars.
+
+    Raises
+    ------
+    InputError
+        For a scale of u and v, quoted errors, epochs or breaks of the drift that cannot be meant.
+    """
+    stars = stars.sample(SAMPLE)
+    if stars.epoch is not None:
+        refuse_empty_segments(stars.epoch, model.time)
+    return list(_doubts(stars, model.unit, config.detector.scale_mas))
+
+
+def _doubts(stars: Matches, unit: str, scale_mas: float | None) -> Iterator[str]:
+    if stars.epoch is not None:
+        yield from _doubts_on_dates(stars.epoch, ", ".join(stars.sources))
+    scale = _scale(stars)
+    if len(stars) < FEWEST or scale is None:
+        return
+    yield from _doubts_on_scale(stars, scale, unit, scale_mas)
+    yield from _doubts_on_errors(stars, scale)
+
+
+def _scale(stars: Matches) -> float | None:
+    """Units of u and v in a pixel, by the spread of both; None where stars lie on one spot."""
+    pixels = float(np.hypot(np.std(stars.x), np.std(stars.y)))
+    plane = float(np.hypot(np.std(stars.u), np.std(stars.v)))
+    return plane / pixels if pixels > 0 and plane > 0 else None
+
+
+def _doubts_on_scale(
+    stars: Matches, scale: float, unit: str, scale_mas: float | None
+) -> Iterator[str]:
+    where = ", ".join(stars.sources)
+    if unit in IN_DEGREES:
+        reach = float(max(np.ptp(stars.u), np.ptp(stars.v))) * IN_DEGREES[unit]
+        if reach > HALF_TURN:
+            raise InputError(
+                f"u and v span {reach:.4g} degrees if they are in {unit}",
+                where=where,
+                do="correct data.unit, or the unit in the table: they may be pixels",
+            )
+    expected = 1.0
+    if unit != "pix":
+        if scale_mas is None:
+            return
+        expected = scale_mas / 3.6e6 / IN_DEGREES[unit]
+    factor = scale / expected
+    by = "pixels" if unit == "pix" else f"pixels and detector.scale_mas = {scale_mas:g}"
+    said = f"u and v, in {unit}, span {factor:.3g} times what {by} say"
+    if not 1 / OFF < factor < OFF:
+        raise InputError(said, where=where, do="correct data.unit, the scale or the columns")
+    if not 1 / ODD < factor < ODD:
+        yield f"{said}: check data.unit and the scale"
+
+
+def _doubts_on_errors(stars: Matches, scale: float) -> Iterator[str]:
+    if not stars.has_sigma:
+        return
+    sigma = np.minimum(stars.sigma_u, stars.sigma_v) / scale
+    middle, least = float(np.median(sigma)), float(sigma.min())
+    if middle < SMALLEST_ERROR:
+        raise InputError(
+            f"half of the errors are below {middle:.2g} px, which no detector reaches",
+            where=", ".join(stars.sources),
+            do="check the unit of the columns of errors, or data.sigma",
+        )
+    if least < SMALLEST_ERROR:
+        yield f"the smallest of the quoted errors is {least:.2g} px: check such rows"
+
+
+def _doubts_on_dates(epochs: Float, where: str) -> Iterator[str]:
+    """Sentences on epochs that are hardly decimal years; InputError for those that are none."""
+    first, last = float(np.min(epochs)), float(np.max(epochs))
+    for date in (first, last):
+        if not 1800 <= date <= 2200:
+            raise InputError(
+                f"an epoch is {date:.10g}, and epochs are decimal years",
+                where=where,
+                do="convert it, or give the column the unit MJD or JD",
+            )
+    if first < YEARS[0] or last > YEARS[1]:
+        yield f"epochs lie between {first:.1f} and {last:.1f}: check that they are decimal years"
+
+
+def refuse_empty_segments(epochs: Float, time: TimeDependence | None) -> None:
+    """Refuse a break of the drift without data on both of its sides, up to the next break."""
+    if time is None or not time.breaks:
+        return
+    counts = np.bincount(
+        np.searchsorted(time.breaks, epochs, side="right"), minlength=time.n_segments
+    )
+    for k, n in enumerate(counts):
+        if n == 0:
+            date, side = (time.breaks[k - 1], "after") if k else (time.breaks[0], "before")
+            raise InputError(
+                f"there are no data {side} the break at {date:g}"
+                + (f" and before that at {time.breaks[k]:g}" if 0 < k < len(time.breaks) else ""),
+                where="model.tdd.breaks",
+                do=f"leave it out: the data are of {np.min(epochs):.2f} to {np.max(epochs):.2f}",
+            )

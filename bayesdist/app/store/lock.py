@@ -1,0 +1,104 @@
+"""One process at a time in a folder: a lock that ends with its process, and who holds it."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+
+from bayesdist.errors import InputError
+from bayesdist.files import made_folder
+
+__all__ = ["LOCK", "locked"]
+
+try:
+    import fcntl
+except ImportError:  # systems that know no such locks
+    fcntl = None  # type: ignore[assignment]
+
+LOCK = ".bayesdist.lock"
+LONGEST = 200  # bytes that are read of it
+
+log = logging.getLogger("bayesdist")
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keep other processes from writing into a folder, which is made where it is not there.
+
+    The lock is that of a file, not the file itself: one that a killed process has left holds
+    nobody up.
+
+    Raises
+    ------
+    InputError
+        While another process holds the lock, with what that process is; where the folder is
+        read-only.
+    """
+    made_folder(folder)
+    if fcntl is None:
+        yield
+        return
+    path = folder / LOCK
+    held = _acquired(path)
+    try:
+        with suppress(OSError):  # a full disk
+            os.ftruncate(held, 0)
+            os.pwrite(held, _holder().encode(), 0)
+        yield
+    finally:
+        with suppress(OSError):
+            path.unlink()  # while it is held: nobody else's is removed
+        os.close(held)
+
+
+def _acquired(path: Path) -> int:
+    """Descriptor of the locked file."""
+    while True:
+        try:
+            held = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError as error:
+            raise InputError(
+                f"the folder cannot be written into ({error.strerror})",
+                where=str(path.parent),
+                do="make room, or choose a folder that you may write to",
+            ) from error
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            holder = _read(held)
+            os.close(held)
+            raise InputError(
+                f"another process is at work on this run{holder and f' ({holder})'}",
+                where=str(path.parent),
+                do="wait until it has ended, or choose another folder",
+            ) from error
+        except OSError as error:  # file systems that know no locks
+            log.debug("%s cannot be locked: %s", path, error)
+            return held
+        if _is_at(held, path):
+            return held
+        os.close(held)  # its holder has removed it meanwhile
+
+
+def _is_at(held: int, path: Path) -> bool:
+    """Boolean: an open file still has its name."""
+    with suppress(FileNotFoundError):
+        return os.path.samestat(os.fstat(held), path.stat())
+    return False
+
+
+def _holder() -> str:
+    """This process, in words."""
+    since = datetime.now(UTC).isoformat(timespec="seconds")
+    return f"process {os.getpid()} on {socket.gethostname()} since {since}"
+
+
+def _read(held: int) -> str:
+    """Words in a lock; empty where there are none."""
+    text = os.pread(held, LONGEST, 0).decode("utf-8", errors="replace")
+    return "".join(c for c in text if c.isprintable())

@@ -1,0 +1,187 @@
+"""Positions on the sky of pixels, with the covariance that a calibration gives them.
+
+With phi the Legendre products at a pixel, S the covariance of the coefficients and A the derivative
+of a step on the sky (east, north) by one on the plane, two stars n and m have the covariance
+
+    A_n phi_n S phi_m A_m + A_n T A_m + [n = m] A_n (L + J C J) A_n
+
+where T are errors that all stars of an image share, L those of each star by itself, C that of its
+centroid in pixels and J the slope of the map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.calibration.plane import ARCSEC
+from bayesdist.data.sky.tangent import sky_of_plane, tangent_jacobian
+from bayesdist.errors import InputError
+
+__all__ = ["SkyPositions", "sky_positions"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class SkyPositions:
+    """Positions on the sky (N,) and their covariance."""
+
+    ra: Float  # degrees; NaN for a pixel that is no number
+    dec: Float
+    cov: Float | None  # (N, 2, 2), to the east and to the north, mas^2; None where nothing is known
+    joint: Float | None = None  # (2 N, 2 N), the same of all stars, east and north in turn
+
+    @property
+    def sigma(self) -> Float | None:
+        """Standard deviations (2, N) to the east and to the north, mas."""
+        if self.cov is None:
+            return None
+        return np.sqrt(np.einsum("naa->an", self.cov))
+
+
+def sky_positions(
+    calibration: Calibration,
+    x: ArrayLike,
+    y: ArrayLike,
+    chip: ArrayLike,
+    *,
+    epoch: float | None = None,
+    point: tuple[float, float] | None = None,
+    centroids: tuple[ArrayLike, ArrayLike] | None = None,
+    joint: bool = False,
+) -> SkyPositions:
+    """Positions on the sky of pixels, with all errors that the calibration knows.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        In a plane that touches the sky, or with a `point`.
+    x, y : array_like, shape (N,)
+        FITS 1-based pixels.
+    chip : array_like of int, shape (N,)
+        Chip number of each.
+    epoch : float, optional
+        Decimal years, of a calibration that drifts.
+    point : tuple of float, optional
+        Sky position of (u, v) = (0, 0) in degrees, u to the east and v to the north, in place of
+        the calibration's own.
+    centroids : tuple of array_like, optional
+        Standard deviations of x and y, in pixels.
+    joint : bool
+        Whether the covariance of all stars is wanted.
+
+    Returns
+    -------
+    SkyPositions
+
+    Raises
+    ------
+    InputError
+        For a plane that does not touch the sky and no point, or a unit that is no angle.
+    """
+    x, y = np.atleast_1d(np.asarray(x, float)), np.atleast_1d(np.asarray(y, float))
+    chip = np.broadcast_to(np.asarray(chip, np.int64), x.shape)
+    point, unit = _touching(calibration, point)
+    maps = calibration.with_tables(calibration.at(epoch, origin="stated"))
+    plane = np.full((2, x.size), np.nan)
+    slope = np.full((x.size, 2, 2), np.nan)
+    for number, one in maps.items():
+        mine = chip == number
+        plane[:, mine] = one.at(x[mine], y[mine])
+        slope[mine] = one.slope(x[mine], y[mine])
+    ra, dec = sky_of_plane(unit * plane[0], unit * plane[1], point)
+    step = np.full((x.size, 2, 2), np.nan)
+    known = np.isfinite(ra)
+    # mas on the sky by a unit of the plane
+    step[known] = 1e3 * unit * np.linalg.inv(tangent_jacobian(ra[known], dec[known], point))
+    if calibration.errors == "none" and not calibration.further and centroids is None:
+        return SkyPositions(ra, dec, None)
+    own = _own(calibration, slope, centroids)
+    shared = np.diag([sum(r.u**2 for r in calibration.further if r.shared),
+                      sum(r.v**2 for r in calibration.further if r.shared)])  # fmt: skip
+    single = own + shared
+    for number, one in maps.items():
+        mine = chip == number
+        found = one.covariance_at(x[mine], y[mine])
+        if found is not None:
+            single[mine] += found
+    cov = np.einsum("nab,nbc,ndc->nad", step, single, step)
+    if not joint:
+        return SkyPositions(ra, dec, cov)
+    design = _designs(calibration, maps, x, y, chip)
+    whole = np.einsum("nak,kl,mbl->namb", design, _coefficients(calibration, epoch), design)
+    whole += shared[None, :, None, :]
+    rows = np.arange(x.size)
+    whole[rows, :, rows, :] += own
+    whole = np.einsum("nab,nbmc,mdc->namd", step, whole, step, optimize=True)
+    return SkyPositions(ra, dec, cov, whole.reshape(2 * x.size, 2 * x.size))
+
+
+def _touching(
+    calibration: Calibration, point: tuple[float, float] | None
+) -> tuple[tuple[float, float], float]:
+    """Point where the plane touches the sky, and arcseconds in its unit."""
+    plane = calibration.plane
+    if plane.kind == "aperture":
+        raise InputError(
+            "lies in V2, V3 or the Ideal system of an aperture, and not on the sky",
+            where=calibration.name,
+            do="put it into the image's header by a pipeline, or give a file in TPV or SIP",
+        )
+    if point is None:
+        point = plane.point
+    if point is None:
+        raise InputError(
+            "does not say where its plane touches the sky",
+            where=calibration.name,
+            do="give --point RA DEC, the sky position of u, v = 0, if u is east and v is north",
+        )
+    if calibration.unit not in ARCSEC:
+        raise InputError(
+            f"is in {calibration.unit}, which is no angle on the sky",
+            where=calibration.name,
+            do="give a calibration in arcsec, mas or deg",
+        )
+    return point, ARCSEC[calibration.unit]
+
+
+def _own(
+    calibration: Calibration, slope: Float, centroids: tuple[ArrayLike, ArrayLike] | None
+) -> Float:
+    """Covariances (N, 2, 2) on the plane of errors that each star has by itself."""
+    alone = [row for row in calibration.further if not row.shared]
+    out = np.zeros(slope.shape)
+    out[:, 0, 0] = sum(row.u**2 for row in alone)
+    out[:, 1, 1] = sum(row.v**2 for row in alone)
+    if centroids is not None:
+        sigma = np.stack([np.broadcast_to(np.asarray(s, float), len(slope)) for s in centroids])
+        out += np.einsum("nab,bn,ncb->nac", slope, sigma**2, slope)
+    return out
+
+
+def _coefficients(calibration: Calibration, epoch: float | None) -> Float:
+    """Covariance of the coefficients of all chips; zero where there is none."""
+    found = calibration.joint_covariance(calibration.numbers, epoch, origin="stated")
+    n = 2 * calibration.model.n_terms * len(calibration.numbers)
+    return np.zeros((n, n)) if found is None else found
+
+
+def _designs(
+    calibration: Calibration, maps: dict[int, ChipMap], x: Float, y: Float, chip: Int
+) -> Float:
+    """Derivatives (N, 2, n) of positions by the coefficients of all chips."""
+    K = calibration.model.n_terms
+    out = np.zeros((x.size, 2, 2 * K * len(maps)))
+    for k, (number, one) in enumerate(maps.items()):
+        mine = np.flatnonzero(chip == number)
+        phi = one.design(x[mine], y[mine])
+        for axis in (0, 1):
+            start = (2 * k + axis) * K
+            out[mine, axis, start : start + K] = phi
+    return out

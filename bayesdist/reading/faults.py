@@ -1,0 +1,76 @@
+"""One error for whatever libraries raise on a damaged file."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from bayesdist.errors import BayesdistError, FormatError, InputError
+
+__all__ = ["naming_faults", "reason_of", "restoring"]
+
+
+@contextmanager
+def naming_faults(path: Path, where: str = "") -> Iterator[None]:
+    """Turn any failure while a file is read into an error that names the file, or `where` in it.
+
+    Readers of damaged files raise exceptions of every kind, so all are caught; only our own pass as
+    they are.  InputError when the system refuses to read, FormatError when the content is not what
+    the format demands.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except FileNotFoundError as error:
+        raise InputError("does not exist", where=str(path), do="check the path") from error
+    except (IsADirectoryError, PermissionError) as error:
+        raise InputError(
+            f"cannot be read ({error.strerror})", where=str(path), do="check the path"
+        ) from error
+    except Exception as error:
+        raise FormatError(
+            f"cannot be read as {path.suffix.lower() or 'a table'} ({reason_of(error)})",
+            where=where or str(path),
+            do="it may be truncated or of another format: fetch or write it again",
+        ) from error
+
+
+@contextmanager
+def restoring(path: Path, what: str, *, do: str) -> Iterator[None]:
+    """Turn any failure while an artefact is made from its file into one FormatError.
+
+    A file of a run's folder may have been changed by anybody: what is missing in it, or of another
+    shape, shows where objects are made from it.
+
+    Parameters
+    ----------
+    path : Path
+    what : str
+        With its article, as in 'a posterior'.
+    do : str
+        By which the file is made again.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of foreign files
+            yield
+    except BayesdistError as error:
+        if str(path) in error.where:
+            raise
+        where = f"{path}: {error.where}" if error.where else str(path)
+        raise FormatError(error.cause, where=where, do=do) from error
+    except Exception as error:
+        raise FormatError(
+            f"this is not {what} that bayesdist wrote, or it is damaged ({reason_of(error)})",
+            where=str(path),
+            do=do,
+        ) from error
+
+
+def reason_of(error: Exception) -> str:
+    """First line of what an exception says, or its kind where it says nothing."""
+    line = next(iter(str(error).strip().splitlines()), "") or type(error).__name__
+    return line[:160].rstrip(".")

@@ -1,0 +1,84 @@
+"""FITS files in memory, whose headers announce no more than follows them."""
+
+from __future__ import annotations
+
+import io
+import warnings
+
+from astropy.io import fits
+
+from bayesdist.errors import FormatError
+
+__all__ = ["FITS_START", "HDU_STARTS", "RECORD", "data_size", "open_fits", "padded"]
+
+FITS_START = b"SIMPLE  ="
+HDU_STARTS = (FITS_START, b"XTENSION=")
+RECORD = 2880  # bytes
+
+
+def open_fits(raw: bytes, where: str) -> fits.HDUList:
+    """HDUs by astropy, with their data in memory.
+
+    Raises
+    ------
+    FormatError
+        For a file that is truncated, or whose headers cannot be followed.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of other programs' cards
+        _refuse_unfounded(raw, where)
+    # from memory: after a failure astropy leaves a file of its own open
+    return fits.open(io.BytesIO(raw), memmap=False, lazy_load_hdus=False)
+
+
+def _refuse_unfounded(raw: bytes, where: str) -> None:
+    """Refuse a file that ends before the data that its headers announce."""
+    at, number = 0, 0
+    while raw[at : at + 9] in HDU_STARTS:
+        end = raw.find(b"END" + 77 * b" ", at)
+        while end >= 0 and (end - at) % 80:
+            end = raw.find(b"END" + 77 * b" ", end + 1)
+        if end < 0:
+            raise FormatError(
+                f"ends within the header of HDU {number}",
+                where=where,
+                do="it is truncated: fetch or write it again",
+            )
+        begin = at + padded(end + 80 - at)
+        size = data_size(fits.Header.fromstring(raw[at:end].decode("latin-1")))
+        if size is None or begin + size > len(raw):
+            announced = "a size that is none" if size is None else f"{size} bytes"
+            raise FormatError(
+                f"the header of HDU {number} announces {announced}, and "
+                f"{max(0, len(raw) - begin)} bytes follow",
+                where=where,
+                do="it is truncated or damaged: fetch or write it again",
+            )
+        at, number = begin + padded(size), number + 1
+
+
+def data_size(header: fits.Header) -> int | None:
+    """Bytes of data that a header announces (FITS 4.0, section 4.4.1); None for nonsense."""
+    try:
+        axes = header.get("NAXIS", 0)
+        sides = [header[f"NAXIS{k + 1}"] for k in range(axes)]
+        bits, groups, more = header["BITPIX"], header.get("GCOUNT", 1), header.get("PCOUNT", 0)
+    except KeyError:
+        return 0  # cards without those of an HDU
+    except (TypeError, ValueError, OverflowError, fits.VerifyError):
+        return None
+    if not all(isinstance(one, int) for one in (*sides, bits, groups, more)):
+        return None
+    if axes < 0 or min([*sides, groups, more, 0]) < 0:
+        return None
+    if header.get("GROUPS") is True and sides and sides[0] == 0:
+        sides = sides[1:]  # random groups
+    n = 1 if sides else 0
+    for side in sides:
+        n *= side
+    return abs(bits) // 8 * groups * (more + n)
+
+
+def padded(n: int) -> int:
+    """Bytes of whole records."""
+    return -(-n // RECORD) * RECORD

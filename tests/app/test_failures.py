@@ -1,0 +1,81 @@
+"""What nobody foresaw ends in one sentence and a code of its own, never in a traceback."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import click
+import pytest
+
+from bayesdist.app import cli as commands
+from tests.app.support import cli
+
+ERRORS = [
+    (IndexError("list index out of range"), 70, "IndexError: list index out of range"),
+    (AssertionError(), 70, "(AssertionError)"),
+    (MemoryError(), 71, "the memory of this machine is not enough"),
+    (PermissionError(13, "Permission denied", "a.fits"), 74, "a.fits: Permission denied"),
+    (OSError("the disk is gone"), 74, "the disk is gone; check"),
+]
+
+
+def _failing(monkeypatch, error: BaseException) -> None:
+    @click.command()
+    def fails() -> None:
+        raise error
+
+    monkeypatch.setattr(commands.LazyGroup, "load", staticmethod(lambda target: fails))
+
+
+@pytest.mark.parametrize(("error", "code", "words"), ERRORS)
+def test_an_exception_of_any_kind(tmp_path, monkeypatch, error, code, words):
+    monkeypatch.chdir(tmp_path)
+    _failing(monkeypatch, error)
+    result = cli("inspect")
+    assert (result.code, result.out, result.err.count("\n")) == (code, "", 1)
+    assert words in result.err and "Traceback" not in result.err
+    written = list(tmp_path.iterdir())
+    assert len(written) == (code == 70)
+    for path in written:
+        assert str(path) in result.err and "please report it" in result.err
+        text = path.read_text()
+        assert "Traceback" in text and type(error).__name__ in text
+        assert text.startswith("command   bayesdist inspect\nbayesdist ")
+
+
+def test_endless_recursion(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    @click.command()
+    def deeper() -> None:
+        def down(n: int) -> int:
+            return down(n + 1) + 1
+
+        down(0)
+
+    monkeypatch.setattr(commands.LazyGroup, "load", staticmethod(lambda target: deeper))
+    result = cli("inspect")
+    assert result.code == 65 and "nested too deep" in result.err
+    [path] = tmp_path.iterdir()
+    assert str(path) in result.err and path.stat().st_size < 20_000
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_where_the_current_folder_cannot_be_written(tmp_path, monkeypatch):
+    (tmp_path / "closed").mkdir()
+    (tmp_path / "open").mkdir()
+    monkeypatch.chdir(tmp_path / "closed")
+    (tmp_path / "closed").chmod(stat.S_IRUSR | stat.S_IXUSR)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "open"))
+    _failing(monkeypatch, KeyError("x"))
+    assert str(tmp_path / "open") in cli("inspect").err
+
+
+def test_the_codes_are_in_the_documentation_and_the_help():
+    root = Path(__file__).parents[2]
+    text = (root / "docs" / "commands.md").read_text(encoding="utf-8")
+    for _, code, _ in [*ERRORS, (None, 65, ""), (None, 130, "")]:
+        assert f"\n| {code} |" in text
+        assert f" {code} " in commands.EPILOG

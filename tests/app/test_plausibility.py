@@ -1,0 +1,150 @@
+"""What cannot be meant is refused, what is odd is said: scale, errors, dates, breaks, numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bayesdist.app.config import parse_config
+from bayesdist.app.matches.plausibility import doubts_on_stars, refuse_empty_segments
+from bayesdist.data import Matches
+from bayesdist.errors import ConfigError, InputError
+from bayesdist.model import Chip, DistortionModel, TimeDependence
+
+TEXT = """
+[data]
+matches = "stars.ecsv"
+{data}
+[detector]
+size = [1000, 800]
+{detector}
+[model]
+order = 2
+{more}
+"""
+
+
+def config(data="", detector="", more=""):
+    return parse_config(TEXT.format(data=data, detector=detector, more=more), "c.toml")
+
+
+def stars(rng, scale=1.0, unit="pix", sigma=0.01, n=200, **columns):
+    """Stars of a detector without distortion, whose pixels have a size."""
+    x, y = rng.uniform(1, 1000, n), rng.uniform(1, 800, n)
+    return Matches(
+        x=x, y=y, u=scale * x, v=scale * y, sigma_u=np.full(n, sigma), sigma_v=np.full(n, sigma),
+        unit=unit, sources=("stars.ecsv",), **columns,
+    )  # fmt: skip
+
+
+def model(unit="pix"):
+    return DistortionModel(1, (Chip(1, "A", (1000.0, 800.0), (500.5, 400.5)),), unit=unit)
+
+
+def doubts(found, **settings):
+    return doubts_on_stars(found, model(found.unit), config(**settings))
+
+
+# -- scale ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
+def test_pixels_that_are_pixels(rng, scale):
+    assert doubts(stars(rng, scale)) == []
+
+
+@pytest.mark.parametrize("scale", [1 / 5, 5.0])
+def test_a_scale_that_is_odd_is_said(rng, scale):
+    [text] = doubts(stars(rng, scale, sigma=0.01))
+    assert f"u and v, in pix, span {scale:.3g} times what pixels say" in text
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+def test_a_scale_that_cannot_be_meant(rng, scale):
+    with pytest.raises(InputError, match=r"stars\.ecsv: u and v, in pix, span .* correct data"):
+        doubts(stars(rng, scale))
+
+
+def test_pixels_that_are_called_an_angle(rng):
+    with pytest.raises(InputError, match=r"span 9\d\d degrees if they are in deg"):
+        doubts(stars(rng, unit="deg"))
+    # an arcsecond in a pixel may be meant, unless the configuration says otherwise
+    assert doubts(stars(rng, unit="arcsec")) == []
+    [text] = doubts(stars(rng, unit="arcsec"), detector="scale_mas = 50.0")
+    assert "span 20 times what pixels and detector.scale_mas = 50 say" in text
+    with pytest.raises(InputError, match="span 2e\\+04 times"):
+        doubts(stars(rng, unit="arcsec"), detector="scale_mas = 0.05")
+    assert doubts(stars(rng, 0.05, "arcsec", 1e-3), detector="scale_mas = 50.0") == []
+
+
+# -- errors and dates -----------------------------------------------------------------------------
+
+
+def test_errors_that_no_detector_reaches(rng):
+    with pytest.raises(InputError, match="half of the errors are below 1e-09 px"):
+        doubts(stars(rng, sigma=1e-9))
+    some = np.full(200, 0.01)
+    some[3] = 1e-8
+    found = replace(stars(rng), sigma_u=some)
+    assert doubts(found) == ["the smallest of the quoted errors is 1e-08 px: check such rows"]
+
+
+def test_dates_that_are_no_decimal_years(rng):
+    with pytest.raises(InputError, match=r"an epoch is 55197\.5, and epochs are decimal years"):
+        doubts(stars(rng, epoch=np.full(200, 55197.5)))
+    [text] = doubts(stars(rng, epoch=np.full(200, 1920.0)))
+    assert "between 1920.0 and 1920.0" in text
+    assert doubts(stars(rng, epoch=np.full(200, 2004.5))) == []
+
+
+def test_breaks_have_data_on_both_sides():
+    dates = np.array([2002.5, 2004.0, 2010.0])
+
+    def drift(*breaks):
+        return TimeDependence((("u", 1, 0),), (2005.0,), breaks)
+
+    for breaks in ((), (2003.0,), (2003.0, 2007.0)):
+        refuse_empty_segments(dates, drift(*breaks))
+    refuse_empty_segments(dates, None)
+    for breaks, words in (
+        ((2001.0,), "no data before the break at 2001"),
+        ((2011.0,), "no data after the break at 2011"),
+        ((2005.0, 2006.0), "no data after the break at 2005 and before that at 2006"),
+    ):
+        with pytest.raises(InputError, match=words) as caught:
+            refuse_empty_segments(dates, drift(*breaks))
+        assert "2002.50 to 2010.00" in str(caught.value)
+
+
+# -- configurations -------------------------------------------------------------------------------
+
+DEEP = "[" * 3000 + "]" * 3000
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"data": f"x = {DEEP}"}, "brackets"),
+        ({"data": "epoch = " + "1" * 100_000}, "thousands of digits"),
+        ({"data": "epoch = 1e300"}, "data.epoch: 1e+300 is no plausible number"),
+        ({"data": "sigma = 1e-300"}, "data.sigma: 1e-300 is no plausible number"),
+        ({"data": "epoch = 55197.5"}, "data.epoch: 55197.5 does not fit"),
+        ({"data": "tangent_point = [0.0, 91.0]"}, "less than or equal to 90"),
+        ({"data": "tangent_point = [1e9, 1e9]"}, "less than or equal to 360"),
+        ({"more": "[model.tdd]\nterms = []\nepoch0 = 1e300"}, "model.tdd.epoch0: 1e+300 is no"),
+        ({"more": "[model.tdd]\nterms = []\nepoch0 = 53000.0"}, "model.tdd.epoch0"),
+        ({"more": "[fit]\nclip_chi2 = 1e300"}, "fit.clip_chi2: 1e+300 is no plausible number"),
+        ({"more": "[fit]\nclip_abs = 1e12"}, "fit.clip_abs: 1000000000000.0 does not fit"),
+        ({"more": "[assess]\ngrid = [100000, 100000]"}, "assess.grid[1]: 100000 does not fit"),
+        ({"more": "[assess]\ndraws = 1000000000"}, "assess.draws: 1000000000 does not fit"),
+        ({"more": "[sampler]\nensembles = 1000000"}, "sampler.ensembles: 1000000 does not fit"),
+        ({"more": 2 * '[[prior]]\nparameter = "u_1_0"\nmean = 1\nsigma = 1\n'}, "two [[prior]]"),
+    ],
+)
+def test_settings_that_cannot_be_meant(settings, words):
+    with pytest.raises(ConfigError) as caught:
+        config(**settings)
+    assert words in str(caught.value) and "c.toml" in str(caught.value)
+    assert len(str(caught.value)) < 300

@@ -1,0 +1,182 @@
+"""A folder of a run that was moved, copied, damaged, or made by somebody else."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from bayesdist.app.store.record import Record
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.errors import InputError
+from bayesdist.files import path_within
+from tests.app.support import cli, good, refused, write_config
+
+pytestmark = pytest.mark.usefixtures("no_report")
+
+REQUIREMENT = "[[requirement]]\nname = 'r'\nstatistic = 'rms'\nlimit = 0.1\n"
+
+
+@pytest.fixture
+def project(finished, tmp_path) -> Path:
+    """Input and run of a folder that lies elsewhere than where it was made."""
+    return shutil.copytree(finished.path.parent, tmp_path / "project")
+
+
+def altered(path: Path) -> None:
+    """One bit of a file is another one; its size and its times are as they were."""
+    before, content = path.stat(), bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+def commands(run: Path, folder: Path) -> dict[str, tuple[object, ...]]:
+    """Commands that go by the files of a run, and write nothing into it."""
+    requirements = folder / "requirements.toml"
+    requirements.write_text(REQUIREMENT, encoding="utf-8")
+    return {
+        "budget": ("budget", run, "--at", 10, 10),
+        "requirements": ("requirements", run, "--requirements", requirements),
+        "compare": ("compare", run, run),
+        "report": ("stage", "report", run),
+        "plan": ("plan", run),
+        "monitor": ("monitor", run, folder / "none.ecsv"),
+        "convert": ("convert", run, "--to", "sip", "-o", folder / "sip.hdr"),
+    }
+
+
+READ = {
+    "fit.nc": ("fit", "budget", "requirements", "compare", "report", "plan", "monitor", "convert"),
+    "posterior.nc": ("sample", "budget", "requirements", "compare", "report", "plan", "monitor"),
+    "diagnostics.h5": ("diagnose", "budget", "requirements", "compare", "report", "plan"),
+    "evaluation.h5": ("evaluate", "report"),
+}
+
+
+@pytest.mark.parametrize("name", sorted(READ))
+def test_no_command_goes_by_a_damaged_file(project, tmp_path, name):
+    stage, *readers = READ[name]
+    run = project / "run"
+    every = commands(run, tmp_path)
+    altered(run / name)
+    for command in readers:
+        words = (str(run / name), f"not as stage '{stage}' wrote it", f"bayesdist stage {stage}")
+        refused(tmp_path, *every[command], words=words)
+    (run / name).unlink()
+    refused(tmp_path, *every[readers[0]], words=(str(run / name), "is gone"))
+
+
+def test_the_page_of_many_runs_names_damage(project, tmp_path):
+    run = project / "run"
+    altered(run / "budget.ecsv")
+    good("report", run, project / "run", "-o", tmp_path / "all.html")
+    page = (tmp_path / "all.html").read_text(encoding="utf-8")
+    assert page.count("budget.ecsv is not as stage &#39;evaluate&#39; wrote it") == 2
+    assert page.count("FAIL") == 2
+
+
+def test_a_project_that_was_moved_is_the_same(project, finished):
+    """Its inputs are found from the run, and those at the old place are not looked at."""
+    run, hidden = project / "run", finished.path.parent / "input"
+    away = hidden.rename(hidden.with_name("away"))
+    try:
+        good("stage", "report", run)
+        said = good("run", project / "input" / "config.toml", "-o", run, "--resume").err
+        assert said.count("done before") == 6
+        assert RunDirectory(run).facts["base"] == str(project / "input")
+        good("budget", run, "--at", 10, 10)
+        assert good("stage", "export", run).code == 0
+    finally:
+        away.rename(hidden)
+
+
+def test_a_run_without_its_inputs_names_them(project, finished, tmp_path):
+    """A run that went elsewhere alone finds them where they were, or says which ones it misses."""
+    run, hidden = (project / "run").rename(tmp_path / "alone"), finished.path.parent / "input"
+    good("budget", run, "--at", 10, 10)
+    away = hidden.rename(hidden.with_name("away"))
+    try:
+        refused(tmp_path, "budget", run, "--at", 10, 10, words=(str(hidden / "stars.ecsv"),))
+        good("compare", run, finished.path)  # needs none of them
+    finally:
+        away.rename(hidden)
+
+
+def test_inputs_that_changed_are_named_where_they_are(project, tmp_path):
+    altered(project / "input" / "stars.ecsv")
+    words = (str(project / "input" / "stars.ecsv"), "changed since the run began")
+    refused(tmp_path, "budget", project / "run", "--at", 10, 10, words=words)
+
+
+def test_files_of_a_run_are_known_by_names_without_folders(finished):
+    record = json.loads((finished.path / "run.json").read_text())
+    assert set(record["inputs"]) == {"stars.ecsv"}
+    names = {name for one in record["artefacts"].values() for name in one["files"]}
+    assert names and not any(Path(name).is_absolute() for name in names)
+
+
+@pytest.mark.parametrize("name", ["../outside.txt", "figures/../../outside.txt", "{absolute}"])
+@pytest.mark.parametrize("where", ["artefact", "under way"])
+def test_a_record_that_names_files_elsewhere_is_refused(project, finished, tmp_path, name, where):
+    """Whatever a stage wrote before is removed when it is made again: never a file of others."""
+    run, outside = project / "run", project / "outside.txt"
+    outside.write_text("precious", encoding="utf-8")
+    name = name.format(absolute=outside)
+    record = json.loads((run / "run.json").read_text())
+    if where == "artefact":
+        record["artefacts"]["evaluate"]["files"][name] = {"size": 8, "sha256": 64 * "0"}
+    else:
+        record["under_way"] = {"stage": "evaluate", "files": [name]}
+    (run / "run.json").write_text(json.dumps(record), encoding="utf-8")
+    for arguments in (
+        ("stage", "evaluate", run),
+        ("run", project / "input" / "config.toml", "-o", run, "--resume"),
+        ("run", project / "input" / "config.toml", "-o", run, "--force"),
+    ):
+        refused(tmp_path, *arguments, words=("outside of its folder", str(run / "run.json")))
+    assert outside.read_text(encoding="utf-8") == "precious"
+
+
+def test_a_link_does_not_lead_to_files_of_others(project, tmp_path):
+    """A folder within the run that is a link to another one is not emptied."""
+    run, other = project / "run", tmp_path / "other"
+    other.mkdir()
+    (other / "x.txt").write_text("precious", encoding="utf-8")
+    (run / "linked").symlink_to(other)
+    record = Record.read(run / "run.json")
+    record.under_way = {"stage": "evaluate", "files": ["linked/x.txt"]}
+    record.write(run / "run.json")
+    result = cli("stage", "export", run)
+    assert result.code == 1 and "outside of its folder ('linked/x.txt')" in result.err
+    with pytest.raises(InputError, match="outside of its folder"):
+        path_within(run, "linked/x.txt", where="", links=True)
+    assert (other / "x.txt").exists()
+
+
+def test_matches_of_a_folder_above_are_as_the_user_wants_them(finished, tmp_path):
+    """A configuration is its user's own: '../stars.ecsv' is read, and keeps its name."""
+    shutil.copy(finished.config.with_name("stars.ecsv"), tmp_path / "stars.ecsv")
+    (tmp_path / "job").mkdir()
+    config = write_config(tmp_path / "job" / "c.toml", data={"matches": "../stars.ecsv"})
+    good("run", config, "-o", tmp_path / "job" / "run")
+    run = tmp_path / "job" / "run"
+    assert set(RunDirectory(run).facts["inputs"]) == {"../stars.ecsv"}
+    moved = tmp_path.rename(tmp_path.with_name(f"{tmp_path.name}-moved"))
+    good("stage", "diagnose", moved / "job" / "run")
+
+
+def test_products_have_names_and_no_folders(tmp_path, finished):
+    """What a release is called becomes the names of its files."""
+    from bayesdist.app.config.products import ReleaseBlock
+
+    period = {"name": "pre", "years": (2002.0, 2009.0)}
+    for given in ({"name": "../x"}, {"name": "a/b"}, {"name": ""}, {"name": "/x"}):
+        with pytest.raises(ValueError, match="name"):
+            ReleaseBlock(reference="r", period=[period], **given)
+        with pytest.raises(ValueError, match="name"):
+            ReleaseBlock(reference="r", name="x", period=[period | given])
+    assert ReleaseBlock(reference="r", name="v1.0-b", period=[period]).name == "v1.0-b"

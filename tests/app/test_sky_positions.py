@@ -1,0 +1,181 @@
+"""Pixels to the sky with the errors of a calibration: `apply --sky` and `apply_to_sky`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from astropy import units
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.table import QTable, Table
+from astropy.wcs import WCS
+
+import bayesdist as bd
+from bayesdist.calibration.calibration import Calibration, GaussianSolution
+from bayesdist.calibration.further import FurtherError
+from bayesdist.calibration.plane import Plane
+from bayesdist.calibration.sky_positions import sky_positions
+from bayesdist.errors import InputError
+from bayesdist.products.registry import build, product_settings, read_calibration
+
+from .support import cli
+
+POINT = (150.0, 40.0)
+CHIPS = tuple(bd.Chip(n, f"chip {n}", (400.0, 300.0), (200.5, 150.5)) for n in (1, 2))
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    """Two chips of 0.26 arcsec to the pixel, a random covariance, and three further errors."""
+    rng = np.random.default_rng(1)
+    model = bd.DistortionModel(3, CHIPS, "arcsec")
+    theta = 0.05 * rng.normal(size=model.n_params)
+    for n, offset in ((1, 0.0), (2, 90.0)):
+        for axis in (0, 1):
+            start = model.coefficient_slice(n, axis).start
+            theta[start] = offset * (1 - axis)
+            theta[start + 1 + axis] = 0.26 * (200, 150)[axis] * (-1, 1)[axis]
+    root = 0.003 * rng.normal(size=(model.n_params, model.n_params)) / np.sqrt(model.n_params)
+    return Calibration(
+        "camera",
+        GaussianSolution(model, theta, root @ root.T),
+        Plane("sky", point=POINT),
+        further=(
+            FurtherError("unmodelled structure", "local", 0.002, 0.001),
+            FurtherError("catalogue", "systematic", 0.004, 0.003, "given by the user"),
+            FurtherError("readout", "random", 0.0, 0.002),
+        ),
+    )
+
+
+@pytest.fixture(scope="module")
+def stars():
+    rng = np.random.default_rng(2)
+    n = 6
+    return Table(
+        {
+            "x": rng.uniform(1, 400, n),
+            "y": rng.uniform(1, 300, n),
+            "chip": [1, 2, 1, 2, 2, 1],
+            "sx": rng.uniform(0.005, 0.02, n),
+            "sy": rng.uniform(0.005, 0.02, n),
+        }
+    )
+
+
+def test_the_covariance_is_that_of_draws(calibration, stars):
+    """Parameters, further errors and centroids drawn, and every star taken to the sky with them."""
+    rng = np.random.default_rng(3)
+    x, y, chip = (np.asarray(stars[c]) for c in ("x", "y", "chip"))
+    sigma = np.stack([stars["sx"], stars["sy"]])
+    at = sky_positions(calibration, x, y, chip, centroids=tuple(sigma), joint=True)
+    true = SkyCoord(at.ra, at.dec, unit="deg")
+    n, out = 3000, []
+    thetas = calibration.solution.draws(n, rng)
+    for theta in thetas:
+        px, py = np.stack([x, y]) + sigma * rng.normal(size=(2, 6))
+        u, v = np.empty(6), np.empty(6)
+        for number in (1, 2):
+            mine = chip == number
+            phi = calibration.model.basis(number).evaluate(px[mine], py[mine])
+            u[mine], v[mine] = (
+                phi @ theta[calibration.model.coefficient_slice(number, a)] for a in (0, 1)
+            )
+        u += 0.004 * rng.normal() + 0.002 * rng.normal(size=6)
+        v += 0.003 * rng.normal() + np.hypot(0.001, 0.002) * rng.normal(size=6)
+        wcs = _gnomonic()
+        sky = SkyCoord(*wcs.wcs_pix2world(u / 3600, v / 3600, 0), unit="deg")
+        east, north = true.spherical_offsets_to(sky)
+        out.append(np.stack([east.mas, north.mas], axis=-1).ravel())
+    drawn = np.cov(np.array(out).T)
+    scale = np.sqrt(np.diag(at.joint))
+    # of a correlation r the standard error is (1 - r^2) / sqrt(n); the largest of 78
+    assert np.abs((drawn - at.joint) / np.outer(scale, scale)).max() < 4.5 * np.sqrt(2 / n)
+    blocks = at.joint.reshape(6, 2, 6, 2)[np.arange(6), :, np.arange(6), :]
+    np.testing.assert_allclose(blocks, at.cov, rtol=1e-9)
+
+
+def _gnomonic():
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = "RA---TAN", "DEC--TAN"
+    wcs.wcs.crval, wcs.wcs.crpix, wcs.wcs.cdelt = POINT, (1.0, 1.0), (1.0, 1.0)
+    return wcs
+
+
+def test_what_all_stars_share_drops_out_of_differences(calibration, stars):
+    """Of two stars nearly at one pixel only the errors of each by itself are left."""
+    x, y = [100.0, 100.0 + 1e-6], [50.0, 50.0]
+    at = sky_positions(calibration, x, y, 1, joint=True)
+    difference = np.array([1.0, 0.0, -1.0, 0.0])
+    alone = 2 * (1e3 * 0.002) ** 2
+    assert difference @ at.joint @ difference == pytest.approx(alone, rel=1e-3)
+    assert at.cov[0, 0, 0] > alone
+
+
+@pytest.mark.parametrize("key", ["tpv", "cpdis"])
+def test_a_file_and_what_it_was_made_from_say_the_same(calibration, stars, tmp_path, key):
+    """Positions, errors, and the further ones, from the files as written."""
+    for one in build(key, calibration, product_settings()[key]()):
+        (tmp_path / one.file_name).write_bytes(one.content)
+    first = {"tpv": "tpv.head", "cpdis": "cpdis.fits"}[key]
+    again = read_calibration(tmp_path / first)
+    assert again.further == calibration.further
+    here = bd.apply_to_sky(calibration, stars, centroids=("sx", "sy"))
+    there = bd.apply_to_sky(tmp_path / first, stars, centroids=("sx", "sy"))
+    for name in ("ra", "dec", "sigma_ra", "sigma_dec", "corr_ra_dec"):
+        np.testing.assert_allclose(here[name], there[name], rtol=1e-9, err_msg=name)
+
+
+def test_tables_of_all_kinds_are_taken(calibration, stars):
+    expected = bd.apply_to_sky(calibration, stars)
+    frame = pd.DataFrame({c: np.asarray(stars[c]) for c in stars.colnames})
+    for one in (QTable(stars), frame, {c: np.asarray(stars[c]) for c in stars.colnames}):
+        found = bd.apply_to_sky(calibration, one)
+        assert (found["ra"] == expected["ra"]).all() and found["sigma_ra"].unit == units.mas
+    zero = stars.copy()
+    zero["x"] -= 1
+    zero["y"] -= 1
+    found = bd.apply_to_sky(calibration, zero, pixel_origin=0)
+    np.testing.assert_allclose(found["ra"].value, expected["ra"].value, rtol=0, atol=1e-12)
+
+
+def test_the_command_writes_what_python_gives(calibration, stars, tmp_path):
+    for one in build("tpv", calibration, product_settings()["tpv"]()):
+        (tmp_path / one.file_name).write_bytes(one.content)
+    stars.write(tmp_path / "stars.csv")
+    head, table, out = (str(tmp_path / n) for n in ("tpv.head", "stars.csv", "sky.fits"))
+    done = cli("apply", head, table, "-o", out, "--sky", "--centroids", "sx", "sy", "--joint")
+    assert done.code == 0, done.err
+    for line in (
+        "coefficients, with their covariance (correlated between stars)",
+        "catalogue (the same for all stars)",
+        "unmodelled structure (of each star by itself)",
+        "centroids (of each star by itself)",
+    ):
+        assert line in done.out
+    expected = bd.apply_to_sky(calibration, stars, centroids=("sx", "sy"), covariance=True)
+    with fits.open(out) as file:
+        np.testing.assert_allclose(
+            file["COVARIANCE"].data, expected.meta["covariance"], rtol=1e-8, atol=1e-9
+        )
+        np.testing.assert_allclose(file[1].data["sigma_ra"], expected["sigma_ra"].value)
+    done = cli("apply", head, table, "-o", str(tmp_path / "a.ecsv"), "--sky", "--joint")
+    assert done.code == 1 and "name a .fits file" in done.err
+    done = cli("apply", head, table, "-o", str(tmp_path / "a.ecsv"), "--joint")
+    assert done.code == 2 and "--sky" in done.err
+
+
+def test_planes_that_are_not_on_the_sky_are_refused(calibration, stars):
+    for plane, message in (
+        (Plane("free"), "where its plane touches the sky"),
+        (Plane("aperture", v2v3=(0.0, 0.0)), "V2, V3"),
+    ):
+        with pytest.raises(InputError, match=message):
+            bd.apply_to_sky(replace(calibration, plane=plane), stars)
+    free = replace(calibration, plane=Plane("free"))
+    found = bd.apply_to_sky(free, stars, point=POINT)
+    expected = bd.apply_to_sky(calibration, stars)
+    assert (found["dec"] == expected["dec"]).all()

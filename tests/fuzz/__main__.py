@@ -1,0 +1,52 @@
+"""Draw cases, count what became of them, and write down those that failed."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import sys
+import tempfile
+from pathlib import Path
+
+from tests.fuzz.cases import drawn, kept
+from tests.fuzz.inputs import inputs
+from tests.fuzz.mutation import MUTATIONS
+from tests.fuzz.verdicts import table_of, tried
+
+
+def main() -> int:
+    """Exit code: 1 where a case failed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cases", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", default="", help="inputs whose name or kind has this in it")
+    parser.add_argument("--kept", action="store_true", help="only the cases that failed once")
+    parser.add_argument("--failed", metavar="FILE", help="write the cases that failed")
+    parser.add_argument("--json", metavar="FILE", help="write counts and failures")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="bayesdist-fuzz-") as folder:
+        known = [one for one in inputs(Path(folder)) if given.only in f"{one.kind} {one.name}"]
+        cases = kept()
+        if not given.kept:
+            cases += drawn(known, given.cases, given.seed)
+        verdicts, failed = [], []
+        for verdict in tried(known, cases):
+            verdicts.append(verdict)
+            if verdict.failed:
+                failed.append(verdict)
+                print(verdict.told, file=sys.stderr, flush=True)
+    used = [sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    table = table_of(verdicts)
+    print(table, "", table_of(verdicts, lambda v: MUTATIONS[v.case.mutation].kind), sep="\n")
+    print(f"\n{used[0]:.0f} s of processor time here, {used[1]:.0f} s in {len(verdicts)} cases")
+    if given.failed:
+        Path(given.failed).write_text("".join(f"{v.case.line}\n" for v in failed), "utf-8")
+    if given.json:
+        found = {"table": table, "tried": len(verdicts), "failed": [v.told for v in failed]}
+        Path(given.json).write_text(json.dumps(found), "utf-8")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,124 @@
+"""SIP headers of u, v in a frame of pixels, and what is warned of in others."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.wcs import WCS, FITSFixedWarning
+
+import bayesdist as bd
+from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of
+from bayesdist.calibration.further import FurtherError
+from bayesdist.calibration.plane import Plane
+from bayesdist.errors import InputError
+from bayesdist.products.formats.common.document import BuildOptions, Choice
+from bayesdist.products.registry import (
+    build,
+    lint,
+    open_document,
+    product_settings,
+    read_back,
+    read_calibration,
+)
+
+
+@pytest.fixture(scope="module")
+def fit():
+    """An order-3 distortion whose u, v are pixels of a frame that is turned and mirrored."""
+    rng = np.random.default_rng(1)
+    chip = bd.Chip(1, "camera", (900.0, 700.0), (450.5, 350.5))
+    model = bd.DistortionModel(3, (chip,), "pix")
+    theta = 0.3 * rng.normal(size=model.n_params)
+    u, v = (model.coefficient_slice(1, axis).start for axis in (0, 1))
+    theta[[u, u + 1, u + 2]] = 1200.0, 100.0, 340.0
+    theta[[v, v + 1, v + 2]] = -300.0, 440.0, -90.0
+    stars, _ = bd.simulate_matches(model, theta, 400, sigma=0.01, rng=rng)
+    return bd.fit_linear(stars, model)
+
+
+def made(fit, tmp_path, **settings):
+    calibration = calibration_of(fit, "run")
+    files = build("sip", calibration, product_settings()["sip"](**settings), BuildOptions())
+    path = tmp_path / files[0].file_name
+    path.write_bytes(files[0].content)
+    return files, path
+
+
+@pytest.mark.parametrize("linear", ["cd"])
+def test_astropy_gives_u_and_v_of_linear_axes(fit, tmp_path, linear):
+    """all_pix2world is the model to 1e-6 px, and all_world2pix the way back; no sky is made."""
+    files, path = made(fit, tmp_path, axes="linear", linear=linear)
+    header = fits.Header.fromtextfile(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FITSFixedWarning)
+        wcs = WCS(header)
+    assert not wcs.has_celestial
+    rng = np.random.default_rng(2)
+    x, y = rng.uniform(1, 900, 300), rng.uniform(1, 700, 300)
+    expected = calibration_of(fit).forward(x, y, chip=1)
+    np.testing.assert_allclose(np.stack(wcs.all_pix2world(x, y, 1), axis=-1), expected, atol=1e-6)
+    assert files[0].warnings == ()
+    found = read_calibration(path)
+    assert found.unit == "pix"
+    np.testing.assert_allclose(found.forward(x, y, chip=1), expected, atol=1e-6)
+    [back] = read_back("sip", files, calibration_of(fit), BuildOptions())
+    np.testing.assert_allclose(back.forward(x, y, 1, None), expected, atol=1e-6)
+    assert [f.level for f in lint(path)] == ["note"]
+
+
+def test_what_programs_would_make_of_a_header_is_warned_of(fit, tmp_path):
+    [one], _ = made(fit, tmp_path)
+    [warning] = one.warnings
+    assert "CRVAL is a placeholder" in warning and "axes = 'linear'" in warning
+    determinant = np.linalg.det(calibration_of(fit).chip().linear)
+    assert ("mirror" in warning) == (determinant > 0)
+    [one], _ = made(fit, tmp_path, crval=(10.0, 20.0))
+    assert "CRVAL is as it was given" in one.warnings[0]
+
+
+def test_constant_and_linear_terms_are_warned_of(tmp_path):
+    rng = np.random.default_rng(3)
+    matches, _ = bd.simulate_wise(400, rng=rng)
+    fit = bd.fit_linear(matches, bd.build_model(matches, order=3, size=(1016, 1016)))
+    [one], _ = made(fit, tmp_path, linear="sip")
+    assert any("stwcs and gwcs drop" in w for w in one.warnings)
+    [one], _ = made(fit, tmp_path, linear="cd")
+    assert not any("stwcs" in w for w in one.warnings)
+
+
+def test_axes_of_the_sky_are_not_linear(fit, tmp_path):
+    with pytest.raises(InputError, match="leave axes out"):
+        made(fit, tmp_path, axes="linear", crval=(1.0, 2.0))
+
+
+def test_parameters_beside_a_header_have_the_covariance(fit, tmp_path):
+    """Read together they are the solution; apart the sigmas, with a note; changed an error."""
+    chip = bd.Chip(1, "camera", (900.0, 700.0), (450.5, 350.5))
+    model = bd.DistortionModel(3, (chip,), "arcsec")
+    further = (FurtherError("structure", "local", 0.002, 0.001),)
+    mean = 0.25 * fit.mean
+    mean[[0, model.n_terms]] = 20.0, -10.0
+    solution = GaussianSolution(model, mean, 0.0625 * fit.cov)
+    calibration = Calibration("run", solution, Plane("sky", point=(30.0, 60.0)), further=further)
+    files = build("sip", calibration, product_settings()["sip"](parameters=True), BuildOptions())
+    for one in files:
+        (tmp_path / one.file_name).write_bytes(one.content)
+    assert [one.file_name for one in files] == ["sip_parameters.fits", "sip.hdr"]
+    found = read_calibration(tmp_path / "sip.hdr")
+    np.testing.assert_array_equal(found.solution.cov, solution.cov)
+    assert found.errors == "covariance" and found.further == further
+    used = open_document(tmp_path / "sip.hdr").calibration(Choice(as_used=True))
+    assert used.errors == "sigma"
+    text = (tmp_path / "sip.hdr").read_text()
+    card = next(line for line in text.splitlines() if line.startswith("CD1_1"))
+    value = float(card[10:].split("/")[0])
+    (tmp_path / "sip.hdr").write_text(text.replace(card, f"CD1_1   = {value * (1 + 1e-5):.15E}"))
+    with pytest.raises(InputError, match="one of the two was changed"):
+        read_calibration(tmp_path / "sip.hdr")
+    (tmp_path / "sip.hdr").write_text(text)
+    (tmp_path / "sip_parameters.fits").unlink()
+    found = read_calibration(tmp_path / "sip.hdr")
+    assert found.errors == "sigma" and "which is not here" in found.notes[-1]
