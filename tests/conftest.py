@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
+from tests import ALONE
 from tests.reduced import FULL
+
+if not ALONE:
+    numba.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")
@@ -51,6 +57,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return next((k for k, name in enumerate(FIRST) if item.nodeid.startswith(name)), len(FIRST))
 
     items.sort(key=place)
+
+
+def pytest_collection_finish() -> None:
+    """Modules and tests stay: the garbage collector need not look at them again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 # folders whose files look at the same thing, which is long in the making

@@ -1,4 +1,4 @@
-"""Reports whose figures are made but not drawn.
+"""Reports whose figures are made but not drawn, or not even made.
 
 That takes most of the time of a small run.  Figures as they look are the subject of tests/report,
 and the demo draws them in a process of its own.
@@ -16,16 +16,20 @@ from PIL import Image
 
 
 @contextmanager
-def sketched() -> Iterator[None]:
-    """Context in which a speck stands for each figure of a report, and corner plots are empty."""
+def sketched(*, made: bool = True) -> Iterator[None]:
+    """Context in which a speck stands for each figure of a report, and corner plots are empty.
+
+    Figures of a run that are not `made` have their names in place of words.
+    """
     from matplotlib.figure import Figure
 
-    from bayesdist.report import drawing
+    from bayesdist.report import drawing, run_report
     from bayesdist.report.sections.run import posterior
 
     with (
         patch.object(drawing, "render", _sketch),
         patch.object(posterior, "corner_figure", lambda *_, **__: Figure()),
+        patch.object(run_report, "draw_all", drawing.draw_all if made else _unmade),
     ):
         yield
 
@@ -37,6 +41,16 @@ def _sketch(plot, *, pdf=False, svg=False):
     page = io.BytesIO()
     Image.new("RGB", (4, 3), "white").save(page, format="png")
     return Drawing(page.getvalue(), b"%PDF-1.7" if pdf else None, plot.title, plot.text, plot.alt)
+
+
+def _unmade(registry, results, *, pdf=False, processes=1):
+    """A speck for each figure that the results have."""
+    from matplotlib.figure import Figure
+
+    from bayesdist.report.registry import Plot
+
+    names = [item.name for item in registry.items(results, "figure")]
+    return {name: _sketch(Plot(Figure(), name, name, name), pdf=pdf) for name in names}
 
 
 def main() -> int:

@@ -21,6 +21,7 @@ PAGE = DOCS / "new_instrument.md"
 FILE = "megacam_gaia/megacam744331p_gaiadr1_pairs_8arcsec.csv"
 POSITIONS = [f"{z}_{which}_arcsec" for which in ("hdrwcs", "gaia") for z in "xy"]
 MIDDLE = ((-640.4, 148.0), (-950.0, -40.0))  # arcsec: two CCDs side by side
+FEW_DRAWS = "[sampler]\ntarget_ess = 50\ntarget_rhat = 1.1\n"
 
 
 def named_blocks() -> dict[str, str]:
@@ -85,7 +86,7 @@ def pairs(data_dir, full) -> Table:
 def followed(tmp_path_factory, pairs, full):
     """Folder in which the page was followed, and what each command printed.
 
-    Reduced, figures of the report are not drawn.
+    Reduced, draws are few, and figures of the report are not drawn.
     """
     folder = tmp_path_factory.mktemp("megacam")
     pairs.write(folder / "pairs.csv", format="ascii.csv")
@@ -97,7 +98,8 @@ def followed(tmp_path_factory, pairs, full):
     for language, text in blocks(PAGE):
         if language == "toml" and text.startswith("# megacam.toml\n"):
             config = folder / "megacam.toml"
-            config.write_text(changed(config.read_text("utf-8"), text), encoding="utf-8")
+            changes = text if full else f"{text}\n{FEW_DRAWS}"
+            config.write_text(changed(config.read_text("utf-8"), changes), encoding="utf-8")
         for line in text.splitlines() if language == "console" else ():
             words = shlex.split(line)
             assert words[:2] == ["$", "bayesdist"]

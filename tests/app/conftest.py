@@ -37,7 +37,14 @@ class Finished:
 
 @pytest.fixture(scope="package", autouse=True)
 def sketched(full) -> Iterator[None]:
-    """Figures of reports are made but not drawn, and corner plots not made, unless run in full."""
+    """Figures of reports are neither made nor drawn, unless run in full."""
+    with nullcontext() if full else sketches.sketched(made=False):
+        yield
+
+
+@pytest.fixture(scope="module")
+def figures_made(sketched, full) -> Iterator[None]:
+    """Figures of reports are made and have their words; they are drawn if run in full."""
     with nullcontext() if full else sketches.sketched():
         yield
 

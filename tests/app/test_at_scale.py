@@ -106,6 +106,7 @@ def test_a_run_on_disk_is_the_run_in_memory(job, tmp_path, on_disk, monkeypatch)
         assert joined == whole[name].to_pylist(), name
 
 
+@pytest.mark.usefixtures("figures_made")
 def test_no_stage_takes_all_rows_into_memory(job, tmp_path, on_disk, monkeypatch):
     """The largest table that is ever made has the rows of one piece, or of the sample."""
     sizes = []

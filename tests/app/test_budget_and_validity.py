@@ -9,6 +9,8 @@ from astropy.table import Table
 
 from tests.app.support import cli, good, one_sentence, refused
 
+pytestmark = pytest.mark.usefixtures("figures_made")
+
 SIZE = (512, 256)
 N, EPOCHS = 250, np.linspace(2004.0, 2012.0, 6)
 SIGMA, DRIFT = 0.02, 2e-5

@@ -585,6 +585,7 @@ def test_a_damaged_campaign_is_calibrated_and_says_so(campaign, monkeypatch):
     campaign.lists(scattered, ONE).lists(lambda t: t[t["chip"] == 1], "f606w-006")
     # a few steps: what is said does not rest on the draws
     campaign.replaced("target_ess = 100", "max_steps = 20")
+    campaign.replaced("grid = [33, 17]", "grid = [9, 5]\ndraws = 200")
     run = campaign.path.parent / "run"
     good("run", campaign.path / CONFIG, "-o", run, "-q")
     warnings = " ".join(summary_of(run)["warnings"])

@@ -13,9 +13,17 @@ from bayesdist.data import read_matches, tangent_plane
 from bayesdist.infer import load_posterior
 from tests.app.layouts import LAYOUTS, POINT, SCALE, SIGMA, field_of, gaia_table, plane_of, sky_of
 from tests.app.support import good, refused
+from tests.reduced import case_in_full
 
 BY_NAME = {layout.name: layout for layout in LAYOUTS}
-RUN = ("ascii_head.cat", "photutils.ecsv", "gaia.csv", "wise.txt", "detpos.fits")
+RUN = (
+    "photutils.ecsv",
+    "detpos.fits",
+    *(
+        case_in_full(name, instead="two layouts are run, and all are begun")
+        for name in ("ascii_head.cat", "gaia.csv", "wise.txt")
+    ),
+)
 
 
 def begun(name, folder):

@@ -33,6 +33,8 @@ from tests.app.support import (
     write_job,
 )
 
+pytestmark = pytest.mark.usefixtures("figures_made")
+
 CENTRES = [55212.5, 55262.5, 55312.5]
 NAMES = ["55212.5", "55262.5", "55312.5"]
 DAYS = 5.0

@@ -33,6 +33,8 @@ from tests.app.support import (
     write_job,
 )
 
+pytestmark = pytest.mark.usefixtures("figures_made")
+
 SIZE = (4096, 2048)
 MAS = 50.0
 CHIPS = (

@@ -152,8 +152,8 @@ def test_a_chip_without_detections_is_said(rng):
 
 
 def test_a_wrong_field_is_named_with_the_best_count(rng):
-    _, lists, log, _, _ = campaign(rng, 2, stars=4000)
-    uv, mag = positions(rng, 4000, 6000.0)
+    _, lists, log, _, _ = campaign(rng, 2, stars=2500)
+    uv, mag = positions(rng, 2500, 6000.0)
     other = ReferenceCatalog(u=uv[:, 0], v=uv[:, 1], mag=mag, source="elsewhere.ecsv")
     message = (
         r"e0\.parquet, exposure e0: does not match elsewhere\.ecsv: .* \d+ stars, where chance"
@@ -180,7 +180,7 @@ def test_what_would_match_is_named(rng, factor, mirror):
 
 def test_no_reason_is_made_up(rng):
     """Where a list matches as it is, or where nothing matches, there is nothing to be named."""
-    catalog, lists, _, _, _ = campaign(rng, 1, stars=4000)
+    catalog, lists, _, _, _ = campaign(rng, 1, stars=2500)
     plane = start(lists[0].x, lists[0].y, lists[0].chip, 2005.0)
     uv = np.column_stack([catalog.u, catalog.v])
     for places in (uv, rng.permuted(uv, axis=0)):
@@ -212,7 +212,7 @@ def test_an_exposure_of_no_sky_is_left_out_and_counted(rng):
 
 @pytest.mark.parametrize("numbers", [(0, 1), (2, 4)], ids=["the first two", "more than a fifth"])
 def test_too_many_of_them_are_an_error(rng, numbers):
-    catalog, lists, log, _, _ = campaign(rng, 6, stars=4000)
+    catalog, lists, log, _, _ = campaign(rng, 6, stars=2500)
     bad = [strewn(rng, one) if k in numbers else one for k, one in enumerate(lists)]
     with pytest.raises(InputError, match=rf"exposure e{numbers[0]}: .* 1 more of 6 exposures"):
         match_campaign(bad, log, catalog, start, skip=True)

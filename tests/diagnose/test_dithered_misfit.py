@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
-from scipy.stats import binom
 
 from bayesdist.diagnose.selfcal.misfit import _shifts, dithered_misfit
 from bayesdist.diagnose.selfcal.scores import taken_by_stars
@@ -33,19 +31,6 @@ def _simulated(seed, **more):
 def _waved(detections, rms, period=150.0):
     wave = np.sqrt(2) * rms * np.sin(2 * np.pi * detections.x / period)
     return replace(detections, x=detections.x + wave)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "more", [{}, {"rolls": (0, 0, 0)}, {"n_chips": 2}], ids=["rolls", "one roll", "two chips"]
-)
-def test_noise_is_no_structure(more, full):
-    """p-values are those of chance; three tests share them: Bonferroni is a little too careful."""
-    seeds = range(100 if full else 25)
-    p = np.array([dithered_misfit(_solved(_simulated(1000 + k, **more))).p_value for k in seeds])
-    for level in (0.01, 0.1, 0.3):
-        assert (p < level).sum() <= binom.ppf(0.999, len(p), level)
-    assert (p < 0.5).sum() >= max(binom.ppf(0.001, len(p), 0.3), 1)
 
 
 def test_a_wave_is_found_with_its_size():

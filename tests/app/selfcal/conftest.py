@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
+from tests import sketches
 from tests.app.selfcal.support import list_table, small, write_selfcal
 from tests.app.support import Result, good
 from tests.dithered_fields import DitheredField
@@ -36,9 +38,10 @@ def _finished(folder: Path, rolls: tuple[float, ...], *, report: bool) -> Finish
 
 
 @pytest.fixture(scope="package")
-def three_rolls(tmp_path_factory) -> Finished:
-    """With its report."""
-    return _finished(tmp_path_factory.mktemp("three"), ROLLS["three rolls"], report=True)
+def three_rolls(sketched, full, tmp_path_factory) -> Finished:
+    """With its report and the words of its figures."""
+    with nullcontext() if full else sketches.sketched():
+        return _finished(tmp_path_factory.mktemp("three"), ROLLS["three rolls"], report=True)
 
 
 @pytest.fixture(scope="package")

@@ -15,6 +15,7 @@ from bayesdist.diagnose.correlated.deviations import DeviationColumns, deviation
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.structure import LENGTHS, chip_structure
 from tests.infer.by_nuts import nuts_draws
+from tests.reduced import only_in_full
 
 pytestmark = pytest.mark.slow
 numpyro = pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
@@ -64,11 +65,12 @@ def agree(ours: np.ndarray, got: dict[str, np.ndarray], name: str, what: str, ca
     assert (np.abs(ratio - 1) < 4 * np.sqrt(kurtosis(flat, axis=0, fisher=False) / 4 / sizes)).all()
 
 
+@only_in_full(
+    "test_against_dense has what is conditional, test_coverage and tests/coverage the rest"
+)
 @pytest.mark.parametrize("found", [True, False], ids=["a field", "nothing"])
 def test_structure(found, full, capsys):
     """Polynomial, higher orders and sines of both axes; three amplitudes; length and likeness."""
-    if not full and not found:
-        pytest.skip("a field is run: set BAYESDIST_FULL=1")
     import jax
     import jax.numpy as jnp
     import numpyro.distributions as dist

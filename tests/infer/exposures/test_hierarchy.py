@@ -18,6 +18,7 @@ from bayesdist.infer.exposures.scatter import Scatter
 from bayesdist.infer.transforms import lines, reference_gauge
 from bayesdist.model import FRAME_KINDS
 from bayesdist.model.frames import CHIP_DEVIATIONS
+from tests.reduced import case_in_full
 
 from ..small_campaign import LINEAR, campaign, campaign_model, seen_by, true_lines
 from ..support import UNCLIPPED, columns_of, residual_of
@@ -279,21 +280,27 @@ def named_by_chance(n, campaigns=20_000):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("own", [None, OWN], ids=["together", "apart"])
+@pytest.mark.parametrize(
+    "own",
+    [
+        case_in_full(None, instead="chips that deviate by themselves are run", id="together"),
+        pytest.param(OWN, id="apart"),
+    ],
+)
 def test_scatter_and_lines_over_many_truths(full, own):
     """Pulls of alpha and beta, and where the true tau lies in its posterior."""
-    n = 100 if full else 6
+    n, exposures = (100, 40) if full else (4, 24)
     truth = TAU if own is None else np.concatenate([TAU, own])
     pulls, ranks, outlying = [], [], 0
     for seed in range(n):
-        model, matches, theta = campaign(1000 + seed, 40, 150, own=own)
+        model, matches, theta = campaign(1000 + seed, exposures, 150, own=own)
         found = fit_hierarchical(matches, model, n_tau=128)
         outlying += len(found.outlying)
         a = lines(reference_gauge(found)).select(*FREE)
         d = a.values - true_lines(model, theta).select(*FREE).values
         pulls.append(d @ np.linalg.solve(a.cov, d))
         ranks.append((found.tau_draws < truth).mean(axis=0))
-    assert outlying <= stats.poisson(n * named_by_chance(40)).isf(1e-3)
+    assert outlying <= stats.poisson(n * named_by_chance(exposures)).isf(1e-3)
     # the covariance of the lines describes their errors
     assert stats.kstest(pulls, stats.chi2(len(FREE)).cdf).pvalue > 1e-3
     rms = np.sqrt(np.mean(pulls) / len(FREE))
@@ -327,23 +334,23 @@ def test_a_gap_that_goes_with_the_shear_is_no_second_measurement_of_it(full):
     In the gauge of WFC2 its B_2 deviates by twice the shear, and no error of its rate can be below
     what that scatter leaves of a line through the exposures.
     """
-    n = 60 if full else 4
+    n, exposures = (60, 40) if full else (2, 24)
     pulls, ratio = [], []
     for seed in range(n):
-        whole, matches, theta = campaign(2000 + seed, 40, 150, tau=(5e-6, 5e-6, 5e-6))
+        whole, matches, theta = campaign(2000 + seed, exposures, 150, tau=(5e-6, 5e-6, 5e-6))
         model = replace(whole, chips=whole.chips[::-1], chip_deviations=True)
         found = lines(reference_gauge(fit_hierarchical(matches, model, n_tau=128)))
         for of in ("WFC2.B_2.beta", "WFC1.B_2.beta", "WFC2.B_3.beta", "WFC2.A_2.beta"):
             d = found.select(of).values - true_lines(whole, theta).select(of).values
             pulls.append(float(d[0] / found.select(of).sigma[0]))
-        epoch = np.array([matches.epoch[matches.exposure == e][0] for e in range(40)])
+        epoch = np.array([matches.epoch[matches.exposure == e][0] for e in range(exposures)])
         least = 2 * 5e-6 / np.sqrt(((epoch - epoch.mean()) ** 2).sum())
         ratio.append(found.select("WFC2.B_2.beta").sigma[0] / least)
     assert np.median(ratio) > 0.9
     assert np.sqrt(np.mean(np.square(pulls))) < 1 + 3 / np.sqrt(2 * 2 * n)  # two are independent
 
 
-def test_exposures_that_went_wrong_are_named_and_do_no_harm():
+def test_exposures_that_went_wrong_are_named_and_do_no_harm(full):
     wrong = {"j004.scale": 3e-4, "j011.shear_plus": -2e-4, "j011.WFC1.rotation": 1e-4}
     model, matches, theta = campaign(16, 30, 200, own=OWN, wrong=wrong)
     found = fit_hierarchical(matches, model)
@@ -358,7 +365,7 @@ def test_exposures_that_went_wrong_are_named_and_do_no_harm():
     assert found.mean[k] == pytest.approx(theta[k], abs=5 * found.sigma[k])
     # not only gross ones, and two of few: everything of ten times the usual size
     rng = np.random.default_rng(3)
-    for seed in (18, 19, 20):
+    for seed in (18, 19, 20) if full else (18,):
         wrong = {
             f"{e}.{kind}": 10 * t * rng.standard_normal()
             for e in ("j003", "j009")

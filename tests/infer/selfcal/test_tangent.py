@@ -12,7 +12,6 @@ from bayesdist.infer.selfcal import self_calibrate
 from bayesdist.infer.selfcal.relative import gauge_free_matrix
 from bayesdist.infer.selfcal.tangent import TangentPlane
 from bayesdist.model import Chip, DistortionModel
-from tests.infer.selfcal.fields import field
 from tests.infer.selfcal.wide import (
     ARCSEC,
     DEC,
@@ -91,10 +90,11 @@ def _pointing_test(found):
     return next(t for t in selfcal_score_tests(found.mode) if t.name == "pointing")
 
 
-def test_a_wide_field():
+def test_a_wide_field(full):
     """A field of 19 minutes of arc, steps of 8: half a hundredth of a pixel if it were flat."""
     total, dof, p_values = 0.0, 0, []
-    for seed in range(4):
+    n_fields = 4 if full else 2
+    for seed in range(n_fields):
         detections, pointings, rolls, bends = observed(seed)
         model, theta = _start(detections, pointings, rolls)
         given = {"match_radius": 1.0, "start_radius": 20.0}
@@ -109,22 +109,7 @@ def test_a_wide_field():
             told = _pointing_test(flat)
             assert told.significant and told.p_value < 1e-6
             assert "scale_mas" in told.remedy
-    assert dof == 4 * 16
+    assert dof == n_fields * 16
     low, high = stats.chi2.ppf([0.001, 0.999], dof)
     assert low < total < high
-    assert min(p_values) > 0.001 / 4
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("more", [{}, {"rolls": (0, 0, 0)}], ids=["rolls", "one roll"])
-def test_noise_does_not_go_with_where_exposures_point(more):
-    """p-values of small fields, on a sky that is flat, are those of chance."""
-    p_values = []
-    for seed in range(25):
-        simulated = field(500 + seed, 8, 900, disturbed=0.025, spurious=0.025, **more)
-        given = {"match_radius": 1.0, "start_radius": 2.0}
-        found = self_calibrate(simulated.model, simulated.unlabelled, simulated.theta, **given)
-        p_values.append(_pointing_test(found).p_value)
-    for level in (0.01, 0.1, 0.5):
-        low, high = stats.binom.ppf([0.001, 0.999], len(p_values), level)
-        assert low <= np.sum(np.array(p_values) < level) <= high
+    assert min(p_values) > 0.001 / n_fields

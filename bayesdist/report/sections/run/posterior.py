@@ -172,7 +172,7 @@ def correlations(r: ReportInput) -> Plot:
     """Matrix of the correlations between coefficients, as a map of colours."""
     posterior = needed(r.posterior)
     names, matrix = correlation_matrix(posterior)
-    fig = new_figure(0.72 * WIDTH, 0.62 * WIDTH)
+    fig = new_figure(0.72 * WIDTH, 0.62 * WIDTH, layout="compressed")
     ax = fig.subplots()
     image = ax.imshow(matrix, vmin=-1, vmax=1, cmap=DIVERGING, interpolation="nearest")
     step = -(-len(names) // _NAMED)
