@@ -72,7 +72,13 @@ class UncertaintyMap:
         return per_axis(self.sigma_u, self.sigma_v)
 
     def circular_error(self, probability: float) -> Float:
-        """Radius (ny, nx) of the circle that holds the true position with a probability."""
+        """Radius (ny, nx) of the circle that holds the true position with a probability.
+
+        Parameters
+        ----------
+        probability : float
+            Between 0 and 1.
+        """
         return circular_error(self.sigma_u, self.sigma_v, self.correlation, probability)
 
     @property

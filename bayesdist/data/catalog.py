@@ -135,14 +135,28 @@ class ReferenceCatalog:
         return len(self.u)
 
     def select(self, which: NDArray[Any]) -> ReferenceCatalog:
-        """Stars by mask or indices."""
+        """Stars by mask or indices.
+
+        Parameters
+        ----------
+        which : ndarray
+            Boolean mask (S,), or indices.
+        """
         arrays = {name: values[which] for name, values in columns_of(self, _COLUMNS).items()}
         if isinstance(self.epoch, np.ndarray):
             arrays["epoch"] = self.epoch[which]
         return replace(self, **arrays, star=self.star[which])
 
     def rescaled(self, factor: float, unit: str) -> ReferenceCatalog:
-        """Catalogue in another unit, of which the present one is `factor`."""
+        """Catalogue in another unit, of which the present one is `factor`.
+
+        Parameters
+        ----------
+        factor : float
+            Of all lengths: positions, motions and their errors.
+        unit : str
+            Name of the new unit.
+        """
         lengths = columns_of(self, [name for name in _COLUMNS if name != "mag"])
         return replace(self, **{k: factor * values for k, values in lengths.items()}, unit=unit)
 

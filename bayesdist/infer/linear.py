@@ -140,7 +140,13 @@ class LinearFit(Solution):
         return self.n_rows - self.n_used
 
     def uses(self, matches: Matches) -> NDArray[np.bool_]:
-        """Boolean mask (N,) of a table's stars that the second pass uses."""
+        """Boolean mask (N,) of a table's stars that the second pass uses.
+
+        Parameters
+        ----------
+        matches : Matches
+            Those that were fitted, or others of the same exposures.
+        """
         return self.clip.keeps(self.model, matches)
 
     @cached_property
@@ -148,11 +154,25 @@ class LinearFit(Solution):
         return scaled_cholesky(self.cov)  # parameters fixed by a gauge have no error
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Parameter vectors (n, D) from the Gaussian with this mean and covariance."""
+        """Parameter vectors (n, D) from the Gaussian with this mean and covariance.
+
+        Parameters
+        ----------
+        n : int
+            How many.
+        rng : numpy.random.Generator
+            Source of the random numbers.
+        """
         return self.mean + rng.standard_normal((n, len(self.mean))) @ self._root.T
 
     def mapped(self, matrix: Float) -> LinearFit:
-        """Fit whose deviations from the mean are mapped by a matrix (D, D)."""
+        """Fit whose deviations from the mean are mapped by a matrix (D, D).
+
+        Parameters
+        ----------
+        matrix : ndarray, shape (D, D)
+            Of all parameters, in the order of the model's names.
+        """
         return replace(self, cov=matrix @ self.cov @ matrix.T)
 
 

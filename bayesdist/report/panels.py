@@ -55,7 +55,9 @@ class ChipPanels(Panels):
         # maps of a chip are side by side; of a wide detector, or chip, one above the other
         side_by_side = columns == 1 if mosaic.several else aspect >= WIDE
         down, across = (rows, maps) if side_by_side else (maps * rows, columns)
-        width = WIDTH if across > 1 or aspect < WIDE else 0.66 * WIDTH
+        # wide chips one above the other leave half a page empty unless they are narrow
+        narrow = aspect >= WIDE or down > 1
+        width = WIDTH if across > 1 or not narrow else 0.66 * WIDTH
         margin = 0.75 + 0.55 * (across - 1) + (0.8 if colorbar else 0.0)
         height = down * (min((width - margin) / across * aspect, TALLEST_PANEL) + 0.8)
         figure = new_figure(width, height, layout="compressed")

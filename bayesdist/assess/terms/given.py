@@ -108,7 +108,15 @@ class UserTerm:
         return float(su), float(sv)
 
     def in_unit(self, unit: str, pixel_scale: float | None = None) -> UserTerm:
-        """Term with its standard deviations in another unit."""
+        """Term with its standard deviations in another unit.
+
+        Parameters
+        ----------
+        unit : str
+            pix, arcsec, mas or deg.
+        pixel_scale : float, optional
+            Size of a pixel in mas, needed to or from pixels.
+        """
         su, sv = self.sigma(unit, pixel_scale)
         return replace(self, sigma_u=su, sigma_v=sv, unit=unit)
 

@@ -193,12 +193,26 @@ class Posterior(Solution):
         return self.flat.std(axis=0, ddof=1)
 
     def interval(self, probability: float) -> Float:
-        """Central interval of every entry of theta, shape (D, 2)."""
+        """Central interval of every entry of theta, shape (D, 2).
+
+        Parameters
+        ----------
+        probability : float
+            Between 0 and 1.
+        """
         tail = (1 - probability) / 2
         return np.quantile(self.flat, [tail, 1 - tail], axis=0).T
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Random draws (n, D) of theta, without replacement as long as there are enough."""
+        """Random draws (n, D) of theta, without replacement as long as there are enough.
+
+        Parameters
+        ----------
+        n : int
+            How many.
+        rng : numpy.random.Generator
+            Source of the random numbers.
+        """
         total = len(self.flat)
         return self.flat[rng.choice(total, size=n, replace=n > total)]
 
@@ -223,5 +237,11 @@ class Posterior(Solution):
         return MixtureAt(self.mean, self.bound_mixture.constants(h.mean(axis=0)[None]))
 
     def mapped(self, matrix: Float) -> Posterior:
-        """Posterior whose deviations from the mean are mapped by a matrix (D, D)."""
+        """Posterior whose deviations from the mean are mapped by a matrix (D, D).
+
+        Parameters
+        ----------
+        matrix : ndarray, shape (D, D)
+            Of all parameters, in the order of the model's names.
+        """
         return replace(self, theta=self.mean + (self.theta - self.mean) @ matrix.T)

@@ -171,7 +171,13 @@ class SipHeader:
         )
 
     def plane(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
-        """Coordinates (xi, eta) of pixels about CRVAL, degrees; with linear axes pixels."""
+        """Coordinates (xi, eta) of pixels about CRVAL, degrees; with linear axes pixels.
+
+        Parameters
+        ----------
+        x, y : array_like
+            FITS pixels, counted from 1.
+        """
         U, V = self.forward(x, y)
         return self.cd[0, 0] * U + self.cd[0, 1] * V, self.cd[1, 0] * U + self.cd[1, 1] * V
 

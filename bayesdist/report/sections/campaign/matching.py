@@ -97,7 +97,7 @@ def catalogue_errors(r: ReportInput) -> Plot:
         right.remove()
     for ax in fig.axes:
         ax.set_yscale("log")
-        ax.set_xlabel("instrumental magnitude")
+        ax.set_xlabel("instrumental magnitude [mag]")
         ax.grid(True, which="major", lw=0.4, color=GUIDE, zorder=0)
         legend = ax.legend(loc="upper center", markerscale=2.2, handlelength=1.6)
         legend.set_zorder(6)
@@ -169,7 +169,7 @@ def fit_quality(r: ReportInput) -> Plot:
     ax.set_yscale("log")
     ax.set_xlim(brightest - 0.4, faintest + 0.4)
     ax.set_ylim(low / 1.5, high * 3)  # room for the legend
-    ax.set_xlabel("instrumental magnitude")
+    ax.set_xlabel("instrumental magnitude [mag]")
     ax.set_ylabel("quality of the fit q")
     legend = ax.legend(loc="upper center", ncols=3, markerscale=4)
     legend.set_zorder(6)

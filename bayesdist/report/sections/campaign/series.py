@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from bayesdist.numbers import count, display_scale, number, size_of
@@ -143,6 +144,7 @@ def _draw_course(panels: Any, series: LinearSeries, course: TermCourse, unit: st
             row[1].set_xticks((0, 180, 360))
             row[1].set_ylim(row[0].get_ylim())
             row[1].tick_params(labelleft=False)
+        row[0].xaxis.set_major_locator(MaxNLocator(3))
         for ax in row:
             guide_lines(ax)
     _share_limits(panels[0], panels[1])

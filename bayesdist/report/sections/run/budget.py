@@ -46,6 +46,7 @@ __all__ = [
 ]
 
 AS_ABOVE = "as above"  # of the rows of single chips
+_LETTERS = 31  # of a label beside another one, over a narrow figure
 _MOST_PANELS = 3  # chips whose bars are shown with those of the detector
 _KIND_COLORS = {
     "random": PALETTE["sky"],
@@ -221,7 +222,10 @@ def budget_dominating(r: ReportInput) -> Plot:
         Patch(color=c, label=f"{_shortened(budget.names[k])} ({100 * share[k]:.0f} %)")
         for c, k in zip(colors, present, strict=True)
     ]
-    panels.figure.legend(handles=handles, loc="outside upper left", ncols=2)
+    longest = max(len(str(handle.get_label())) for handle in handles)
+    narrow = panels.figure.get_figwidth() < WIDTH
+    columns = 1 if narrow and longest > _LETTERS else 2
+    panels.figure.legend(handles=handles, loc="outside upper left", ncols=columns)
     top = int(share.argmax())
     return Plot(
         panels.figure,

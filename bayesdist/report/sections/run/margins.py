@@ -214,9 +214,9 @@ def validity_period(r: ReportInput) -> Plot:
             ax.axvline(one.date, color=PALETTE["vermilion"])
         ax.set_ylim(-0.03, 1.03)
         ax.set_xlim(one.epoch[0], one.epoch[-1])
-        ax.set_ylabel("P(met)")
+        ax.set_ylabel("P(met) [no unit]")
         ax.set_title(one.sentence)
-    panels[-1].set_xlabel("Epoch (yr)")
+    panels[-1].set_xlabel("epoch [yr]")
     return Plot(
         fig,
         "How long the requirements are met",
