@@ -255,9 +255,8 @@ frame = "shift"
 
 def test_a_run_goes_by_it(tmp_path):
     """The fit of a configuration, saved and loaded, and the inputs that are recorded."""
-    from bayesdist.app.kinds.kind import kind_of
-
     from bayesdist.app.config import parse_config
+    from bayesdist.app.kind import kind_of
     from bayesdist.app.kinds.reader import StarReader
     from bayesdist.app.store.rundir import _hashes
 

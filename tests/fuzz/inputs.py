@@ -31,7 +31,7 @@ FORMS = {
     **dict.fromkeys((".ecsv", ".csv", ".tsv", ".tbl", ".txt", ".cat", ".als", ".dat"), "rows"),
     **dict.fromkeys((".uvMXY", ".XYMEEE"), "rows"),
     **dict.fromkeys((".nc", ".h5"), "hdf5"),
-    **{".fits": "fits", ".gz": "gz", ".parquet": "parquet", ".toml": "toml", ".json": "json"},
+    ".fits": "fits", ".gz": "gz", ".parquet": "parquet", ".toml": "toml", ".json": "json",
     ".asdf": "asdf",
 }
 
@@ -72,7 +72,7 @@ class Input:
         if content.startswith(b"SIMPLE  ="):
             return "fits"
         name = self.path.name
-        if name.endswith(".txt") and "siaf" in name or "ast" in name:
+        if (name.endswith(".txt") and "siaf" in name) or "ast" in name:
             return "text"
         return FORMS.get(self.path.suffix, "text")
 

@@ -83,7 +83,7 @@ CASE = Case("a.csv", "say", "cell_not_finite", {"line": 1, "cell": 0, "text": "n
     ],
 )
 def test_each_kind_of_failure_is_seen(one, monkeypatch, command, expected):
-    monkeypatch.setattr(sandbox, "main", lambda line: command(line) and 0 or 0)
+    monkeypatch.setattr(sandbox, "main", lambda line: (command(line) and 0) or 0)
     monkeypatch.setattr(sandbox, "SECONDS", 1.0)
     found = answers([(one, CASE, "say")] * 2)
     before = Answer("returned", 0, "x,y\n1,2\n3", "")
