@@ -14,7 +14,7 @@ FULL = {PUBLISHED_SIZE: 1, ISR: 4, MATERN: 20, LOOSE: 12}
 
 @pytest.fixture(scope="package")
 def campaigns(full: bool) -> dict[Setting, list[Outcome]]:
-    """Outcomes by setting; reduced, one smaller campaign of each of two."""
+    """Outcomes by setting; reduced, one smaller campaign of one."""
     if not full:
         jobs = [(short, 1) for short in SHORT.values()]
         return {s: [found] for s, found in zip(SHORT, over(outcome, jobs), strict=True)}

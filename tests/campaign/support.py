@@ -93,11 +93,8 @@ ISR = Setting("isr", 64.0)
 PUBLISHED_SIZE = Setting("matern", WIDE, 110, 53_900)
 # a chip that is as restless by itself as both are together: its gap to the other is no ruler
 LOOSE = Setting("none", WIDE, own=1.0)
-# what a reduced suite makes of the two: as many lines and nodes, from fewer exposures and stars
-SHORT = {
-    MATERN: replace(MATERN, exposures=24, stars=12_000),
-    LOOSE: replace(LOOSE, exposures=18, stars=5_000),
-}
+# what a reduced suite makes of it: as many lines and nodes, from fewer exposures and stars
+SHORT = {MATERN: replace(MATERN, exposures=24, stars=12_000)}
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from tests.campaign.support import (
     TERMS,
     TRUE_LINES,
 )
+from tests.reduced import case_in_full
 
 pytestmark = pytest.mark.slow
 
@@ -24,6 +25,10 @@ pytestmark = pytest.mark.slow
 INDEPENDENT = 12
 CHANCE = 1e-3
 WAYS = ("joint", "two")
+SETTINGS = [
+    pytest.param(MATERN, id="usual"),
+    case_in_full(LOOSE, instead="test_hierarchy has chips that scatter alone", id="a loose chip"),
+]
 RDATE = (2004.5, 2012.5)
 
 
@@ -43,7 +48,7 @@ def rms(values: np.ndarray, axis=None) -> np.ndarray:
 
 
 @pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("setting", [MATERN, LOOSE], ids=["usual", "a loose chip"])
+@pytest.mark.parametrize("setting", SETTINGS)
 def test_pulls_are_standard_normal(campaigns, setting, way, full, capsys):
     found = pulls(campaigns[setting], way)
     n = len(found)
@@ -90,7 +95,7 @@ def test_both_ways_agree(campaigns, capsys):
     assert np.median(ratio, axis=0).max() < 1.3
 
 
-@pytest.mark.parametrize("setting", [MATERN, LOOSE], ids=["usual", "a loose chip"])
+@pytest.mark.parametrize("setting", SETTINGS)
 def test_drifts_are_known_no_better_than_exposures_scatter(campaigns, setting, capsys):
     """A line through perfect exposures is as good as their scatter allows, and no fit is better.
 

@@ -33,7 +33,7 @@ def main() -> None:
     a = parser.parse_args()
     a.results.mkdir(exist_ok=True)
     pieces = {f"coverage {k}": lambda k=k: coverage(k, full=True) for k in KINDS}
-    pieces |= {f"probability {k}": lambda k=k: probabilities(k, full=True) for k in JUDGED}
+    pieces |= {f"probability {k}": lambda k=k: probabilities(k) for k in JUDGED}
     pieces["ranks"] = lambda: all_ranks(full=True)
     names = [a.only] if a.only else list(pieces)
     found = {n: kept(a.results / f"{n.replace(' ', '_')}.pkl", pieces[n]) for n in names}

@@ -15,11 +15,10 @@ from .limits import limits_from, pilot, said_and_true
 from .places import covered
 from .ranks import ranks
 
-CAMPAIGNS = {True: 24, False: 2}  # of each kind, in full and reduced
-CALIBRATIONS = {True: 200, False: 8}
-TRUTHS = {True: 200, False: 8}  # from the priors
+CAMPAIGNS = {True: 24, False: 1}  # of each kind, in full and reduced
+CALIBRATIONS, PILOTS = 200, 8  # in full alone
+TRUTHS = {True: 200, False: 5}  # from the priors
 JUDGED = ("drift", "pattern")
-PILOTS = {True: 8, False: 2}
 
 
 def over(function: Callable, arguments: Iterable[tuple], *, full: bool) -> list[Any]:
@@ -34,13 +33,12 @@ def coverage(kind: str, *, full: bool) -> list[dict]:
     return over(partial(covered, kind), [(k,) for k in range(CAMPAIGNS[full])], full=full)
 
 
-def probabilities(kind: str, *, full: bool) -> tuple[np.ndarray, np.ndarray]:
+def probabilities(kind: str) -> tuple[np.ndarray, np.ndarray]:
     """What is said, and whether it is met, (n,) each."""
-    pilots = over(partial(pilot, kind), [(k,) for k in range(PILOTS[full])], full=full)
-    n = CALIBRATIONS[full]
-    limits = limits_from(kind, pilots, n)
-    seeds = range(10_000, 10_000 + n)  # not those of the coverage
-    found = over(partial(said_and_true, kind), list(zip(limits, seeds, strict=True)), full=full)
+    pilots = over(partial(pilot, kind), [(k,) for k in range(PILOTS)], full=True)
+    limits = limits_from(kind, pilots, CALIBRATIONS)
+    seeds = range(10_000, 10_000 + CALIBRATIONS)  # not those of the coverage
+    found = over(partial(said_and_true, kind), list(zip(limits, seeds, strict=True)), full=True)
     said, met = np.array(found, float).T
     return said, met
 

@@ -5,7 +5,7 @@ on 64-px nodes that the model leaves out, each carried from matched stars to the
 application does it.  50 random places, dates and magnitudes in each: what is there against what the
 budget says of that place.  The bands are binomial, with
 as many independent errors as the claimed ones are worth: all places of a campaign share its
-coefficients.  Reduced, the suite shows errors that are wrong by about a fifth; in full, by about a
+coefficients.  Reduced, the suite shows errors that are wrong by about a third; in full, by about a
 tenth.
 
 What the model may leave out is marginalised, never tested to zero.  So where nothing is left out

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer import kernel
+from bayesdist.infer.kernel.blocks import threads_for
 from bayesdist.infer.selfcal.problem import Problem
 
 __all__ = [
@@ -36,6 +37,7 @@ Int = NDArray[np.int64]
 
 STARS = 4096  # eliminated at a time
 SURE, NEVER = 0.99, 1e-6  # memberships beyond which no other choice is considered
+MODE = 10  # evaluations of a polynomial that last as long as the search for a star's mode
 SCRATCH = 2_000_000  # bytes of coefficients of draws at a time: the cache of a core
 
 
@@ -141,25 +143,29 @@ def _passes(
 ) -> Iterator[tuple[Float, ...]]:
     p = problem
     j2, log_core, log_out = mixture.constants(p.log_outlier)
+    # products of the polynomials' terms: so many times their values
+    evaluations = 2 * p.model.n_terms * len(p) * min(1.0, STARS / p.n_stars)
     for first in range(0, p.n_stars, STARS):
-        yield kernel.eliminate_stars(
-            first,
-            min(first + STARS, p.n_stars),
-            *p.columns,
-            stars,
-            structure.coef,
-            p.groups.chip,
-            structure.linear,
-            structure.extra,
-            structure.columns,
-            p.model.n_params,
-            p.model.order,
-            j2,
-            log_core,
-            log_out,
-            p.least_root,
-            observed,
-        )
+        with threads_for(evaluations):
+            found = kernel.eliminate_stars(
+                first,
+                min(first + STARS, p.n_stars),
+                *p.columns,
+                stars,
+                structure.coef,
+                p.groups.chip,
+                structure.linear,
+                structure.extra,
+                structure.columns,
+                p.model.n_params,
+                p.model.order,
+                j2,
+                log_core,
+                log_out,
+                p.least_root,
+                observed,
+            )
+        yield found
 
 
 def _assemble(
@@ -185,10 +191,11 @@ def memberships(problem: Problem, theta: Float, mixture: Mixture, stars: Float) 
     """Probability (N,) that a detection belongs to its star."""
     p = problem
     j2, log_core, log_out = mixture.constants(p.log_outlier)
-    return np.asarray(
-        kernel.weighted_stars(
+    places = p.places(theta)
+    with threads_for(MODE * len(p)):
+        found = kernel.weighted_stars(
             p.starts,
-            p.places(theta),
+            places,
             p.W,
             p.var,
             j2,
@@ -201,7 +208,7 @@ def memberships(problem: Problem, theta: Float, mixture: Mixture, stars: Float) 
             p.least_root,
             stars.copy(),
         )
-    )
+    return np.asarray(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,18 +268,20 @@ def log_marginal(problem: Problem, theta: Float, mixtures: Float, modes: StarMod
     step = max(8, SCRATCH // (16 * p.model.n_terms * len(p.groups)) // 8 * 8)
     for a in range(0, len(theta), step):
         some = slice(a, a + step)
-        sums = kernel.log_marginals(
-            0,
-            p.n_stars,
-            *p.columns,
-            modes.stars,
-            modes.middles,
-            modes.weight,
-            modes.state,
-            np.ascontiguousarray(np.moveaxis(p.effective(theta[some]), 0, -1)),
-            p.model.order,
-            rows[some],
-            p.least_root,
-        )
+        coefficients = np.ascontiguousarray(np.moveaxis(p.effective(theta[some]), 0, -1))
+        with threads_for(MODE * len(p) * len(theta[some])):
+            sums = kernel.log_marginals(
+                0,
+                p.n_stars,
+                *p.columns,
+                modes.stars,
+                modes.middles,
+                modes.weight,
+                modes.state,
+                coefficients,
+                p.model.order,
+                rows[some],
+                p.least_root,
+            )
         out[some] = sums.sum(axis=0)
     return out

@@ -12,6 +12,7 @@ from scipy import ndimage
 from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
 from bayesdist.infer import kernel
+from bayesdist.infer.kernel.blocks import threads_for
 from bayesdist.model import DistortionModel
 from bayesdist.model.grouping import Groups
 
@@ -148,9 +149,9 @@ class Problem:
 
     def places(self, theta: Float) -> Float:
         """Sky position (N, 2) of each detection by the model."""
-        found = kernel.positions(
-            self.groups.index, self.X, self.Y, self.powers(theta), self.model.order
-        )
+        powers = self.powers(theta)
+        with threads_for(len(self.X)):
+            found = kernel.positions(self.groups.index, self.X, self.Y, powers, self.model.order)
         return np.asarray(found + self.offset)
 
     @cached_property
@@ -172,10 +173,12 @@ class Problem:
     def jacobians(self, theta: Float, rows: slice) -> Float:
         """Derivatives (n, 2, 2) of positions of some detections by their pixels."""
         g, order = self.groups.index[rows], self.model.order
-        columns = [
-            kernel.positions(g, self.X[rows], self.Y[rows], by, order) / self._half[g, k, None]
-            for k, by in enumerate(self._slopes(theta))
-        ]
+        slopes = self._slopes(theta)
+        with threads_for(len(g)):
+            columns = [
+                kernel.positions(g, self.X[rows], self.Y[rows], by, order) / self._half[g, k, None]
+                for k, by in enumerate(slopes)
+            ]
         return np.stack(columns, axis=2)
 
     def star_places(self, stars: Float) -> Float:
@@ -235,18 +238,20 @@ class Problem:
         """Problem linearised about a solution: theta (D,) and stars (S, q)."""
         groups, half = self.groups, self._half
         by_X, by_Y = self._slopes(theta)
-        X, Y, offset, W = kernel.linearised(
-            groups.index,
-            *self.seen,
-            self.X,
-            self.Y,
-            self.star_places(stars),
-            self.powers(theta),
-            by_X,
-            by_Y,
-            half,
-            self.model.order,
-        )
+        places, powers = self.star_places(stars), self.powers(theta)
+        with threads_for(5 * len(self.X)):
+            X, Y, offset, W = kernel.linearised(
+                groups.index,
+                *self.seen,
+                self.X,
+                self.Y,
+                places,
+                powers,
+                by_X,
+                by_Y,
+                half,
+                self.model.order,
+            )
         return replace(self, X=X, Y=Y, offset=offset, W=W)
 
     def of_stars(self, which: Int) -> Problem:

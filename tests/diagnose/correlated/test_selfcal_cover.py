@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ def waves(rng, length):
     return at
 
 
+@cache
 def solved(seed: int, rms: float):
     """The solution of a field with structure, the field and the structure at scaled positions."""
     rng = np.random.default_rng(900 + seed)

@@ -54,7 +54,7 @@ def monitored(seed, **options):
 
 
 def test_exposures_that_scatter_are_no_change(full) -> None:
-    n = 100 if full else 10
+    n = 100 if full else 6
     values, scatters, since = [], [], []
     for seed in range(n):
         _, change, date = monitored(seed)
@@ -118,7 +118,7 @@ def test_a_catalogue_that_both_sides_share_is_no_change(full) -> None:
     Taken for independent they make probabilities that are anything but uniform.
     """
     values, ignored = [], []
-    for seed in range(60 if full else 8):
+    for seed in range(60 if full else 6):
         one = field(seed, n_exposures=30, n_stars=200, one_pointing=True, centroid=0.004)
         early = one.matches.exposure < 24
         old, new = one.matches.select(early), one.matches.select(~early)

@@ -136,10 +136,10 @@ RATIOS = {
 
 
 @pytest.mark.parametrize("log_ratio", RATIOS.values(), ids=RATIOS)
-def test_the_bound_holds(log_ratio):
+def test_the_bound_holds(log_ratio, full):
     """Shifts of mean, square, tail probability: by quadrature, in 95 of 100 certificates."""
-    failed, below, tight = 0, 0, []
-    for seed in range(100):
+    failed, below, tight, n = 0, 0, [], 100 if full else 30
+    for seed in range(n):
         surrogate, certificate = certified(log_ratio, 1, 1, seed)
         p, s, chi2 = by_quadrature(log_ratio, surrogate)
         worst = 0.0
@@ -154,8 +154,9 @@ def test_the_bound_holds(log_ratio):
         within = by_quadrature(log_ratio, surrogate, REACH)[2]
         below += certificate.chi2_upper < within
         tight.append(certificate.chi2 / within)
-    assert failed <= 5
-    assert below <= stats.binom(100, 0.05).ppf(0.999)
+    most = stats.binom(n, 0.05).ppf(0.999)
+    assert failed <= (5 if full else most)
+    assert below <= most
     # and it is no empty phrase: the estimate of chi2 is about right
     assert 0.7 < np.median(tight) < 1.3
 

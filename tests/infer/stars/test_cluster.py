@@ -33,6 +33,7 @@ from bayesdist.infer.stars import cluster as cluster_module
 from bayesdist.infer.stars.cluster import ClusterShards
 from bayesdist.infer.stars.shards import Shards
 from tests.infer.support import TWO_CHIPS, simulated
+from tests.reduced import only_in_full
 
 PIECE = 500
 N = 2200  # five pieces on three workers
@@ -290,6 +291,8 @@ def test_worker_dies_of_a_task_that_then_succeeds(there, problem, tmp_path):
     assert (tmp_path / "mark").exists()
 
 
+@pytest.mark.slow
+@only_in_full("a worker's death, and that of all while they read, are run")
 def test_task_that_kills_every_worker_ends_with_an_error(there, cluster):
     before = cluster.scheduler.allowed_failures
     # with 0, a shard that is read again where such a task runs would be given up as well
