@@ -8,14 +8,17 @@ files, in the parts of `stars/`.
 
 from __future__ import annotations
 
+import io
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import FormatError
@@ -29,18 +32,34 @@ from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.model import DistortionModel
 from bayesdist.reading.documents import json_of
 from bayesdist.reading.faults import restoring
-from bayesdist.reading.hdf5 import NETCDF_ENGINE, netcdf_dataset, netcdf_tree
-
-if TYPE_CHECKING:
-    import xarray as xr
+from bayesdist.reading.hdf5 import netcdf_group
 
 __all__ = ["load_fit", "load_posterior", "save_fit", "save_posterior"]
 
 SCHEMA = 2
+TEXT = h5py.string_dtype()
 POSTERIOR_NUMBERS = ("n_stars", "n_flagged", "n_false", "reference_sigma")
 MOST_STARS = 1_000_000  # with more stars their data are not repeated in the file
 LARGEST = 16_000_000  # bytes of log-likelihood that are stored star by star and draw by draw
 FIT_NUMBERS = ("n_rows", "n_used", "rms_u", "rms_v", "rms_rejected", "chi2", "dof", "condition")
+
+
+@dataclass(frozen=True)
+class Variable:
+    """Variable of a netCDF file: texts, or an array."""
+
+    dimensions: tuple[str, ...]
+    values: Sequence[str] | NDArray[Any]
+    attrs: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Group of a netCDF file that is to be written."""
+
+    variables: Mapping[str, Variable]
+    attrs: Mapping[str, Any] = field(default_factory=dict)
+    groups: Mapping[str, Group] = field(default_factory=dict)
 
 
 def save_posterior(
@@ -78,28 +97,26 @@ def save_posterior(
     >>> np.array_equal(bd.load_posterior("posterior.nc").theta, posterior.theta)
     True
     """
-    import xarray as xr
-
     c = posterior.convergence
-    n_theta = len(posterior.model.names)
-    parameter = ("parameter", list(posterior.model.names))
-    sampled = ("sampled", list(c.names))
+    chains = ("chain", "draw")
+    theta = Variable((*chains, "parameter"), posterior.theta, {"coordinates": "unit"})
     groups = {
-        "posterior": xr.Dataset(
+        "posterior": Group(
             {
-                "theta": (("chain", "draw", "parameter"), posterior.theta),
-                **{k: (("chain", "draw"), v) for k, v in posterior.hyper.items()},
+                "theta": theta,
+                **{k: Variable(chains, v) for k, v in posterior.hyper.items()},
+                "parameter": Variable(("parameter",), posterior.model.names),
+                "unit": Variable(("parameter",), posterior.model.units),
             },
-            coords={"parameter": parameter, "unit": ("parameter", list(posterior.model.units))},
         ),
-        "sample_stats": xr.Dataset(
-            {"lp": (("chain", "draw"), posterior.log_prob)},
-            attrs=asdict(posterior.sampler) | {"exact": int(posterior.sampler.exact)},
+        "sample_stats": Group(
+            {"lp": Variable(chains, posterior.log_prob)},
+            asdict(posterior.sampler) | {"exact": int(posterior.sampler.exact)},
         ),
-        "diagnostics": xr.Dataset(
-            {name: ("sampled", getattr(c, name)) for name in DIAGNOSTICS},
-            coords={"sampled": sampled},
-            attrs={
+        "diagnostics": Group(
+            {name: Variable(("sampled",), getattr(c, name)) for name in DIAGNOSTICS}
+            | {"sampled": Variable(("sampled",), c.names)},
+            {
                 "pareto_k": c.pareto_k,
                 "importance_efficiency": c.importance_efficiency,
                 "converged": int(c.converged),
@@ -110,33 +127,32 @@ def save_posterior(
         ),
     }
     if matches is not None and len(matches) <= MOST_STARS:
-        groups["observed_data"] = xr.Dataset({"u": ("star", matches.u), "v": ("star", matches.v)})
+        groups["observed_data"] = Group(
+            {"u": Variable(("star",), matches.u), "v": Variable(("star",), matches.v)}
+        )
         groups["constant_data"] = _constants(posterior, matches)
         # of one draw only where the stars' positions are unknowns too
         few = posterior.log_prob.size * len(matches) * 8 <= LARGEST
         if few and not posterior.own_places:
             values = star_log_likelihood(posterior, matches)
-            groups["log_likelihood"] = xr.Dataset({"uv": (("chain", "draw", "star"), values)})
-    tree = xr.DataTree.from_dict({f"/{name}": data for name, data in groups.items()})
-    tree.attrs = {
+            groups["log_likelihood"] = Group({"uv": Variable((*chains, "star"), values)})
+    attrs = {
         "schema": SCHEMA,
         "creator": "bayesdist",
         "model": json.dumps(posterior.model.to_dict()),
         "mixture": json.dumps(asdict(posterior.mixture)),
         "provenance": json.dumps(dict(provenance or {}), default=str),
         "certificate": json.dumps(posterior.certificate and asdict(posterior.certificate)),
-        "n_parameters": n_theta,
+        "n_parameters": len(posterior.model.names),
         "own_places": int(posterior.own_places),
         **{name: getattr(posterior, name) for name in POSTERIOR_NUMBERS},
     }
-    _write(tree, path)
+    _write(Group({}, attrs, groups), path)
 
 
-def _constants(posterior: Posterior, matches: Matches) -> xr.Dataset:
+def _constants(posterior: Posterior, matches: Matches) -> Group:
     """Columns of the matches that the posterior was made from."""
-    import xarray as xr
-
-    columns = {
+    columns: dict[str, Any] = {
         "x": matches.x,
         "y": matches.y,
         "sigma_u": matches.sigma_u,
@@ -149,9 +165,9 @@ def _constants(posterior: Posterior, matches: Matches) -> xr.Dataset:
     for name in ("epoch", "mag", "colour"):
         if getattr(matches, name) is not None:
             columns[name] = getattr(matches, name)
-    return xr.Dataset(
-        {name: ("star", values) for name, values in columns.items()},
-        attrs={"unit": matches.unit, "exposure_names": json.dumps(matches.exposure_names)},
+    return Group(
+        {name: Variable(("star",), values) for name, values in columns.items()},
+        {"unit": matches.unit, "exposure_names": json.dumps(matches.exposure_names)},
     )
 
 
@@ -187,10 +203,9 @@ def load_posterior(path: str | Path) -> Posterior:
     if path.is_dir():
         path = path / "posterior.nc"
     with _reading(path, "a posterior", "sample"):
-        tree = netcdf_tree(path)
-        attrs = tree.attrs
-        draws, checks = tree["posterior"].to_dataset(), tree["diagnostics"].to_dataset()
-        stats = tree["sample_stats"].to_dataset()
+        file = netcdf_group(path)
+        attrs, groups = file.attrs, file.groups
+        draws, checks, stats = (groups[k] for k in ("posterior", "diagnostics", "sample_stats"))
         if attrs.get("creator") != "bayesdist":
             raise KeyError("creator")
         mixture = _tree(attrs["mixture"])
@@ -200,16 +215,16 @@ def load_posterior(path: str | Path) -> Posterior:
         return Posterior(
             model=DistortionModel.from_dict(_tree(attrs["model"])),
             mixture=OutlierMixture(**mixture),
-            theta=draws["theta"].values,
-            hyper={k: draws[k].values for k in ("j", "f", "s_out") if k in draws},
-            log_prob=stats["lp"].values,
+            theta=draws.variables["theta"],
+            hyper={k: draws.variables[k] for k in ("j", "f", "s_out") if k in draws.variables},
+            log_prob=stats.variables["lp"],
             n_stars=int(attrs["n_stars"]),
             n_flagged=int(attrs["n_flagged"]),
             n_false=float(attrs["n_false"]),
             reference_sigma=float(attrs["reference_sigma"]),
             convergence=Convergence(
-                names=tuple(str(n) for n in checks["sampled"].values),
-                **{name: checks[name].values for name in DIAGNOSTICS},
+                names=tuple(str(n) for n in checks.variables["sampled"]),
+                **{name: checks.variables[name] for name in DIAGNOSTICS},
                 pareto_k=float(checks.attrs["pareto_k"]),
                 importance_efficiency=float(checks.attrs["importance_efficiency"]),
                 converged=bool(checks.attrs["converged"]),
@@ -239,26 +254,24 @@ def _plain(value: object) -> object:
 
 def save_fit(fit: LinearFit, path: str | Path) -> None:
     """Write a linear fit to a netCDF file, which is replaced atomically."""
-    import xarray as xr
-
-    names = list(fit.model.names)
-    data = xr.Dataset(
-        {
-            "mean": ("parameter", fit.mean),
-            "cov": (("parameter", "parameter_2"), fit.cov),
-            "clip": ("parameter", fit.clip.theta),
-        },
-        coords={"parameter": names, "parameter_2": names},
-        attrs={
-            "creator": "bayesdist",
-            "model": json.dumps(fit.model.to_dict()),
-            "rejected": json.dumps(fit.rejected),
-            "clip_chi2_limit": fit.clip.chi2_limit,
-            "clip_abs_limit": fit.clip.abs_limit,
-            **{name: getattr(fit, name) for name in FIT_NUMBERS},
-        },
-    )
-    _write(data, path)
+    names = fit.model.names
+    one = ("parameter",)
+    variables = {
+        "mean": Variable(one, fit.mean),
+        "cov": Variable(("parameter", "parameter_2"), fit.cov),
+        "clip": Variable(one, fit.clip.theta),
+        "parameter": Variable(one, names),
+        "parameter_2": Variable(("parameter_2",), names),
+    }
+    attrs = {
+        "creator": "bayesdist",
+        "model": json.dumps(fit.model.to_dict()),
+        "rejected": json.dumps(fit.rejected),
+        "clip_chi2_limit": fit.clip.chi2_limit,
+        "clip_abs_limit": fit.clip.abs_limit,
+        **{name: getattr(fit, name) for name in FIT_NUMBERS},
+    }
+    _write(Group(variables, attrs), path)
 
 
 def load_fit(path: str | Path) -> LinearFit:
@@ -271,13 +284,13 @@ def load_fit(path: str | Path) -> LinearFit:
     """
     path = Path(path)
     with _reading(path, "a fit", "fit"):
-        data = netcdf_dataset(path)
+        data = netcdf_group(path)
         return LinearFit(
             model=DistortionModel.from_dict(_tree(data.attrs["model"])),
-            mean=data["mean"].values,
-            cov=data["cov"].values,
+            mean=data.variables["mean"],
+            cov=data.variables["cov"],
             clip=Clip(
-                data["clip"].values,
+                data.variables["clip"],
                 float(data.attrs["clip_chi2_limit"]),
                 float(data.attrs["clip_abs_limit"]),
             ),
@@ -286,14 +299,36 @@ def load_fit(path: str | Path) -> LinearFit:
         )
 
 
-def _write(data: xr.Dataset | xr.DataTree, path: str | Path) -> None:
-    """Write a dataset or a tree, replaced atomically.
+def _write(content: Group, path: str | Path) -> None:
+    """Write a netCDF file, replaced atomically.
 
-    The file is built in memory: on a full disk HDF5 itself would crash when it is closed.
+    It is built in memory: on a full disk HDF5 itself would crash when it is closed.
     """
-    content = data.to_netcdf(engine=NETCDF_ENGINE)
+    import h5netcdf  # xarray would write the same, and takes half a second to import
+
+    stream = io.BytesIO()
+    with h5netcdf.File(stream, "w") as file:
+        _fill(file, content)
     with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
+        temporary.write_bytes(stream.getvalue())
+
+
+def _fill(target: Any, content: Group) -> None:
+    """Write a group into one of h5netcdf."""
+    for key, value in content.attrs.items():
+        target.attrs[key] = value
+    for name, one in content.variables.items():
+        text = not isinstance(one.values, np.ndarray)
+        values = np.asarray(one.values, object if text else None)
+        for dimension, size in zip(one.dimensions, values.shape, strict=True):
+            if dimension not in target.dimensions:
+                target.dimensions[dimension] = size
+        kind = TEXT if text else values.dtype
+        variable = target.create_variable(name, one.dimensions, kind, data=values)
+        for key, value in one.attrs.items():
+            variable.attrs[key] = value
+    for name, group in content.groups.items():
+        _fill(target.create_group(name), group)
 
 
 @contextmanager

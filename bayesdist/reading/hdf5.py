@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import FormatError
@@ -16,11 +18,8 @@ from bayesdist.reading.unpacked import refuse_inflated
 
 if TYPE_CHECKING:
     import h5py
-    import xarray as xr
 
-__all__ = ["NETCDF_ENGINE", "hdf5_arrays", "netcdf_dataset", "netcdf_tree"]
-
-NETCDF_ENGINE: Final = "h5netcdf"
+__all__ = ["NetcdfGroup", "hdf5_arrays", "netcdf_group"]
 
 
 def hdf5_arrays(
@@ -48,26 +47,32 @@ def hdf5_arrays(
         return arrays, dict(file.attrs)
 
 
-def netcdf_tree(path: Path) -> xr.DataTree:
-    """Groups of a netCDF file, in memory; errors as of `hdf5_arrays`."""
-    import xarray as xr
+@dataclass(frozen=True)
+class NetcdfGroup:
+    """Group of a netCDF file, in memory: its variables, attributes and groups by name."""
+
+    variables: Mapping[str, NDArray[Any]]
+    attrs: Mapping[str, Any]
+    groups: Mapping[str, NetcdfGroup]
+
+
+def netcdf_group(path: Path) -> NetcdfGroup:
+    """The outermost group of a netCDF file; errors as of `hdf5_arrays`."""
+    import h5netcdf  # xarray would read the same, and takes half a second to import
 
     with _checked(path):
         pass
-    with xr.open_datatree(path, engine=NETCDF_ENGINE) as tree:
-        tree.load()
-    return tree
+    with h5netcdf.File(path, "r", decode_vlen_strings=True) as file:
+        return _loaded(file)
 
 
-def netcdf_dataset(path: Path) -> xr.Dataset:
-    """Variables at the top of a netCDF file, in memory; errors as of `hdf5_arrays`."""
-    import xarray as xr
-
-    with _checked(path):
-        pass
-    with xr.open_dataset(path, engine=NETCDF_ENGINE) as data:
-        data.load()
-    return data
+def _loaded(group: Any) -> NetcdfGroup:
+    """Group of h5netcdf, in memory."""
+    return NetcdfGroup(
+        {name: np.asarray(one[...]) for name, one in group.variables.items()},
+        dict(group.attrs),
+        {name: _loaded(one) for name, one in group.groups.items()},
+    )
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -77,7 +78,7 @@ def corner_figure(columns: Sequence[Column]) -> Figure:
     return fig
 
 
-def _ticks(ax: Axes, which: str, label: str | None) -> None:
+def _ticks(ax: Axes, which: Literal["x", "y"], label: str | None) -> None:
     """Give an axis few ticks, and at the edge of the figure, where it has a label, their values."""
     axis = ax.xaxis if which == "x" else ax.yaxis
     axis.set_major_locator(MaxNLocator(3, prune="lower"))
@@ -101,7 +102,7 @@ def _histogram(ax: Axes, draws: Float, limits: Float) -> None:
 
 def _contours(ax: Axes, draws: Float, limits: Float) -> None:
     """Draw the smoothed density of pairs (N, 2), filled where it holds 1 and 2 sigma."""
-    found, *edges = np.histogram2d(*draws.T, _BINS, limits.tolist())
+    found, *edges = np.histogram2d(draws[:, 0], draws[:, 1], _BINS, limits.tolist())
     density = gaussian_filter(found, 1.0)
     outer, inner = content_levels(density)
     # one more cell on each side, so that contours end at the edge of the panel and not within

@@ -281,11 +281,8 @@ def test_damage_that_hdf5_reports_in_its_own_way(tmp_path, monkeypatch, kind):
     def broken(*args, **kwargs):
         raise RuntimeError("Unspecified error in H5DSget_num_scales (return value <0)")
 
-    name, load = {
-        "fit": ("open_dataset", load_fit),
-        "posterior": ("open_datatree", load_posterior),
-    }[kind]
-    monkeypatch.setattr(xr, name, broken)
+    load = {"fit": load_fit, "posterior": load_posterior}[kind]
+    monkeypatch.setattr(files, "netcdf_group", broken)
     path = tmp_path / "bad.nc"
     path.write_bytes(b"whatever")
     with pytest.raises(FormatError, match=r"bad\.nc"):

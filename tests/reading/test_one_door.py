@@ -22,6 +22,7 @@ OPENERS = {
     "ascii": {"read"},
     "fits": {"open", "getdata", "getheader"},
     "h5py": {"File"},
+    "h5netcdf": {"File"},
     "xr": {"open_dataset", "open_datatree", "open_dataarray", "load_dataset"},
     "xarray": {"open_dataset", "open_datatree", "open_dataarray", "load_dataset"},
     "asdf": {"open"},
@@ -37,6 +38,7 @@ OPENERS = {
 ALLOWED = {
     ("files.py", "temporary.open"): "what was just written is brought to the disk",
     ("app/store/store.py", "os.open"): "a folder, to be locked",
+    ("infer/files.py", "h5netcdf.File"): "a new file in memory",
     ("infer/sampler/checkpoints.py", "h5py.File"): "a new file in memory",
     ("report/drawing.py", "Image.open"): "a picture in memory, of our own",
 }

@@ -25,7 +25,7 @@ from bayesdist.version import __version__
 __all__ = ["SCHEMA", "Artefact", "FileMark", "Record", "as_json", "versions", "write_json"]
 
 SCHEMA = 2
-PACKAGES = ("arviz-stats", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
+PACKAGES = ("arviz-stats", "astropy", "emcee", "numba", "numpy", "scipy")
 
 
 def as_json(value: Any) -> Any:
