@@ -81,7 +81,7 @@ def _of_collection(one: Any) -> tuple[str, Iterable[Sequence[float]]]:
             (*xy, level) for level, path in lines for xy in np.asarray(path.vertices)
         )
     if isinstance(one, LineCollection):
-        paths = [np.asarray(path.vertices) for path in one.get_paths()]
+        paths = [np.asarray(path.vertices, float) for path in one.get_paths()]
         ends = np.array([path for path in paths if len(path) == 2])
         whole = np.isfinite(ends).all(axis=(1, 2)) if ends.size else []
         return "segment", ends.reshape(-1, 4)[whole]
