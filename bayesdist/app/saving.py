@@ -77,7 +77,7 @@ def _log_matches(data: FitData, config: Config) -> None:
         log.info("fit: %s", note)
     for reason, count in matches.rejected.items():
         log.info("fit: %d rows were left out in reading: %s", count, reason)
-    for text in doubts_on_stars(data.stars, data.model, config):
+    for text in doubts_on_stars(data.sample, data.model, config):
         log.warning("fit: WARNING: %s", text)
     shift = epoch_shift(data.sample, fit)
     if shift is not None and shift.significant:

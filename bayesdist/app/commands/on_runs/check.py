@@ -79,7 +79,7 @@ def _lines(results: Results) -> Iterator[str]:
     idle = idle_dates(config, config.requirements())
     scaled = data.error_scale_sentence
     for text in (
-        *doubts_on_stars(data.stars, model, config),
+        *doubts_on_stars(data.sample, model, config),
         *warnings_of(results.checks),
         *([idle] if idle else []),
         *([scaled] if scaled else []),
