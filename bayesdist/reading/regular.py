@@ -15,6 +15,7 @@ __all__ = ["head_of", "opened", "read_bytes", "read_lines", "read_text"]
 
 PathLike = str | os.PathLike[str]
 
+MOST_HOLLOW = 1000  # times what was written: no file system compresses data as much
 MOST_TEXT = 2**28  # bytes of a configuration, or of a file of JSON
 
 _KINDS = {
@@ -33,7 +34,7 @@ def opened(path: PathLike) -> Iterator[io.BufferedReader]:
     Raises
     ------
     InputError
-        For a path where there is none, or none that the system lets us read.
+        For a path where there is none, none that the system lets us read, and a file of holes.
     """
     try:
         stream = open(path, "rb", opener=_without_waiting)  # noqa: SIM115  in a context below
@@ -49,15 +50,28 @@ def opened(path: PathLike) -> Iterator[io.BufferedReader]:
             do="check the path and its permissions",
         ) from error
     with stream:
-        kind = stat.S_IFMT(os.fstat(stream.fileno()).st_mode)
+        found = os.fstat(stream.fileno())
+        kind = stat.S_IFMT(found.st_mode)
         if kind != stat.S_IFREG:
             raise _irregular(path, kind)
+        _refuse_hollow(path, found)
         yield stream
 
 
 def _without_waiting(path: str, flags: int) -> int:
     """File descriptor; a pipe that nobody writes into is opened too, and not waited for."""
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def _refuse_hollow(path: PathLike, found: os.stat_result) -> None:
+    """Refuse a large file of which hardly anything was written: to read its holes takes hours."""
+    written = 512 * getattr(found, "st_blocks", found.st_size)
+    if found.st_size > memory_limit() and found.st_size > MOST_HOLLOW * max(written, 1):
+        raise InputError(
+            f"has {size_text(found.st_size)}, of which {size_text(written)} were ever written",
+            where=str(path),
+            do="it is damaged: fetch or write it again",
+        )
 
 
 def _irregular(path: PathLike, kind: int) -> InputError:

@@ -93,7 +93,7 @@ def rows_of(text):
     for line in text.splitlines():
         words = re.sub(r"\b(random|systematic|local)\b", " ", line).split()
         numbers = [k for k, word in enumerate(words) if re.fullmatch(r"[\d.]+(e-\d+)?", word)]
-        if len(numbers) > 2:
+        if len(numbers) > 2 and numbers[0] > 0:  # a row begins with the name of its term
             out[" ".join(words[: numbers[0]])] = tuple(float(words[k]) for k in numbers[:2])
     return out
 

@@ -375,7 +375,7 @@ def test_a_missing_list(campaign):
 def test_an_empty_file_and_an_empty_list(campaign):
     campaign.lists(lambda t: t[:0], ONE).refused(f"{ONE}.parquet", "no detections")
     (campaign.path / "lists" / f"{ONE}.parquet").write_bytes(b"")
-    campaign.refused(f"{ONE}.parquet", "cannot be read")
+    campaign.refused(f"{ONE}.parquet", "is empty")
 
 
 @pytest.mark.parametrize("column", ["x", "mag", "q"])

@@ -171,7 +171,7 @@ def test_wrong_requests_are_refused(job, tmp_path):
         words=("this file exists", "--force"),
     )
     refused(folder, "select-order", config, "--figure", folder / "o.png", words=("o.png",))
-    for low, high in ((3, 3), (5, 3), (0, 4), (3, 10)):
+    for low, high in ((3, 3), (5, 3), (0, 4), (3, 13)):
         refused(
             folder,
             "select-order",

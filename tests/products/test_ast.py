@@ -197,7 +197,7 @@ def test_bad_dumps_get_a_sentence(tmp_path, ast):
         (lambda t: t.replace("NCF1 = 10", "NCF1 = many"), "no number"),
         (lambda t: t.replace("Begin WinMap", "Begin PcdMap").replace("End WinMap", "End PcdMap"),
          "has a PcdMap, which is no polynomial"),
-        (lambda t: t.replace("PF3 = 1", "PF3 = 12"), "order 12"),
+        (lambda t: t.replace("PF3 = 1", "PF3 = 13"), "order 13"),
         (lambda t: t.replace("size 1200.0 900.0", "size large"), "give two numbers"),
     ):  # fmt: skip
         path.write_text(change(right))

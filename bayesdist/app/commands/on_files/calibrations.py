@@ -82,6 +82,13 @@ def solution_at(path: Path) -> Solution | None:
     was assessed with, or for the fit where there is no posterior yet.
     """
     if path.is_dir():
+        if not (path / "run.json").exists():
+            raise InputError(
+                "has no run.json, without which the errors that the run was assessed with are not "
+                "known",
+                where=str(path),
+                do=f"restore it, or give {path / 'posterior.nc'}, the bare posterior",
+            )
         if (path / "posterior.nc").exists() or not (path / "fit.nc").exists():
             return _as_assessed(path)
         return _fit_at(path / "fit.nc")

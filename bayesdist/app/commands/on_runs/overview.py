@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,6 +17,8 @@ from bayesdist.numbers import with_mas
 from bayesdist.report.overview import OverviewRow, write_overview
 
 __all__ = ["overview"]
+
+log = logging.getLogger("bayesdist")
 
 NO_VERDICT = "no verdict is recorded; 'bayesdist stage report' makes one"
 
@@ -45,6 +48,7 @@ def _row(run: RunDirectory, output: Path) -> OverviewRow:
     damage = next(filter(None, map(run.damage, run.record.artefacts)), None)
     if damage is not None:  # what is recorded is of other files
         verdict = {"level": "fail", "headline": " ".join(damage)}
+        log.warning("%s: WARNING: %s %s", run.path, *damage)
     return OverviewRow(
         name=run.path.as_posix(),
         link=_link(run / "report.html", output),

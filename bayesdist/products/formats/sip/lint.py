@@ -69,7 +69,7 @@ def lint_sip(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Findi
 
 def _frame(sip: SipHeader) -> Iterator[Finding]:
     ra, dec = sip.crval
-    if not (abs(ra) <= 360 and abs(dec) <= 90):
+    if not sip.linear_axes and not (abs(ra) <= 360 and abs(dec) <= 90):
         yield Finding("error", "CRVAL1, CRVAL2", f"({ra:g}, {dec:g}) degrees lie on no sphere")
     if not np.abs(sip.crpix).max() <= FAR:
         yield Finding("error", "CRPIX1, CRPIX2", f"{sip.crpix[0]:g}, {sip.crpix[1]:g} is no pixel")

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC
-from bayesdist.data.sky.tangent import sky_of_plane, tangent_plane
 from bayesdist.errors import FormatError
 from bayesdist.products.formats.common.cards import header_of, text_card
 from bayesdist.products.formats.common.content import Content
@@ -78,6 +77,8 @@ def _difference(found: Calibration, stored: Calibration) -> float:
     b = stored.forward(x, y, chip=there)
     pixel = np.sqrt(abs(np.linalg.det(stored.chip(there, origin="stated").linear)))
     if found.plane.point is not None and stored.plane.point is not None:
+        from bayesdist.data.sky.tangent import sky_of_plane, tangent_plane  # slow to import
+
         xi, eta = (ARCSEC[found.unit] * a).T
         ra, dec = sky_of_plane(xi, eta, found.plane.point)
         a = np.stack(tangent_plane(ra, dec, stored.plane.point), axis=-1) / ARCSEC[stored.unit]
