@@ -16,6 +16,7 @@ from bayesdist.version import __version__
 
 __all__ = ["main"]
 
+_LONGEST = 1000  # letters of a sentence
 COMMANDS = "bayesdist.app.commands"
 CORE = {
     "init": f"{COMMANDS}.runs:init",
@@ -132,6 +133,8 @@ def _exit_code(call: Callable[[], int | None], command: str) -> int:
         return error.exit_code
     except BayesdistError as error:
         sentence = " ".join(str(error).split())  # libraries below break their reasons into lines
+        if len(sentence) > _LONGEST:  # it quotes something
+            sentence = f"{sentence[: _LONGEST // 2]} ... {sentence[-_LONGEST // 2 :]}"
         print(f"bayesdist: {sentence}", file=sys.stderr)
         return error.exit_code
     except (KeyboardInterrupt, click.Abort):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 from astropy.table import Column, MaskedColumn, Table
 from astropy.table.meta import get_header_from_yaml
 
+from bayesdist.errors import FormatError
 from bayesdist.reading.regular import opened
 from bayesdist.reading.unpacked import refuse_inflated
 
@@ -31,13 +33,20 @@ def open_parquet(path: Path, as_codes: Collection[str] = ()) -> pyarrow.parquet.
 
     with opened(path):
         pass
-    return pyarrow.parquet.ParquetFile(
+    stored = pyarrow.parquet.ParquetFile(
         path,
         read_dictionary=sorted(as_codes) or None,
         pre_buffer=False,
         buffer_size=_BUFFER,
         page_checksum_verification=True,
     )
+    for name, n in Counter(stored.schema_arrow.names).items():
+        if n > 1:
+            stored.close()
+            raise FormatError(
+                f"has {n} columns named {name!r}", where=str(path), do="rename one of them"
+            )
+    return stored
 
 
 def parquet_table(path: Path) -> Table:

@@ -89,7 +89,7 @@ def solution_at(path: Path) -> Solution | None:
                 where=str(path),
                 do=f"restore it, or give {path / 'posterior.nc'}, the bare posterior",
             )
-        if (path / "posterior.nc").exists() or not (path / "fit.nc").exists():
+        if "sample" in RunDirectory(path).record.artefacts or not (path / "fit.nc").exists():
             return _as_assessed(path)
         return _fit_at(path / "fit.nc")
     if path.suffix != ".nc":

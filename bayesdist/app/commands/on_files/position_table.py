@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,6 +24,8 @@ __all__ = [
     "refuse_columns",
     "write_positions",
 ]
+
+log = logging.getLogger("bayesdist")
 
 Float = NDArray[np.float64]
 
@@ -52,7 +55,12 @@ def position_column(table: Table, name: str, where: str) -> Float:
     column = table[name]
     if column.dtype.kind not in "iuf" or column.ndim != 1:
         raise InputError("holds no numbers", where=f"{where}, column {name!r}", do="check it")
-    return np.ma.filled(np.ma.asarray(column).astype(float), np.nan)
+    values: Float = np.ma.filled(np.ma.asarray(column).astype(float), np.nan)
+    lost = ~np.isfinite(values)
+    if lost.any():
+        n = np.count_nonzero(lost)
+        log.warning("%s, column %r: no finite value in %d of its rows", where, name, n)
+    return np.where(lost, np.nan, values)
 
 
 def chip_numbers(

@@ -106,7 +106,7 @@ class Content:
         if self.path is None or not name or Path(name).name != name:
             return None
         path = self.path.parent / name
-        return read_content(path) if path.is_file() else None
+        return read_content(path) if path.exists() else None
 
     @property
     def is_fits(self) -> bool:

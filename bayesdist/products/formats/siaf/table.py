@@ -29,6 +29,7 @@ from bayesdist.products.formats.common.document import Choice, MissingSizeError
 from bayesdist.products.formats.common.read_back import ReadBack
 from bayesdist.products.formats.common.record import calibration_from
 from bayesdist.reading.documents import json_of
+from bayesdist.reading.faults import reason_of
 
 __all__ = [
     "AGREEMENT",
@@ -236,7 +237,7 @@ def _number(text: str, where: str) -> float:
 def record_beside(name: str) -> Mapping[str, Any] | None:
     """Record of the side file in the folder of a table; None where there is none."""
     path = Path(name).with_name(side_name(name))
-    return _record_of_side(read_content(path)) if path.is_file() else None
+    return _record_of_side(read_content(path)) if path.exists() else None
 
 
 def _record_of_side(content: Content) -> Mapping[str, Any]:
@@ -244,7 +245,7 @@ def _record_of_side(content: Content) -> Mapping[str, Any]:
         record = json_of(content.text, content.name)["bayesdist"]
     except (FormatError, KeyError, TypeError) as error:
         raise FormatError(
-            f"is no side file of a SIAF table ({error})",
+            f"is no side file of a SIAF table ({reason_of(error)})",
             where=content.name,
             do="fetch the file again",
         ) from error
