@@ -59,7 +59,7 @@ def position_column(table: Table, name: str, where: str) -> Float:
     lost = ~np.isfinite(values)
     if lost.any():
         n = np.count_nonzero(lost)
-        log.warning("%s, column %r: no finite value in %d of its rows", where, name, n)
+        log.warning("%s: WARNING: column %r has no finite value in %d rows", where, name, n)
     return np.where(lost, np.nan, values)
 
 
