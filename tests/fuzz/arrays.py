@@ -83,7 +83,7 @@ def value_not_finite(content, column, row, value):
     one = floats[column % len(floats)]
     numbers = table.column(one).to_pylist()
     numbers[int(row * (len(numbers) - 1))] = value
-    field = table.schema.field(one)
+    field = table.schema.field(one).with_nullable(True)
     return _as_parquet(table.set_column(one, field, pa.array(numbers, field.type)))
 
 

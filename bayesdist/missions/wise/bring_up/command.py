@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from bayesdist.app.screen import table_text
 from bayesdist.app.tables.output import record_folder, write_table
 from bayesdist.data.detections import Detections
-from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.column import SourceColumn, row_number
 from bayesdist.data.tables.names import find_columns
+from bayesdist.data.tables.repeated import first_duplicate
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bands.optical import optical_models
 from bayesdist.missions.wise.bring_up.iterate import BringUp, bring_up
@@ -108,6 +109,12 @@ def _read_lists(*paths: Path) -> list[Detections]:
         one = {name: SourceColumn(table[key], str(path), key) for name, key in found.items()}
         columns.append([one[name].numbers() for name in ("x", "y", "sigma")])
         codes, names = one["frame"].labels()
+        pair = first_duplicate([*columns[-1], codes])
+        if pair is not None:
+            first, second = map(row_number, pair)
+            raise InputError(
+                f"repeats {first}", where=f"{path}, {second}", do="keep each detection once"
+            )
         frames.append(np.array(names, str)[codes])
     unique, code = np.unique(np.concatenate(frames), return_inverse=True)
     parts = np.split(code, np.cumsum([len(one) for one in frames])[:-1])

@@ -71,11 +71,17 @@ class Hdu:
     def rows(self) -> NDArray[np.void]:
         """Rows of a binary table: native numbers, and text without trailing blanks.
 
-        FormatError when this is no binary table.
+        FormatError when this is no binary table, or one with cards that cannot be read.
         """
         if self.header.get("XTENSION", "").strip() != "BINTABLE":
             raise FormatError(f"HDU {self.name!r} is no binary table")
-        table = fits.BinTableHDU.fromstring(self.to_bytes()).data
+        try:
+            table = fits.BinTableHDU.fromstring(self.to_bytes()).data
+        except fits.VerifyError as error:
+            raise FormatError(
+                f"HDU {self.name!r} cannot be read ({reason_of(error)})",
+                do="it is damaged: fetch or write it again",
+            ) from error
         columns = {name: np.asarray(table[name]) for name in table.names}
         columns = {
             n: np.strings.rstrip(c) if c.dtype.kind == "U" else c for n, c in columns.items()
