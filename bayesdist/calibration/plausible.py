@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
@@ -13,6 +14,7 @@ __all__ = ["FAR", "refuse_senseless"]
 MOST_PIXELS = 1e6  # columns or rows of a chip
 FAR = 1e7  # pixels from the chip to its reference pixel
 BEND = 10.0  # sizes of the chip by which positions may be off the linear terms
+ROUNDING = 1e-3  # of covariances in text
 OFF = 1e3  # factor between a stated scale and the size of a pixel
 
 
@@ -43,6 +45,8 @@ def _faults(found: Calibration) -> list[str]:
         return ["some coefficients are not finite"]
     if not np.isfinite(found.solution.cov).all():
         return ["some errors of coefficients are not finite"]
+    if not _is_covariance(found.solution.cov):
+        return ["the covariance of its coefficients is none: a correlation lies beyond 1"]
     if any(not np.isfinite(table.values).all() for table in (*found.before, *found.after)):
         return ["some values of its look-up tables are not finite"]
     point = found.plane.point
@@ -59,6 +63,15 @@ def _faults(found: Calibration) -> list[str]:
     if not 1 / OFF < found.scale / pixel < OFF:
         return [f"the stated scale is {found.scale:g}, and the linear terms give {pixel:.3g}"]
     return []
+
+
+def _is_covariance(cov: NDArray[np.float64]) -> bool:
+    """Whether variances are positive or zero, and correlations lie between -1 and 1."""
+    variance = np.diag(cov)
+    if variance.min(initial=0.0) < 0:
+        return False
+    sigma = np.sqrt(variance)
+    return bool((np.abs(cov) <= (1 + ROUNDING) * np.outer(sigma, sigma)).all())
 
 
 def _faults_of_map(number: int, one: ChipMap) -> list[str]:

@@ -145,5 +145,5 @@ def determined(matrix: Float) -> Float:
     known = diagonal > 0
     unit = np.where(known, 1.0 / np.sqrt(np.where(known, diagonal, 1.0)), 0.0)
     values, vectors = np.linalg.eigh(unit[:, None] * matrix * unit)
-    good = values > RANK * max(values[-1], 1e-300)
+    good = values > RANK * values.max(initial=1e-300)
     return np.asarray(unit[:, None] * vectors[:, good] / np.sqrt(values[good]))

@@ -119,8 +119,11 @@ class IdcTab:
 
     @property
     def rows(self) -> NDArray[np.void]:
-        """Coefficient table as a structured array."""
-        return self.hdus[1].rows
+        """Coefficient table as a structured array; FormatError where it is none."""
+        try:
+            return self.hdus[1].rows
+        except FormatError as error:
+            raise FormatError(error.cause, where=self.name, do=error.do) from error
 
     @property
     def columns(self) -> tuple[str, ...]:
