@@ -21,6 +21,7 @@ class PlacedSettings(FormatSettings):
     own.
     """
 
+    detector: str | None = None  # by default the names of the chips, or of the calibration
     useafter: str
     pedigree: str
     author: str
