@@ -24,7 +24,7 @@ from tests.fuzz.inputs import HERE, Input
 from tests.fuzz.mutation import MUTATIONS
 from tests.sketches import sketched
 
-SECONDS = 60.0  # of processor time: kernels may have to be compiled
+SECONDS = 20.0  # of processor time
 WAIT = 120.0  # seconds of the clock: the machine may be busy
 MEMORY = 3 << 30  # beyond what the process has mapped when it begins
 BATCH = 40
