@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import bayesdist as bd
+from bayesdist.app.config import load_config
+from bayesdist.app.config.model import PriorCalibrationBlock
+from bayesdist.app.kinds.earlier import earlier_calibration
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.calibration.calibration import calibration_of
 from bayesdist.calibration.prior import prior_of_calibration
 from bayesdist.errors import InputError
@@ -276,3 +281,17 @@ def test_a_run_goes_by_it(tmp_path):
     found.save(tmp_path)
     again = kind.load_fitted(tmp_path, lambda: matched, config, {})
     np.testing.assert_array_equal(again.priors.joint.precision, found.priors.joint.precision)
+
+
+@pytest.mark.parametrize("stage", ["fit", "sample", "diagnose"])
+def test_a_run_that_is_damaged_is_no_prior(finished, tmp_path, stage):
+    """Without the errors that were found in it, it would claim too much."""
+    run = RunDirectory(shutil.copytree(finished.path, tmp_path / "run"))
+    model = bd.load_posterior(run.path).model
+    block = PriorCalibrationBlock(source="run", frame="none")
+    config = load_config(finished.config)[0].model_copy(update={"prior_calibration": block})
+    assert earlier_calibration(model, config, tmp_path) is not None
+    name = next(iter(run.record.artefacts[stage].files))
+    (run / name).unlink()
+    with pytest.raises(InputError, match=f"{name}: is gone"):
+        earlier_calibration(model, config, tmp_path)

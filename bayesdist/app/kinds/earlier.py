@@ -59,7 +59,10 @@ def _calibration(path: Path, filter: str | None) -> Calibration:
         )
     folder = path.parent
     if path.name == POSTERIOR and (folder / "run.json").exists():
-        run, fit = RunDirectory(folder), load_fit(folder / FIT)
+        run = RunDirectory(folder)
+        for stage in ("fit", "sample", "diagnose"):  # errors that are lost would narrow the prior
+            run.refuse_damaged(stage)
+        fit = load_fit(folder / FIT)
         found = load_diagnostics(run, fit, posterior)
         hierarchy = fit if run.config.campaign is not None else None
         posterior = solution_with_errors(posterior, found, hierarchy)
