@@ -170,7 +170,9 @@ def _product_checks(product: dict[str, Any]) -> tuple[Check, ...]:
     levels = {"error": "fail", "warning": "warn", "note": "note"}
     for finding in product["findings"]:
         level, _, text = finding.partition(": ")
-        out.append(Check("Products", text, level, "", levels.get(level, "note")))
+        # the sentence is what was found: the headline names the criterion
+        name = "as programs read it"
+        out.append(Check("Products", name, text, "", levels.get(level, "note")))
     return tuple(out)
 
 

@@ -10,7 +10,8 @@ import pytest
 from bayesdist.assess.checks import catalogue_checks
 from bayesdist.assess.requirements.validity import ValidityPeriod
 from bayesdist.checks import Check
-from bayesdist.report.sections.run.status import status_checks, verdict
+from bayesdist.report.context import Product
+from bayesdist.report.sections.run.status import status_checks, status_table, verdict
 
 YEARS = np.linspace(2010.3, 2020.3, 41)
 
@@ -34,6 +35,14 @@ def test_a_row_that_warns_is_in_the_headline(converged):
     assert worse.level == "warn" and worse.headline.startswith("One criterion warns (Odd stars)")
     failed = verdict(replace(good, checks=(*good.checks, row, replace(row, level="fail"))))
     assert failed.level == "fail" and failed.headline.startswith("One criterion fails (Odd stars)")
+
+
+def test_several_findings_of_a_file_are_counted_and_the_file_named_once(converged):
+    found = [Check("Products", "as read", text, "", "warn") for text in ("no parity", "no CRVAL")]
+    run = replace(_met_only(converged), products=(Product("a.hdr", "SIP", tuple(found)),))
+    assert verdict(run).headline.startswith("2 criteria warn (a.hdr: as read);")
+    rows = [row for row in status_table(run).rows if row[0] == "Products"]
+    assert [row[2] for row in rows] == ["no parity", "no CRVAL"]
 
 
 def test_the_headline_names_the_epoch_of_the_verdicts(converged):

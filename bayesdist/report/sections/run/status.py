@@ -145,7 +145,8 @@ def _rows_clause(names: Sequence[str], verb: str) -> str:
     """Clause on the rows of the status table that fail or warn."""
     if len(names) == 1:
         return f"one criterion {verb} ({names[0]})"
-    shown = "; ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+    different = tuple(dict.fromkeys(names))  # a file may have several findings
+    shown = "; ".join(different[:_NAMED]) + (", ..." if len(different) > _NAMED else "")
     return f"{len(names)} criteria {verb[:-1]} ({shown})"
 
 
