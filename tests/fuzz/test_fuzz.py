@@ -7,6 +7,8 @@ import os
 import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -74,6 +76,20 @@ def _exits(line):
     os._exit(3)
 
 
+def _answers_of(command, one):
+    """Answers of a function in place of the command line, tried twice."""
+    sandbox.main = lambda line: bool(command(line)) * 0
+    sandbox.WAIT = 2.0
+    return list(answers([(one, CASE, "say")] * 2))
+
+
+@pytest.fixture(scope="module")
+def elsewhere():
+    """A process that forks: this one may have threads of libraries that other tests use."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        yield pool
+
+
 CASE = Case("a.csv", "say", "cell_not_finite", {"line": 1, "cell": 0, "text": "nan"})
 
 
@@ -87,10 +103,8 @@ CASE = Case("a.csv", "say", "cell_not_finite", {"line": 1, "cell": 0, "text": "n
         (_exits, "traceback"),
     ],
 )
-def test_each_kind_of_failure_is_seen(one, monkeypatch, command, expected):
-    monkeypatch.setattr(sandbox, "main", lambda line: bool(command(line)) * 0)
-    monkeypatch.setattr(sandbox, "WAIT", 2.0)
-    found = list(answers([(one, CASE, "say")] * 2))
+def test_each_kind_of_failure_is_seen(one, elsewhere, command, expected):
+    found = elsewhere.submit(_answers_of, command, one).result()
     before = Answer("returned", 0, "x,y\n1,2\n3", "")
     assert [became(CASE, before, answer) for answer in found] == [expected] * 2
 
