@@ -79,12 +79,14 @@ def apply_to_table(
     names = tuple(columns or (OUT if inverse else ("x", "y")))
     rows = read_table(Path(table))
     x, y = (position_column(rows, name, str(table)) for name in names)
-    chips = chip_numbers(rows, chip, list(chips_of), found.name, str(table), needed=not inverse)
+    what = found.name, str(table)
     if inverse:
+        given = chip is not None or len(chips_of) == 1 or "chip" in rows.colnames
+        chips = chip_numbers(rows, chip, list(chips_of), *what) if given else None
         at, lines = _back(a, found, x, y, chips, method, order, epoch)
         added = ("x", "y")
     else:
-        at, added = _forth(a, x, y, chips), OUT
+        at, added = _forth(a, x, y, chip_numbers(rows, chip, list(chips_of), *what)), OUT
         lines = _frame_lines(a, source)
     add_positions(rows, at, added, str(table))
     rows.meta = {"calibration": found.name, "scale": pixel, "unit": found.unit}
@@ -93,8 +95,7 @@ def apply_to_table(
     return "\n".join([_head(output, at, found, epoch), *lines, *_losses(a, at, x, y, inverse)])
 
 
-def _forth(a: Application, x: Float, y: Float, chips: NDArray[np.int64] | None) -> Positions:
-    assert chips is not None
+def _forth(a: Application, x: Float, y: Float, chips: NDArray[np.int64]) -> Positions:
     return _gathered(
         {n: (chips == n, a.forward(x[chips == n], y[chips == n], chip=n)) for n in a.chips}, x.size
     )

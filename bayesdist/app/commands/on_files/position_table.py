@@ -64,9 +64,9 @@ def position_column(table: Table, name: str, where: str) -> Float:
 
 
 def chip_numbers(
-    table: Table, chip: int | None, known: Sequence[int], name: str, where: str, *, needed: bool
-) -> NDArray[np.int64] | None:
-    """Chip (N,) of each row, by an option or a column; None where it is not `needed` and not given.
+    table: Table, chip: int | None, known: Sequence[int], name: str, where: str
+) -> NDArray[np.int64]:
+    """Chip (N,) of each row, by an option or a column.
 
     `known` are the chips of the calibration; `name` and `where` are what to call it and the table.
     """
@@ -78,8 +78,6 @@ def chip_numbers(
     if len(known) == 1:
         return np.full(len(table), known[0])
     if "chip" not in table.colnames:
-        if not needed:
-            return None
         raise InputError(
             f"there is no column 'chip', and {name} has chips {listed}",
             where=where,

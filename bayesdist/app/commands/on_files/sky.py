@@ -199,8 +199,7 @@ def _with_sky(
     if centroids is not None:
         a, b = (position_column(plain, c, name) for c in centroids)
         sigma = a, b
-    numbers = chip_numbers(plain, chip, list(found.numbers), found.name, name, needed=True)
-    assert numbers is not None
+    numbers = chip_numbers(plain, chip, list(found.numbers), found.name, name)
     at = sky_positions(found, x, y, numbers, epoch=epoch, point=point, centroids=sigma, joint=joint)
     new = COLUMNS if at.sigma is not None else COLUMNS[:2]
     refuse_columns(rows, new, name)

@@ -94,15 +94,14 @@ def of_chips(parts: Mapping[int, ReadBack]) -> ReadBack:
         return parts[chip].forward(x, y, chip, epoch)
 
     def missed(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
-        back = parts[chip].missed
-        assert back is not None
-        return back(x, y, chip, epoch)
+        return back[chip](x, y, chip, epoch)
 
     each = parts.values()
+    back = {n: one.missed for n, one in parts.items() if one.missed is not None}
     names = dict.fromkeys(one.file for one in each)
     return ReadBack(
         ", ".join(names),
         forward,
-        missed if all(one.missed is not None for one in each) else None,
+        missed if len(back) == len(parts) else None,
         own_axes=any(one.own_axes for one in each),
     )

@@ -102,8 +102,7 @@ def _sampled(
     if one.basis.order == 1 and len(one.before) == 1 and not one.after:
         table = one.before[0]
         return _checked(one, linear, crpix, table.first, table.step, table.shape[::-1])
-    for asked in (step,) if step is not None else _STEPS:
-        assert asked is not None
+    for asked in _STEPS if step is None else (step,):
         counts = [int(min(max(np.ceil(n / asked), 1), _MOST - 1)) + 1 for n in one.basis.size]
         steps = [n / (count - 1) for n, count in zip(one.basis.size, counts, strict=True)]
         found = _checked(
@@ -136,11 +135,9 @@ def _checked(
 
 def _sigma(one: ChipMap, linear: Float, table: LookupTable) -> Float | None:
     """Standard errors (2, ny, nx) of the nodes, pixels; None without errors."""
-    if one.cov is None:
+    cov = one.covariance_at(*(v.ravel() for v in np.meshgrid(*table.nodes())))
+    if cov is None:
         return None
-    x, y = (v.ravel() for v in np.meshgrid(*table.nodes()))
-    cov = one.covariance_at(x, y)
-    assert cov is not None
     back = np.linalg.inv(linear)
     moved = back @ cov @ back.T
     return np.sqrt(moved.diagonal(axis1=1, axis2=2)).T.reshape(2, *table.shape)

@@ -142,9 +142,9 @@ def _with_covariance(
         return calibration
     K, reference = model.n_terms, calibration.numbers[0]
     jacobian = np.zeros((model.n_params, len(entries)))  # of the parameters by the numbers in COVAR
-    zero = _numbers_of_row(tab, tab.row(reference, names), reference)
+    zero = _numbers_of_row(tab, entries, tab.row(reference, names), reference)
     for number in calibration.numbers:
-        place = _numbers_of_row(tab, tab.row(number, names), number)
+        place = _numbers_of_row(tab, entries, tab.row(number, names), number)
         by = np.zeros((2, K, len(entries)))
         for axis, prefix in enumerate(tab.prefixes):
             for k, (i, j) in enumerate(tab.terms):
@@ -172,10 +172,8 @@ def _with_covariance(
     return replace(calibration, solution=solution, errors="covariance")
 
 
-def _numbers_of_row(tab: IdcTab, row: int, chip: int) -> dict[str, int]:
+def _numbers_of_row(tab: IdcTab, entries: NDArray[np.void], row: int, chip: int) -> dict[str, int]:
     """Indices in COVAR of the numbers of a row, by name; empty where they are missing."""
-    entries = tab.covariance
-    assert entries is not None
     listed = [str(name).strip() for name in entries["PARAM"]]
     mine = np.flatnonzero(entries["DETCHIP"].astype(int) == chip)
     own = [c for c in FILTER_COLUMNS if c in (entries.dtype.names or ())]
@@ -186,7 +184,7 @@ def _numbers_of_row(tab: IdcTab, row: int, chip: int) -> dict[str, int]:
             [int(k) for k in mine if tuple(str(entries[c][k]).strip() for c in own) == one]
             for one in sorted(sets)
         ]
-        same = [s for s in of_set if _is_of_row(tab, row, listed, s)]
+        same = [s for s in of_set if _is_of_row(tab, entries, row, listed, s)]
         if not same:
             return {}
         # the drift is common to all filters, and stands with the first one
@@ -195,9 +193,9 @@ def _numbers_of_row(tab: IdcTab, row: int, chip: int) -> dict[str, int]:
     return {listed[k]: int(k) for k in mine}
 
 
-def _is_of_row(tab: IdcTab, row: int, listed: list[str], some: Sequence[int]) -> bool:
-    entries = tab.covariance
-    assert entries is not None
+def _is_of_row(
+    tab: IdcTab, entries: NDArray[np.void], row: int, listed: list[str], some: Sequence[int]
+) -> bool:
     return all(
         float(entries["VALUE"][k]) == float(tab.rows[listed[k]][row])
         for k in some

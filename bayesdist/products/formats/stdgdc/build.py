@@ -63,8 +63,9 @@ def stdgdc_content(
     kind = np.float32 if precision == "single" else np.float64
     tables = _tables(one, frame, (nx, ny))
     planes = dict(zip(EXTENSIONS, (np.asarray(t, kind) for t in tables), strict=True))
-    if one.cov is not None:
-        sigmas = _sigmas(one, frame, (nx, ny))
+    cov = one.covariance_at(*_mesh((nx, ny)))
+    if cov is not None:
+        sigmas = _sigmas(cov, frame, (nx, ny))
         planes |= dict(zip(SIGMAS, (np.asarray(t, np.float32) for t in sigmas), strict=True))
     worst = _error(one, frame, np.asarray(planes["XGC"], float), np.asarray(planes["YGC"], float))
     primary = fits.PrimaryHDU()
@@ -112,11 +113,9 @@ def _tables(one: ChipMap, frame: CorrectedFrame, size: tuple[int, int]) -> tuple
     return (*there, -2.5 * np.log10(area), *np.reshape(back, (2, *shape)))
 
 
-def _sigmas(one: ChipMap, frame: CorrectedFrame, size: tuple[int, int]) -> tuple[Float, ...]:
+def _sigmas(cov: Float, frame: CorrectedFrame, size: tuple[int, int]) -> tuple[Float, ...]:
     """Standard errors of the corrected positions, and their correlation."""
     shape = size[::-1]
-    cov = one.covariance_at(*_mesh(size))
-    assert cov is not None
     turn = np.linalg.inv(frame.similarity)
     cov = turn @ cov @ turn.T
     sx, sy = np.sqrt(cov[:, 0, 0]), np.sqrt(cov[:, 1, 1])

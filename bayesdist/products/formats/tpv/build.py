@@ -120,10 +120,8 @@ def _cards(
     ]
     for axis, pv in enumerate(head.pv, start=1):
         cards += [number_card(f"PV{axis}_{m}", value) for m, value in pv.items()]
-    if one.cov is not None:
-        x, y = detector_grid(one.basis.size, _GRID)
-        cov = one.covariance_at(x, y)
-        assert cov is not None
+    cov = one.covariance_at(*detector_grid(one.basis.size, _GRID))
+    if cov is not None:
         rms = np.sqrt(cov.mean(axis=0).diagonal()) * arcsec / 3600.0
         cards += [
             number_card(f"CRDER{k}", float(v), "[deg] rms error by the solution")
@@ -141,11 +139,11 @@ def _cards(
     ]
     if one.epoch is not None:
         cards.append(number_card("BDEPOCH", float(one.epoch), "[yr] date of the coefficients"))
-    assert head.size is not None
+    columns, rows = map(int, one.basis.size)
     return [
         *cards,
-        number_card("IMAGEW", head.size[0], "[pix] columns of the detector"),
-        number_card("IMAGEH", head.size[1], "[pix] rows of the detector"),
+        number_card("IMAGEW", columns, "[pix] columns of the detector"),
+        number_card("IMAGEH", rows, "[pix] rows of the detector"),
     ]
 
 

@@ -120,13 +120,12 @@ def closure_of(forward: Model, back: Model, x: Float, y: Float) -> float:
     return float(np.hypot(there[0] - (x - 1.0), there[1] - (y - 1.0)).max())
 
 
-def recorded(file: DistortionFile) -> Calibration:
+def recorded(file: DistortionFile, record: Mapping[str, Any]) -> Calibration:
     """Calibration as the record has it, with the tables of the transform."""
-    assert file.record is not None
     values = [table.lookup_table for table in tables_of(file.model)]
     inner = [np.asarray(v, float)[1:-1, 1:-1].T for v in values]  # without the padding
     pairs = [np.stack(inner[k : k + 2]) for k in range(0, len(inner), 2)]
-    return calibration_from(file.record, file.name, pairs)
+    return calibration_from(record, file.name, pairs)
 
 
 def departure(file: DistortionFile, calibration: Calibration) -> float:
@@ -149,12 +148,14 @@ def transforms_read_back(files: Mapping[int, DistortionFile]) -> ReadBack:
         def forward(x: Float, y: Float, _: int, __: float | None) -> Float:
             return file.v2v3(x, y).T
 
+        if back is None:
+            return ReadBack(file.name, forward, None, own_axes=True)
+
         def missed(x: Float, y: Float, _: int, __: float | None) -> Float:
-            assert back is not None
             pixels = np.stack([x, y]) - 1.0
             return (evaluated(back, *evaluated(file.model, *pixels)) - pixels).T
 
-        return ReadBack(file.name, forward, None if back is None else missed, own_axes=True)
+        return ReadBack(file.name, forward, missed, own_axes=True)
 
     return of_chips({number: read_back(file) for number, file in files.items()})
 
@@ -168,7 +169,7 @@ def distortion_calibration(file: DistortionFile, choice: Choice) -> Calibration:
     """
     notes: tuple[str, ...] = ()
     if file.record is not None:
-        found = recorded(file)
+        found = recorded(file, file.record)
         far = departure(file, found)
         if far <= AGREEMENT:
             return found

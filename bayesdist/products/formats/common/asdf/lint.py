@@ -44,7 +44,7 @@ def lint_distortion(file: DistortionFile) -> list[Finding]:
         return [*findings, Finding("error", "model", "gives values that are not finite")]
     return [
         *findings,
-        *_linear(file),
+        *_linear(file, file.size),
         *_inverse(file),
         *_repeated(file.model),
         *_record(file),
@@ -64,10 +64,9 @@ def _units(file: DistortionFile) -> Iterator[Finding]:
             yield Finding("warning", f"meta.{name}", f"is missing; it should be {wanted[0]!r}")
 
 
-def _linear(file: DistortionFile) -> Iterator[Finding]:
+def _linear(file: DistortionFile, size: tuple[float, float]) -> Iterator[Finding]:
     """Findings on parity and scale at the middle of the detector."""
-    assert file.size is not None
-    x, y = ((n + 1) / 2 for n in file.size)
+    x, y = ((n + 1) / 2 for n in size)
     at = file.v2v3([x, x + 0.5, x - 0.5, x, x], [y, y, y, y + 0.5, y - 0.5])
     slope = np.stack([at[:, 1] - at[:, 2], at[:, 3] - at[:, 4]], axis=1)
     area = float(np.linalg.det(slope))
@@ -156,7 +155,7 @@ def _record(file: DistortionFile) -> Iterator[Finding]:
         yield Finding("note", "bayesdist", "is not there: the file states no uncertainty")
         return
     try:
-        found = recorded(file)
+        found = recorded(file, file.record)
     except BayesdistError as error:
         yield Finding("error", "bayesdist", error.cause)
         return

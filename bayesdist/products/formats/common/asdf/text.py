@@ -67,7 +67,7 @@ def _uncertainty(file: DistortionFile) -> list[str]:
     if file.record is None:
         return ["  errors    none stated"]
     try:
-        found = recorded(file)
+        found = recorded(file, file.record)
         [chip] = found.by_chip().values()
         cov = chip.covariance_at(*file.grid())
     except BayesdistError:
