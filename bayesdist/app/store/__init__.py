@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from bayesdist.app.store.keys import Adjustable, differences
 from bayesdist.app.store.record import Artefact, Record, as_json, versions, write_json
-from bayesdist.app.store.store import Made, RunStore, Stage
+from bayesdist.app.store.store import ArtefactStore, Made, Stage
 
 __all__ = [
     "Adjustable",
     "Artefact",
+    "ArtefactStore",
     "Made",
     "Record",
-    "RunStore",
     "Stage",
     "as_json",
     "differences",

@@ -13,7 +13,7 @@ from bayesdist.app.config import (
     config_of_record,
     load_config,
 )
-from bayesdist.app.store import Made, Record, RunStore, as_json, versions
+from bayesdist.app.store import ArtefactStore, Made, Record, as_json, versions
 from bayesdist.app.store.inputs import base_of, hashes_of, places_of
 from bayesdist.app.store.made_from import STAGES, changes, made_from_of, with_seed
 from bayesdist.app.store.refusals import (
@@ -40,7 +40,7 @@ def part_files(folder: Path) -> list[Path]:
     return sorted(folder.glob("part-" + 5 * "[0-9]" + ".parquet"))
 
 
-class RunDirectory(RunStore):
+class RunDirectory(ArtefactStore):
     """The folder of a run: its configuration and inputs, and the artefacts of its stages.
 
     Parameters

@@ -26,7 +26,7 @@ from bayesdist.app.store.record import (
 from bayesdist.files import is_leftover, path_within, remove_leftovers, watched_writes
 from bayesdist.reading.regular import read_bytes
 
-__all__ = ["Made", "RunStore", "Stage"]
+__all__ = ["ArtefactStore", "Made", "Stage"]
 
 T = TypeVar("T")
 
@@ -70,8 +70,8 @@ class Made(Generic[T]):
     value: T | None = None
 
 
-class RunStore:
-    """Artefacts of a run.
+class ArtefactStore:
+    """Artefacts in a folder, each by the content that it was made from.
 
     An artefact stands while its key, a hash of what it was made from, and its files are as they
     were.  What a stage writes is noted in run.json before it takes its name, so that all of it is

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bayesdist import files
-from bayesdist.app.store import Adjustable, Record, RunStore, Stage
+from bayesdist.app.store import Adjustable, ArtefactStore, Record, Stage
 from bayesdist.files import atomic_path
 
 STAGES = ("first", "second", "third")
@@ -33,7 +33,7 @@ class Job:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.store = RunStore(
+        self.store = ArtefactStore(
             folder,
             {
                 "first": Stage(),
