@@ -2,7 +2,7 @@
 
 Everything that a user can put right is raised as a `BayesdistError`; the command line prints its
 one sentence and exits with its code.  Any other exception is a defect of the program, and the
-command line says so (`bayesdist.app.failures`).
+command line says so (`bayesdist.app.commands.failures`).
 """
 
 from __future__ import annotations

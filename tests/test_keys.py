@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
+from bayesdist.app.commands.patterns.config import PlanConfig
 from bayesdist.app.config import KINDS, parse_config
 from bayesdist.app.config.data import data_sections
-from bayesdist.app.patterns.config import PlanConfig
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES = ("configuration.md", "campaign.md", "self_calibration.md", "planning.md")

@@ -144,7 +144,7 @@ def _exit_code(call: Callable[[], int | None], command: str) -> int:
         sys.stderr.close()
         return 0
     except Exception as error:  # of which nobody below could say more
-        from bayesdist.app.failures import failure
+        from bayesdist.app.commands.failures import failure
 
         code, sentence = failure(error, command)
         print(f"bayesdist: {sentence}", file=sys.stderr)

@@ -39,7 +39,7 @@ def plan(run: str, requirement: str | None, epochs: tuple[float, ...]) -> None:
 @click.pass_obj
 def plan_dither(line: str, patterns: str, output: str | None) -> None:
     """Compare dither patterns for a self-calibration, without data."""
-    from bayesdist.app.patterns.command import plan_patterns
+    from bayesdist.app.commands.patterns.command import plan_patterns
 
     click.echo(plan_patterns(patterns, output, line))
 

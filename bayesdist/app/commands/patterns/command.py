@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.patterns.config import PlanConfig, load_plan
+from bayesdist.app.commands.patterns.config import PlanConfig, load_plan
 from bayesdist.app.screen import table_text
 from bayesdist.app.tables.output import record_folder, write_table
 from bayesdist.assess.planning.dithers import KINDS, PlannedPattern, compare_patterns
