@@ -14,7 +14,7 @@ from bayesdist.products.formats.common.document import (
 )
 from bayesdist.products.formats.cpdis.file import CpdisFile, cpdis_calibration, cpdis_of
 from bayesdist.products.formats.cpdis.lint import lint_cpdis
-from bayesdist.products.formats.wcs.format import describe as describe_wcs
+from bayesdist.products.formats.sip.format import describe_wcs
 
 __all__ = ["FORMAT", "Settings"]
 

@@ -30,9 +30,8 @@ from bayesdist.products.formats.sip.parameters import (
 )
 from bayesdist.products.formats.sip.read import holds_sip, sip_of
 from bayesdist.products.formats.sip.write import sip_text
-from bayesdist.products.formats.wcs.format import describe as describe_wcs
 
-__all__ = ["FORMAT", "Settings"]
+__all__ = ["FORMAT", "Settings", "describe_wcs"]
 
 
 class Settings(FormatSettings):
@@ -47,6 +46,14 @@ class Settings(FormatSettings):
 
 def _parse(content: Content) -> Content | None:
     return content if holds_sip(content) else None
+
+
+def describe_wcs(content: Content, extra: Sequence[Finding] = ()) -> list[str]:
+    """Lines of text on each world coordinate system of a file, and `extra` findings."""
+    # astropy.wcs takes longer to import than most files to read
+    from bayesdist.products.formats.sip.wcs_text import describe_wcs as lines_on
+
+    return lines_on(content, extra)
 
 
 def _lint(content: Content) -> tuple[Finding, ...]:

@@ -14,11 +14,11 @@ from bayesdist.products.formats.common.document import (
     finding_lines,
 )
 from bayesdist.products.formats.common.parameters import parameters_content
+from bayesdist.products.formats.sip.format import describe_wcs
 from bayesdist.products.formats.tpv.calibration import tpv_calibration
 from bayesdist.products.formats.tpv.head import TpvFile, tpv_of
 from bayesdist.products.formats.tpv.lint import lint_tpv
 from bayesdist.products.formats.tpv.pv import HIGHEST
-from bayesdist.products.formats.wcs.format import describe as describe_wcs
 
 __all__ = ["FORMAT", "Settings"]
 

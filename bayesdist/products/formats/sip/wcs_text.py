@@ -18,7 +18,12 @@ from bayesdist.products.formats.common.document import Finding, finding_lines
 from bayesdist.products.formats.sip.lint import lint_sip
 from bayesdist.products.formats.sip.read import image_size, parsed
 from bayesdist.products.formats.sip.text import coefficient_lines, sip_lines
-from bayesdist.products.formats.wcs.sky import HeaderText, add_sky_lines, first_line, pv_keywords
+from bayesdist.products.formats.sip.wcs_sky import (
+    HeaderText,
+    add_sky_lines,
+    first_line,
+    pv_keywords,
+)
 
 __all__ = ["describe_wcs"]
 

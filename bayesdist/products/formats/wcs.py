@@ -1,0 +1,19 @@
+"""Files with the keywords of a world coordinate system, of whatever kind, as a format."""
+
+from __future__ import annotations
+
+from bayesdist.products.formats.common.cards import holds_wcs
+from bayesdist.products.formats.common.content import Content
+from bayesdist.products.formats.common.document import Format
+from bayesdist.products.formats.sip.format import describe_wcs
+
+__all__ = ["FORMAT"]
+
+
+def _parse(content: Content) -> Content | None:
+    return content if any(holds_wcs(hdu.header) for hdu in content.hdus) else None
+
+
+FORMAT = Format(
+    "wcs", "a FITS file or text file of cards with WCS keywords", 39, _parse, describe_wcs
+)

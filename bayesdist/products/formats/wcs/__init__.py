@@ -1,1 +1,0 @@
-"""Headers with world coordinate systems, described as astropy.wcs has them."""
