@@ -83,8 +83,8 @@ class Hst1passList:
         FormatError
             When the list lacks pixels, u or v.
         """
-        x, y = self._pair("XY", "xy")
-        u, v = self._pair("uv")
+        x, y = self._pair(("X", "Y"), ("x", "y"))
+        u, v = self._pair(("u", "v"))
         return Matches(
             x=x,
             y=y,
@@ -116,7 +116,7 @@ class Hst1passList:
         FormatError
             When the list lacks pixels.
         """
-        x, y = self._pair("XY", "xy")
+        x, y = self._pair(("X", "Y"), ("x", "y"))
         return Detections(
             x=x,
             y=y,
@@ -130,7 +130,7 @@ class Hst1passList:
     def _mag(self) -> Float | None:
         return self.columns.get("M", self.columns.get("m"))
 
-    def _pair(self, *pairs: str) -> tuple[Float, Float]:
+    def _pair(self, *pairs: tuple[str, str]) -> tuple[Float, Float]:
         """Columns of the first of these pairs that the list has."""
         for a, b in pairs:
             if a in self.columns and b in self.columns:
