@@ -129,12 +129,50 @@ def test_intervals_cover_as_they_say():
         other = theta + CHANGE * _even(model) * rng.normal(size=model.n_params)
         found = fitted(stars_of(model, other, 10, rng), model, prior.loose())
         changed.append(_pulls(model, found.mean - other, found.cov, x, y))
-    for pull in (np.array(pulls), np.array(wider), np.array(changed)):
+    for pull in (pulls, wider, changed):
         # mean over positions of one truth: these are independent of each other
         for level, sigmas in ((0.6827, 1.0), (0.9545, 2.0)):
-            covered = (np.abs(pull) < sigmas).mean(axis=1)
-            error = covered.std(ddof=1) / np.sqrt(len(covered))
-            assert abs(covered.mean() - level) < 4 * error
+            covered, error = _coverage(pull, sigmas)
+            assert abs(covered - level) < 4 * error
+
+
+@pytest.mark.parametrize("n_stars", [10, 200])
+def test_a_prior_of_few_draws_covers_at_least_as_it_says(n_stars):
+    """Mean and covariance of four draws a parameter, the fewest that are taken: 68 and 95 %.
+
+    Few stars after it get errors that are too large, by no more than the factor of Hartlap on the
+    inverse covariance; as many as before get right ones.  Without the factor these were too small.
+    """
+    rng, model = np.random.default_rng(4), model_of(3)
+    x, y = rng.uniform(1, 1000, 50), rng.uniform(1, 800, 50)
+    n = model.n_params
+    pulls, plain, wider = [], [], []
+    for _ in range(150):
+        theta = truth_of(model, rng)
+        second = stars_of(model, theta, n_stars, rng)
+        exact = earlier(fitted(stars_of(model, theta, 200, rng), model), model, frame="none")
+        draws = rng.multivariate_normal(exact.mean, exact.cov, 4 * n)
+        few = replace(exact, mean=draws.mean(axis=0), cov=np.cov(draws.T), draws=4.0 * n)
+        found = fitted(second, model, few.about(theta))
+        pulls.append(_pulls(model, found.mean - theta, found.cov, x, y))
+        raw = fitted(second, model, replace(few, draws=np.inf).about(theta))
+        plain.append(_pulls(model, raw.mean - theta, raw.cov, x, y))
+        known = fitted(second, model, exact.about(theta))
+        wider.append(np.trace(np.linalg.solve(known.cov, found.cov)) / n)
+    for level, sigmas in ((0.6827, 1.0), (0.9545, 2.0)):
+        covered, error = _coverage(pulls, sigmas)
+        assert covered > level - 4 * error
+        if n_stars == 200:
+            assert covered < level + 4 * error
+            covered, error = _coverage(plain, sigmas)
+            assert covered < level - 2 * error
+    assert 1.0 < np.mean(wider) < (4 * n - 1) / (4 * n - n - 2)
+
+
+def _coverage(pulls, sigmas):
+    """Fraction of positions within so many sigma, and its error from truth to truth."""
+    covered = (np.abs(pulls) < sigmas).mean(axis=1)
+    return covered.mean(), covered.std(ddof=1) / np.sqrt(len(covered))
 
 
 def _even(model):
