@@ -242,3 +242,5 @@ def test_only_the_parts_that_are_asked_for(tmp_path):
     assert (tmp_path / "bench.md").read_text(encoding="utf-8") == to_markdown(bench)
     with pytest.raises(SystemExit):
         program.main(["--only", "nothing"])
+    with pytest.raises(SystemExit):  # fields are those of SCAMP's part alone
+        program.main(["--only", "linear", "--fields", "10", "--output", str(tmp_path)])

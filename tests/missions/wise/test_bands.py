@@ -260,6 +260,7 @@ def test_every_file_is_there_and_the_page_needs_no_other(compared):
     assert not re.search(r"<(?:link|script|iframe|img)[^>]*https:", page)
     assert page.count("<figure") == len([f for f in files if f.endswith(".png")])
     assert "NOT CONVERGED" not in page
+    assert page.count("SIMULATED DATA") == 2  # on the screen, and on each page of paper
     assert "W4" in compared.result.out and "bands.html" in compared.result.out
 
 
