@@ -12,6 +12,7 @@ import bayesdist as bd
 from bayesdist.app.config import load_config
 from bayesdist.app.config.model import PriorCalibrationBlock
 from bayesdist.app.kinds.earlier import earlier_calibration
+from bayesdist.app.store import Record
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.calibration.calibration import calibration_of
 from bayesdist.calibration.prior import prior_of_calibration
@@ -19,7 +20,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer import save_fit
 from bayesdist.infer.linear import NO_REJECTION
 
-from .support import as_table
+from .support import as_table, good, refused
 
 SIZE = (1000.0, 800.0)
 CHIP = bd.Chip(1, "chip 1", SIZE, (500.5, 400.5))
@@ -333,3 +334,35 @@ def test_a_run_that_is_damaged_is_no_prior(finished, tmp_path, stage):
     (run / name).unlink()
     with pytest.raises(InputError, match=f"{name}: is gone"):
         earlier_calibration(model, config, tmp_path)
+
+
+def never_diagnosed(finished, folder):
+    """A copy of a run that ended before its residuals were looked at."""
+    path = shutil.copytree(finished.path, folder)
+    record = Record.read(path / "run.json")
+    for stage in ("diagnose", "evaluate", "export", "report"):
+        del record.artefacts[stage]
+    record.write(path / "run.json")
+    return path
+
+
+def test_a_run_that_was_never_diagnosed_is_no_prior(finished, tmp_path):
+    run = never_diagnosed(finished, tmp_path / "run")
+    block = PriorCalibrationBlock(source="run", frame="none")
+    config = load_config(finished.config)[0].model_copy(update={"prior_calibration": block})
+    with pytest.raises(InputError, match="needs stage 'diagnose', which has not been run"):
+        earlier_calibration(bd.load_posterior(run).model, config, tmp_path)
+
+
+def test_nor_is_it_a_calibration_for_commands(finished, tmp_path):
+    """Without its record it is a bare posterior, whose errors are its own alone."""
+    run = never_diagnosed(finished, tmp_path / "run")
+    (tmp_path / "stars.csv").write_text("x,y\n500,400\n600,500\n")
+    out = tmp_path / "out.csv"
+    apply = ("apply", run, tmp_path / "stars.csv", "-o", out)
+    words = ("needs stage 'diagnose', which has not been run", f"bayesdist stage diagnose {run}")
+    refused(tmp_path, *apply, words=words)
+    refused(tmp_path, "compare", run, finished.path, words=words)
+    refused(tmp_path, "monitor", run, tmp_path / "stars.csv", words=words)
+    good("apply", shutil.copy(run / "posterior.nc", tmp_path), *apply[2:])
+    assert "sigma_x_out" in out.read_text()

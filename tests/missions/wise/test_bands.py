@@ -15,6 +15,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
+from bayesdist.app.store import Record
 from bayesdist.infer import load_fit, load_posterior
 from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.missions.wise.simulate import wise_solution
@@ -301,9 +302,9 @@ def test_a_run_that_has_not_converged_is_said_on_top(compared, tmp_path):
 
 def test_a_run_that_is_not_finished_is_refused(compared, tmp_path):
     shutil.copytree(compared.run("W4"), tmp_path / "run")
-    record = json.loads((tmp_path / "run" / "run.json").read_text(encoding="utf-8"))
-    del record["artefacts"]["sample"]
-    (tmp_path / "run" / "run.json").write_text(json.dumps(record), encoding="utf-8")
+    record = Record.read(tmp_path / "run" / "run.json")
+    del record.artefacts["sample"]
+    record.write(tmp_path / "run" / "run.json")
     words = ["needs stage 'sample'", "bayesdist stage sample"]
     refused(tmp_path, "wise", "bands", tmp_path / "run", "-o", tmp_path / "out", words=words)
 
