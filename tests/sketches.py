@@ -54,10 +54,10 @@ def _unmade(registry, results, *, pdf=False, processes=1):
 
 
 def main() -> int:
-    """Exit code of a command of bayesdist whose report is a sketch."""
+    """Exit code of a command of bayesdist whose report has no figures."""
     from bayesdist.app.cli import main as command
 
-    with sketched():
+    with sketched(made=False):
         return command(sys.argv[1:])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,24 +12,26 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.data.detections import Detections
-from bayesdist.data.formats.files import exposure_names, input_files
-from bayesdist.data.formats.hst1pass import is_hst1pass, read_hst1pass
+from bayesdist.data.formats.files import exposure_names, input_files, kind_of
+from bayesdist.data.formats.hst1pass import read_hst1pass
 from bayesdist.data.tables.checks import COMPLETED, counted
 from bayesdist.data.tables.column import SourceColumn
-from bayesdist.data.tables.names import BASIC, find_columns
+from bayesdist.data.tables.names import ALIASES, BASIC, find_columns, origin_of
 from bayesdist.errors import FormatError, InputError
-from bayesdist.reading.regular import read_lines
 from bayesdist.reading.tables import TABLE_SUFFIXES, read_table
 
 __all__ = ["StarCuts", "read_star_lists"]
 
+log = logging.getLogger("bayesdist")
+
 Bool = NDArray[np.bool_]
 
-_LIST_ALIASES = {key: BASIC[key] for key in ("x", "y", "exposure", "chip", "mag")} | {
+_LIST_ALIASES = {key: BASIC[key] for key in ("exposure", "chip", "epoch")} | {
+    "x": ALIASES["x"],
+    "y": ALIASES["y"],
+    "mag": (*ALIASES["mag"], "m"),
     "q": ("q", "qfit", "quality"),
-    "epoch": BASIC["epoch"],
 }
-_LIST_ALIASES["mag"] = (*_LIST_ALIASES["mag"], "m")
 
 
 @dataclass(frozen=True)
@@ -105,12 +108,13 @@ def read_star_lists(
     Parameters
     ----------
     path : path-like or sequence of path-like
-        Files, patterns or a folder of Parquet files: tables (.ecsv, .csv, .fits, .parquet) or lists
+        Files, patterns or a folder of Parquet files: tables as `read_matches` takes them, or lists
         of hst1pass.  A table with a column of exposures may hold several of them; any other file is
         one exposure, named for the file.
     columns : mapping of str to str, optional
         Column of each quantity: x y exposure chip mag q epoch; without a column of chips all are 1.
-        Lists of hst1pass know theirs.
+        Lists of hst1pass know theirs.  Pixels that the table's names or header show to count from 0
+        are converted.
 
     Returns
     -------
@@ -126,16 +130,18 @@ def read_star_lists(
     files = input_files(path)
     out: list[Detections] = []
     for file, name in zip(files, exposure_names(files), strict=True):
-        if file.name.lower().removesuffix(".gz").endswith(tuple(TABLE_SUFFIXES)):
+        named = file.name.lower().removesuffix(".gz").endswith(tuple(TABLE_SUFFIXES))
+        kind = "table" if named else kind_of(file, columns)
+        if kind == "hst1pass":
+            out.append(read_hst1pass(file).detections(name=name))
+        elif kind == "table":
             out += _of_table(read_table(file), columns, str(file), name)
-            continue
-        if not is_hst1pass(read_lines(file)):
+        else:
             raise FormatError(
-                "is neither a table nor a list of hst1pass",
+                f"has matches or a catalogue ({kind}), and star lists are asked for",
                 where=str(file),
-                do=f"give a file that ends in {', '.join(TABLE_SUFFIXES)}",
+                do="give tables with x, y, or lists of hst1pass",
             )
-        out.append(read_hst1pass(file).detections(name=name))
     names = [one.name for one in out]
     for k, one in enumerate(out):
         if one.name in names[:k]:
@@ -151,7 +157,9 @@ def _of_table(
     table: Table, columns: Mapping[str, str] | None, source: str, name: str
 ) -> list[Detections]:
     """Detections of each exposure of a table."""
-    found = find_columns(table.colnames, columns, _LIST_ALIASES, source=source, needed="xy")
+    found = find_columns(
+        table.colnames, columns, _LIST_ALIASES, source=source, pairs=[("x", "y")], needed="xy"
+    )
     if not len(table):
         raise InputError("holds no detections", where=source, do="give a list with stars")
 
@@ -163,9 +171,12 @@ def _of_table(
         codes, names = column("exposure").labels()
     else:
         codes, names = np.zeros(len(table), np.int64), (name,)
+    origin, why = origin_of(found["x"], table.colnames, table.meta)
+    if origin == 0:
+        log.info("%s: 1 is added to its pixels: %s", source, why)
     whole = Detections(
-        values["x"],
-        values["y"],
+        values["x"] + 1 - origin,
+        values["y"] + 1 - origin,
         chip=column("chip").integers() if "chip" in found else COMPLETED,
         mag=values.get("mag"),
         q=values.get("q"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -71,7 +72,15 @@ def restoring(path: Path, what: str, *, do: str) -> Iterator[None]:
 
 
 # what they say is about the reader's code, not about the file
-_OF_CODE = (ArithmeticError, AssertionError, AttributeError, LookupError, NameError, TypeError)
+_OF_CODE = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    LookupError,
+    NameError,
+    TypeError,
+    struct.error,
+)
 
 
 def reason_of(error: Exception) -> str:

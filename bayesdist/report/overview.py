@@ -81,8 +81,8 @@ def _badness(row: OverviewRow) -> tuple[int, float]:
     return row.key, math.inf if row.worst_margin is None else row.worst_margin
 
 
-def write_overview(path: str | os.PathLike[str], rows: Sequence[OverviewRow]) -> None:
-    """Write the page; the worst runs stand first.
+def write_overview(path: str | os.PathLike[str], rows: Sequence[OverviewRow]) -> list[OverviewRow]:
+    """Rows as the page shows them, the worst runs first, once it is written.
 
     InputError when the file cannot be written.
     """
@@ -90,3 +90,4 @@ def write_overview(path: str | os.PathLike[str], rows: Sequence[OverviewRow]) ->
     text = template("overview.html.jinja").render(rows=ordered, heads=HEADS)
     with atomic_path(Path(path)) as temporary:
         temporary.write_text(text, encoding="utf-8")
+    return ordered

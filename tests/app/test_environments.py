@@ -18,7 +18,9 @@ import numpy as np
 import pytest
 
 from bayesdist.infer import load_posterior
-from tests.app.support import EXACT, REPOSITORY, as_table, one_sentence, simulated, write_job
+from tests.app.several import encoded, results_of
+from tests.app.support import EXACT, REPOSITORY, as_table, good, one_sentence, simulated, write_job
+from tests.reduced import case_in_full, only_in_full
 
 FILES = ("budget.ecsv", "margins.ecsv", "coefficients.ecsv", "sip.hdr", "summary.json")
 
@@ -121,15 +123,43 @@ SURROUNDINGS: dict[str, dict[str, Any]] = {
 }
 
 
+def all_at_once() -> dict[str, Any]:
+    """Options of a process in all of SURROUNDINGS."""
+    environment: dict[str, str | None] = {}
+    for options in SURROUNDINGS.values():
+        environment |= options.get("environment", {})
+
+    def prepare() -> None:
+        os.umask(0o077)
+        with_few_files(16)()
+        closed(0, 1, 2)()
+
+    return {
+        "environment": environment,
+        "python": ("-O", "-m", "tests.sketches"),
+        "prepare": prepare,
+    }
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SURROUNDINGS)
-def test_a_run_is_the_same(job, usual, tmp_path, name):
-    done = started("run", job, "-o", tmp_path / "run", **SURROUNDINGS[name])
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param(all_at_once(), id="all at once"),
+        *(
+            case_in_full(options, instead="all of them at once are run", id=name)
+            for name, options in SURROUNDINGS.items()
+        ),
+    ],
+)
+def test_a_run_is_the_same(job, usual, tmp_path, options):
+    done = started("run", job, "-o", tmp_path / "run", **options)
     assert done.returncode == 0, done.stderr
     as_usual(tmp_path / "run", usual)
 
 
 @pytest.mark.slow
+@only_in_full("a run in the locale C is made")
 def test_a_run_is_the_same_where_an_i_has_no_dot(job, usual, tmp_path):
     """In Turkish, lower-case letters of I and capital ones of i are others."""
     done = started(
@@ -139,12 +169,15 @@ def test_a_run_is_the_same_where_an_i_has_no_dot(job, usual, tmp_path):
     as_usual(tmp_path / "run", usual)
 
 
-def test_files_of_a_run_are_for_its_user_alone_if_that_is_wanted(job, usual, tmp_path):
+def test_files_of_a_run_are_for_its_user_alone_if_that_is_wanted(usual, tmp_path):
     """And for others to read where that is: temporary files are made for their owner only."""
     run = shutil.copytree(usual, tmp_path / "run")
     for mask in (0o077, 0o022):
-        done = started("stage", "export", run, prepare=lambda mask=mask: os.umask(mask))
-        assert done.returncode == 0, done.stderr
+        before = os.umask(mask)
+        try:
+            good("stage", "export", run)
+        finally:
+            os.umask(before)
         for name in ("sip.hdr", "run.json", "summary.json"):
             assert (run / name).stat().st_mode & 0o777 == 0o666 & ~mask, name
 
@@ -167,7 +200,7 @@ def test_a_full_stdout_is_an_error_and_no_traceback(usual):
     if not Path("/dev/full").exists():
         pytest.skip("there is no /dev/full")
     with Path("/dev/full").open("w") as full:
-        done = started("budget", usual, "--at", 10, 10, stdout=full)
+        done = started("inspect", usual, stdout=full)
     assert done.returncode == 74
     assert done.stderr.startswith("bayesdist: ") and "No space left on device" in done.stderr
     assert len(done.stderr.splitlines()) == 1
@@ -214,19 +247,22 @@ class ReadOnly:
 def test_a_run_in_a_read_only_folder_can_be_read(job, usual, tmp_path):
     """What only reads works; what would write says so and does nothing."""
     run = shutil.copytree(usual, tmp_path / "run")
-    sealed = ReadOnly(tmp_path)
-    done = started("budget", run, "--at", 10, 10, before=sealed.before)
-    assert done.returncode == 0 and "total" in done.stdout
-    for arguments in (
+    commands = [
+        ("budget", run, "--at", 10, 10),
         ("stage", "export", run),
         ("run", job, "-o", run, "--resume"),
         ("run", job, "-o", tmp_path / "new"),
         ("requirements", run, "--requirements", job),
-    ):
-        done = started(*arguments, before=sealed.before)
-        assert done.returncode == 1, done.stderr
-        if arguments[0] != "requirements":
-            one_sentence(done.stderr, str(tmp_path), "Read-only file system", "may write")
+    ]
+    python, before = ("-m", "tests.app.several"), ReadOnly(tmp_path).before
+    reading, *writing, judging = results_of(
+        started(*encoded(commands), python=python, before=before)
+    )
+    assert reading.code == 0 and "total" in reading.out
+    for result in writing:
+        assert result.code == 1, result.err
+        one_sentence(result.err, str(tmp_path), "Read-only file system", "may write")
+    assert judging.code == 1
 
 
 def test_without_a_place_for_compiled_code_it_is_compiled_anew(tmp_path):

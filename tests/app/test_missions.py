@@ -16,6 +16,7 @@ import pytest
 
 from bayesdist.app.commands.groups import LazyGroup
 from bayesdist.mission import GROUP, Mission, load_object
+from tests.app.several import encoded, results_of
 from tests.app.support import REPOSITORY, one_sentence
 
 MEGACAM = """
@@ -58,9 +59,11 @@ def installed(folder: Path, source: str) -> None:
     (info / "entry_points.txt").write_text(f"[{GROUP}]\nmegacam = megacam:MISSION\n")
 
 
-def called(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def called(
+    folder: Path, *arguments: str, module: str = "bayesdist"
+) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "bayesdist", *arguments],
+        [sys.executable, "-m", module, *arguments],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(REPOSITORY)])},
         capture_output=True,
@@ -89,11 +92,14 @@ def test_a_package_adds_a_format_of_matches(tmp_path):
     assert max(config["detector"]["size"]) <= 1024  # a tenth of the numbers in the file
     assert config["data"].get("unit", "arcsec") == "arcsec"
     text = (tmp_path / "c.toml").read_text()
-    for format, refused in (("tenths", False), ("tents", True)):
-        (tmp_path / "c.toml").write_text(text.replace("[data]", f'[data]\nformat = "{format}"', 1))
-        checked = called(tmp_path, "check", "c.toml")
-        assert ("which is no format" in checked.stderr) is refused
-        assert ("'tenths'" in checked.stderr) is refused
+    for format in ("tenths", "tents"):
+        given = text.replace("[data]", f'[data]\nformat = "{format}"', 1)
+        (tmp_path / f"{format}.toml").write_text(given)
+    commands = encoded([("check", "tenths.toml"), ("check", "tents.toml")])
+    known, unknown = results_of(called(tmp_path, *commands, module="tests.app.several"))
+    for checked, refused in ((known, False), (unknown, True)):
+        assert ("which is no format" in checked.err) is refused
+        assert ("'tenths'" in checked.err) is refused
 
 
 def test_a_mission_that_cannot_be_loaded_is_named(tmp_path):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
+from bayesdist.app.store import Record
 from tests.app.support import as_table, good, refused, simulated, write_config
 
 DATES = np.linspace(2016.0, 2017.1, 12)
@@ -82,9 +83,9 @@ def test_new_matches_may_have_a_configuration(finished, tmp_path) -> None:
 def test_the_old_matches_are_not_needed(finished, tmp_path) -> None:
     run = tmp_path / "run"
     shutil.copytree(finished.path, run)
-    record = json.loads((run / "run.json").read_text())
-    record["base"] = str(tmp_path / "gone")
-    (run / "run.json").write_text(json.dumps(record))
+    record = Record.read(run / "run.json")
+    record.facts["base"] = str(tmp_path / "gone")
+    record.write(run / "run.json")
     as_table(new_matches()).write(tmp_path / "new.ecsv")
     said = good("monitor", run, tmp_path / "new.ecsv").out
     assert said == good("monitor", finished.path, tmp_path / "new.ecsv").out

@@ -10,6 +10,7 @@ from lxml import html as lxml_html
 from bayesdist.app.commands.on_runs.overview import overview
 from bayesdist.errors import InputError
 from bayesdist.report.overview import OverviewRow, write_overview
+from tests.app.support import cli
 
 ROW = OverviewRow(
     name="a", link="a/report.html", detector="WISE W2", simulated=False, level="pass",
@@ -53,7 +54,8 @@ def test_a_folder_without_a_run_is_refused(tmp_path):
 def test_a_run_has_its_row(finished, tmp_path):
     summary = json.loads((finished.path / "summary.json").read_text())
     text = overview([finished.path], tmp_path / "all.html")
-    assert "verdicts of 1 run" in text
+    row = f"{finished.path.as_posix()} {summary['verdict']['headline']}"
+    assert row in " ".join(text.split()) and text.endswith("all.html")
     page = (tmp_path / "all.html").read_text("utf-8")
     (row,) = lxml_html.fromstring(page).xpath("//tbody/tr")
     cells = [cell.text_content().strip() for cell in row]
@@ -61,3 +63,14 @@ def test_a_run_has_its_row(finished, tmp_path):
     assert f"{min(m['margin_percent'] for m in summary['margins']):.0f}" in [
         cell.replace("\N{MINUS SIGN}", "-") for cell in cells
     ]
+
+
+def test_the_report_of_one_run_is_its_own(finished, tmp_path, monkeypatch):
+    """Without -o no page of many runs is made: report.html is drawn again."""
+    monkeypatch.chdir(tmp_path)
+    report = finished.path / "report.html"
+    before = report.stat().st_mtime_ns
+    result = cli("report", finished.path)
+    assert result.code == 0 and report.stat().st_mtime_ns > before
+    assert result.out.strip() == str(report)
+    assert not (tmp_path / "reports.html").exists()

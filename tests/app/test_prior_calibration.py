@@ -12,6 +12,7 @@ import bayesdist as bd
 from bayesdist.app.config import load_config
 from bayesdist.app.config.model import PriorCalibrationBlock
 from bayesdist.app.kinds.earlier import earlier_calibration
+from bayesdist.app.store import Record
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.calibration.calibration import calibration_of
 from bayesdist.calibration.prior import prior_of_calibration
@@ -19,7 +20,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer import save_fit
 from bayesdist.infer.linear import NO_REJECTION
 
-from .support import as_table
+from .support import as_table, good, refused
 
 SIZE = (1000.0, 800.0)
 CHIP = bd.Chip(1, "chip 1", SIZE, (500.5, 400.5))
@@ -129,12 +130,50 @@ def test_intervals_cover_as_they_say():
         other = theta + CHANGE * _even(model) * rng.normal(size=model.n_params)
         found = fitted(stars_of(model, other, 10, rng), model, prior.loose())
         changed.append(_pulls(model, found.mean - other, found.cov, x, y))
-    for pull in (np.array(pulls), np.array(wider), np.array(changed)):
+    for pull in (pulls, wider, changed):
         # mean over positions of one truth: these are independent of each other
         for level, sigmas in ((0.6827, 1.0), (0.9545, 2.0)):
-            covered = (np.abs(pull) < sigmas).mean(axis=1)
-            error = covered.std(ddof=1) / np.sqrt(len(covered))
-            assert abs(covered.mean() - level) < 4 * error
+            covered, error = _coverage(pull, sigmas)
+            assert abs(covered - level) < 4 * error
+
+
+@pytest.mark.parametrize("n_stars", [10, 200])
+def test_a_prior_of_few_draws_covers_at_least_as_it_says(n_stars):
+    """Mean and covariance of four draws a parameter, the fewest that are taken: 68 and 95 %.
+
+    Few stars after it get errors that are too large, by no more than the factor of Hartlap on the
+    inverse covariance; as many as before get right ones.  Without the factor these were too small.
+    """
+    rng, model = np.random.default_rng(4), model_of(3)
+    x, y = rng.uniform(1, 1000, 50), rng.uniform(1, 800, 50)
+    n = model.n_params
+    pulls, plain, wider = [], [], []
+    for _ in range(150):
+        theta = truth_of(model, rng)
+        second = stars_of(model, theta, n_stars, rng)
+        exact = earlier(fitted(stars_of(model, theta, 200, rng), model), model, frame="none")
+        draws = rng.multivariate_normal(exact.mean, exact.cov, 4 * n)
+        few = replace(exact, mean=draws.mean(axis=0), cov=np.cov(draws.T), draws=4.0 * n)
+        found = fitted(second, model, few.about(theta))
+        pulls.append(_pulls(model, found.mean - theta, found.cov, x, y))
+        raw = fitted(second, model, replace(few, draws=np.inf).about(theta))
+        plain.append(_pulls(model, raw.mean - theta, raw.cov, x, y))
+        known = fitted(second, model, exact.about(theta))
+        wider.append(np.trace(np.linalg.solve(known.cov, found.cov)) / n)
+    for level, sigmas in ((0.6827, 1.0), (0.9545, 2.0)):
+        covered, error = _coverage(pulls, sigmas)
+        assert covered > level - 4 * error
+        if n_stars == 200:
+            assert covered < level + 4 * error
+            covered, error = _coverage(plain, sigmas)
+            assert covered < level - 2 * error
+    assert 1.0 < np.mean(wider) < (4 * n - 1) / (4 * n - n - 2)
+
+
+def _coverage(pulls, sigmas):
+    """Fraction of positions within so many sigma, and its error from truth to truth."""
+    covered = (np.abs(pulls) < sigmas).mean(axis=1)
+    return covered.mean(), covered.std(ddof=1) / np.sqrt(len(covered))
 
 
 def _even(model):
@@ -295,3 +334,35 @@ def test_a_run_that_is_damaged_is_no_prior(finished, tmp_path, stage):
     (run / name).unlink()
     with pytest.raises(InputError, match=f"{name}: is gone"):
         earlier_calibration(model, config, tmp_path)
+
+
+def never_diagnosed(finished, folder):
+    """A copy of a run that ended before its residuals were looked at."""
+    path = shutil.copytree(finished.path, folder)
+    record = Record.read(path / "run.json")
+    for stage in ("diagnose", "evaluate", "export", "report"):
+        del record.artefacts[stage]
+    record.write(path / "run.json")
+    return path
+
+
+def test_a_run_that_was_never_diagnosed_is_no_prior(finished, tmp_path):
+    run = never_diagnosed(finished, tmp_path / "run")
+    block = PriorCalibrationBlock(source="run", frame="none")
+    config = load_config(finished.config)[0].model_copy(update={"prior_calibration": block})
+    with pytest.raises(InputError, match="needs stage 'diagnose', which has not been run"):
+        earlier_calibration(bd.load_posterior(run).model, config, tmp_path)
+
+
+def test_nor_is_it_a_calibration_for_commands(finished, tmp_path):
+    """Without its record it is a bare posterior, whose errors are its own alone."""
+    run = never_diagnosed(finished, tmp_path / "run")
+    (tmp_path / "stars.csv").write_text("x,y\n500,400\n600,500\n")
+    out = tmp_path / "out.csv"
+    apply = ("apply", run, tmp_path / "stars.csv", "-o", out)
+    words = ("needs stage 'diagnose', which has not been run", f"bayesdist stage diagnose {run}")
+    refused(tmp_path, *apply, words=words)
+    refused(tmp_path, "compare", run, finished.path, words=words)
+    refused(tmp_path, "monitor", run, tmp_path / "stars.csv", words=words)
+    good("apply", shutil.copy(run / "posterior.nc", tmp_path), *apply[2:])
+    assert "sigma_x_out" in out.read_text()

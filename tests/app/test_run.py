@@ -753,9 +753,13 @@ def test_simulate_gives_a_job_that_check_accepts(tmp_path):
     assert (tmp_path / "sim" / "stars.ecsv").read_bytes() == stars
 
 
-def test_demo(tmp_path):
-    """In a process of its own: as a user sees it, and without a bar where there is no terminal."""
-    done = process("demo", "-o", "demo", cwd=tmp_path)
+def test_demo(tmp_path, full):
+    """In a process of its own: as a user sees it, and without a bar where there is no terminal.
+
+    Reduced, its figures are sketches; tests/report draws figures.
+    """
+    program = "bayesdist" if full else "tests.sketches"
+    done = process("demo", "-o", "demo", cwd=tmp_path, program=program)
     assert done.returncode == 0, done.stderr
     assert "\r" not in done.stderr and "Traceback" not in done.stderr
     header, _, *rows = done.stdout.splitlines()[1:]

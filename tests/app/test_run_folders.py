@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bayesdist.app.store.record import Record
+from bayesdist.app.store.record import FileMark, Record
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.errors import InputError
 from bayesdist.files import path_within
@@ -126,12 +126,12 @@ def test_a_record_that_names_files_elsewhere_is_refused(project, finished, tmp_p
     run, outside = project / "run", project / "outside.txt"
     outside.write_text("precious", encoding="utf-8")
     name = name.format(absolute=outside)
-    record = json.loads((run / "run.json").read_text())
+    record = Record.read(run / "run.json")
     if where == "artefact":
-        record["artefacts"]["evaluate"]["files"][name] = {"size": 8, "sha256": 64 * "0"}
+        record.artefacts["evaluate"].files[name] = FileMark(8, 64 * "0")
     else:
-        record["under_way"] = {"stage": "evaluate", "files": [name]}
-    (run / "run.json").write_text(json.dumps(record), encoding="utf-8")
+        record.under_way = {"stage": "evaluate", "files": [name]}
+    record.write(run / "run.json")
     for arguments in (
         ("stage", "evaluate", run),
         ("run", project / "input" / "config.toml", "-o", run, "--resume"),

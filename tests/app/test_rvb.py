@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import tomllib
 from pathlib import Path
@@ -12,6 +11,7 @@ import pytest
 from astropy.table import Table, vstack
 
 from bayesdist.app.matches import reading
+from bayesdist.app.store import Record
 from bayesdist.data import open_matches
 from bayesdist.infer import load_fit
 from bayesdist.missions.wise.pairs.read import read_rvb
@@ -95,16 +95,16 @@ def test_half_a_set_that_a_killed_run_left_is_not_trusted(tmp_path):
     good("run", config, "-o", tmp_path / "run")
     run = tmp_path / "run"
     whole = len(open_matches(run / "pairs"))
-    record = json.loads((run / "run.json").read_text())
-    assert record.pop("pairs")["n_rows"] == 600
-    record["artefacts"] = {}
-    (run / "run.json").write_text(json.dumps(record))
+    record = Record.read(run / "run.json")
+    assert record.facts.pop("pairs")["n_rows"] == 600
+    record.artefacts = {}
+    record.write(run / "run.json")
     (run / "pairs" / "part-00000.parquet").write_bytes(b"half")
     good("run", config, "-o", run, "--resume")
     assert len(open_matches(run / "pairs")) == whole
     # nor is a folder touched that holds something else
     (run / "pairs" / "mine.txt").touch()
-    (run / "run.json").write_text(json.dumps(record))
+    record.write(run / "run.json")
     result = cli("stage", "fit", run)
     assert result.code == 1 and "remove this folder" in result.err
     assert not list(tmp_path.glob(".bayesdist-*"))

@@ -22,6 +22,7 @@ from astropy.wcs.utils import fit_wcs_from_points
 from bayesdist.products import read_calibration
 from bayesdist.products.formats.tpv.head import read_tpv
 from tests.app.support import EXACT, begin_stagewise, good, summary_of, write_config, write_job
+from tests.reduced import case_in_full
 
 SIZE = (2000, 1500)
 PIXEL = 0.4  # arcsec
@@ -81,7 +82,12 @@ def made(folder: Path, truth: WCS, rng, **sections) -> Path:
 
 @pytest.mark.parametrize(
     ("crval", "parity"),
-    [((83.8, -5.4), -1), ((83.8, -5.4), 1), ((359.999, 41.2), -1), ((211.0, 89.8), 1)],
+    [
+        case_in_full((83.8, -5.4), -1, instead="harder places are run"),
+        case_in_full((83.8, -5.4), 1, instead="harder places are run"),
+        ((359.999, 41.2), -1),
+        ((211.0, 89.8), 1),
+    ],
 )
 def test_positions_are_those_of_the_truth(crval, parity, tmp_path, rng) -> None:
     truth = camera(crval, parity)

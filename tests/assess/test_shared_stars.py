@@ -90,7 +90,7 @@ def test_positions_in_exposures_that_no_fit_has_seen(full):
     positions have in common is one fit and one tau, so that truths are counted, not positions.
     """
     rng = np.random.default_rng(8)
-    n_truths, n_new = (60 if full else 12), 12
+    n_truths, n_new = (60 if full else 8), 12
     inside = {0.68: [], 0.95: []}
     squares, without = [], []
     for seed in range(n_truths):

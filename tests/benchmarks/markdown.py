@@ -165,10 +165,9 @@ def _kernel(part: dict[str, Any]) -> list[str]:
         "parameter vectors at once. numpy: one parameter vector, design matrix stored, BLAS as it "
         "comes. Measured ceilings: "
         f"{roof['fma_per_ns']:.1f} multiply-adds per ns and core in the cache, "
-        f"{roof['divide_root_ns']:.2f} ns for one division and one root, "
         f"{roof['bytes_per_ns']:.1f} GB/s (triad). The roofline is the largest of: "
         f"multiply-adds of two Horner polynomials and {part['mixture_ops']} operations of the "
-        "mixture, one division and one root, 48 bytes of a star shared by the batch.",
+        "mixture (its inverse root included), 48 bytes of a star shared by the batch.",
         "",
     ]
     head = ["order", "N"]

@@ -20,7 +20,7 @@ from tests.benchmarks.ldac import write_catalogues, write_references
 from tests.benchmarks.markdown import to_markdown
 from tests.benchmarks.plain import PlainDensity
 from tests.benchmarks.problem import simulated
-from tests.benchmarks.roofline import Roofline
+from tests.benchmarks.roofline import MIXTURE_OPS, Roofline
 from tests.benchmarks.scaling import exponent
 
 AGREE = 5.0  # Monte-Carlo errors, the largest of nine parameters
@@ -103,11 +103,12 @@ def test_exponent_of_a_power_law():
 
 
 def test_roofline_counts_the_terms_of_two_polynomials():
-    roof = Roofline(fma_per_ns=10.0, divide_root_ns=2.0, bytes_per_ns=20.0)
+    roof = Roofline(fma_per_ns=10.0, bytes_per_ns=20.0)
     floor = roof.floor_ns(order=5, batch=1, threads=1)
     assert floor["polynomials"] == pytest.approx(42 / 10)
     assert floor["memory"] == pytest.approx(48 / 20)
-    assert roof.floor_ns(5, 16, 2)["division and root"] == pytest.approx(1.0)
+    arithmetic = roof.floor_ns(5, 16, 2)["arithmetic"]
+    assert arithmetic == pytest.approx((42 + MIXTURE_OPS) / 10 / 2)
 
 
 @pytest.fixture(scope="module")
@@ -241,3 +242,5 @@ def test_only_the_parts_that_are_asked_for(tmp_path):
     assert (tmp_path / "bench.md").read_text(encoding="utf-8") == to_markdown(bench)
     with pytest.raises(SystemExit):
         program.main(["--only", "nothing"])
+    with pytest.raises(SystemExit):  # fields are those of SCAMP's part alone
+        program.main(["--only", "linear", "--fields", "10", "--output", str(tmp_path)])

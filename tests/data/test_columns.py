@@ -182,6 +182,9 @@ def test_labels_of_every_type():
         m = read(stars(exposure=labels))
         assert m.exposure_names == ("7", "3", "9")
         assert m.exposure.tolist() == [0, 0, 1, 1, 0, 2]
+    several = np.array([{"a": 1}, "b", "b", "b", "b", "b"], object)
+    with pytest.raises(InputError, match="row 1, column 'exposure': several values stand where"):
+        read(stars(exposure=several))
 
 
 def test_chips_are_whole_numbers():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bayesdist.data import read_hst1pass, read_matches, read_matchup
+from bayesdist.data.starlists import read_star_lists
 from bayesdist.errors import FormatError, InputError
 
 LIST = """\
@@ -61,8 +62,55 @@ def test_damage_is_named(small):
 
 def test_a_list_without_raw_positions_is_refused(small):
     small.write_text(small.read_text().replace("  X --", "  r --"))
-    with pytest.raises(FormatError, match="has no column 'X'"):
+    with pytest.raises(FormatError, match="has no columns X, Y or x, y"):
         read_hst1pass(small).matches()
+
+
+RAW = """\
+#     FILT:      F606W
+#  FILEOUT: {name}
+# (01)  x -- x posn (no CTE corr)  c002-c010    F006
+# (02)  y -- y posn (no CTE corr)  c012-c020    F007
+# (03)  m -- instl mag             c022-c028    F002
+# (04)  q -- quality of fit        c030-c034    F019
+# (05)  K -- chip number           c036-c037    F030
+#....x.... ....y.... ...m... ..q.. .K
+  100.2500   12.5000 -12.700 0.031 K1
+ 2040.1250 2000.7500  -9.200 0.120 K2
+"""
+
+
+@pytest.mark.parametrize("head", ["", "# x y m q\n", "# photometry of one exposure\n", RAW])
+def test_lists_of_raw_positions(tmp_path, head):
+    """As hst1pass and jwst1pass write `.xymq`, and as others do: with names, or without any."""
+    path = tmp_path / "jw01501_nis_cal.xymq"
+    rows = "100.250 12.500 -12.700 0.031\n2040.125 2000.750 -9.200 0.120\n"
+    path.write_text(head.format(name=path.name) if head is RAW else head + rows)
+    [one] = read_star_lists(path)
+    assert one.name == "jw01501_nis_cal"
+    assert (one.x.tolist(), one.y.tolist()) == ([100.25, 2040.125], [12.5, 2000.75])
+    assert (one.mag.tolist(), one.q.tolist()) == ([-12.7, -9.2], [0.031, 0.12])
+    with pytest.raises(FormatError, match=r"no columns u, v \(it has x y m q\)"):
+        read_matches(path)
+
+
+def test_positions_corrected_for_charge_transfer_come_first(tmp_path):
+    path = tmp_path / "j8c0_flc.xymXYMq"
+    path.write_text("1.0 2.0 -9.0 1.5 2.5 -9.5 0.1\n")
+    [one] = read_star_lists(path)
+    assert (one.x[0], one.y[0], one.mag[0]) == (1.5, 2.5, -9.5)
+
+
+def test_a_list_without_its_columns_is_named(tmp_path):
+    path = tmp_path / "j8c0_flc.xymq"
+    path.write_text("100.250 12.500 -12.700\n")
+    with pytest.raises(FormatError, match="row 1: has 3 of 4 columns"):
+        read_star_lists(path)
+    for name in ("MATCHUP.XYMEEE", "stars.lst"):
+        path = tmp_path / name
+        path.write_text("1 2 3 4 5 6\n")
+        with pytest.raises(FormatError, match="is of no known kind"):
+            read_star_lists(path)
 
 
 def test_the_real_headers_count_their_stars(data_dir):

@@ -66,8 +66,36 @@ def test_one_file_for_each_exposure(tmp_path):
     with pytest.raises(InputError, match=r"exposure j1 stands in .*j1\.csv, too"):
         read_star_lists([tmp_path / "j1.csv", tmp_path / "again.ecsv"])
     (tmp_path / "notes.txt").write_text("nothing\n")
-    with pytest.raises(InputError, match="neither a table nor a list"):
+    with pytest.raises(InputError, match=r"notes\.txt: is of no known kind"):
         read_star_lists(tmp_path / "notes.txt")
+    (tmp_path / "MATCHUP").write_text("# xbar ybar mbar xsig ysig msig\n1 2 3 4 5 6\n")
+    with pytest.raises(InputError, match=r"a catalogue \(matchup\), and star lists are asked for"):
+        read_star_lists(tmp_path / "MATCHUP")
+
+
+@pytest.mark.parametrize("names", [("xcentroid", "ycentroid"), ("x", "y", "tnpix", "xcpeak")])
+def test_pixels_that_count_from_zero_are_converted(tmp_path, caplog, names):
+    """photutils and sep put the centre of the first pixel at 0."""
+    Table({name: [10.0, 20.0] for name in names}).write(tmp_path / "j1.ecsv")
+    with caplog.at_level("INFO", "bayesdist"):
+        [one] = read_star_lists(tmp_path / "j1.ecsv")
+    assert (one.x.tolist(), one.y.tolist()) == ([11.0, 21.0], [11.0, 21.0])
+    assert "j1.ecsv: 1 is added to its pixels" in caplog.text
+
+
+def test_text_of_other_programs_is_a_star_list(tmp_path):
+    (tmp_path / "j1.cat").write_text(
+        "#   1 XWIN_IMAGE  Windowed position [pixel]\n#   2 YWIN_IMAGE  Windowed position [pixel]\n"
+        "#   3 MAG_AUTO  Kron-like magnitude [mag]\n10.5 20.25 -9.5\n"
+    )
+    (tmp_path / "j2.als").write_text(
+        " NL   NX   NY  LOWBAD HIGHBAD  THRESH     AP1  PH/ADU  RNOISE    FRAD\n"
+        "  1 2048 2048   -24.2 32000.0   38.53    3.00    2.00    4.00    5.00\n\n"
+        "      1   10.500   20.250   14.500   0.0100   97.4      4.    1.02   0.01\n"
+    )
+    for one in read_star_lists([tmp_path / "j1.cat", tmp_path / "j2.als"]):
+        assert (one.x.tolist(), one.y.tolist()) == ([10.5], [20.25])
+        assert one.mag.tolist() == [{"j1": -9.5, "j2": 14.5}[one.name]]
 
 
 def test_real_lists_give_their_raw_pixels(data_dir):

@@ -31,7 +31,7 @@ def p_values_of(seed: int, more: dict[str, object]) -> tuple[float, float]:
 @pytest.fixture(scope="module")
 def found(full) -> list[np.ndarray]:
     """Groups (n, 2) of such p-values."""
-    seeds = range(100 if full else 8)
+    seeds = range(100 if full else 5)
     groups = [np.array([p_values_of(k, more) for k in seeds]) for more in FIELDS.values()]
     return groups if full else [np.concatenate(groups)]
 

@@ -31,6 +31,7 @@ from bayesdist.infer.density.target import Target
 from bayesdist.limits import HELD_OUT_DOUBTFUL
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
+from tests.reduced import case_in_full
 
 SIZE = (1000.0, 800.0)
 RUNS = 200 if os.environ.get("BAYESDIST_FULL") else 40
@@ -133,7 +134,9 @@ def test_uniform_false_matches_have_uniform_probabilities():
     assert_calibrated(some)
 
 
-@pytest.mark.parametrize("frames", ["shift", "shift_rotation_scale"])
+@pytest.mark.parametrize(
+    "frames", [case_in_full("shift", instead="frames of all kinds are run"), "shift_rotation_scale"]
+)
 def test_whole_exposures_have_uniform_probabilities(frames):
     """Frames of whole exposures are fitted to the very stars that are judged: that is allowed for.
 

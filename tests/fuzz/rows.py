@@ -96,14 +96,21 @@ def row_twice(content, line):
     return _line(content, line, lambda row: [row, row])
 
 
+def _number_from(content: bytes, line: int, cell: int) -> int:
+    """Cell that is a number, from one on: any text is a name in the place of a name."""
+    found = CELL.findall(content.split(b"\n")[line])
+    places = [(cell + k) % len(found) for k in range(len(found))]
+    return next(k for k in places if NUMBER.fullmatch(found[k]))
+
+
 @changes("no number", KNOWABLE, "rows", arguments=_of_a_row(cell=cells, text=values.not_finite))
 def cell_not_finite(content, line, cell, text):
-    return _with_cell(content, line, cell, text.encode())
+    return _with_cell(content, line, _number_from(content, line, cell), text.encode())
 
 
 @changes("no number", KNOWABLE, "rows", arguments=_of_a_row(cell=cells, text=values.no_number))
 def cell_no_number(content, line, cell, text):
-    return _with_cell(content, line, cell, text.encode())
+    return _with_cell(content, line, _number_from(content, line, cell), text.encode())
 
 
 @changes("odd numbers", OPEN, "rows", arguments=_of_a_row(cell=cells, text=values.odd))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import io
 import json
 import os
@@ -28,8 +29,9 @@ SECONDS = 20.0  # of processor time
 WAIT = 120.0  # seconds of the clock: the machine may be busy
 MEMORY = 3 << 30  # beyond what the process has mapped when it begins
 BATCH = 40
-# answers that depend on the machine
-TIMES = re.compile(r"^cost .*$|\d+(\.\d+)? (s|ms|min)\b.*$", re.MULTILINE)
+# answers that depend on the machine, or count rows
+TIMES = re.compile(r"^cost .*$|\d+(\.\d+)? (s|ms|min)\b.*$|\d+ positions", re.MULTILINE)
+POSITIONS = "out.csv"  # of `apply`
 
 
 @dataclass(frozen=True)
@@ -166,7 +168,20 @@ def _answer(
 
 
 def _text(path: Path) -> str:
-    return path.read_text("utf-8", "replace") if path.is_file() and not path.is_symlink() else ""
+    if not path.is_file() or path.is_symlink():
+        return ""
+    text = path.read_text("utf-8", "replace")
+    return _computed(text) if path.name == POSITIONS else text
+
+
+def _computed(text: str) -> str:
+    """Rows of `apply` by what it has computed, each once.
+
+    Its other columns are copies, and a position that stands twice is computed twice.
+    """
+    rows = list(csv.DictReader(line for line in text.splitlines() if line[:1] != "#"))
+    names = [name for name in (rows[0] if rows else ()) if name and "_out" in name]
+    return "\n".join(sorted({" ".join(row[name] or "" for name in names) for row in rows}))
 
 
 def _copied(one: Input, copy: Path) -> None:

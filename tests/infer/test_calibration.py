@@ -22,7 +22,7 @@ def _band(level: float, n: int, tests: int = 1) -> tuple[float, float]:
 
 @pytest.fixture(scope="module")
 def runs(full: bool) -> list[dict[str, np.ndarray]]:
-    return over_seeds(coverage_of, 200 if full else 40)
+    return over_seeds(coverage_of, 200 if full else 24)
 
 
 @pytest.mark.parametrize("level", LEVELS)
@@ -59,12 +59,12 @@ def test_clipped_least_squares_is_overconfident(runs):
 
 def test_ranks_are_uniform(full, capsys):
     """Simulation-based calibration (Talts et al. 2018): truths from the prior rank uniformly."""
-    n = 200 if full else 30
+    n = 200 if full else 20
     ranks = over_seeds(ranks_of, n)
     assert sum(r["converged"] for r in ranks) >= 0.99 * n
     for key in ("f", "j", "s_out"):
         values = np.array([r[key] for r in ranks])
-        counts, _ = np.histogram(values, bins=10 if full else 5, range=(-0.5, 199.5))
+        counts, _ = np.histogram(values, bins=10 if full else 4, range=(-0.5, 199.5))
         p = chisquare(counts).pvalue
         with capsys.disabled():
             print(f"\nranks of {key}: {counts.tolist()}, chi-square p = {p:.3f}")

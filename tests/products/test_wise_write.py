@@ -13,7 +13,7 @@ import pytest
 from numpy.polynomial import polynomial
 
 from bayesdist.data import Matches
-from bayesdist.errors import InputError
+from bayesdist.errors import FormatError, InputError
 from bayesdist.infer import fit_linear
 from bayesdist.missions.wise.published import WISE_COEFFICIENTS
 from bayesdist.missions.wise.simulate import wise_set, wise_solution
@@ -207,6 +207,22 @@ def test_what_the_layout_cannot_hold_is_refused(printed, tmp_path, change, messa
         write_wise_meta(path, {**printed, 1: replace(printed[1], **change)})
     assert [p.name for p in tmp_path.iterdir()] == ["w.meta"]
     assert path.read_text() == "an earlier file"
+
+
+@pytest.mark.parametrize(
+    ("band", "message"),
+    [("1,5", "is not band, keyword, type, value of an error"), ("3", "errors are of band 3")],
+)
+def test_errors_that_cannot_be_read_are_not_passed_over(fitted, tmp_path, band, message):
+    """They stand in comment lines, of which others are passed over."""
+    path = tmp_path / "w.meta"
+    write_wise_meta(path, fitted)
+    whole = path.read_text()
+    damaged = re.sub(r"(?m)^\\ \d+ (?= *AE_2_0 )", rf"\\ {band} ", whole)
+    assert damaged != whole
+    path.write_text(damaged)
+    with pytest.raises(FormatError, match=message):
+        read_wise_meta(path)
 
 
 def test_bands_there_are_four_of(printed, tmp_path):

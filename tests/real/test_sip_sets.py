@@ -87,11 +87,13 @@ def test_written_headers_come_back_and_astropy_reads_them(sets, tmp_path, full) 
             assert_allclose(found, by_astropy(one, x, y), atol=EXACT, rtol=0)
 
 
-def test_turned_headers_agree_with_astropy_at_turned_pixels(sets) -> None:
-    """All sets, each in one of the eight orientations; a sector and the odd orders in all."""
+def test_turned_headers_agree_with_astropy_at_turned_pixels(sets, full) -> None:
+    """All sets, or one in five, each in one of the eight orientations; some of them in all."""
     x, y = random_pixels(SIZE, 50)
     for number, one in enumerate(sets):
-        whole = one.sector == 13 or one.sip.order[0] > 5
+        whole = (one.sector == 13 and full) or one.sip.order[0] > 5
+        if not full and number % 5 and not whole:
+            continue
         before = by_astropy(one, x, y)
         for k, (turn, mirror) in enumerate(TURNS):
             if not whole and k != number % len(TURNS):
@@ -108,11 +110,11 @@ def test_turned_headers_agree_with_astropy_at_turned_pixels(sets) -> None:
                 assert_allclose(after.all_pix2world(*at, 1), sky, atol=1e-13 * 360, rtol=0)
 
 
-def test_no_stated_inverse_beats_a_fitted_one_of_its_order(sets) -> None:
+def test_no_stated_inverse_beats_a_fitted_one_of_its_order(sets, full) -> None:
     """Least squares over the same pixels; and one order more closes better."""
     x, y = detector_grid(SIZE, 65, chebyshev=True)
     for one in sets:
-        if one.sector % 12 and one.sip.order[0] < 6:
+        if one.sector % (12 if full else 48) and one.sip.order[0] < 6:
             continue
         sip = one.sip
         order = max(sip.inverse_order)

@@ -350,6 +350,21 @@ def test_no_table_is_cut_on_a_screen_of_a_desk(wide):
     assert total.find_elements("tag name", "td")[-1].is_displayed()
 
 
+def test_figures_keep_their_size_on_the_screen_of_a_phone(opened):
+    """Their letters could not be read if they were shrunk: what is too wide scrolls in its box."""
+    edges(opened, 390, "figure")
+    drawn, box, page, overflow = opened.execute_script(
+        "const i = document.querySelector('figure img');"
+        "i.style.setProperty('--width', '8in');"  # the tests' pictures are specks
+        "const b = i.parentElement, found = [i.clientWidth, b.clientWidth,"
+        " document.documentElement.scrollWidth, getComputedStyle(b).overflowX];"
+        "i.style.removeProperty('--width'); return found;"
+    )
+    opened.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert drawn == pytest.approx(8 * 96, abs=1)
+    assert box <= page <= 390 and overflow == "auto"
+
+
 def test_captions_stay_on_the_screen_of_a_phone(wide):
     """A table that is wider than the screen scrolls, and its caption does not."""
     right = edges(wide, 390, "main caption")

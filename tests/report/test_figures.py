@@ -26,6 +26,7 @@ from bayesdist.report.sections.run.posterior import (
 )
 from bayesdist.report.sections.run.residuals import MixtureCurve, _histograms
 from bayesdist.report.style import figure_style, nice_below
+from tests.reduced import case_in_full
 
 from .plots import figures_of
 from .runs import SIZE, report_input
@@ -42,10 +43,21 @@ RUNS = {
     "wide in arcsec, no outliers": {"size": (4096.0, 2048.0), "outliers": "none"} | ARCSEC,
     "two wide chips": WFC,
     "two square chips in arcsec, uniform": {"names": ("A", "B"), "outliers": "uniform"} | ARCSEC,
+    "two wide chips in arcsec, uniform": WFC | {"outliers": "uniform"} | ARCSEC,
 }
+# reduced, the shapes, units and models of outliers that are not those of the first one together
+REDUCED = ("square", "two wide chips in arcsec, uniform")
 
 
-@pytest.fixture(scope="module", params=RUNS, ids=str)
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(name, id=name)
+        if name in REDUCED
+        else case_in_full(name, instead="others are run", id=name)
+        for name in RUNS
+    ],
+)
 def every_figure(request):
     options = RUNS[request.param]
     figures = figures_of(report_input(**options)) if options else request.getfixturevalue("figures")

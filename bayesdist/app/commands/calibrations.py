@@ -132,12 +132,21 @@ def convert(file: str, to: str, output: str | None, **options: Any) -> None:
 @click.argument("a", metavar="A")
 @click.argument("b", metavar="B")
 @click.option("-o", "--output", metavar="DIR", help="Folder to create for tables and figure.")
-@click.option("--chip", type=int, metavar="N", show_default="all common chips")
+@click.option(
+    "--chip", type=int, metavar="N", show_default="all common chips", help="Chip that is compared."
+)
 @click.option("--filter", metavar="F", help="Filter of IDCTABs, or WISE band; F:G for A and B.")
 @epoch
 @image_size
 @click.option("--keep-linear", is_flag=True, help="Do not remove shift, rotation and scale.")
-@click.option("--grid", type=int, nargs=2, default=(33, 17), metavar="NX NY")
+@click.option(
+    "--grid",
+    type=int,
+    nargs=2,
+    default=(33, 17),
+    metavar="NX NY",
+    help="Number of positions along x and y.",
+)
 @click.pass_obj
 def compare(
     line: str, a: str, b: str, output: str | None, keep_linear: bool, **options: Any

@@ -46,7 +46,14 @@ def plan_dither(line: str, patterns: str, output: str | None) -> None:
 
 @command(name="select-order")
 @click.argument("config", metavar="CONFIG.toml")
-@click.option("--orders", nargs=2, type=int, default=(3, 9), metavar="LOW HIGH")
+@click.option(
+    "--orders",
+    nargs=2,
+    type=int,
+    default=(3, 9),
+    metavar="LOW HIGH",
+    help="Lowest and highest order that are compared.",
+)
 @click.option(
     "--chip",
     type=int,
@@ -55,7 +62,7 @@ def plan_dither(line: str, patterns: str, output: str | None) -> None:
     help="Chip that is compared.",
 )
 @click.option("-o", "--output", metavar="orders.ecsv", help="Write the table to a file.")
-@click.option("--figure", metavar="orders.png")
+@click.option("--figure", metavar="orders.png", help="Draw the comparison into a file.")
 @force
 def select_order(
     config: str,

@@ -34,7 +34,9 @@ def requirements(run: str, requirements: str) -> int:
     metavar="X Y",
     help="Budget of the separation from this pixel; may be repeated.",
 )
-@click.option("--chip", type=int, metavar="N", show_default="the only one")
+@click.option(
+    "--chip", type=int, metavar="N", show_default="the only one", help="Chip of the positions."
+)
 @click.option("--epoch", type=float, metavar="T", help="Date in decimal years.")
 @click.option(
     "--magnitude", type=float, metavar="M", help="Add the centroid error at this magnitude."

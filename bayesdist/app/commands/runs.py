@@ -59,7 +59,11 @@ def check(config: str) -> None:
 @click.option("--force", is_flag=True, help="Replace an existing run.")
 @click.option("--strict", is_flag=True, help="Exit with 3 unless converged.")
 @click.option(
-    "--seed", type=click.IntRange(min=0), metavar="N", show_default="that of the configuration"
+    "--seed",
+    type=click.IntRange(min=0),
+    metavar="N",
+    show_default="that of the configuration",
+    help="Seed of the random numbers.",
 )
 @click.pass_obj
 def run(
@@ -108,13 +112,19 @@ def stage(name: str, run: str, strict: bool, pdf: bool) -> None:
 @command()
 @click.argument("runs", metavar="RUN...", nargs=-1, required=True)
 @click.option(
-    "-o", "--output", default="reports.html", metavar="FILE", help="The page that is written."
+    "-o", "--output", metavar="FILE", help="The page of several runs.  [default: reports.html]"
 )
-def report(runs: tuple[str, ...], output: str) -> None:
-    """One page for many runs, with status, worst margin and validity of each.
+def report(runs: tuple[str, ...], output: str | None) -> None:
+    """Write one page for many runs, with status, worst margin and validity of each.
 
-    The report of a single run is made by 'bayesdist stage report RUN'.
+    For one run without -o this draws its own report.html again, as 'bayesdist stage report RUN'.
     """
+    if len(runs) == 1 and output is None:
+        from bayesdist.app.run import continue_stage
+
+        continue_stage(runs[0], "report")
+        click.echo(f"{runs[0]}/report.html")
+        return
     from bayesdist.app.commands.on_runs.overview import overview
 
-    click.echo(overview(runs, output))
+    click.echo(overview(runs, output or "reports.html"))

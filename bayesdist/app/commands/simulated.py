@@ -18,7 +18,9 @@ __all__ = ["camera"]
 @click.option(
     "-o", "--output", default="camera_gaia.csv", metavar="FILE.csv", help="File to write."
 )
-@click.option("--stars", type=click.IntRange(min=1), default=4000, metavar="N", help="How many.")
+@click.option(
+    "--stars", type=click.IntRange(min=1), default=4000, metavar="N", help="Number of stars."
+)
 @seed
 @force
 def camera(output: str, stars: int, seed: int, force: bool) -> None:

@@ -116,7 +116,6 @@ class SelfcalConfig(RunConfig):
     campaign: ClassVar[None] = None
     tables: ClassVar[TablesBlock] = TablesBlock()
     fit: ClassVar[Fit] = Fit()
-    compute: ClassVar[ComputeBlock] = ComputeBlock()
     periods: ClassVar[None] = None
     holdout: ClassVar[None] = None
     prior_calibration: ClassVar[None] = None
@@ -126,6 +125,7 @@ class SelfcalConfig(RunConfig):
     model: SelfcalModel
     outliers: SelfcalOutliers = SelfcalOutliers()
     sampler: SelfcalSampler = SelfcalSampler()
+    compute: ComputeBlock = ComputeBlock()
     prior: list[PriorBlock] = Field(default_factory=list)
     products: SelfcalProducts = SelfcalProducts()
 

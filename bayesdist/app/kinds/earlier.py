@@ -60,8 +60,8 @@ def _calibration(path: Path, filter: str | None) -> Calibration:
     folder = path.parent
     if path.name == POSTERIOR and (folder / "run.json").exists():
         run = RunDirectory(folder)
-        for stage in ("fit", "sample", "diagnose"):  # errors that are lost would narrow the prior
-            run.refuse_damaged(stage)
+        # errors that are lost, or were never found, would narrow the prior
+        run.require("prior_calibration", ("fit", "sample", "diagnose"))
         fit = load_fit(folder / FIT)
         found = load_diagnostics(run, fit, posterior)
         hierarchy = fit if run.config.campaign is not None else None

@@ -62,4 +62,5 @@ def sample_detections(
         **config.sampler.model_dump(),
         folder=folder,
         progress=progress,
+        compute=config.resources(),
     )

@@ -101,6 +101,7 @@ class _UnderWay(_Part):
 class _Whole(_Head):
     """Content of run.json."""
 
+    sha256: str
     artefacts: dict[str, _Artefact]
     stages: dict[str, _StageNote]
     under_way: _UnderWay | None
@@ -192,7 +193,10 @@ class Record:
 
     @classmethod
     def read(cls, path: Path) -> Record:
-        """Content of a run.json; InputError where it cannot be read or has another schema."""
+        """Content of a run.json.
+
+        InputError where it cannot be read, has another schema, or is not as it was written.
+        """
         do = "restore it, or choose another folder"
         facts = read_json(path, do=do)
         head = model_of(_HEAD, facts, str(path), do=do)
@@ -205,6 +209,12 @@ class Record:
                 do="use that version, or choose another folder",
             )
         model_of(_WHOLE, facts, str(path), do=do)
+        if facts.pop("sha256") != digest_of(facts):
+            raise InputError(
+                "was changed since bayesdist wrote it (its checksum is another)",
+                where=str(path),
+                do=do,
+            )
         found = facts.pop("artefacts")
         artefacts = {name: Artefact.from_json(one) for name, one in found.items()}
         rest = {key: facts.pop(key) for key in ("stages", "under_way", "checkpoints")}
@@ -228,4 +238,5 @@ class Record:
         """Replace run.json."""
         found = {name: asdict(one) for name, one in self.artefacts.items()}
         whole = {"schema": SCHEMA, **self.facts, "stages": self.stages, "artefacts": found}
-        write_json(path, whole | {"under_way": self.under_way, "checkpoints": self.checkpoints})
+        whole |= {"under_way": self.under_way, "checkpoints": self.checkpoints}
+        write_json(path, whole | {"sha256": digest_of(as_json(whole))})

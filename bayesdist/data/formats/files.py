@@ -116,18 +116,17 @@ def kind_of(file: Path, columns: Mapping[str, str] | None) -> str:
             return "astrometry.net" if is_astrometrynet(read_table(file).colnames) else "table"
         return "table"
     lines = [] if is_binary(file) else read_lines(file)
-    if is_hst1pass(lines):
-        return "hst1pass"
     if is_matchup(lines):
         return "matchup"
-    if name.endswith("uvwxympq"):
+    if is_hst1pass(file, lines):
         return "hst1pass"  # its reader finds what is wrong
     if is_text_table(lines) or is_fits(file):
         return "table"
     raise FormatError(
         "is of no known kind",
         where=str(file),
-        do=f"give a file that ends in {', '.join(TABLE_SUFFIXES)}, or set the format",
+        do="name its columns in its first line, or give a file that ends in "
+        + ", ".join(TABLE_SUFFIXES),
     )
 
 

@@ -1,12 +1,14 @@
-"""Star lists of hst1pass (`*.uvwXYMpq`) and the MATCHUP masters made from them.
+"""Star lists of hst1pass (`*.uvwXYMpq`, `*.xymq`) and the MATCHUP masters made from them.
 
-hst1pass is J. Anderson's one-pass photometry of HST exposures (WFC3 ISR 2022-05).  A list names its
-columns in the block under FILEOUT near the end of its header.
+hst1pass is J. Anderson's one-pass photometry of HST exposures (WFC3 ISR 2022-05), jwst1pass that of
+JWST.  A list names its columns in the block under FILEOUT near the end of its header; lists without
+one, of the older programs or by other hands, have a letter of their suffix for each column.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +27,8 @@ Float = NDArray[np.float64]
 
 _COLUMN = re.compile(r"#\s*\((\d+)\)\s+(\S+)\s+--\s")
 _KEYWORD = re.compile(r"#\s*(\w+)\s*:\s*(.*?)\s*$")
+_SUFFIX = re.compile(r"\w*(xym|XYM|XYm)\w*")
+_LABELS = "IJKN"  # row, column, chip and number of a star for grepping: I0042, K1, N00007
 _DAMAGED = "fetch or write the file again"
 
 
@@ -39,8 +43,9 @@ class Hst1passList:
     source : str
         File.
     columns : dict of str to ndarray, shape (N,)
-        By the letters of hst1pass: u, v position corrected by the observatory's solution; X, Y raw
-        pixels, FITS 1-based; w, M instrumental magnitudes; p peak; q quality of the fit.
+        By the letters of hst1pass: u, v position corrected by the observatory's solution; x, y raw
+        pixels, FITS 1-based, and X, Y those corrected for charge transfer; m, M, w instrumental
+        magnitudes, raw, corrected likewise, and of undistorted pixels; p peak; q quality of fit.
     filter : str
         Empty where the header has none.
     epoch : float or None
@@ -59,8 +64,9 @@ class Hst1passList:
     def matches(self, *, name: str | None = None) -> Matches:
         """Matches of raw pixels with the observatory's corrected positions.
 
-        The block under FILEOUT calls X, Y "dist-cor", but they are raw: the header's BDRY_xy and
-        BDRY_uv rows give the corners of the chip in both systems.
+        Pixels are X, Y, or x, y where a list has no X, Y.  The block under FILEOUT calls X, Y
+        "dist-cor", but they are raw: the header's BDRY_xy and BDRY_uv rows give the corners of the
+        chip in both systems.
 
         Parameters
         ----------
@@ -75,24 +81,26 @@ class Hst1passList:
         Raises
         ------
         FormatError
-            When the list lacks one of X, Y, u, v.
+            When the list lacks pixels, u or v.
         """
-        self._require("XYuv")
-        n = len(self.columns["X"])
+        x, y = self._pair(("X", "Y"), ("x", "y"))
+        u, v = self._pair(("u", "v"))
         return Matches(
-            x=self.columns["X"],
-            y=self.columns["Y"],
-            u=self.columns["u"],
-            v=self.columns["v"],
-            mag=self.columns.get("M"),
-            epoch=None if self.epoch is None else np.full(n, self.epoch),
+            x=x,
+            y=y,
+            u=u,
+            v=v,
+            mag=self._mag,
+            epoch=None if self.epoch is None else np.full(len(x), self.epoch),
             exposure_names=(self.name if name is None else name,),
             filter_names=(self.filter,),
             sources=(self.source,),
         )
 
     def detections(self, *, name: str | None = None) -> Detections:
-        """Raw pixels, instrumental magnitudes M and qualities q of the detections.
+        """Raw pixels, instrumental magnitudes and qualities q of the detections.
+
+        Pixels are X, Y with the magnitudes M, or x, y and m where a list has none.
 
         Parameters
         ----------
@@ -106,32 +114,47 @@ class Hst1passList:
         Raises
         ------
         FormatError
-            When the list lacks X or Y.
+            When the list lacks pixels.
         """
-        self._require("XY")
+        x, y = self._pair(("X", "Y"), ("x", "y"))
         return Detections(
-            x=self.columns["X"],
-            y=self.columns["Y"],
+            x=x,
+            y=y,
             exposure_names=(self.name if name is None else name,),
-            mag=self.columns.get("M"),
+            mag=self._mag,
             q=self.columns.get("q"),
             source=self.source,
         )
 
-    def _require(self, letters: str) -> None:
-        """Refuse a list without one of these columns."""
-        for letter in letters:
-            if letter not in self.columns:
-                raise FormatError(
-                    f"has no column {letter!r} (it has {' '.join(self.columns)})",
-                    where=self.source,
-                    do="run hst1pass with OUT=uvwXYMpq",
-                )
+    @property
+    def _mag(self) -> Float | None:
+        return self.columns.get("M", self.columns.get("m"))
+
+    def _pair(self, *pairs: tuple[str, str]) -> tuple[Float, Float]:
+        """Columns of the first of these pairs that the list has."""
+        for a, b in pairs:
+            if a in self.columns and b in self.columns:
+                return self.columns[a], self.columns[b]
+        wanted = " or ".join(", ".join(pair) for pair in pairs)
+        raise FormatError(
+            f"has no columns {wanted} (it has {' '.join(self.columns)})",
+            where=self.source,
+            do="run hst1pass with OUT=uvwXYMpq",
+        )
 
 
-def is_hst1pass(lines: list[str]) -> bool:
-    """True for lines of an hst1pass list."""
-    return any(line.startswith("#") and "FILEOUT:" in line for line in lines)
+def is_hst1pass(path: Path, lines: list[str]) -> bool:
+    """True for an hst1pass list, by its lines or its suffix."""
+    return any(line.startswith("#") and "FILEOUT:" in line for line in lines) or bool(
+        _suffix_letters(path)
+    )
+
+
+def _suffix_letters(path: Path) -> list[str]:
+    """Letters of a suffix such as `.xymq`, which names the columns; none of other suffixes."""
+    letters = path.name.removesuffix(".gz").partition(".")[2].rpartition(".")[2]
+    named = _SUFFIX.fullmatch(letters) and len(set(letters)) == len(letters)  # no MATCHUP.XYMEEE
+    return list(letters) if named else []
 
 
 def is_matchup(lines: list[str]) -> bool:
@@ -156,8 +179,8 @@ def read_hst1pass(path: str | Path) -> Hst1passList:
     Raises
     ------
     InputError
-        For a missing file, a header without its FILEOUT block, no rows, or rows that do not have
-        its columns (a truncated file).
+        For a missing file, columns that neither a FILEOUT block nor the suffix names, no rows, or
+        rows that do not have these columns (a truncated file).
 
     Examples
     --------
@@ -173,20 +196,24 @@ def read_hst1pass(path: str | Path) -> Hst1passList:
     header = [line for line in lines if line.startswith("#")]
     start = next((k for k, line in enumerate(header) if "FILEOUT:" in line), None)
     if start is None:
-        raise FormatError(
-            "is no hst1pass list, or its header is cut off: no FILEOUT block names the columns",
-            where=str(path),
-            do=_DAMAGED,
-        )
-    names = [found[2] for line in header[start:] if (found := _COLUMN.match(line))]
+        names = _suffix_letters(path)
+    else:
+        names = [found[2] for line in header[start:] if (found := _COLUMN.match(line))]
     if not names:
-        raise FormatError("the FILEOUT block names no columns", where=str(path), do=_DAMAGED)
-    values = _numbers(path, lines, len(names))
+        what = "the FILEOUT block names no columns"
+        if start is None:
+            what = (
+                "is no hst1pass list, or its header is cut off: no FILEOUT block names the "
+                "columns, and no suffix such as .xymq"
+            )
+        raise FormatError(what, where=str(path), do=_DAMAGED)
+    kept = [k for k, name in enumerate(names) if name not in _LABELS]
+    values = _numbers(path, lines, len(names), kept)
     keywords = {found[1]: found[2] for line in header if (found := _KEYWORD.match(line))}
     return Hst1passList(
         name=path.name.split(".")[0],
         source=str(path),
-        columns={name: values[:, k].copy() for k, name in enumerate(names)},
+        columns={names[k]: values[:, m].copy() for m, k in enumerate(kept)},
         filter=keywords.get("FILT", "").strip("' "),
         epoch=_float(keywords.get("rDAT")),
         exptime=_float(keywords.get("EXPTI")),
@@ -201,20 +228,20 @@ def _float(text: str | None) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _numbers(path: Path, lines: list[str], n_columns: int) -> Float:
-    """Leading `n_columns` fields of the rows that are no comments."""
+def _numbers(path: Path, lines: list[str], n_columns: int, kept: Sequence[int]) -> Float:
+    """Some of the leading `n_columns` fields of the rows that are no comments."""
     rows = [line for line in lines if line.strip() and not line.startswith("#")]
     if not rows:
         raise FormatError("holds no stars", where=str(path), do="give a list with stars")
     if not lines[-1].endswith("\n"):
         raise FormatError("the last line is cut off", where=str(path), do=_DAMAGED)
-    out = np.empty((len(rows), n_columns))
+    out = np.empty((len(rows), len(kept)))
     for k, line in enumerate(rows):
         fields = line.split()
         try:
             if len(fields) < n_columns:
                 raise ValueError(f"has {len(fields)} of {n_columns} columns")
-            out[k] = fields[:n_columns]
+            out[k] = [fields[m] for m in kept]
         except ValueError as error:
             raise FormatError(str(error), where=f"{path}, row {k + 1}", do=_DAMAGED) from None
     return out
@@ -267,7 +294,7 @@ def read_matchup(
         )
     if not lines[0].startswith("#"):
         lines = ["#" + lines[0], *lines[1:]]
-    x, y, m, xsig, ysig, _ = _numbers(path, lines, 6).T
+    x, y, m, xsig, ysig, _ = _numbers(path, lines, 6, range(6)).T
     return ReferenceCatalog(
         u=x, v=y, sigma_u=xsig, sigma_v=ysig, mag=m, epoch=epoch, unit=unit, source=str(path)
     )

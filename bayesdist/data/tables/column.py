@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -199,7 +199,12 @@ class SourceColumn:
         values = self._plain()
         if values.dtype.kind == "O":  # each object once: most are the same few
             known: dict[tuple[type, Any], int] = {}  # by their types, too: 1 is not True
-            codes = np.array([known.setdefault((type(v), v), len(known)) for v in values], np.int64)
+            try:
+                numbers = [known.setdefault((type(v), v), len(known)) for v in values]
+            except TypeError:  # Parquet has lists and structures
+                index = [isinstance(v, Hashable) for v in values].index(False)
+                raise self.fail(index, "several values stand where a name must be") from None
+            codes = np.array(numbers, np.int64)
             found: Iterable[Any] = [v for _, v in known]
         else:
             codes, found = encoded(values)

@@ -37,7 +37,7 @@ EXPOSURES = Family(
     "exposures deviate from each other in linear terms that their frames do not fit",
     "no deviations of single exposures are left in the residuals",
     held_by="exposures",
-    denial="it is not single exposures that deviate",
+    denial="deviating exposures do not explain it",
 )
 STARS_PER_DIRECTION = 4  # of an exposure that is tested
 MAX_PRODUCTS = 1e10  # of scores: beyond, those of other exposures count by their mean

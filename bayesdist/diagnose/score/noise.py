@@ -28,7 +28,7 @@ Int = NDArray[np.int64]
 
 BY_POSITION = Family(
     "noise by position",
-    "give errors that go with position",
+    "give errors that depend on position",
     "the noise differs from cell to cell",
     "the noise is described equally well from cell to cell",
     held_by="noise",
@@ -36,21 +36,21 @@ BY_POSITION = Family(
 )
 BY_MAGNITUDE = Family(
     "noise by magnitude",
-    "give errors that go with magnitude, or finer ones if they do",
+    "give errors that depend on magnitude, or finer ones if they already do",
     "the noise differs from bright to faint stars",
     "the noise is described equally well from bright to faint stars",
     held_by="noise",
 )
 BY_EXPOSURE = Family(
     "noise by exposure",
-    "give each exposure errors of its own, or leave out exposures",
+    "give each exposure its own errors, or leave out exposures",
     "the noise differs from exposure to exposure",
     "the noise is described equally well from exposure to exposure",
     held_by="noise",
 )
 BY_AXIS = Family(
     "noise by axis",
-    "give errors sigma_u and sigma_v of their own",
+    "give separate errors sigma_u and sigma_v",
     "along the other axis, beside its errors",
     "the noise is described equally well along u and v",
     held_by="noise",

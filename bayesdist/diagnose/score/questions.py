@@ -116,7 +116,7 @@ def order_family(total: int, order: int) -> Family:
         f"no terms of order {total} are left in the residuals",
         group="orders",
         held_by="structure",
-        denial="it is not the missing order",
+        denial="the missing order does not explain it",
     )
 
 

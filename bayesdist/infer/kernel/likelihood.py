@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bayesdist.infer.kernel.blocks import BLOCK, threads_for
 from bayesdist.infer.kernel.mixture import Constants, log_of_product, packed, total_of
-from bayesdist.infer.kernel.numeric import exp_negative
+from bayesdist.infer.kernel.numeric import exp_negative, inverse_root
 from bayesdist.infer.kernel.polynomial import FAST, polynomial
 
 __all__ = ["log_likelihood"]
@@ -50,8 +50,8 @@ def _partial_sums(blocks, X, Y, u, v, var_u, var_v, coef, powers, rows, unit2):
                 ru *= ru
                 rv *= rv
                 au, av = su[s] + j2, sv[s] + j2
-                inverse = 1.0 / (au * av)
-                peak = core * math.sqrt(inverse)
+                root = inverse_root(au * av)
+                peak, inverse = core * root, root * root
                 # the smaller exponent is taken out, so that exp never overflows
                 q_in = 0.5 * (ru * av + rv * au) * inverse
                 q_out = (ru + rv) * half + never

@@ -12,6 +12,7 @@ is left are the parameters of a `DistortionModel`.
     tangent     the exposures' tangent planes, mapped to one
     start       start of the search
     calibrate   grouping and solving in turn; errors of detections, by magnitude
+    pieces      detections in pieces of whole stars, here or on a cluster
     posterior   density, proposal and draws
     relative    solutions without their gauge
     catalogue   the stars

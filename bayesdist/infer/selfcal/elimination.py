@@ -229,8 +229,19 @@ class StarModes:
         total = np.bincount(p.star, weight)
         lost = total[p.star] <= 0  # a star without members stays in the middle
         weight = np.where(lost, 1.0 / p.counts[p.star], weight / np.where(lost, 1.0, total[p.star]))
-        middles = [np.bincount(p.star, weight * z[:, axis]) for axis in (0, 1)]
-        return cls(stars, weight, np.stack(middles, axis=1), _states(p, member))
+        return cls(stars, weight, _means(p, weight, z), _states(p, member))
+
+    def moved(self, problem: Problem, theta: Float) -> Float:
+        """Stars (S, q), moved as their detections are by theta (D,): start of a search there."""
+        out = self.stars.copy()
+        out[:, :2] += _means(problem, self.weight, problem.places(theta)) - self.middles
+        return out
+
+
+def _means(problem: Problem, weight: Float, places: Float) -> Float:
+    """Weighted mean positions (S, 2) of the detections of each star."""
+    means = [np.bincount(problem.star, weight * places[:, axis]) for axis in (0, 1)]
+    return np.stack(means, axis=1)
 
 
 def _states(problem: Problem, member: Float) -> NDArray[np.int8]:

@@ -27,16 +27,12 @@ from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.sampler.chains import Settings, ensemble_seeds, run_chains
-from bayesdist.infer.selfcal.elimination import (
-    Mixture,
-    StarModes,
-    expand,
-    log_marginal,
-    memberships,
-)
+from bayesdist.infer.selfcal.elimination import Mixture, memberships
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
+from bayesdist.infer.selfcal.pieces import in_pieces, log_density, slope
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.stars.mixture import Hyper, OutlierMixture
+from bayesdist.infer.stars.shards import Compute, Pieces
 
 __all__ = ["SelfTarget", "propose", "sample_selfcal"]
 
@@ -58,6 +54,7 @@ class SelfTarget:
     """Density of psi = (free parameters, log j, logit f); j in pixels."""
 
     solution: SelfCalibrationMode  # the mode; parameters that it fixes stay there
+    pieces: Pieces  # its detections
     outliers: OutlierMixture | None = None  # in pixels; as by `mixture` by default
 
     @property
@@ -91,11 +88,6 @@ class SelfTarget:
         all_names = self.problem.model.names
         return (*(all_names[k] for k in self.solution.free), *self.hyper.names)
 
-    @cached_property
-    def _modes(self) -> StarModes:
-        s = self.solution
-        return StarModes.at(s.problem, s.theta, s.mixture, s.stars)
-
     def theta(self, free: Float) -> Float:
         """Parameters (..., D) from free ones (..., F)."""
         out = np.tile(self.solution.theta, (*free.shape[:-1], 1))
@@ -116,7 +108,7 @@ class SelfTarget:
             return out
         theta, h = self.theta(psi[ok, : self.n_theta]), psi[ok, self.n_theta :]
         value = self.prior.log_density(theta) + self.hyper.log_prior(h)
-        value += log_marginal(self.problem, theta, self.mixtures(h), self._modes)
+        value += self.pieces.sum(log_density, theta, self.mixtures(h))
         out[ok] = np.where(np.isnan(value), -np.inf, value)
         return out
 
@@ -134,6 +126,7 @@ def sample_selfcal(
     checkpoint_every: int = 200,
     folder: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
+    compute: Compute | None = None,
 ) -> Posterior:
     """Sample distortion, frames, jitter and fraction of false detections.
 
@@ -144,6 +137,8 @@ def sample_selfcal(
         In pixels; uniform within the match radius by default.
     seed, ensembles, target_ess, target_rhat, max_steps, checkpoint_every, folder, progress
         As `sample`.
+    compute : Compute, optional
+        Where the passes over the detections are made; in this process by default.
 
     Returns
     -------
@@ -158,19 +153,19 @@ def sample_selfcal(
     """
     seeds = ensemble_seeds(seed, ensembles)
     started = time.monotonic()
-    target = SelfTarget(solution, outliers)
-    proposal = propose(target)
-    settings = Settings(
-        seeds=seeds,
-        n_stars=RELATIVE_COST * len(solution.problem),
-        limits=Limits(target_ess, target_rhat),
-        max_steps=max_steps,
-        checkpoint_every=checkpoint_every,
-        folder=None if folder is None else Path(folder),
-        fingerprint=_fingerprint(solution, target.mixture, seed, ensembles, checkpoint_every),
-        progress=progress,
-    )
-    chains = run_chains(target, proposal, settings)
+    with in_pieces(solution, compute) as pieces:
+        target = SelfTarget(solution, pieces, outliers)
+        settings = Settings(
+            seeds=seeds,
+            n_stars=RELATIVE_COST * len(solution.problem),
+            limits=Limits(target_ess, target_rhat),
+            max_steps=max_steps,
+            checkpoint_every=checkpoint_every,
+            folder=None if folder is None else Path(folder),
+            fingerprint=_fingerprint(solution, target.mixture, seed, ensembles, checkpoint_every),
+            progress=progress,
+        )
+        chains = run_chains(target, propose(target), settings)
     problem, draws, n = solution.problem, chains.draws, target.n_theta
     member = memberships(problem, solution.theta, solution.mixture, solution.stars)
     posterior = Posterior(
@@ -297,13 +292,12 @@ def _nodes_at(target: SelfTarget) -> tuple[Float, float]:
 
 def _node(target: SelfTarget, split: Split, at: Float, z: float, bend: float) -> Node:
     """Node with mode and curvature of everything else at one jitter, for a given fraction."""
-    solution, problem, free = target.solution, target.problem, target.solution.free
-    theta, stars = solution.theta.copy(), solution.stars
+    solution, free = target.solution, target.solution.free
+    theta = solution.theta.copy()
     held = float(np.exp(at[0])) if len(at) else float(target.mixture.jitter or 0.0)
-    middles = problem.middles(theta)
     observed = True
     for _ in range(MAX_STEPS):
-        found = expand(problem, theta, Mixture(held, z**3), stars, observed=observed)
+        found = target.pieces.sum(slope, theta, Mixture(held, z**3), observed)
         gradient = (found.gradient + target.prior.pull(theta))[free]
         H = np.zeros((len(free) + 1,) * 2)
         H[:-1, :-1] = (found.curvature + target.prior.precision)[np.ix_(free, free)]
@@ -323,10 +317,6 @@ def _node(target: SelfTarget, split: Split, at: Float, z: float, bend: float) ->
         if gradient @ step < MAX_DECREMENT:
             break
         theta[free] += step
-        after = problem.middles(theta)
-        stars = found.stars.copy()
-        stars[:, :2] += after - middles
-        middles = after
     y = np.append(theta[free], z)
     # of the density itself: that of the expansion has one choice of members
     value = float(target.log_density(split.to_psi(y, at)[None])[0])

@@ -1,11 +1,11 @@
-"""The Dask engine: shards stay on the workers that read them, and only sums travel.
+"""The Dask engine: pieces of the data stay on the workers that made them, and only sums travel.
 
-Each batch of the data becomes one task whose result, a shard, stays on the worker that made it.  A
-pass is one map-reduce: a task for each shard, run on its worker, whose results come back and are
-added in the order of the shards, as threads add them, however many workers there are and whatever
-happens to them: a worker that is lost takes its shards along, and Dask makes them again elsewhere
-from the batches.  The result of a kernel for one shard is reproducible up to rounding: code that
-was compiled for another processor may differ in the last bits.
+Each piece is the result of one task, and stays on the worker that ran it.  A pass is one
+map-reduce: a task for each piece, run on its worker, whose results come back and are added in the
+order of the pieces, as threads add them, however many workers there are and whatever happens to
+them: a worker that is lost takes its pieces along, and Dask makes them again elsewhere.  The result
+of a kernel for one piece is reproducible up to rounding: code that was compiled for another
+processor may differ in the last bits.
 
 The only module that uses dask and distributed; it is imported when the engine is requested.
 """
@@ -17,16 +17,17 @@ import logging
 import pickle
 import threading
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
+from functools import partial
 from time import monotonic
 from typing import Any
 
-from bayesdist.data.matches import BatchReader, Matches
+from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import kernel
-from bayesdist.infer.stars.shards import Compute, Shards, Task, shard_of, total
+from bayesdist.infer.stars.shards import Compute, Pieces, Shards, Task, shard_of, total
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.survey import Survey
 from bayesdist.model import DistortionModel
@@ -34,7 +35,6 @@ from bayesdist.version import __version__
 
 try:
     import dask
-    from dask.sizeof import sizeof
     from dask.system import CPU_COUNT
     from distributed import Client, Future, KilledWorker, LocalCluster, get_worker
     from distributed.comm import resolve_address
@@ -45,35 +45,33 @@ except ModuleNotFoundError as error:
         do="pip install 'bayesdist[dask]'",
     ) from error
 
-__all__ = ["ClusterShards"]
+__all__ = ["ClusterPieces", "ClusterShards"]
 
 CONNECT = 10.0  # seconds to find the scheduler
 PATIENCE = 60.0  # seconds without any worker after which none is expected any more
 POLL = 1.0  # seconds between two checks for workers
-ALLOWED_FAILURES = 10  # workers that a shard may lose before it counts as their killer
+ALLOWED_FAILURES = 10  # workers that a piece may lose before it counts as their killer
 LARGE = 50_000  # bytes of arguments from which one worker passes them on to the others
 TOGETHER = 256  # results that are fetched at a time
 
 _one_pass = threading.Lock()  # a pass uses all threads of its process
 
 
-class ClusterShards(Shards):
-    """Shards on the workers of a Dask cluster.
+class ClusterPieces(Pieces):
+    """Pieces on the workers of a Dask cluster, made there by one function.
 
-    Batches of stars in memory are sent; those on disk are read by the workers, which have to see
-    the files under the same absolute paths.  With a `scheduler` in `compute`, the
-    cluster is that one; the version of bayesdist must be the same on its workers.  Otherwise
-    `workers` processes are started here and ended by `close`, or when this object or the program
-    goes; a script that does so needs the usual ``if __name__ == "__main__":``.
+    With a `scheduler` in `compute`, the cluster is that one; the version of bayesdist must be the
+    same on its workers.  Otherwise `workers` processes are started here and ended by `close`, or
+    when this object or the program goes; a script that does so needs the usual
+    ``if __name__ == "__main__":``.
 
     InputError when the cluster cannot be reached or started, has no workers, or has workers with
-    another version of bayesdist; and as `prepare` and `BatchReader.load`.
+    another version of bayesdist.
     """
 
-    def __init__(self, model: DistortionModel, matches: Matches, compute: Compute) -> None:
-        super().__init__(model)
-        self._shards: list[Future] = []
-        self._loading: set[str] = set()  # workers that batches are tied to
+    def __init__(self, make: Task, sources: Iterable[Any], compute: Compute) -> None:
+        self._pieces: list[Future] = []
+        self._loading: set[str] = set()  # workers that sources are tied to
         self._client, cluster, self._threads = _connected(compute)
         self._where = self._client.scheduler.address
         self._end = weakref.finalize(self, _end, self._client, cluster)
@@ -81,31 +79,30 @@ class ClusterShards(Shards):
             places = _places(self._client)
             self._loading = set(places)
             _require_version(self._client)
-            # the scheduler stores the batches, so that a lost shard can be made again
+            # the scheduler stores the sources, so that a lost piece can be made again
             with _large_graphs():
-                for k, reader in enumerate(matches.readers()):
-                    self._shards.append(
+                for k, source in enumerate(sources):
+                    self._pieces.append(
                         self._client.submit(
-                            _shard,
-                            model,
-                            reader,
-                            len(matches),
+                            make,
+                            source,
                             workers=[places[k % len(places)]],
                             allow_other_workers=True,
                             pure=False,
                         )
                     )
-            self.survey = total(self._results(self._on_each(_survey)))
+            for _ in self._results(self._on_each(_made)):
+                pass
             self._settle()
         except BaseException:
             self.close()
             raise
 
     def sum(self, task: Task, *args: Any) -> Any:
-        """Sum over the shards of ``task(stars, *args)``, in their order.
+        """Sum over the pieces of ``task(piece, *args)``, in their order.
 
         InputError when there are no workers any more, or when they die of the task; else any
-        exception that the task raises on the first shard, in their order, that it fails on.
+        exception that the task raises on the first piece, in their order, that it fails on.
         """
         work: _Work | Future = _Work(task, args, self._threads)
         with _large_graphs():
@@ -116,16 +113,16 @@ class ClusterShards(Shards):
 
     def close(self) -> None:
         """Release the data, and the cluster where it was started for them."""
-        self._shards = []
+        self._pieces = []
         self._end()
 
     def _on_each(self, function: Task, **options: Any) -> list[Future]:
         # Tied to some workers, loosely.  Tasks that are not, and few, count as roots of a graph:
-        # Dask then spreads them without regard to the positions of the shards, which would travel.
+        # Dask then spreads them without regard to the positions of the pieces, which would travel.
         workers = sorted(self._workers()) or None
         return self._client.map(
             function,
-            self._shards,
+            self._pieces,
             workers=workers,
             allow_other_workers=workers is not None,
             pure=False,
@@ -133,7 +130,7 @@ class ClusterShards(Shards):
         )
 
     def _results(self, futures: Sequence[Future]) -> Iterator[Any]:
-        """Results in the order of the shards, or the first error in that order."""
+        """Results in the order of the pieces, or the first error in that order."""
         try:
             for k in range(0, len(futures), TOGETHER):
                 yield from self._awaited(futures[k : k + TOGETHER])
@@ -192,14 +189,48 @@ class ClusterShards(Shards):
             return set()
 
     def _settle(self) -> None:
-        """Untie the shards from the workers over which they were spread.
+        """Untie the pieces from the workers over which they were spread.
 
         Dask takes no other worker for a tied task when, for a moment, there was none at all: it
         would wait for the lost one for ever.
         """
-        free: dict[Any, list[str]] = {shard.key: [] for shard in self._shards}
+        free: dict[Any, list[str]] = {piece.key: [] for piece in self._pieces}
         self._client.sync(self._client.scheduler.set_restrictions, worker=free)
         self._loading = set()
+
+
+class ClusterShards(ClusterPieces, Shards):
+    """Shards on the workers of a Dask cluster.
+
+    Batches of stars in memory are sent; those on disk are read by the workers, which have to see
+    the files under the same absolute paths.
+
+    InputError as `ClusterPieces`, `prepare` and `BatchReader.load`.
+    """
+
+    def __init__(self, model: DistortionModel, matches: Matches, compute: Compute) -> None:
+        Shards.__init__(self, model)
+        make = partial(shard_of, model, n_total=len(matches))
+        ClusterPieces.__init__(self, make, matches.readers(), compute)
+        try:
+            self.survey = super().sum(_survey)
+        except BaseException:
+            self.close()
+            raise
+
+    def sum(self, task: Task, *args: Any) -> Any:
+        """As `ClusterPieces.sum`, of ``task(stars, *args)``."""
+        return super().sum(_of_stars, task, *args)
+
+
+def _survey(shard: tuple[Stars, Survey]) -> Survey:
+    """On a worker: survey of a shard."""
+    return shard[1]
+
+
+def _of_stars(shard: tuple[Stars, Survey], task: Task, *args: Any) -> Any:
+    """On a worker: result of a task on the stars of a shard."""
+    return task(shard[0], *args)
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,14 +242,8 @@ class _Work:
     threads: int | None
 
 
-def _shard(model: DistortionModel, reader: BatchReader, n_total: int) -> tuple[Stars, Survey]:
-    """On a worker: read one batch, in this function, so that Dask knows the size of a shard."""
-    return shard_of(model, reader, n_total)
-
-
-def _survey(shard: tuple[Stars, Survey]) -> Survey:
-    """On a worker: survey of a shard."""
-    return shard[1]
+def _made(_: Any) -> None:
+    """On a worker: nothing of a piece, once it has been made."""
 
 
 def _same(work: _Work) -> _Work:
@@ -226,18 +251,12 @@ def _same(work: _Work) -> _Work:
     return work
 
 
-def _pass(shard: tuple[Stars, Survey], work: _Work) -> Any:
-    """On a worker: result of a task on one shard."""
+def _pass(piece: Any, work: _Work) -> Any:
+    """On a worker: result of a task on one piece."""
     with _one_pass:
         # of this thread, which may be another one each time
         kernel.set_threads(work.threads or get_worker().state.nthreads)
-        return work.task(shard[0], *work.args)
-
-
-@sizeof.register(Stars)
-def _bytes_of(stars: Stars) -> int:
-    """Size of a shard, without which the scheduler would move it as if it were nothing."""
-    return stars.nbytes
+        return work.task(piece, *work.args)
 
 
 async def _in_order(client: Any, futures: Sequence[Future]) -> list[Any]:

@@ -1,7 +1,8 @@
-"""The data as shards, and the one operation on them: a task on each, and the sum.
+"""The data in pieces, and the one operation on them: a task on each, and the sum.
 
-All inference passes through `Shards.sum`.  Results add up in the order of the shards, which is that
-of the data, so that they depend neither on the threads nor on the engine.
+All passes over matched stars go through `Shards.sum`, where the pieces are called shards.  Results
+add up in the order of the shards, which is that of the data, so that they depend neither on the
+threads nor on the engine.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.infer.stars.survey import Survey, survey
 from bayesdist.model import DistortionModel, Groups
 
-__all__ = ["Compute", "LocalShards", "Shards", "shard_of", "total"]
+__all__ = ["Compute", "LocalShards", "Pieces", "Shards", "shard_of", "total"]
 
 Task = Callable[..., Any]
 
@@ -67,8 +68,20 @@ class Compute:
             )
 
 
-class Shards(ABC):
-    """Stars of a model, in memory, on disk or on a cluster.
+class Pieces(ABC):
+    """The data in pieces, in memory, on disk or on a cluster."""
+
+    @abstractmethod
+    def sum(self, task: Task, *args: Any) -> Any:
+        """Sum over the pieces of ``task(piece, *args)``, in their order."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release the data."""
+
+
+class Shards(Pieces):
+    """Stars of a model, whose pieces are `Stars`.
 
     Parameters
     ----------
@@ -93,14 +106,6 @@ class Shards(ABC):
     def groups(self) -> Groups:
         """Groups of the whole, without members."""
         return self.survey.groups
-
-    @abstractmethod
-    def sum(self, task: Task, *args: Any) -> Any:
-        """Sum over the shards of ``task(stars, *args)``, in their order."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Release the data."""
 
 
 class LocalShards(Shards):

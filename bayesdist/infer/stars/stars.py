@@ -64,6 +64,10 @@ class Stars:
         shared = self.var_u is self.var_v
         return 8 * len(self) * ((5 if shared else 6) + len(self.offsets))
 
+    def __sizeof__(self) -> int:
+        """Bytes of all columns, without which Dask would move a shard as if it were nothing."""
+        return self.nbytes
+
     @cached_property
     def blocks(self) -> Int:
         """Pieces (n, 3) that fit into the cache."""

@@ -47,7 +47,7 @@ def handbook(line: str, file: str, output: str, **options: Any) -> None:
 @filter_name
 @epoch
 @pixel_scale
-@click.option("-o", "--output", required=True, metavar="OUT.fits")
+@click.option("-o", "--output", required=True, metavar="OUT.fits", help="File to write.")
 @click.option("--chip", type=int, metavar="N", show_default="all", help="Chip of the primary HDU.")
 @click.option("--image", metavar="FLT", help="A calibrated image that the maps shall match.")
 @force

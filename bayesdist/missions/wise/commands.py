@@ -18,7 +18,7 @@ from bayesdist.app.commands.options import (
 
 
 @command()
-@click.option("-o", "--output", default="bayesdist-demo", metavar="DIR")
+@click.option("-o", "--output", default="bayesdist-demo", metavar="DIR", help="Folder to create.")
 @click.option(
     "--as",
     "format",
@@ -87,7 +87,7 @@ def bands(
 @click.argument("detections", metavar="DETECTIONS")
 @click.argument("reference", metavar="REFERENCE")
 @new_folder
-@click.option("--band", required=True, metavar="W1")
+@click.option("--band", required=True, metavar="W1", help="Band of the detections.")
 @click.option("--order", type=int, default=4, metavar="N", help="Final order of the polynomial.")
 @click.option(
     "--radius",
@@ -126,7 +126,7 @@ def bring_up(line: str, detections: str, reference: str, output: str, **options:
     "--angle", type=float, default=0.0, metavar="DEG", help="Angle from x towards y, degrees."
 )
 @click.option("--mirror", is_flag=True, help="Change the sign of x first.")
-@click.option("-o", "--output", required=True, metavar="OUT")
+@click.option("-o", "--output", required=True, metavar="OUT", help="File to write.")
 @force
 def rotate(file: str, output: str, angle: float, mirror: bool, force: bool) -> None:
     """Rotate the pixel frame of a SIP header or of WISE meta-data."""

@@ -79,7 +79,7 @@ def _calibrated(folder, seed, scatter_deg, n_chips):
         (2, 2, 0.001),
         case_in_full(2, 2, 0.0015, instead=ENDS),
         case_in_full(2, 2, 0.003, instead=ENDS),
-        (2, 2, 0.005),
+        case_in_full(2, 2, 0.005, instead="one chip is run"),
         (2, 1, 0.005),
         case_in_full(5, 1, 0.005, instead="another seed is run"),
     ],

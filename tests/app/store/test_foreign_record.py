@@ -11,6 +11,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from bayesdist.app.store import Record
+from bayesdist.app.store.keys import digest_of
 from bayesdist.app.store.record import SCHEMA
 from bayesdist.app.summary import Summary
 from bayesdist.errors import InputError
@@ -50,6 +51,11 @@ WHOLE: dict[str, Any] = {
 VALUES = (None, [], {}, "text", -1, 1e300, [None], {"a": [1]}, True)
 
 
+def _text(tree: dict[str, Any]) -> str:
+    """With its checksum, as whoever makes such a file can give it."""
+    return json.dumps(tree | {"sha256": digest_of(tree)})
+
+
 def _places(tree: Any, above: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     inner = tree.items() if isinstance(tree, dict) else enumerate(tree)
     for key, value in inner:
@@ -68,10 +74,19 @@ def _replaced(place: tuple[Any, ...], value: Any) -> Any:
 
 def test_a_record_is_read_as_it_was_written(tmp_path):
     path = tmp_path / "run.json"
-    path.write_text(json.dumps(WHOLE))
+    path.write_text(_text(WHOLE))
     record = Record.read(path)
     record.write(path)
-    assert json.loads(path.read_text()) == WHOLE
+    assert json.loads(path.read_text()) == json.loads(_text(WHOLE))
+
+
+def test_a_record_that_was_edited_is_refused(tmp_path):
+    path = tmp_path / "run.json"
+    Record({"config": {"scale": 1.5}}).write(path)
+    assert Record.read(path).facts == {"config": {"scale": 1.5}}
+    path.write_text(path.read_text().replace("1.5", "1.6"))
+    with pytest.raises(InputError, match=r"run\.json: was changed since .*; restore it"):
+        Record.read(path)
 
 
 @pytest.mark.parametrize("place", list(_places(WHOLE)), ids=lambda p: ".".join(map(str, p)))
@@ -79,7 +94,7 @@ def test_any_other_value_anywhere(tmp_path, place):
     """It is read where a value of that kind may stand there, and can be written again."""
     path = tmp_path / "run.json"
     for value in VALUES:
-        path.write_text(json.dumps(_replaced(place, value)))
+        path.write_text(_text(_replaced(place, value)))
         sentence = ""
         try:
             Record.read(path).write(path)
@@ -96,7 +111,7 @@ def test_a_number_in_place_of_a_table_or_a_list_is_refused(tmp_path, place):
     if not isinstance(found, dict | list | str) or place[:1] == ("config",) or "parts" in place[3:]:
         return
     path = tmp_path / "run.json"
-    path.write_text(json.dumps(_replaced(place, 1.5)))
+    path.write_text(_text(_replaced(place, 1.5)))
     with pytest.raises(InputError, match=r"run\.json: is not as bayesdist wrote it \("):
         Record.read(path)
 

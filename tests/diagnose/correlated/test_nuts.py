@@ -1,4 +1,4 @@
-"""Marginalised posteriors against NumPyro's NUTS, with every coefficient explicit."""
+"""Marginalised posteriors against NumPyro's NUTS, with every coefficient explicit, or dense."""
 
 from __future__ import annotations
 
@@ -159,46 +159,87 @@ def test_structure(found, full, capsys):
     agree(ours, got, "at", "structure" + (" of a field" if found else " of nothing"), capsys)
 
 
-def test_deviations_of_exposures(full, capsys):
-    """Scale and shears of six exposures and the curvature of a drift, two scatters."""
-    import jax
-    import jax.numpy as jnp
-    import numpyro.distributions as dist
+MEDIANS = {"shape": 1e-5, "rotation": 1e-5, "curvature": 3e-7}
+NOISE = 1e-4
 
-    jax.config.update("jax_enable_x64", True)
+
+@pytest.fixture
+def deviations():
+    """Scale and shears of six exposures and the curvature of a drift: their draws, and the data."""
     rng = np.random.default_rng(3)
     scatter = np.array(["shape"] * 18 + ["rotation"] * 6 + ["curvature"] * 2)
-    priors = DiscrepancyPriors(exposure=1e-5, curvature=3e-7)
+    priors = DiscrepancyPriors(exposure=MEDIANS["shape"], curvature=MEDIANS["curvature"])
     sizes = {"shape": 2e-5, "rotation": 5e-6, "curvature": 2e-7}
     q, n = len(scatter), 80
     d = np.array([sizes[s] for s in scatter]) * rng.standard_normal(q)
     A = rng.standard_normal((n, q))
     A[:, -2:] *= 40.0
-    noise = 1e-4
-    data = A @ d + noise * rng.standard_normal(n)
-    S, score = A.T @ A / noise**2, A.T @ data / noise**2
+    data = A @ d + NOISE * rng.standard_normal(n)
+    S, score = A.T @ A / NOISE**2, A.T @ data / NOISE**2
     columns = DeviationColumns(
         None, np.zeros(1), (), ((0, 0, 1), (0, 1, 2)), scatter, np.zeros(1, int), 6, 2010.0, 1.0
     )
     found = deviation_draws(columns, S, score, -np.eye(q), priors, 60_000, rng)
-    medians = {"shape": 1e-5, "rotation": 1e-5, "curvature": 3e-7}
-    index = np.array([list(medians).index(s) for s in scatter])
-    matrix, seen = jnp.array(A / noise), jnp.array(data / noise)
+    index = np.array([list(MEDIANS).index(s) for s in scatter])
+    return found.theta, A / NOISE, data / NOISE, index
+
+
+def test_deviations_of_exposures_are_those_of_the_integral(deviations):
+    """Dense, over a fine mesh of the three amplitudes: given these all else is normal."""
+    theta, matrix, seen, index = deviations
+    S, score = matrix.T @ matrix, matrix.T @ seen
+    axes = [np.linspace(-7, 7, n) for n in (71, 31, 31)]
+    logs = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+    def conditional(logs):
+        """Means, covariances and log evidence of the deviations for each of the amplitudes."""
+        spread = (np.exp(logs) * list(MEDIANS.values()))[:, index]
+        precision = spread[:, :, None] * S * spread[:, None] + np.eye(len(index))
+        cov = np.linalg.inv(precision) * spread[:, :, None] * spread[:, None]
+        mean = cov @ score
+        evidence = 0.5 * mean @ score - 0.5 * np.linalg.slogdet(precision)[1]
+        return mean, cov, evidence + (logs - np.log1p(np.exp(2 * logs))).sum(axis=1)
+
+    parts = np.array_split(logs, 100)
+    density = np.concatenate([conditional(part)[2] for part in parts])
+    some = density > density.max() - 15
+    mean, cov, density = conditional(logs[some])
+    weight = np.exp(density - density.max())
+    weight /= weight.sum()
+    expected = weight @ mean
+    second = np.einsum("n,nq->q", weight, mean**2 + np.diagonal(cov, axis1=1, axis2=2))
+    sd = np.sqrt(second - expected**2)
+    # the amplitudes of the draws are those of a coarse mesh
+    np.testing.assert_allclose((theta.mean(axis=0) - expected) / sd, 0, atol=0.05)
+    np.testing.assert_allclose(theta.std(axis=0) / sd, 1, atol=0.03)
+
+
+@only_in_full("the integral above is dense, and takes a second")
+def test_deviations_of_exposures(deviations, full, capsys):
+    """The same density without any conjugacy."""
+    import jax
+    import jax.numpy as jnp
+    import numpyro.distributions as dist
+
+    jax.config.update("jax_enable_x64", True)
+    theta, *arrays, index = deviations
+    q = len(index)
+    matrix, seen = (jnp.array(a) for a in arrays)
 
     def density():
         logs = jnp.stack(
             [
                 numpyro.sample(name, dist.Uniform(np.log(m) - 7, np.log(m) + 7))
-                for name, m in medians.items()
+                for name, m in MEDIANS.items()
             ]
         )
-        z = jnp.exp(logs) / jnp.array(list(medians.values()))
+        z = jnp.exp(logs) / jnp.array(list(MEDIANS.values()))
         numpyro.factor("prior", (jnp.log(z) - jnp.log1p(z**2)).sum())
         own = numpyro.sample("own", dist.Normal(0, 1).expand((q,)))
         each = jnp.exp(logs)[index] * own
         numpyro.factor("seen", -0.5 * ((seen - matrix @ each) ** 2).sum())
         numpyro.deterministic("each", each)
 
-    start = {"own": np.zeros(q)} | {name: np.log(m) for name, m in medians.items()}
+    start = {"own": np.zeros(q)} | {name: np.log(m) for name, m in MEDIANS.items()}
     got = nuts(density, start, 4, full)
-    agree(found.theta, got, "each", "deviations", capsys)
+    agree(theta, got, "each", "deviations", capsys)

@@ -14,6 +14,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer import build_model, fit_linear
 from bayesdist.infer.catalogue.added_errors import DECISIVE, grouped_errors
 from bayesdist.model import Chip
+from tests.reduced import case_in_full
 
 from ..support import UNCLIPPED
 
@@ -117,7 +118,15 @@ def test_stated_errors_are_those_by_which_estimates_scatter():
     assert (pulls**2).mean() == pytest.approx(1.0, abs=4 * np.sqrt(2 / 60))
 
 
-@pytest.mark.parametrize(("dof", "n"), [(None, 300), (None, 2000), (4, 300), (4, 2000)])
+@pytest.mark.parametrize(
+    ("dof", "n"),
+    [
+        (None, 300),
+        case_in_full(None, 2000, instead="longer tails are run"),
+        case_in_full(4, 300, instead="more stars are run"),
+        (4, 2000),
+    ],
+)
 def test_equal_axes_are_not_split(dof, n):
     """At odds of 20 to 1; long tails, of a t distribution, are none either."""
     seeds = range(20)

@@ -54,7 +54,7 @@ def monitored(seed, **options):
 
 
 def test_exposures_that_scatter_are_no_change(full) -> None:
-    n = 100 if full else 6
+    n = 100 if full else 4
     values, scatters, since = [], [], []
     for seed in range(n):
         _, change, date = monitored(seed)

@@ -289,7 +289,7 @@ def named_by_chance(n, campaigns=20_000):
 )
 def test_scatter_and_lines_over_many_truths(full, own):
     """Pulls of alpha and beta, and where the true tau lies in its posterior."""
-    n, exposures = (100, 40) if full else (4, 24)
+    n, exposures = (100, 40) if full else (3, 24)
     truth = TAU if own is None else np.concatenate([TAU, own])
     pulls, ranks, outlying = [], [], 0
     for seed in range(n):

@@ -1,4 +1,4 @@
-"""The branch-free exponential against libm, bit by bit, and the logarithm of a product."""
+"""The branch-free exponential and inverse root against libm, and the logarithm of a product."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from bayesdist.infer.kernel.blocks import BLOCK
 from bayesdist.infer.kernel.mixture import log_of_product
-from bayesdist.infer.kernel.numeric import LOWEST, bits_of, exp_negative, from_bits
+from bayesdist.infer.kernel.numeric import LOWEST, bits_of, exp_negative, from_bits, inverse_root
 from bayesdist.infer.kernel.polynomial import FAST
 
 SUMS = FAST | {"reassoc"}
@@ -221,3 +221,19 @@ def test_the_library_of_c_is_there():
     c = ctypes.CDLL(name).exp
     c.restype, c.argtypes = ctypes.c_double, [ctypes.c_double]
     assert all(c(t) == math.exp(t) for t in (-0.1, -1.0, -33.3, -699.9))
+
+
+def test_inverse_root_is_within_two_units_of_the_last_digit():
+    @nb.njit(fastmath=FAST)
+    def loop(x, out):
+        for s in range(len(x)):
+            out[s] = inverse_root(x[s])
+
+    rng = np.random.default_rng(2)
+    mantissas = np.concatenate([np.linspace(1.0, 4.0, 100_001), rng.uniform(1, 4, 100_000)])
+    wide = mantissas * 4.0 ** rng.integers(-510, 510, mantissas.size)
+    edges = np.array([np.finfo(float).tiny, np.finfo(float).max])
+    x = np.concatenate([mantissas, wide, edges])
+    found = np.empty_like(x)
+    loop(x, found)
+    assert ulps(found, np.array([1.0 / math.sqrt(t) for t in x])).max() <= ULP

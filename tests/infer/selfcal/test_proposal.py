@@ -9,7 +9,7 @@ import pytest
 
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.equations.priors import Prior
-from bayesdist.infer.selfcal import posterior
+from bayesdist.infer.selfcal import pieces, posterior
 from bayesdist.infer.selfcal.mode import solve
 from bayesdist.infer.selfcal.posterior import SelfTarget
 
@@ -19,7 +19,7 @@ from .fields import field, problem_of
 def indefinite(when):
     """`expand` with a negative curvature in those passes for which `when(observed, k)` is true."""
     passes = {True: 0, False: 0}
-    expand = posterior.expand
+    expand = pieces.expand
 
     def wrapped(*args, observed=True):
         passes[observed] += 1
@@ -37,12 +37,14 @@ def target():
     problem, _ = problem_of(simulated, min_detections=3)
     K = simulated.model.n_terms
     free = np.setdiff1d(np.arange(simulated.model.n_params), [0, 1, K, K + 1])
-    return SelfTarget(solve(problem, simulated.theta, free, Prior.none(simulated.theta)))
+    mode = solve(problem, simulated.theta, free, Prior.none(simulated.theta))
+    with pieces.in_pieces(mode) as whole:
+        yield SelfTarget(mode, whole)
 
 
 def test_nodes_are_found_past_an_indefinite_curvature(target, monkeypatch):
     plain = posterior.propose(target)
-    monkeypatch.setattr(posterior, "expand", indefinite(lambda observed, k: observed and k == 2))
+    monkeypatch.setattr(pieces, "expand", indefinite(lambda observed, k: observed and k == 2))
     found = posterior.propose(target)
     sigma = np.sqrt(np.diag(target.solution.cov)[target.solution.free])
     assert len(found.nodes) == len(plain.nodes)
@@ -52,6 +54,6 @@ def test_nodes_are_found_past_an_indefinite_curvature(target, monkeypatch):
 
 
 def test_what_is_indefinite_with_any_weights_is_refused(target, monkeypatch):
-    monkeypatch.setattr(posterior, "expand", indefinite(lambda *_: True))
+    monkeypatch.setattr(pieces, "expand", indefinite(lambda *_: True))
     with pytest.raises(DegenerateError, match="do not determine"):
         posterior.propose(target)

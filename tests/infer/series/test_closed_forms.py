@@ -16,6 +16,7 @@ from bayesdist.infer.series import (
 )
 from bayesdist.infer.series.problem import WIDE, Problem, trend_equations
 from bayesdist.infer.series.small import cholesky, precision_of
+from tests.reduced import case_in_full
 
 from .straight import straight_lines
 
@@ -101,7 +102,14 @@ def test_textbook_line(rng):
     assert posterior.beta.std() == pytest.approx(s / np.sqrt(n) / epoch.std(), rel=0.04)
 
 
-@pytest.mark.parametrize("formal", [0.0, 0.3, 3.0])
+@pytest.mark.parametrize(
+    "formal",
+    [
+        case_in_full(0.0, instead="formal errors beside the scatter are run"),
+        0.3,
+        case_in_full(3.0, instead="formal errors beside the scatter are run"),
+    ],
+)
 def test_one_scatter_is_a_one_dimensional_integral(formal, rng):
     """Scatter and slope against quadrature, from no formal errors to formal errors above all."""
     n = 30

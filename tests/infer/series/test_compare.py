@@ -120,7 +120,7 @@ def false_claim(seed: int) -> tuple[str, bool, float]:
 @pytest.mark.slow
 def test_an_irregular_drift_is_not_taken_for_a_line(full, capsys):
     """First-order processes without any trend: slopes of three sigma are common there."""
-    n = 100 if full else 8
+    n = 100 if full else 5
     claims = over_seeds(false_claim, n)
     share = np.mean([line for _, line, _ in claims])
     naive = np.mean([ratio > 3 for _, _, ratio in claims])
@@ -137,7 +137,7 @@ def false_line(seed: int) -> bool:
 
 @pytest.mark.slow
 def test_scatter_alone_is_not_taken_for_a_line(full):
-    n = 100 if full else 5
+    n = 100 if full else 3
     assert np.mean(over_seeds(false_line, n)) <= 0.03
 
 

@@ -15,6 +15,7 @@ from bayesdist.infer.series.chains import run
 from bayesdist.infer.series.problem import WIDE, Problem
 from bayesdist.infer.series.scatter import FRACTION_PRIOR, KAPPA_RATE, MAX_FRACTION, MIN_KAPPA
 from tests.infer.calibration import over_seeds
+from tests.reduced import only_in_full
 
 from .test_scatter import prior_draws
 
@@ -101,18 +102,16 @@ def spline_ranks(seed: int) -> dict[str, float]:
     return ranks_of("spline", seed)
 
 
+@only_in_full("test_calibration has pulls and coverage, test_closed_forms the densities")
 @pytest.mark.parametrize("function", [line_ranks, step_ranks, spline_ranks])
-def test_ranks_are_uniform(function, full, capsys):
-    if function is not line_ranks and not full:
-        pytest.skip("lines are run: set BAYESDIST_FULL=1")
-    n = 300 if full else 16
-    ranks = over_seeds(function, n)
+def test_ranks_are_uniform(function, capsys):
+    ranks = over_seeds(function, 300)
     assert np.mean([r["converged"] for r in ranks]) > 0.9
     for key in ranks[0]:
         if key == "converged":
             continue
         values = np.array([r[key] for r in ranks])
-        counts, _ = np.histogram(values, bins=10 if full else 4, range=(-0.5, THINNED + 0.5))
+        counts, _ = np.histogram(values, bins=10, range=(-0.5, THINNED + 0.5))
         p = chisquare(counts).pvalue
         with capsys.disabled():
             print(f"\n{function.__name__}, {key}: {counts}, p = {p:.3f}", end="")

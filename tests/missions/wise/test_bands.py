@@ -15,6 +15,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
+from bayesdist.app.store import Record
 from bayesdist.infer import load_fit, load_posterior
 from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.missions.wise.simulate import wise_solution
@@ -260,6 +261,7 @@ def test_every_file_is_there_and_the_page_needs_no_other(compared):
     assert not re.search(r"<(?:link|script|iframe|img)[^>]*https:", page)
     assert page.count("<figure") == len([f for f in files if f.endswith(".png")])
     assert "NOT CONVERGED" not in page
+    assert page.count("SIMULATED DATA") == 2  # on the screen, and on each page of paper
     assert "W4" in compared.result.out and "bands.html" in compared.result.out
 
 
@@ -300,9 +302,9 @@ def test_a_run_that_has_not_converged_is_said_on_top(compared, tmp_path):
 
 def test_a_run_that_is_not_finished_is_refused(compared, tmp_path):
     shutil.copytree(compared.run("W4"), tmp_path / "run")
-    record = json.loads((tmp_path / "run" / "run.json").read_text(encoding="utf-8"))
-    del record["artefacts"]["sample"]
-    (tmp_path / "run" / "run.json").write_text(json.dumps(record), encoding="utf-8")
+    record = Record.read(tmp_path / "run" / "run.json")
+    del record.artefacts["sample"]
+    record.write(tmp_path / "run" / "run.json")
     words = ["needs stage 'sample'", "bayesdist stage sample"]
     refused(tmp_path, "wise", "bands", tmp_path / "run", "-o", tmp_path / "out", words=words)
 

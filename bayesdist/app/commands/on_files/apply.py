@@ -15,6 +15,7 @@ from bayesdist.app.commands.on_files.position_table import (
     check_output,
     chip_numbers,
     position_column,
+    refuse_no_rows,
     write_positions,
 )
 from bayesdist.app.screen import number
@@ -78,6 +79,7 @@ def apply_to_table(
     a = Application(chips_of, frame, images)
     names = tuple(columns or (OUT if inverse else ("x", "y")))
     rows = read_table(Path(table))
+    refuse_no_rows(rows, str(table))
     x, y = (position_column(rows, name, str(table)) for name in names)
     what = found.name, str(table)
     if inverse:

@@ -110,7 +110,9 @@ def _as_assessed(folder: Path) -> Solution:
     """The posterior of a folder, with the errors as assessed where it is that of a run."""
     if not (folder / "run.json").exists():
         return load_posterior(folder)
-    with open_results(RunDirectory(folder)) as results:
+    run = RunDirectory(folder)
+    run.require("calibration", ("fit", "sample", "diagnose"))
+    with open_results(run) as results:
         return results.solution
 
 

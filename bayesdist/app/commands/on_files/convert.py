@@ -80,6 +80,8 @@ def convert(
     lines = [f"{', '.join(str(p) for p in places)}: by {source.name}"]
     back = _read_back(held, filter, made.model.chips[0].size)
     lines += [f"  {note}" for note in (*source.notes, *notes)]
+    if source.errors == "none":
+        lines.append("  note: it states no errors, and neither do the new files")
     lines += [f"  warning: {w}" for w in dict.fromkeys(w for one in built for w in one.warnings)]
     used = _read_back(held, filter, made.model.chips[0].size, as_used=True)
     lines += [f"  {line}" for line in _losses(source, back, used, at, scale)]

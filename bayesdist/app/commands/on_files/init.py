@@ -226,6 +226,8 @@ def _read(
     if table.has_mag:
         return table, line, '"by_magnitude"        # the table carries no errors', False
     what = "GUESSED: the table carries neither errors nor magnitudes"
+    if "flux" in taken:
+        what += f" (not all {taken['flux']} are positive)"
     found = guessed_sigma(table.sample(SAMPLE))
     if found is None:
         return table, line, f"{SIGMA}                    # {what}", False

@@ -22,6 +22,7 @@ __all__ = [
     "chip_numbers",
     "position_column",
     "refuse_columns",
+    "refuse_no_rows",
     "write_positions",
 ]
 
@@ -42,6 +43,12 @@ def check_output(output: Path, force: bool) -> None:
             do=f"choose one of {', '.join(_FORMATS)}",
         )
     refuse_existing(output, force)
+
+
+def refuse_no_rows(table: Table, where: str) -> None:
+    """Refuse a table without positions."""
+    if not len(table):
+        raise InputError("has no rows", where=where, do="give a table of positions")
 
 
 def position_column(table: Table, name: str, where: str) -> Float:

@@ -18,6 +18,7 @@ from bayesdist.app.commands.on_files.position_table import (
     chip_numbers,
     position_column,
     refuse_columns,
+    refuse_no_rows,
     write_positions,
 )
 from bayesdist.app.screen import number
@@ -147,6 +148,7 @@ def sky_to_table(
         )
     found = _calibration(path, filter, size)
     rows, name = _rows(table)
+    refuse_no_rows(rows, name)
     rows, at = _with_sky(
         found, rows, name, columns or ("x", "y"), centroids, pixel_origin, chip, epoch, point, joint
     )

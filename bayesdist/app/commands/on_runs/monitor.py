@@ -51,6 +51,7 @@ def monitor(
     directory = RunDirectory(run)
     if not directory.is_initialized:
         raise directory.not_a_run_error()
+    directory.require("monitor", ("fit", "sample", "diagnose"))
     config = directory.config
     posterior, matches, fitted, left_out = _fitted(directory, config, Path(new))
     try:
@@ -74,7 +75,8 @@ def monitor(
             misfit=worst_misfit(misfits_of(fitted.fit, *residual_sums(fitted.fit, shards))),
             pixel_mas=pixel_scale_of(posterior, scale_mas=config.detector.scale_mas),
         )
-        facts = _facts(fitted, posterior) | {"left_out": list(left_out)}
+        facts = _facts(fitted, posterior)
+        facts |= {"left_out": list(left_out), "rejected": dict(matches.rejected)}
     finally:
         fitted.target.shards.close()
     if output is not None:
@@ -191,6 +193,7 @@ def _lines(found: Monitored, facts: dict[str, Any], scores: Sequence[PeriodScore
         lines.append("exposures deviate as those of the release scatter")
     if facts["left_out"]:
         lines.append(f"left out: {len(facts['left_out'])} exposure(s) that the release has seen")
+    lines += [f"rows left out: {n} ({reason})" for reason, n in facts["rejected"].items()]
     for key, what in (("j", "error beyond the quoted ones"), ("f", "fraction of false matches")):
         if key in facts["mixture"] and key in facts["mixture_released"]:
             old = facts["mixture_released"][key]

@@ -11,6 +11,7 @@ from urllib.parse import quote
 
 from bayesdist.app.config import config_of_record
 from bayesdist.app.report import title_of
+from bayesdist.app.screen import table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.summary import head_of
 from bayesdist.numbers import with_mas
@@ -26,13 +27,15 @@ NO_VERDICT = "no verdict is recorded; 'bayesdist stage report' makes one"
 def overview(runs: Sequence[str | Path], output: str | Path) -> str:
     """Text to print, once the page that compares runs by their summary.json is written.
 
+    It has a line for each run with its verdict, the worst one first.
     InputError for a folder that holds no run.
     """
     rows = [_row(RunDirectory(run), Path(output)) for run in runs]
-    write_overview(output, rows)
-    worst = [row.name for row in rows if row.level == "fail"]
-    failed = f"; failed: {', '.join(worst)}" if worst else ""
-    return f"{output}: verdicts of {len(rows)} run{'s' if len(rows) > 1 else ''}{failed}"
+    table = [
+        {"Status": row.level.replace("fail", "FAIL"), "Run": row.name, "Verdict": row.headline}
+        for row in write_overview(output, rows)
+    ]
+    return f"{table_text(table)}\n\npage: {output}"
 
 
 def _row(run: RunDirectory, output: Path) -> OverviewRow:

@@ -50,6 +50,7 @@ class BandResult:
 
     name: str  # of the band, and of its run
     path: str
+    simulated: bool
     converged: bool
     reasons: tuple[str, ...]  # why it has not
     arcsec: float  # per pixel
@@ -91,6 +92,16 @@ class BandsInput:
     def not_converged(self) -> tuple[BandResult, ...]:
         """Bands whose sampling has not reached its targets."""
         return tuple(b for b in self.bands if not b.converged)
+
+    @property
+    def simulated(self) -> bool:
+        """True if the data of some band are simulated."""
+        return any(b.simulated for b in self.bands)
+
+    @property
+    def title(self) -> str:
+        """Names of the bands, after that of the mission where it is known."""
+        return ("WISE " if self.wise else "") + ", ".join(self.names)
 
     @property
     def names(self) -> tuple[str, ...]:

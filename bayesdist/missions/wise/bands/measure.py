@@ -120,6 +120,7 @@ def _measured(
     return BandResult(
         name=run.name,
         path=run.path,
+        simulated=bool(results.run.facts["config"]["data"]["simulated"]),
         converged=convergence.converged,
         reasons=tuple(convergence.reasons),
         arcsec=run.arcsec,

@@ -112,7 +112,7 @@ class Content:
         if self.path is None or not name or Path(name).name != name:
             return None
         path = self.path.parent / name
-        return read_content(path) if path.exists() else None
+        return read_content(path) if os.path.lexists(path) else None  # also links to nowhere
 
     @property
     def is_fits(self) -> bool:

@@ -31,11 +31,12 @@ class Plane:
         return self.hdu.header
 
     def number(self, keyword: str, default: float) -> float:
-        """Value of a keyword; FormatError when it is no number."""
+        """Value of a keyword; FormatError when it is no finite number."""
         value = self.header.get(keyword, default)
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        a_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not a_number or not np.isfinite(value):
             raise FormatError(
-                f"is {value!r}", where=f"{self.where}, keyword {keyword}", do="give a number"
+                f"is {value!r}", where=f"{self.where}, keyword {keyword}", do="give a finite number"
             )
         return value
 

@@ -9,6 +9,7 @@ pixel: ours state them in comments.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -237,7 +238,7 @@ def _number(text: str, where: str) -> float:
 def record_beside(name: str) -> Mapping[str, Any] | None:
     """Record of the side file in the folder of a table; None where there is none."""
     path = Path(name).with_name(side_name(name))
-    return _record_of_side(read_content(path)) if path.exists() else None
+    return _record_of_side(read_content(path)) if os.path.lexists(path) else None
 
 
 def _record_of_side(content: Content) -> Mapping[str, Any]:

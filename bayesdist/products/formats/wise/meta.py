@@ -30,6 +30,7 @@ _ENTRY = re.compile(r"\S*distort_(?:skew|(?:a|b|ap|bp)_)\S*")
 _ENTRY_LINE = re.compile(r"\S*distort_(\S+)\s+(\d+)\s+(\S+)\s+([ir])\s+(\S+)\s*(.*)")
 _KEYWORD = re.compile(r"SKEW|[AB]P?_(?:ORDER|\d_\d)|[AB]_DMAX")
 # Entries of `write_wise_meta` in comment lines, which other readers skip.
+_LIKE_ASIDE = re.compile(r"\\.*\s([AB]E_\d_\d|BDCLOS)\s+r\s.*")
 _ASIDE = re.compile(r"\\\s+(\d+)\s+([AB]E_\d_\d|BDCLOS)\s+r\s+(\S+).*")
 # Columns and rows of the arrays, and arcseconds in a pixel: those of W4 are twice as wide.
 ARRAYS = {1: (1016, 2.75), 2: (1016, 2.75), 3: (1016, 2.75), 4: (508, 5.5)}
@@ -78,9 +79,20 @@ def bands_of(content: Content) -> tuple[WiseBand, ...]:
             entries[band][keyword] = value, comment
         elif aside := _ASIDE.fullmatch(line.rstrip()):
             asides.setdefault(int(aside[1]), {})[aside[2]] = aside[3]
+        elif _LIKE_ASIDE.fullmatch(line.rstrip()):
+            raise FormatError(
+                "is not band, keyword, type, value of an error",
+                where=f"{where}, line {number}",
+                do="correct the line",
+            )
     if not entries:
         raise FormatError(
             "there are no distortion entries", where=where, do="give a WISE meta-data file"
+        )
+    lost = asides.keys() - entries.keys()
+    if lost:
+        raise FormatError(
+            f"errors are of band {min(lost)}, which has no entries", where=where, do="correct them"
         )
     return tuple(
         _wise_band(band, entries[band], asides.get(band, {}), where) for band in sorted(entries)

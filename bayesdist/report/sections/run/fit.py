@@ -146,7 +146,7 @@ def score_test_table(r: ReportInput) -> TextTable:
     rows = tuple(
         (
             t.name if t.unit == r.unit else f"{t.name}, per year",
-            f"{number(t.statistic, 3)} ({number(t.dof, 3)})",
+            f"{number(t.statistic, 3)} ({t.dof:.4g})",
             "< 1e-300" if t.p_value < 1e-300 else number(t.p_value, 2),
             number(t.size * scale.factor, 2),
             number(t.smallest * scale.factor, 2) if np.isfinite(t.smallest) else MISSING,
@@ -161,14 +161,16 @@ def score_test_table(r: ReportInput) -> TextTable:
             "Statistic (dof)",
             "p",
             f"Size [{scale.unit}]",
-            f"Would have seen [{scale.unit}]",
+            f"Detectable [{scale.unit}]",
             "Result",
         ),
         rows,
         words=(0, 5),
         stacked=(5,),
-        note=f"Found: more than chance at {SCORE_TESTS.value:g} over all these tests together"
-        " (Holm). Size: rms over the detector; of the noise rms difference of its standard"
-        " deviations; of the gap its drift, and of motions their rms, in a year;"
-        f" beside it the smallest that would have been seen with probability {POWER:g}.",
+        note=f"An effect is found where p is below {SCORE_TESTS.value:g} after Holm's correction"
+        " for the number of tests. p allows for all that a test tried: of a repeating pattern it is"
+        " that of the largest of all periods and directions, whose own statistic is given. Size is"
+        " the rms over the detector; for noise, the rms difference of standard deviations; for the"
+        " gap between chips, its drift per year; for motions, their rms per year. Detectable is the"
+        f" smallest size that would have been found with probability {POWER:g}.",
     )

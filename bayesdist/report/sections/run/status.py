@@ -146,8 +146,9 @@ def _rows_clause(names: Sequence[str], verb: str) -> str:
     if len(names) == 1:
         return f"one criterion {verb} ({names[0]})"
     different = tuple(dict.fromkeys(names))  # a file may have several findings
-    shown = "; ".join(different[:_NAMED]) + (", ..." if len(different) > _NAMED else "")
-    return f"{len(names)} criteria {verb[:-1]} ({shown})"
+    shown, more = different[:_NAMED], len(different) - _NAMED
+    named = "; ".join((*shown, f"and {more} more") if more > 0 else shown)
+    return f"{len(names)} criteria {verb[:-1]} ({named})"
 
 
 def _margin_sentence(r: ReportInput) -> str:

@@ -1,0 +1,36 @@
+"""A self-calibration whose configuration asks for the Dask engine is sampled by its workers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bayesdist.app.config import load_config
+from bayesdist.app.config.fit import ComputeBlock
+from bayesdist.app.pipeline import fit, match, read, sample
+from bayesdist.infer.selfcal import pieces
+from bayesdist.infer.stars import cluster
+from tests.app.selfcal.support import list_table, small, write_selfcal
+
+
+@pytest.mark.timeout(300)
+def test_draws_are_those_of_one_process(tmp_path, monkeypatch):
+    passes = []
+
+    class Counted(cluster.ClusterPieces):
+        def sum(self, task, *args):
+            passes.append(task)
+            return super().sum(task, *args)
+
+    monkeypatch.setattr(pieces, "PIECE", 500)
+    monkeypatch.setattr(cluster, "ClusterPieces", Counted)
+    sections = {"sampler": {"target_ess": 100}, "compute": {"engine": "dask", "workers": 2}}
+    path = write_selfcal(tmp_path, list_table(small()), **sections)
+    config, _ = load_config(path)
+    data = fit(match(read(config, tmp_path), config, tmp_path), config, tmp_path)
+    there = sample(data, config)
+    assert {pieces.log_density, pieces.slope} == set(passes)
+    here = sample(data, config.model_copy(update={"compute": ComputeBlock()}))
+    sd = here.theta.std(axis=(0, 1))
+    assert (np.abs(there.theta - here.theta) <= 1e-10 * np.maximum(sd, np.abs(here.theta))).all()
+    np.testing.assert_allclose(there.log_prob, here.log_prob, rtol=1e-10)

@@ -1,0 +1,209 @@
+"""Detections on the workers of a cluster give what they give in one process.
+
+Random numbers and decisions are the same, and sums over pieces differ from those over the whole by
+rounding alone.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from distributed import LocalCluster
+
+from bayesdist.infer import Compute
+from bayesdist.infer.equations.priors import Prior
+from bayesdist.infer.selfcal import pieces, posterior, sample_selfcal
+from bayesdist.infer.selfcal.elimination import Mixture, expand
+from bayesdist.infer.selfcal.mode import solve_in_gauge
+from bayesdist.infer.selfcal.pieces import StarPiece, in_pieces, log_density, slope
+from bayesdist.infer.selfcal.problem import StarPriors
+from bayesdist.infer.stars.shards import Pieces
+from tests.infer.selfcal import fields
+
+PIECE = 200  # detections: some ten pieces on three workers
+
+pytestmark = pytest.mark.timeout(300)
+
+
+@pytest.fixture(scope="module")
+def solution():
+    """Mode with false detections, and stars that have a prior."""
+    simulated = fields.field(3, 8, 300, n_chips=2, disturbed=0.03)
+    problem, stars = fields.problem_of(simulated, min_detections=3)
+    priors = StarPriors.none(problem.n_stars, problem.n_star)
+    priors.precision[::5] += np.eye(2) / 0.02**2
+    priors.centre[::5] = stars[::5]
+    problem.priors.centre[:], problem.priors.precision[:] = priors.centre, priors.precision
+    return solve_in_gauge(problem, simulated.theta, Prior.none)
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Three workers that somebody else has started."""
+    with LocalCluster(
+        n_workers=3,
+        threads_per_worker=1,
+        memory_limit=0,
+        dashboard_address="127.0.0.1:0",
+        silence_logs=logging.CRITICAL,
+    ) as cluster:
+        yield cluster
+
+
+@pytest.fixture
+def compute(cluster, monkeypatch) -> Compute:
+    monkeypatch.setattr(pieces, "PIECE", PIECE)
+    return Compute(engine="dask", scheduler=cluster.scheduler_address)
+
+
+def assert_close(a, b, scale=1.0):
+    """To 1e-10 of the larger of the value and its scale."""
+    error = np.abs(np.asarray(a) - b) / np.maximum(np.abs(b), scale)
+    assert error.max() <= 1e-10, error.max()
+
+
+def assert_same_draws(a, b):
+    """The same random numbers and decisions, hence the same chains."""
+    assert a.theta.shape == b.theta.shape
+    free = b.theta.std(axis=(0, 1)) > 0
+    assert_close(a.theta[..., free], b.theta[..., free], b.theta.std(axis=(0, 1))[free])
+    assert_close(a.log_prob, b.log_prob)
+    for name, values in b.hyper.items():
+        assert_close(a.hyper[name], values, values.std())
+
+
+# -- tasks ----------------------------------------------------------------------------------------
+
+
+def pid_of(piece) -> tuple[int, ...]:
+    return (os.getpid(),)
+
+
+def content(piece) -> tuple[np.ndarray, ...]:
+    return (piece.problem.var,)
+
+
+def die_once(piece, mark, first) -> np.ndarray:
+    """Takes the worker down in the middle of the task, the first time it sees one piece."""
+    if piece.problem.X[0] == first and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return piece.problem.var[:1]
+
+
+# -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [1, 50, PIECE, 10**9])
+def test_pieces_hold_each_star_once_with_all_its_detections(solution, size):
+    whole = StarPiece.at(solution)
+    parts = list(whole.split(size))
+    problems = [part.problem for part in parts]
+    counts = np.concatenate([p.counts for p in problems])
+    assert np.array_equal(counts, solution.problem.counts)
+    for name in ("X", "Y", "offset", "W", "var"):
+        joined = np.concatenate([getattr(p, name) for p in problems])
+        assert np.array_equal(joined, getattr(solution.problem, name)), name
+    assert np.array_equal(np.concatenate([part.modes.stars for part in parts]), solution.stars)
+    most = solution.problem.counts.max()
+    assert max(len(p) for p in problems) < size + most
+    assert (len(parts) == 1) == (size > len(solution.problem))
+
+
+def test_density_and_slope_are_those_of_the_whole(solution, compute):
+    """At draws about the mode, and at the mode itself, where the slope vanishes."""
+    rng = np.random.default_rng(1)
+    off = np.zeros((20, len(solution.theta)))
+    off[:, solution.free] = rng.multivariate_normal(
+        np.zeros(len(solution.free)), np.linalg.inv(solution.precision), 20
+    )
+    theta = solution.theta + off
+    mixtures = np.column_stack([rng.uniform(0.001, 0.05, 20), rng.uniform(0.001, 0.1, 20)])
+    with in_pieces(solution) as here, in_pieces(solution, compute) as there:
+        assert len(set(there.sum(pid_of))) == 3
+        assert_close(
+            there.sum(log_density, theta, mixtures), here.sum(log_density, theta, mixtures)
+        )
+        for observed in (True, False):
+            mixture = Mixture(0.01, 0.02)
+            a, b = (one.sum(slope, theta[0], mixture, observed) for one in (there, here))
+            root = np.sqrt(np.diag(b.curvature))
+            assert_close(a.gradient, b.gradient, root)
+            assert_close(a.curvature, b.curvature, np.outer(root, root))
+        found = here.sum(slope, solution.theta, solution.mixture, True)
+    known = solution.expansion
+    root = np.sqrt(np.diag(known.curvature))
+    assert_close(found.curvature, known.curvature, np.outer(root, root))
+    assert np.abs(found.gradient[solution.free] / root[solution.free]).max() < 0.01
+    again = expand(solution.problem, theta[0], Mixture(0.01, 0.02), solution.stars.copy())
+    modes = StarPiece.at(solution).modes
+    assert np.abs(modes.moved(solution.problem, theta[0]) - again.stars).max() < 0.01
+
+
+def test_posterior_is_that_of_one_process(solution, compute):
+    expected = sample_selfcal(solution, seed=5, target_ess=100)
+    assert_same_draws(sample_selfcal(solution, seed=5, target_ess=100, compute=compute), expected)
+
+
+@dataclass
+class Interrupted(Pieces):
+    """Pieces, one of whose workers is killed before a pass."""
+
+    pieces: Pieces
+    at: int
+    passes: int = 0
+    victims: list[int] = field(default_factory=list)
+
+    def sum(self, task, *args):
+        self.passes += 1
+        if self.passes == self.at:
+            self.victims.append(self.pieces.sum(pid_of)[0])
+            os.kill(self.victims[0], signal.SIGKILL)
+        return self.pieces.sum(task, *args)
+
+    def close(self):
+        self.pieces.close()
+
+
+def test_one_of_three_workers_is_killed_while_sampling(solution, compute, monkeypatch):
+    struck = []
+
+    def interrupted(solution, compute=None):
+        class Context:
+            def __enter__(self):
+                self.inner = in_pieces(solution, compute)
+                struck.append(Interrupted(self.inner.__enter__(), at=12))
+                return struck[-1]
+
+            def __exit__(self, *error):
+                return self.inner.__exit__(*error)
+
+        return Context()
+
+    expected = sample_selfcal(solution, seed=5, target_ess=100)
+    monkeypatch.setattr(posterior, "in_pieces", interrupted)
+    assert_same_draws(sample_selfcal(solution, seed=5, target_ess=100, compute=compute), expected)
+    assert struck[0].passes > 12 and struck[0].victims
+
+
+def test_worker_dies_of_a_task_and_its_pieces_are_made_again(solution, compute, tmp_path):
+    with in_pieces(solution, compute) as there:
+        before = there.sum(content)
+        first = solution.problem.X[0]
+        assert there.sum(die_once, tmp_path / "mark", first) is not None
+        assert (tmp_path / "mark").exists()
+        after = there.sum(content)
+    assert np.array_equal(np.concatenate(before), np.concatenate(after))
+    assert np.array_equal(np.concatenate(after), solution.problem.var)
+
+
+def test_a_cluster_knows_how_large_a_piece_is(solution):
+    """Otherwise it would move pieces as if they were nothing."""
+    p = solution.problem
+    assert sys.getsizeof(StarPiece.at(solution)) > 8 * 8 * len(p)
