@@ -38,7 +38,7 @@ GAP = 2079.58  # B_1 of WFC1, Section 4.4.1
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("campaign") / "acs"
-    good("simulate", "acs", "-o", folder, "--exposures", 16, "--stars", 7000, "--seed", 3, "-q")
+    good("simulate", "acs", "-o", folder, "--exposures", 20, "--stars", 9000, "--seed", 3, "-q")
     config = folder / "campaign_f606w.toml"
     text = config.read_text(encoding="utf-8")
     # wider cells than the pattern's leave the linear terms alone; 100 draws' worth moves a mean by
@@ -78,7 +78,7 @@ def run(folder, full):
 
 def test_nearly_all_stars_are_matched_and_hardly_any_wrongly(run, folder):
     found = summary_of(run)["matching"]
-    assert found["n_exposures"] == 16
+    assert found["n_exposures"] == 20
     assert found["completeness"]["median"] > 0.95
     assert found["false_fraction"] < 0.01
     truth = read_acs(folder).truth

@@ -32,7 +32,7 @@ HOLDOUT = "[holdout]\nfraction = 0.2\nexposures = 2\n"
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("campaign") / "acs"
-    options = ("--exposures", N, "--stars", 4000, "--seed", 11, "--no-tables", "-q")
+    options = ("--exposures", N, "--stars", 5000, "--seed", 11, "--no-tables", "-q")
     good("simulate", "acs", "-o", folder, *options)
     return folder
 

@@ -16,6 +16,7 @@ from tests.adversarial.campaign_measure import assessed
 from tests.adversarial.campaign_truth import EPOCH0, TWO, Recipe, made
 from tests.adversarial.exposure_kinds import BREATHING
 from tests.app.support import summary_of
+from tests.reduced import only_in_full
 
 EXPOSURES, SEEDS = 21, 6
 HOLDOUT = {"fraction": 0.1, "exposures": 3}
@@ -77,6 +78,7 @@ def _frame(x, y, w):
 
 
 @pytest.mark.slow
+@only_in_full("test_campaign_holdout holds exposures out, test_hierarchy has some that went wrong")
 def test_heavy_tails_and_exposures_held_out_go_through(tmp_path, full):
     """Pulls of one run are correlated: some forty free directions in 120 numbers of each."""
     pulls = []

@@ -19,6 +19,7 @@ from bayesdist.products import IdcTab, idctab_from_solution, read_idctab, write_
 from bayesdist.products.formats.lookup.d2im import read_d2im, write_d2im
 from bayesdist.products.formats.lookup.file import LookupFile, write_lookup_file
 from bayesdist.products.formats.lookup.npol import read_npol, write_npol
+from tests.reduced import case_in_full
 
 from .stwcs_offline import gnomonic, separation_mas, sky
 from .support import F606W, wfc_solution
@@ -129,7 +130,8 @@ def test_our_own_plane_is_that_of_stwcs(tmp_path, idctab, pixels) -> None:
 
 @pytest.mark.parametrize(
     ("first", "step", "shape"),
-    [((32.5, 32.5), (64.0, 64.0), (32, 64)), ((1.0, 1.0), (64.0, 64.0), (33, 65)),
+    [case_in_full((32.5, 32.5), (64.0, 64.0), (32, 64), instead="one that is less usual is run"),
+     case_in_full((1.0, 1.0), (64.0, 64.0), (33, 65), instead="one that is less usual is run"),
      ((100.0, 77.5), (180.5, 93.0), (20, 22))],
 )  # fmt: skip
 def test_any_registration_is_kept(tmp_path, idctab, pixels, first, step, shape) -> None:
@@ -149,7 +151,14 @@ def test_any_registration_is_kept(tmp_path, idctab, pixels, first, step, shape) 
     assert worst < npol.header["BDNPLERR"] + 0.005
 
 
-@pytest.mark.parametrize("first", [(32.5, 32.5), (1.0, 1.0), (100.0, 50.0)])
+@pytest.mark.parametrize(
+    "first",
+    [
+        case_in_full((32.5, 32.5), instead="another one is run"),
+        case_in_full((1.0, 1.0), instead="another one is run"),
+        (100.0, 50.0),
+    ],
+)
 def test_tables_without_a_positive_node_do_not_drop_out(tmp_path, idctab, pixels, first) -> None:
     """stwcs gives their maximum as CPERR, and astropy leaves out what is below zero."""
     path, tab = idctab

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import platform
 import sys
@@ -14,6 +13,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic_core import to_json
 
 from bayesdist.app.store.keys import digest_of
 from bayesdist.app.summary import Sections
@@ -51,7 +51,7 @@ def write_json(path: Path, value: Any) -> None:
 
 def json_text(value: Any) -> str:
     """A value as the text of a JSON file."""
-    return json.dumps(as_json(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return to_json(as_json(value), indent=1).decode() + "\n"
 
 
 def versions() -> dict[str, str]:

@@ -95,7 +95,7 @@ def pulls(seed: int, rms: float) -> np.ndarray:
 @pytest.mark.parametrize(
     "rms",
     [
-        case_in_full(0.0, instead="test_p_values has such fields", id="inside"),
+        case_in_full(0.0, instead="test_p_values_are_those_of_chance has such fields", id="inside"),
         pytest.param(RMS, id="structure"),
     ],
 )

@@ -14,6 +14,7 @@ from bayesdist.infer.density.laplace import _expand, conditional_mode, expected_
 from bayesdist.infer.density.marginal import Marginal
 from bayesdist.infer.density.piecewise import PiecewiseExponential
 from bayesdist.infer.density.proposal import GridProposal
+from tests.reduced import case_in_full
 
 from ..oracle import JitterOracle
 from ..support import UNCLIPPED, numerical_gradient, simulated, target_of
@@ -477,7 +478,13 @@ def test_the_search_ends_at_the_same_mode_from_afar(along):
 # -- next to no false matches -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("n", "seed"), [*((2_000, k) for k in range(6)), (100_000, 0)])
+@pytest.mark.parametrize(
+    ("n", "seed"),
+    [
+        *((2_000, k) for k in range(6)),
+        case_in_full(100_000, 0, instead="fewer stars are run"),
+    ],
+)
 def test_clean_tables_have_a_good_proposal(n, seed):
     """Right errors, no false match: fraction and scale of the outliers are a curved ridge.
 

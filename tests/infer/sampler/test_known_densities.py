@@ -29,7 +29,7 @@ from ..support import UNCLIPPED, simulated, target_of
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 MOVES = {"independence": (1.0, 0.0, 0.0), "pCN": (0.0, 1.0, 0.0), "DE": (0.0, 0.0, 1.0)}
-STEPS = {"independence": 600, "pCN": 2000, "DE": 1000}
+STEPS = {"independence": 600, "pCN": 2000, "DE": 2000}
 WALKERS, SEEDS = 48, (1, 2, 3, 4)
 
 

@@ -21,6 +21,7 @@ from bayesdist.infer.series import (
 )
 from bayesdist.infer.series.heldout import held_out
 from tests.infer.calibration import over_seeds
+from tests.reduced import case_in_full
 
 from .campaign import BREAK, campaign, drifting
 
@@ -178,7 +179,7 @@ def test_a_break_in_a_random_walk_is_not_believed(full):
         assert "break" not in describe(series, broken).claim
 
 
-@pytest.mark.parametrize("kind", ["line", "random_walk"])
+@pytest.mark.parametrize("kind", ["line", case_in_full("random_walk", instead="lines are run")])
 def test_weighted_draws_predict_as_refits_do(kind, monkeypatch):
     series = white(6, slope=0.1)
     posterior = fit_series(series, TrendModel(kind))
