@@ -90,8 +90,7 @@ def _linearised(
 
 def linearised(
     group: Int,
-    seen_X: Float,
-    seen_Y: Float,
+    seen: Float,
     X: Float,
     Y: Float,
     places: Float,
@@ -103,7 +102,7 @@ def linearised(
 ) -> tuple[Float, Float, Float, Float]:
     """Positions of stars on the detector by a solution, and the linearised model about them.
 
-    Scaled positions of the detections are `seen_X`, `seen_Y` (N,), those of their stars as far as
+    Scaled positions of the detections are `seen` (2, N), those of their stars as far as
     known X, Y (N,), and the stars' sky positions `places` (N, 2).  `coef`, `by_X`, `by_Y` (G, 2, K)
     are coefficients of the scaled powers, of the model and of its derivatives by X and by Y; `half`
     (G, 2) is the size of X = 1 and Y = 1 in pixels.
@@ -113,7 +112,5 @@ def linearised(
     """
     n = len(X)
     out = np.empty(n), np.empty(n), np.empty((n, 2)), np.empty((n, 3))
-    share_out(
-        _linearised, n, group, seen_X, seen_Y, X, Y, places, coef, by_X, by_Y, half, order, out
-    )
+    share_out(_linearised, n, group, *seen, X, Y, places, coef, by_X, by_Y, half, order, out)
     return out

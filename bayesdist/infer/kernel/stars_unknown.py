@@ -8,6 +8,8 @@ the error is, and a model that made pixels smaller would make errors smaller.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +39,7 @@ __all__ = ["MOST_DOUBTFUL", "eliminate_stars", "log_marginals", "weighted_stars"
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+Flags = NDArray[np.int8]
 
 MOST_DOUBTFUL = 6  # most detections of a star over whose membership is summed
 PIECES = 8  # number of separate sums, whatever the number of threads
@@ -127,12 +130,12 @@ def _log_marginals(
 
 
 def log_marginals(
-    first: int, last: int, starts: Int, group: Int, X: Float, Y: Float, offset: Float, W: Float,
-    var: Float, time: Float, factor: Float, centre: Float, precision: Float, stars: Float,
-    middles: Float, share: Float, state: Int, coef: Float, order: int, rows: Float, least: float,
+    first: int, last: int, detections: tuple[Any, ...], stars: Float,
+    middles: Float, share: Float, state: Flags, coef: Float, order: int, rows: Float, least: float,
 ) -> Float:  # fmt: skip
     """Log densities (PIECES, D) of stars first..last, their parameters integrated out (Laplace).
 
+    `detections` are starts, group, X, Y, offset, W, var, time, factor, centre and precision.
     Summed over all choices of members where some are doubtful: state (N,), as of
     `summed_over_members`.
 
@@ -144,8 +147,8 @@ def log_marginals(
     """
     sums = np.zeros((PIECES, len(rows)))
     share_out(
-        _log_marginals, PIECES, first, last, starts, group, X, Y, offset, W, var, time, factor,
-        centre, precision, stars, middles, share, state, coef, order, rows, least, sums,
+        _log_marginals, PIECES, first, last, *detections, stars, middles, share, state, coef,
+        order, rows, least, sums,
     )  # fmt: skip
     return sums
 
@@ -276,8 +279,7 @@ def _eliminate_stars(
 
 
 def eliminate_stars(
-    first: int, last: int, starts: Int, group: Int, X: Float, Y: Float, offset: Float, W: Float,
-    var: Float, time: Float, factor: Float, centre: Float, precision: Float, stars: Float,
+    first: int, last: int, detections: tuple[Any, ...], stars: Float,
     coef: Float, chip: Int, linear: Float, extra: Float, columns: Int, n_params: int, order: int,
     j2: float, log_core: float, log_out: float, least: float, seen: bool,
 ) -> tuple[Float, ...]:  # fmt: skip
@@ -307,8 +309,7 @@ def eliminate_stars(
         np.zeros((last - first, q, q)),
     )
     share_out(
-        _eliminate_stars, PIECES, first, last, starts, group, X, Y, offset, W, var, time, factor,
-        centre, precision, stars, coef, chip, linear, extra, columns, n_params, order, j2, log_core,
-        log_out, least, seen, sums,
+        _eliminate_stars, PIECES, first, last, *detections, stars, coef, chip, linear, extra,
+        columns, n_params, order, j2, log_core, log_out, least, seen, sums,
     )  # fmt: skip
     return sums
