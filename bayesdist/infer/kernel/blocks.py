@@ -1,22 +1,33 @@
-"""Chunks into which the stars are cut, and the number of threads for them."""
+"""Chunks into which the stars are cut, and the threads that share them.
+
+Threads are Python's.  numba's own compile each pass several times over, and do not survive a fork.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import pairwise
+from typing import Any
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BLOCK", "pieces_of", "set_threads", "threads_for"]
+from bayesdist.infer.kernel.polynomial import FAST
+
+__all__ = ["BLOCK", "PASS", "pieces_of", "set_threads", "share_out", "threads_for"]
 
 Int = NDArray[np.int64]
 
+# how a pass is compiled: without a check for division by zero, which would exclude vectors
+PASS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": FAST, "error_model": "numpy"}
+
 BLOCK = 256  # stars whose scratch arrays stay in the first-level cache
 THREADS_PAY = 200_000  # evaluations of a star below which one thread is faster
+PARTS = 4  # of the work, for each thread: some are done sooner than others
 
 
 def pieces_of(starts: Int, size: int) -> Int:
@@ -29,6 +40,18 @@ def pieces_of(starts: Int, size: int) -> Int:
     begin = np.concatenate([*first, np.zeros(0, np.int64)]).astype(np.int64)
     end = np.minimum(begin + size, np.asarray(starts)[group + 1])
     return np.column_stack([group, begin, end]).astype(np.int64)
+
+
+def share_out(loop: Callable[..., None], n: int, *arguments: Any) -> None:
+    """Run loop(first, end, *arguments) over range(n), in parts if there are several threads."""
+    threads = min(nb.get_num_threads(), n)
+    if threads < 2:
+        loop(0, n, *arguments)
+        return
+    edges = [n * part // (PARTS * threads) for part in range(PARTS * threads + 1)]
+    with ThreadPoolExecutor(threads) as pool:
+        for done in [pool.submit(loop, a, e, *arguments) for a, e in pairwise(edges)]:
+            done.result()
 
 
 @contextmanager

@@ -8,10 +8,10 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.kernel.blocks import BLOCK, threads_for
+from bayesdist.infer.kernel.blocks import BLOCK, PASS, share_out, threads_for
 from bayesdist.infer.kernel.mixture import Constants, log_of_product, packed, total_of
 from bayesdist.infer.kernel.numeric import exp_negative, inverse_root
-from bayesdist.infer.kernel.polynomial import FAST, polynomial
+from bayesdist.infer.kernel.polynomial import polynomial
 
 __all__ = ["log_likelihood"]
 
@@ -21,18 +21,17 @@ Int = NDArray[np.int64]
 SCRATCH = 16_000_000  # bytes of partial sums in memory at a time
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def _partial_sums(blocks, X, Y, u, v, var_u, var_v, coef, powers, rows, unit2):
+@nb.njit(**PASS)
+def _partial_sums(first, end, blocks, X, Y, u, v, var_u, var_v, coef, powers, rows, unit2, sums):
     order = len(powers)  # in the type: it is compiled for one order
-    n_blocks, n_draws = len(blocks), len(rows)
-    sums = np.empty((n_blocks, n_draws))
-    for b in nb.prange(n_blocks):
+    pu, pv, work = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+    density, low = np.empty(BLOCK), np.empty(BLOCK)
+    for b in range(first, end):
         g, a, e = blocks[b]
         n = e - a
-        pu, pv, work = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
-        density, low = np.empty(BLOCK), np.zeros(BLOCK)
+        low[n:] = 0.0
         Xb, Yb, ub, vb, su, sv = X[a:e], Y[a:e], u[a:e], v[a:e], var_u[a:e], var_v[a:e]
-        for d in range(n_draws):
+        for d in range(len(rows)):
             cu, cv = coef[d, g, 0], coef[d, g, 1]
             for s in range(n):
                 pu[s] = polynomial(cu, order, Xb[s], Yb[s])
@@ -61,7 +60,6 @@ def _partial_sums(blocks, X, Y, u, v, var_u, var_v, coef, powers, rows, unit2):
                 density[s] = peak + outlier * t if is_core else peak * t + outlier
             exponents = total_of(low, work) + n * math.log(2 * math.pi * unit2)
             sums[b, d] = log_of_product(density, n, work) - exponents
-    return sums
 
 
 def log_likelihood(
@@ -82,7 +80,18 @@ def log_likelihood(
     with threads_for(len(columns[0]) * len(coef)):
         for a in range(0, len(coef), step):
             some = slice(a, a + step)
-            sums = _partial_sums(blocks, *columns, coef[some], powers, rows[some], constants.unit2)
+            sums = np.empty((len(blocks), len(rows[some])))
+            share_out(
+                _partial_sums,
+                len(blocks),
+                blocks,
+                *columns,
+                coef[some],
+                powers,
+                rows[some],
+                constants.unit2,
+                sums,
+            )
             # draws along the first axis: else numpy adds in another order where there is but one
             out[some] = np.ascontiguousarray(sums.T).sum(axis=1)
     return out

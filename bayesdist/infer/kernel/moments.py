@@ -16,7 +16,7 @@ import numpy as np
 from numpy.polynomial import legendre as series
 from numpy.typing import NDArray
 
-from bayesdist.infer.kernel.blocks import BLOCK, threads_for
+from bayesdist.infer.kernel.blocks import BLOCK, PASS, share_out, threads_for
 from bayesdist.infer.kernel.mixture import Constants, log_of_product, packed
 from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.polynomial import FAST, horner, legendre
@@ -98,13 +98,15 @@ def _nine_dots(a, b, c, p, q, r):
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
-def _add(columns, first, last, P, Q, top, work, out):
-    """Add the moments of columns (n, BLOCK) with P_i Q_j, i + j <= top, to out (n, M).
+def _add(columns, last, P, Q, order, work, out):
+    """Add the moments of columns (n, BLOCK) with P_i Q_j to out (n, M).
 
+    i + j is up to twice the order for the first three, the weights, and up to the order for others.
     Columns are taken by three, and so are the j.
     """
     a, b, c = work[0], work[1], work[2]
-    for k in range(first, last, 3):
+    for k in range(0, last, 3):
+        top = 2 * order if k == 0 else order
         for i in range(top + 1):
             for s in range(BLOCK):
                 a[s] = columns[k, s] * P[i, s]
@@ -123,29 +125,27 @@ def _add(columns, first, last, P, Q, top, work, out):
                     out[k + column, t * (t + 1) // 2 + j] += _dot(work[column], Q[j])
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def _least_squares(pieces, X, Y, u, v, var_u, var_v, about, test, order, rules):
-    n_pieces, top = len(pieces), 2 * order
-    sums = np.zeros((n_pieces, 6, (top + 1) * (top + 2) // 2))
-    scalars = np.zeros((n_pieces, N_LEAST))
+@nb.njit(**PASS)
+def _least_squares(
+    start, stop, pieces, X, Y, u, v, var_u, var_v, coef, order, rules, sums, scalars
+):
+    top = 2 * order
     chi2_limit, r2_limit, corner, power = rules[0], rules[1], rules[2], int(rules[3])
-    for b in nb.prange(n_pieces):
+    for b in range(start, stop):
         g, first, end = pieces[b]
         P, Q = np.empty((top + 1, BLOCK)), np.empty((top + 1, BLOCK))
-        pu, pv, tu, tv = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
-        work = np.empty((3, BLOCK))
+        model, work = np.empty((4, BLOCK)), np.empty((3, BLOCK))
+        pu, pv, tu, tv = model[0], model[1], model[2], model[3]
         # the third and sixth are zeros, since they are taken by three
         columns, parts = np.zeros((6, BLOCK)), np.empty((N_LEAST, BLOCK))
         for a in range(first, end, BLOCK):
             e = min(a + BLOCK, end)
             n = e - a
             Xb, Yb, ub, vb, su, sv = X[a:e], Y[a:e], u[a:e], v[a:e], var_u[a:e], var_v[a:e]
-            legendre(Xb, n, top, P)
-            legendre(Yb, n, top, Q)
-            horner(about[g, 0], order, Xb, Yb, n, pu, work[0])
-            horner(about[g, 1], order, Xb, Yb, n, pv, work[0])
-            horner(test[g, 0], order, Xb, Yb, n, tu, work[0])
-            horner(test[g, 1], order, Xb, Yb, n, tv, work[0])
+            for axis in range(2):  # in loops, so that they are compiled once
+                legendre(Xb if axis == 0 else Yb, n, top, P if axis == 0 else Q)
+            for m in range(4):
+                horner(coef[g, m], order, Xb, Yb, n, model[m], work[0])
             columns[:] = 0.0
             parts[:] = 0.0
             for s in range(n):
@@ -168,16 +168,14 @@ def _least_squares(pieces, X, Y, u, v, var_u, var_v, about, test, order, rules):
                 parts[7, s], parts[8, s] = used * ru, used * rv
             for k in range(N_LEAST):
                 scalars[b, k] += _dot(parts[k], P[0])
-            _add(columns, 0, 3, P, Q, top, work, sums[b])
-            _add(columns, 3, 6, P, Q, order, work, sums[b])
-    return sums, scalars
+            _add(columns, len(columns), P, Q, order, work, sums[b])
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def _mixture(pieces, X, Y, u, v, var_u, var_v, coef, order, row, unit2, em):
-    n_pieces, top = len(pieces), 2 * order
-    sums = np.zeros((n_pieces, COLUMNS, (top + 1) * (top + 2) // 2))
-    scalars = np.zeros((n_pieces, N_MIXTURE))
+@nb.njit(**PASS)
+def _mixture(
+    start, stop, pieces, X, Y, u, v, var_u, var_v, coef, order, row, unit2, em, sums, scalars
+):
+    top = 2 * order
     wavering, log_unit = 0.0 if em else 1.0, math.log(2 * math.pi * unit2)
     j2, core, outlier, half, never, f, w = (
         row[0],
@@ -188,7 +186,7 @@ def _mixture(pieces, X, Y, u, v, var_u, var_v, coef, order, row, unit2, em):
         row[5],
         row[6],
     )
-    for b in nb.prange(n_pieces):
+    for b in range(start, stop):
         g, first, end = pieces[b]
         P, Q = np.empty((top + 1, BLOCK)), np.empty((top + 1, BLOCK))
         pu, pv, work = np.empty(BLOCK), np.empty(BLOCK), np.empty((3, BLOCK))
@@ -198,10 +196,9 @@ def _mixture(pieces, X, Y, u, v, var_u, var_v, coef, order, row, unit2, em):
             e = min(a + BLOCK, end)
             n = e - a
             Xb, Yb, ub, vb, su, sv = X[a:e], Y[a:e], u[a:e], v[a:e], var_u[a:e], var_v[a:e]
-            horner(coef[g, 0], order, Xb, Yb, n, pu, work[0])
-            horner(coef[g, 1], order, Xb, Yb, n, pv, work[0])
-            legendre(Xb, n, top, P)
-            legendre(Yb, n, top, Q)
+            for axis in range(2):  # in a loop, so that they are compiled once
+                horner(coef[g, axis], order, Xb, Yb, n, pu if axis == 0 else pv, work[0])
+                legendre(Xb if axis == 0 else Yb, n, top, P if axis == 0 else Q)
             columns[:] = 0.0
             parts[:] = 0.0
             for s in range(n):
@@ -248,9 +245,14 @@ def _mixture(pieces, X, Y, u, v, var_u, var_v, coef, order, row, unit2, em):
             for k in range(N_MIXTURE):
                 scalars[b, k] += _dot(parts[k], P[0])
             scalars[b, 0] += log_of_product(density, n, work[0]) - n * log_unit
-            _add(columns, 0, 3, P, Q, top, work, sums[b])
-            _add(columns, 3, 6 if em else COLUMNS, P, Q, order, work, sums[b])
-    return sums, scalars
+            _add(columns, 6 if em else COLUMNS, P, Q, order, work, sums[b])
+
+
+def empty_sums(n_pieces: int, order: int, columns: int, scalars: int) -> tuple[Float, Float]:
+    """Zeros (n_pieces, columns, M) and (n_pieces, scalars) for the sums of the pieces."""
+    return np.zeros((n_pieces, columns, (order + 1) * (2 * order + 1))), np.zeros(
+        (n_pieces, scalars)
+    )
 
 
 def _by_group(sums: Float, pieces: Int) -> Float:
@@ -284,10 +286,19 @@ def least_squares_moments(
     v of those used.
     """
     K = (order + 1) * (order + 2) // 2
+    sums, scalars = empty_sums(len(pieces), order, 6, N_LEAST)
     rules = np.array([chi2_limit, min(abs_limit, 1e150) ** 2, corner, float(power)])
     with threads_for(EVALUATIONS * len(columns[0])):
-        sums, scalars = _least_squares(
-            pieces, *columns, np.ascontiguousarray(about), np.ascontiguousarray(test), order, rules
+        share_out(
+            _least_squares,
+            len(pieces),
+            pieces,
+            *columns,
+            np.concatenate([about, test], axis=1),
+            order,
+            rules,
+            sums,
+            scalars,
         )
     total = _by_group(sums, pieces)
     weight = np.zeros((len(about), 3, K, K))
@@ -316,8 +327,11 @@ def mixture_moments(
     outliers, then by log s_out; minus the Hessian by log j, logit f, log s_out: jj, jf, js, ff, fs,
     ss.
     """
+    sums, scalars = empty_sums(len(pieces), order, COLUMNS, N_MIXTURE)
     with threads_for(EVALUATIONS * len(columns[0])):
-        sums, scalars = _mixture(
+        share_out(
+            _mixture,
+            len(pieces),
             pieces,
             *columns,
             np.ascontiguousarray(coef),
@@ -325,6 +339,8 @@ def mixture_moments(
             packed(constants)[0],
             constants.unit2,
             em,
+            sums,
+            scalars,
         )
     return mixture_sums(_by_group(sums, pieces), scalars.sum(axis=0), order, em)
 

@@ -8,10 +8,15 @@ from __future__ import annotations
 
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 
+from bayesdist.infer.kernel.blocks import PASS, share_out
 from bayesdist.infer.kernel.polynomial import FAST
 
 __all__ = ["legendre", "linearised", "positions", "powers"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
@@ -44,31 +49,26 @@ def powers(coef, order, x, y):
     return out
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def positions(group, X, Y, coef, order):
-    """Sky positions (N, 2) of detections from coefficients (G, 2, K) of the scaled powers."""
-    out = np.empty((len(X), 2))
-    for i in nb.prange(len(X)):
+@nb.njit(**PASS)
+def _positions(first, end, group, X, Y, coef, order, out):
+    for i in range(first, end):
         out[i, 0] = powers(coef[group[i], 0], order, X[i], Y[i])
         out[i, 1] = powers(coef[group[i], 1], order, X[i], Y[i])
+
+
+def positions(group: Int, X: Float, Y: Float, coef: Float, order: int) -> Float:
+    """Sky positions (N, 2) of detections from coefficients (G, 2, K) of the scaled powers."""
+    out = np.empty((len(X), 2))
+    share_out(_positions, len(X), group, X, Y, coef, order, out)
     return out
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def linearised(group, seen_X, seen_Y, X, Y, places, coef, by_X, by_Y, half, order):
-    """Positions of stars on the detector by a solution, and the linearised model about them.
-
-    Scaled positions of the detections are `seen_X`, `seen_Y` (N,), those of their stars as far as
-    known X, Y (N,), and the stars' sky positions `places` (N, 2).  `coef`, `by_X`, `by_Y` (G, 2, K)
-    are coefficients of the scaled powers, of the model and of its derivatives by X and by Y; `half`
-    (G, 2) is the size of X = 1 and Y = 1 in pixels.
-
-    Returns X, Y (N,) one Newton step further; the offset (N, 2), J times the pixels from there to
-    the detection; and W (N, 3), uu, uv, vv of the inverse of J J^T.
-    """
-    n = len(X)
-    new_X, new_Y, offset, W = np.empty(n), np.empty(n), np.empty((n, 2)), np.empty((n, 3))
-    for i in nb.prange(n):
+@nb.njit(**PASS)
+def _linearised(
+    first, end, group, seen_X, seen_Y, X, Y, places, coef, by_X, by_Y, half, order, out
+):
+    new_X, new_Y, offset, W = out
+    for i in range(first, end):
         g, x, y = group[i], X[i], Y[i]
         ru = powers(coef[g, 0], order, x, y) - places[i, 0]
         rv = powers(coef[g, 1], order, x, y) - places[i, 1]
@@ -86,4 +86,31 @@ def linearised(group, seen_X, seen_Y, X, Y, places, coef, by_X, by_Y, half, orde
         det = uu * vv - uv * uv
         W[i, 0], W[i, 1], W[i, 2] = vv / det, -uv / det, uu / det
         new_X[i], new_Y[i] = x, y
-    return new_X, new_Y, offset, W
+
+
+def linearised(
+    group: Int,
+    seen: Float,
+    X: Float,
+    Y: Float,
+    places: Float,
+    coef: Float,
+    by_X: Float,
+    by_Y: Float,
+    half: Float,
+    order: int,
+) -> tuple[Float, Float, Float, Float]:
+    """Positions of stars on the detector by a solution, and the linearised model about them.
+
+    Scaled positions of the detections are `seen` (2, N), those of their stars as far as
+    known X, Y (N,), and the stars' sky positions `places` (N, 2).  `coef`, `by_X`, `by_Y` (G, 2, K)
+    are coefficients of the scaled powers, of the model and of its derivatives by X and by Y; `half`
+    (G, 2) is the size of X = 1 and Y = 1 in pixels.
+
+    Returns X, Y (N,) one Newton step further; the offset (N, 2), J times the pixels from there to
+    the detection; and W (N, 3), uu, uv, vv of the inverse of J J^T.
+    """
+    n = len(X)
+    out = np.empty(n), np.empty(n), np.empty((n, 2)), np.empty((n, 3))
+    share_out(_linearised, n, group, *seen, X, Y, places, coef, by_X, by_Y, half, order, out)
+    return out

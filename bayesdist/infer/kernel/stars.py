@@ -8,10 +8,10 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.kernel.blocks import BLOCK, threads_for
+from bayesdist.infer.kernel.blocks import BLOCK, PASS, share_out, threads_for
 from bayesdist.infer.kernel.mixture import Constants, packed
 from bayesdist.infer.kernel.numeric import exp_negative
-from bayesdist.infer.kernel.polynomial import FAST, horner
+from bayesdist.infer.kernel.polynomial import horner
 
 __all__ = ["memberships", "residuals"]
 
@@ -19,9 +19,9 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def _residuals(blocks, X, Y, u, v, coef, order, out):
-    for b in nb.prange(len(blocks)):
+@nb.njit(**PASS)
+def _residuals(first, end, blocks, X, Y, u, v, coef, order, out):
+    for b in range(first, end):
         g, a, e = blocks[b]
         n = e - a
         p, work = np.empty(BLOCK), np.empty(BLOCK)
@@ -41,15 +41,23 @@ def residuals(blocks: Int, columns: tuple[Float, ...], coef: Float, order: int) 
     """
     out = np.empty((len(columns[0]), 2))
     with threads_for(len(out)):
-        _residuals(blocks, *columns[:4], np.ascontiguousarray(coef), order, out)
+        share_out(
+            _residuals,
+            len(blocks),
+            blocks,
+            *columns[:4],
+            np.ascontiguousarray(coef),
+            order,
+            out,
+        )
     return out
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def _memberships(blocks, X, Y, u, v, var_u, var_v, coef, order, rows, unit2, out):
+@nb.njit(**PASS)
+def _memberships(first, end, blocks, X, Y, u, v, var_u, var_v, coef, order, rows, unit2, out):
     share = 1.0 / len(rows)
     constant = math.log(2 * math.pi * unit2)
-    for b in nb.prange(len(blocks)):
+    for b in range(first, end):
         g, a, e = blocks[b]
         n = e - a
         pu, pv, work = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
@@ -83,7 +91,9 @@ def memberships(
     """
     out = np.empty((3, len(columns[0])))
     with threads_for(4 * out.shape[1] * len(coef)):
-        _memberships(
+        share_out(
+            _memberships,
+            len(blocks),
             blocks,
             *columns,
             np.ascontiguousarray(coef),

@@ -8,9 +8,13 @@ the error is, and a model that made pixels smaller would make errors smaller.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 
+from bayesdist.infer.kernel.blocks import PASS, share_out
 from bayesdist.infer.kernel.polynomial import FAST
 from bayesdist.infer.kernel.sky_places import legendre
 from bayesdist.infer.kernel.star_modes import (
@@ -33,19 +37,22 @@ from bayesdist.infer.kernel.star_modes import (
 
 __all__ = ["MOST_DOUBTFUL", "eliminate_stars", "log_marginals", "weighted_stars"]
 
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Flags = NDArray[np.int8]
+
 MOST_DOUBTFUL = 6  # most detections of a star over whose membership is summed
 PIECES = 8  # number of separate sums, whatever the number of threads
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def weighted_stars(
-    starts, z, W, var, j2, log_core, log_out, time, factor, centre, precision, least, stars
-):
-    """Move stars (n, q) to their modes for sky positions z (N, 2); memberships (N,)."""
-    n, q = stars.shape
-    member, odds = np.zeros(len(z)), far_odds(log_core, log_out)
-    for s in nb.prange(n):
-        S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
+@nb.njit(**PASS)
+def _weighted_stars(
+    first, end, starts, z, W, var, j2, log_core, log_out, time, factor, centre, precision, least,
+    stars, member,
+):  # fmt: skip
+    q, odds = stars.shape[1], far_odds(log_core, log_out)
+    S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
+    for s in range(first, end):
         a, e = starts[s], starts[s + 1]
         own = own_rows(W, var, a, e)
         for i in range(a, e):
@@ -60,29 +67,29 @@ def weighted_stars(
             design(S, q, i - a, when, where)
             _, _, square = residual(i - a, own, S, stars[s], q)
             member[i] = membership(odds, square, var[i] + j2)
+
+
+def weighted_stars(
+    starts: Int, z: Float, W: Float, var: Float, j2: float, log_core: float, log_out: float,
+    time: Float, factor: Float, centre: Float, precision: Float, least: float, stars: Float,
+) -> Float:  # fmt: skip
+    """Move stars (n, q) to their modes for sky positions z (N, 2); memberships (N,)."""
+    member = np.zeros(len(z))
+    share_out(
+        _weighted_stars, len(stars), starts, z, W, var, j2, log_core, log_out, time, factor,
+        centre, precision, least, stars, member,
+    )  # fmt: skip
     return member
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def log_marginals(
-    first, last, starts, group, X, Y, offset, W, var, time, factor, centre, precision, stars,
-    middles, share, state, coef, order, rows, least,
+@nb.njit(**PASS)
+def _log_marginals(
+    start, stop, first, last, starts, group, X, Y, offset, W, var, time, factor, centre, precision,
+    stars, middles, share, state, coef, order, rows, least, sums,
 ):  # fmt: skip
-    """Log densities (PIECES, D) of stars first..last, their parameters integrated out (Laplace).
-
-    Summed over all choices of members where some are doubtful: state (N,), as of
-    `summed_over_members`.
-
-    middles (S, 2), share (N,): a star moves with the weighted mean of its detections, and lies at
-    `stars` where that mean is `middles`.
-    coef (G, 2, K, D): of the Legendre products, draws last: one detection takes them together.
-    rows (D, 3): squared jitter, log of the core's fraction, log density of outliers.
-    least: root of the least curvature that a star's position may have.
-    """
     q, K, n_draws = stars.shape[1], coef.shape[2], len(rows)
-    sums = np.zeros((PIECES, n_draws))
     step = -(-(last - first) // PIECES)
-    for piece in nb.prange(PIECES):
+    for piece in range(start, stop):
         S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
         px, py, phi = np.empty(order + 1), np.empty(order + 1), np.empty(K)
         p, mean, doubtful = np.empty(q), np.empty((2, n_draws)), np.empty((MOST_DOUBTFUL, 7))
@@ -120,6 +127,29 @@ def log_marginals(
                     p, S, A, b, True, least,
                 )  # fmt: skip
                 sums[piece, d] += value - log_root(A, q, least)
+
+
+def log_marginals(
+    first: int, last: int, detections: tuple[Any, ...], stars: Float,
+    middles: Float, share: Float, state: Flags, coef: Float, order: int, rows: Float, least: float,
+) -> Float:  # fmt: skip
+    """Log densities (PIECES, D) of stars first..last, their parameters integrated out (Laplace).
+
+    `detections` are starts, group, X, Y, offset, W, var, time, factor, centre and precision.
+    Summed over all choices of members where some are doubtful: state (N,), as of
+    `summed_over_members`.
+
+    middles (S, 2), share (N,): a star moves with the weighted mean of its detections, and lies at
+    `stars` where that mean is `middles`.
+    coef (G, 2, K, D): of the Legendre products, draws last: one detection takes them together.
+    rows (D, 3): squared jitter, log of the core's fraction, log density of outliers.
+    least: root of the least curvature that a star's position may have.
+    """
+    sums = np.zeros((PIECES, len(rows)))
+    share_out(
+        _log_marginals, PIECES, first, last, *detections, stars, middles, share, state, coef,
+        order, rows, least, sums,
+    )  # fmt: skip
     return sums
 
 
@@ -136,36 +166,16 @@ def _add_products(coef, phi, start, out):
             out[d] += phi[-1] * coef[-1, d]
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def eliminate_stars(
-    first, last, starts, group, X, Y, offset, W, var, time, factor, centre, precision, stars,
-    coef, chip, linear, extra, columns, n_params, order, j2, log_core, log_out, least, seen,
+@nb.njit(**PASS)
+def _eliminate_stars(
+    start, stop, first, last, starts, group, X, Y, offset, W, var, time, factor, centre, precision,
+    stars, coef, chip, linear, extra, columns, n_params, order, j2, log_core, log_out, least, seen,
+    sums,
 ):  # fmt: skip
-    """Sums of a second-order expansion over stars first..last, these moved to their modes.
-
-    In addition to the arguments of `log_marginals`: coef (G, 2, K) of the Legendre products, and of
-    each group its chip (G,), the linear part (G, 2, 2) of its frame, the derivatives (G, m, 2, K)
-    by its other parameters and the indices of these (G, m), -1 for none; `seen`: curvature of the
-    mixture itself.
-
-    Returns direct (P, chips, 3, K, K), edge (P, G, m, 2, K), own (P, G, m, m): curvature by
-    coefficients (uu, uv, vv, lower halves), by these and the rest, by the rest; pull_direct (P,
-    chips, 2, K), pull_own (P, G, m): gradients; scalars (P, 4): log density, sums of w, of w (1 -
-    w), and of w times the squared normalised residual; rows (S q, D): L^-1 B of each star; factors
-    (S, q, q): L.
-    """
     q, K, m, odds = stars.shape[1], coef.shape[2], extra.shape[1], far_odds(log_core, log_out)
-    n_chips, n_groups = chip.max() + 1, len(coef)
-    direct = np.zeros((PIECES, n_chips, 3, K, K))
-    edge = np.zeros((PIECES, n_groups, m, 2, K))
-    own = np.zeros((PIECES, n_groups, m, m))
-    pull_direct = np.zeros((PIECES, n_chips, 2, K))
-    pull_own = np.zeros((PIECES, n_groups, m))
-    scalars = np.zeros((PIECES, 4))
-    rows = np.zeros(((last - first) * q, n_params))
-    factors = np.zeros((last - first, q, q))
+    direct, edge, own, pull_direct, pull_own, scalars, rows, factors = sums
     step = -(-(last - first) // PIECES)
-    for piece in nb.prange(PIECES):
+    for piece in range(start, stop):
         S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
         px, py = np.empty(order + 1), np.empty(order + 1)
         by = np.empty((2, max(m, 1)))
@@ -266,4 +276,40 @@ def eliminate_stars(
                         rows[row + k, n] -= below * rows[row + l, n]
                 for n in range(n_params):
                     rows[row + k, n] /= A[k, k]
-    return direct, edge, own, pull_direct, pull_own, scalars, rows, factors
+
+
+def eliminate_stars(
+    first: int, last: int, detections: tuple[Any, ...], stars: Float,
+    coef: Float, chip: Int, linear: Float, extra: Float, columns: Int, n_params: int, order: int,
+    j2: float, log_core: float, log_out: float, least: float, seen: bool,
+) -> tuple[Float, ...]:  # fmt: skip
+    """Sums of a second-order expansion over stars first..last, these moved to their modes.
+
+    In addition to the arguments of `log_marginals`: coef (G, 2, K) of the Legendre products, and of
+    each group its chip (G,), the linear part (G, 2, 2) of its frame, the derivatives (G, m, 2, K)
+    by its other parameters and the indices of these (G, m), -1 for none; `seen`: curvature of the
+    mixture itself.
+
+    Returns direct (P, chips, 3, K, K), edge (P, G, m, 2, K), own (P, G, m, m): curvature by
+    coefficients (uu, uv, vv, lower halves), by these and the rest, by the rest; pull_direct (P,
+    chips, 2, K), pull_own (P, G, m): gradients; scalars (P, 4): log density, sums of w, of w (1 -
+    w), and of w times the squared normalised residual; rows (S q, D): L^-1 B of each star; factors
+    (S, q, q): L.
+    """
+    q, K, m = stars.shape[1], coef.shape[2], extra.shape[1]
+    n_chips, n_groups = chip.max() + 1, len(coef)
+    sums = (
+        np.zeros((PIECES, n_chips, 3, K, K)),
+        np.zeros((PIECES, n_groups, m, 2, K)),
+        np.zeros((PIECES, n_groups, m, m)),
+        np.zeros((PIECES, n_chips, 2, K)),
+        np.zeros((PIECES, n_groups, m)),
+        np.zeros((PIECES, 4)),
+        np.zeros(((last - first) * q, n_params)),
+        np.zeros((last - first, q, q)),
+    )
+    share_out(
+        _eliminate_stars, PIECES, first, last, *detections, stars, coef, chip, linear, extra,
+        columns, n_params, order, j2, log_core, log_out, least, seen, sums,
+    )  # fmt: skip
+    return sums

@@ -19,7 +19,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.kernel.blocks import BLOCK, threads_for
+from bayesdist.infer.kernel.blocks import BLOCK, PASS, share_out, threads_for
 from bayesdist.infer.kernel.circle import MOST, NODES, log_circle, slopes
 from bayesdist.infer.kernel.mixture import GAUSSIAN, Constants, packed
 from bayesdist.infer.kernel.moments import (
@@ -29,6 +29,7 @@ from bayesdist.infer.kernel.moments import (
     _add,
     _by_group,
     _dot,
+    empty_sums,
     mixture_sums,
 )
 from bayesdist.infer.kernel.numeric import exp_negative
@@ -89,13 +90,12 @@ def _parts(star, row, circle, q, work):
     )
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def _evaluated(blocks, stars, coef, order, rows, unit2, circle, out):
+@nb.njit(**PASS)
+def _evaluated(first, end, blocks, stars, coef, order, rows, unit2, circle, sums, out):
     """Log-likelihood (n, D) of each block; star by star, averages to out (3, N) if not empty."""
-    n_blocks, n_draws, wanted = len(blocks), len(rows), out.shape[1] > 0
-    sums = np.empty((n_blocks, n_draws))
+    n_draws, wanted = len(rows), out.shape[1] > 0
     share, constant = 1.0 / n_draws, math.log(2 * math.pi * unit2)
-    for b in nb.prange(n_blocks):
+    for b in range(first, end):
         g, a, e = blocks[b]
         pu, pv, inner = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
         q, work = np.empty(MOST), np.empty(MOST)
@@ -114,7 +114,6 @@ def _evaluated(blocks, stars, coef, order, rows, unit2, circle, out):
                     out[1, i] += share * (value - constant)
                     out[2, i] += share * (value - constant) * (value - constant)
             sums[b, d] = total - (e - a) * constant
-    return sums
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
@@ -180,13 +179,11 @@ def _terms(star, row, circle, wavering, q, work, zc, zo, out):
     out[21] = -p * out_ss - pq * out_s * out_s
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def _moments(pieces, stars, coef, order, row, unit2, circle, em):
-    n_pieces, top = len(pieces), 2 * order
-    sums = np.zeros((n_pieces, COLUMNS, (top + 1) * (top + 2) // 2))
-    scalars = np.zeros((n_pieces, N_MIXTURE))
+@nb.njit(**PASS)
+def _moments(start, stop, pieces, stars, coef, order, row, unit2, circle, em, sums, scalars):
+    top = 2 * order
     wavering, log_unit = 0.0 if em else 1.0, math.log(2 * math.pi * unit2)
-    for b in nb.prange(n_pieces):
+    for b in range(start, stop):
         g, first, end = pieces[b]
         P, Q = np.empty((top + 1, BLOCK)), np.empty((top + 1, BLOCK))
         pu, pv, inner = np.empty(BLOCK), np.empty(BLOCK), np.empty((3, BLOCK))
@@ -206,14 +203,12 @@ def _moments(pieces, stars, coef, order, row, unit2, circle, em):
             for k in range(N_MIXTURE):
                 scalars[b, k] += _dot(columns[COLUMNS + k], P[0])
             scalars[b, 0] -= n * log_unit
-            _add(columns, 0, 3, P, Q, top, inner, sums[b])
-            _add(columns, 3, 6 if em else COLUMNS, P, Q, order, inner, sums[b])
-    return sums, scalars
+            _add(columns, 6 if em else COLUMNS, P, Q, order, inner, sums[b])
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def _scores(blocks, stars, coef, order, row, circle, out):
-    for b in nb.prange(len(blocks)):
+@nb.njit(**PASS)
+def _scores(first, end, blocks, stars, coef, order, row, circle, out):
+    for b in range(first, end):
         g, a, e = blocks[b]
         pu, pv, inner = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
         q, work, zc, zo = np.empty(MOST), np.empty(MOST), np.empty(10), np.empty(10)
@@ -251,8 +246,19 @@ def truncated_log_likelihood(
     with threads_for(INTEGRAL * len(columns[0]) * len(coef)):
         for a in range(0, len(coef), step):
             some = slice(a, a + step)
-            sums = _evaluated(
-                blocks, stars, coef[some], order, rows[some], constants.unit2, circle, nothing
+            sums = np.empty((len(blocks), len(rows[some])))
+            share_out(
+                _evaluated,
+                len(blocks),
+                blocks,
+                stars,
+                coef[some],
+                order,
+                rows[some],
+                constants.unit2,
+                circle,
+                sums,
+                nothing,
             )
             # as in `log_likelihood`
             out[some] = np.ascontiguousarray(sums.T).sum(axis=1)
@@ -273,7 +279,9 @@ def truncated_memberships(
     """
     out = np.empty((3, len(columns[0])))
     with threads_for(INTEGRAL * out.shape[1] * len(coef)):
-        _evaluated(
+        share_out(
+            _evaluated,
+            len(blocks),
             blocks,
             (*columns, *offsets),
             np.ascontiguousarray(coef),
@@ -281,6 +289,7 @@ def truncated_memberships(
             packed(constants),
             constants.unit2,
             _circle(constants),
+            np.empty((len(blocks), len(coef))),
             out,
         )
     return out
@@ -303,8 +312,11 @@ def truncated_moments(
     Hessian, and `cross` is zero.  It is the covariance of a truncated Gaussian times two inverse
     variances, and never negative.
     """
+    sums, scalars = empty_sums(len(pieces), order, COLUMNS, N_MIXTURE)
     with threads_for(INTEGRAL * len(columns[0])):
-        sums, scalars = _moments(
+        share_out(
+            _moments,
+            len(pieces),
             pieces,
             (*columns, *offsets),
             np.ascontiguousarray(coef),
@@ -313,6 +325,8 @@ def truncated_moments(
             constants.unit2,
             _circle(constants),
             em,
+            sums,
+            scalars,
         )
     return mixture_sums(_by_group(sums, pieces), scalars.sum(axis=0), order, em)
 
@@ -332,7 +346,9 @@ def truncated_scores(
     """
     out = np.empty((5, len(columns[0])))
     with threads_for(INTEGRAL * out.shape[1]):
-        _scores(
+        share_out(
+            _scores,
+            len(blocks),
             blocks,
             (*columns, *offsets),
             np.ascontiguousarray(coef),

@@ -150,7 +150,7 @@ def _passes(
             found = kernel.eliminate_stars(
                 first,
                 min(first + STARS, p.n_stars),
-                *p.columns,
+                p.columns,
                 stars,
                 structure.coef,
                 p.groups.chip,
@@ -284,7 +284,7 @@ def log_marginal(problem: Problem, theta: Float, mixtures: Float, modes: StarMod
             sums = kernel.log_marginals(
                 0,
                 p.n_stars,
-                *p.columns,
+                p.columns,
                 modes.stars,
                 modes.middles,
                 modes.weight,

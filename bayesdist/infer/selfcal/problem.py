@@ -242,7 +242,7 @@ class Problem:
         with threads_for(5 * len(self.X)):
             X, Y, offset, W = kernel.linearised(
                 groups.index,
-                *self.seen,
+                self.seen,
                 self.X,
                 self.Y,
                 places,
