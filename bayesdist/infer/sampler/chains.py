@@ -39,20 +39,21 @@ from bayesdist.infer.sampler.move_schedule import (
     block_schedule,
     doubling_schedule,
     first_check,
+    has_mixed,
+    mixing_steps,
     next_check,
     pilot_steps,
     plan_moves,
     walkers_for,
 )
 from bayesdist.infer.sampler.proposal_batch import ProposalBatch, pilot_batch
-from bayesdist.limits import DRAWS_PER_WALKER, PARETO_K
+from bayesdist.limits import PARETO_K
 
 __all__ = ["Chains", "Settings", "ensemble_seeds", "run_chains"]
 
 Float = NDArray[np.float64]
 
 LEAST_ROWS = 10  # rows of a chain that diagnostics need at least
-MIX_STEPS = 500  # by which Crank-Nicolson moves must have mixed every walker
 
 
 @dataclass(frozen=True)
@@ -274,6 +275,7 @@ def _state_dependent(
     if s.max_steps - begin < 10 * runs.plan.thin:  # too few steps to leave any out
         runs = replace(runs, plan=replace(runs.plan, thin=1))
     plan, total = runs.plan, len(s.seeds) * runs.plan.walkers
+    mixed = mixing_steps(len(target.names))
     states, _, further = runs.starts()
     passes += further
     history, wanted, nothing = _History(runs, begin), 0.0, runs.pilot[slice(0, 0)]
@@ -283,14 +285,14 @@ def _state_dependent(
         warmup, last = history.rows // 2, span.end + plan.thin > s.max_steps
         made = total * (history.rows - warmup)
         # at the same step for any targets, as a resumed run may have others
-        trial = not plan.coupled and span.begin < begin + MIX_STEPS <= span.end
+        trial = not plan.coupled and span.begin < begin + mixed <= span.end
         if made < max(wanted, total * LEAST_ROWS) and not last and not trial:
             continue
         verdict = _verdict(target, history, warmup, quality, s.limits)
         if verdict.converged or last:
             break
         ess = min(verdict.ess_bulk_min, verdict.ess_tail_min)
-        if trial and ess < DRAWS_PER_WALKER.value * total:
+        if trial and not has_mixed(ess, len(target.names), total):
             return history.chains(warmup, verdict, passes), False
         wanted = next_check(made, verdict, s.n_stars, total)
     return history.chains(warmup, verdict, passes), True

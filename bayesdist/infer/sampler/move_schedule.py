@@ -24,6 +24,8 @@ __all__ = [
     "doubling_schedule",
     "expected_passes",
     "first_check",
+    "has_mixed",
+    "mixing_steps",
     "next_check",
     "pilot_steps",
     "plan_moves",
@@ -39,6 +41,9 @@ FEWEST_WALKERS, MOST_WALKERS = 8, 64
 
 EFFICIENT, USABLE = 0.5, 0.05  # importance efficiency
 NO_MEAN = 1.0  # Pareto k beyond which weights have no mean: the proposal misses the posterior
+# parameters from which differential evolution, with two walkers for each, mixes later than
+# Crank-Nicolson moves do from next to any proposal
+MANY = 50
 PROBATION = 2048  # proposals below which k scatters too much (by about 0.2 at 512) to reject one
 
 
@@ -76,7 +81,8 @@ def plan_moves(
 
     Acceptance is not used: it looks fine on proposals that miss a tail.  `n_proposals` gave
     efficiency and k; while they are few, a k above its limit is checked by further proposals, which
-    cost less than the other moves.
+    cost less than the other moves.  An efficiency of zero stands for a proposal from which
+    Crank-Nicolson moves do not mix.
     """
     step = min(0.5, 2.0 / np.sqrt(n_params))
     dear = n_stars > DEAR  # every step counts, and there are few of them
@@ -85,10 +91,30 @@ def plan_moves(
     # local moves compensate for a tail that the proposal reaches too seldom
     if efficiency > USABLE and (k < NO_MEAN or n_proposals < PROBATION):
         return Plan("independence + pCN", (0.6, 0.4, 0.0), walkers or 32, step, 1 if dear else 5)
+    if n_params > MANY and efficiency > 0:
+        thin = 1 if dear else 5
+        return Plan("pCN + independence", (0.2, 0.8, 0.0), walkers or 32, step, thin)
     # emcee's red-blue moves need two walkers for each parameter
     least = max(2 * (n_params + 1), 32)
     walkers, thin = max(walkers or 0, least), 1 if dear else 10
     return Plan("DE + pCN + independence", (0.2, 0.3, 0.5), walkers, step, thin)
+
+
+def mixing_steps(n_params: int) -> int:
+    """Steps after which `has_mixed` is asked of Crank-Nicolson moves.
+
+    A walker is independent after some n_params / 2 of them, the step being what it is.
+    """
+    return max(500, 10 * n_params)
+
+
+def has_mixed(ess: float, n_params: int, walkers: int) -> bool:
+    """True if Crank-Nicolson moves are to go on: every walker has made enough effective draws.
+
+    Of many parameters one is enough, since the other moves make fewer in as many passes;
+    `walkers` are those of all ensembles together.
+    """
+    return ess >= (1.0 if n_params > MANY else DRAWS_PER_WALKER.value) * walkers
 
 
 # -- independence: sizes --------------------------------------------------------------------------

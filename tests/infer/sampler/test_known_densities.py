@@ -21,6 +21,8 @@ from bayesdist.infer.convergence import diagnose
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.sampler import ensembles as sampler
+from bayesdist.infer.sampler.chains import Settings, run_chains
+from bayesdist.infer.sampler.move_schedule import mixing_steps
 
 from ..fakes import FakeTarget, advanced, ensembles_of, gaussian_proposal
 from ..oracle import JitterOracle
@@ -192,3 +194,21 @@ def test_wrong_moves_are_found(move, monkeypatch):
     found = deviations(known, move, STEPS[move])
     worst = max(np.abs(found.mean).max(), np.abs(found.sd).max())
     assert worst > 2 * limit(2 * len(known.mean))
+
+
+def test_many_parameters_are_sampled_from_a_proposal_that_is_worth_little():
+    """120 dimensions, the proposal a sixth too wide in each: of a thousand draws ten count."""
+    n = 120
+    cov = 0.5 ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    precision = np.linalg.inv(cov)
+    target = FakeTarget(lambda x: -0.5 * np.einsum("ni,ij,nj->n", x, precision, x), n)
+    settings = Settings(seeds=SEEDS, n_stars=5000, limits=Limits(400, 1.01))
+    chains = run_chains(target, gaussian_proposal(np.zeros(n), 1.35 * cov), settings)
+    assert chains.verdict.importance_efficiency < 0.05
+    assert chains.plan.method == "pCN + independence"
+    assert chains.verdict.converged and chains.steps <= mixing_steps(n) + 200
+    ess = min(chains.verdict.ess_bulk_min, chains.verdict.ess_tail_min)
+    z = chains.draws.mean(axis=(0, 1)) * np.sqrt(ess)
+    assert np.abs(z).max() < 5.0
+    # of all parameters together, whose variances have errors of 2 / ess each
+    assert chains.draws.var(axis=(0, 1)).mean() == pytest.approx(1.0, abs=4 * np.sqrt(2 / ess / 40))

@@ -21,6 +21,8 @@ from bayesdist.infer.sampler.move_schedule import (
     block_schedule,
     doubling_schedule,
     expected_passes,
+    has_mixed,
+    mixing_steps,
     pilot_steps,
     plan_moves,
     walkers_for,
@@ -196,5 +198,13 @@ def test_plan_falls_back_as_the_proposal_gets_worse():
     # as many passes
     for k, n_proposals in ((0.73, 4096), (1.5, 512)):
         assert plan_moves(0.47, k, 45, 1_000_000, n_proposals=n_proposals).method == fair.method
-    for plan in (good, fair, poor):
+    # of many parameters differential evolution is the last resort
+    many = plan_moves(0.01, 1.4, 184, 5000)
+    assert not many.coupled and many.weights[1] > fair.weights[1]
+    assert plan_moves(0.0, np.inf, 184, 5000).coupled
+    # ... and one effective draw of each walker is asked for before it, of few parameters five
+    assert mixing_steps(45) == 500 and mixing_steps(184) == 1840
+    assert has_mixed(130, 184, 128) and not has_mixed(120, 184, 128)
+    assert has_mixed(650, 45, 128) and not has_mixed(630, 45, 128)
+    for plan in (good, fair, poor, many):
         assert sum(plan.weights) == pytest.approx(1)
