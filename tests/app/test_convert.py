@@ -161,6 +161,7 @@ def test_bad_requests_get_a_sentence(tmp_path):
         ((path, "--to", "fit", *new), "there is no format 'fit' that can be built"),
         ((path, "--to", "tpv", "--option", "colour=red", *new), "the keys of tpv are crval"),
         ((path, "--to", "tpv", "--option", "crval", *new), "is not KEY=VALUE"),
+        ((path, "--to", "jwst", *new), "needs useafter, pedigree, author, instrument"),
         ((path, "--to", "tpv", "--order", 11, *new), "choose one from 1 to 7 for TPV headers"),
         ((high, "--to", "tpv", *new), "up to order 7"),
         ((path, "--to", "tpv", "-o", tmp_path / "one.head"), "2 files are made"),

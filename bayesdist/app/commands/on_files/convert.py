@@ -103,12 +103,16 @@ def _settings(to: str, kind: type[FormatSettings], options: Sequence[str]) -> Fo
     try:
         return kind(**values)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or to
+        found = error.errors()
+        names = [".".join(str(part) for part in one["loc"]) or to for one in found]
+        missing = [n for n, one in zip(names, found, strict=True) if one["type"] == "missing"]
+        what, where = found[0]["msg"].lower(), f"products.{to}.{names[0]}"
+        if missing:
+            what, where = f"needs {', '.join(missing)}", f"products.{to}"
         keys = ", ".join(kind.model_fields) or "none"
         raise InputError(
-            first["msg"].lower(), where=f"products.{to}.{where}",
-            do=f"give it by --option KEY=VALUE; the keys of {to} are {keys}",
+            what, where=where,
+            do=f"give --option KEY=VALUE; the keys of {to} are {keys}",
         ) from None  # fmt: skip
 
 

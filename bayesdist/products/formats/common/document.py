@@ -229,7 +229,7 @@ class Document:
             raise InputError(
                 f"is {self.format.title}, which holds no calibration by itself",
                 where=self.name,
-                do="give an IDCTAB, a SIP header, WISE meta-data, or a run directory",
+                do="give a file that holds one, such as an IDCTAB, a header or a run directory",
             )
         with readable(self.name):
             found = self.format.calibration(self.holds, self.name, choice)
