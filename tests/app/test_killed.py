@@ -182,14 +182,14 @@ def test_sigkill_changes_nothing(kind, tmp_path, full, capsys):
     assert begun(command(whole)).wait() == 0
     seconds = _seconds(whole)
 
-    moments, landed = random.Random(17), Counter()
+    moments, aimed, landed = random.Random(17), Counter(), Counter()
     while landed.total() < kills:
-        left = [name for name in seconds if name not in _seconds(torn)]
-        if not left:  # it came to its end in spite of all kills: compare, and begin anew
+        wanted = min(seconds, key=lambda name: aimed[name])
+        if wanted in _seconds(torn):  # has ended in spite of all kills: compare, and begin anew
+            assert begun(command(torn)).wait() == 0
             _assert_same(whole, torn)
             shutil.rmtree(torn)
-            continue
-        wanted = min(left, key=lambda name: landed[name])
+        aimed[wanted] += 1
         delay = moments.uniform(0.0, 0.7) * seconds[wanted]
         process = begun(command(torn))
         while process.poll() is None and _under_way(torn) != wanted:

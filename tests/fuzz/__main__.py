@@ -15,6 +15,8 @@ from tests.fuzz.inputs import inputs
 from tests.fuzz.mutation import MUTATIONS
 from tests.fuzz.verdicts import table_of, tried
 
+BEGUN = 1000  # cases, from which on runs are begun for them
+
 
 def main() -> int:
     """Exit code: 1 where a case failed."""
@@ -27,7 +29,8 @@ def main() -> int:
     parser.add_argument("--json", metavar="FILE", help="write counts and failures")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="bayesdist-fuzz-") as folder:
-        known = [one for one in inputs(Path(folder)) if given.only in f"{one.kind} {one.name}"]
+        made = inputs(Path(folder), begun=given.cases >= BEGUN or bool(given.only))
+        known = [one for one in made if given.only in f"{one.kind} {one.name}"]
         cases = kept()
         if not given.kept:
             cases += drawn(known, given.cases, given.seed)

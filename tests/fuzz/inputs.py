@@ -81,8 +81,8 @@ class Input:
         return FORMS.get(self.path.suffix, "text")
 
 
-def inputs(folder: Path) -> list[Input]:
-    """All inputs, written into a new folder."""
+def inputs(folder: Path, *, begun: bool = True) -> list[Input]:
+    """All inputs, written into a new folder; runs that have `begun` take seconds to make."""
     with sketched():
         run = _run(folder / "finished")
         found = [
@@ -93,6 +93,7 @@ def inputs(folder: Path) -> list[Input]:
             *_products(folder / "products"),
             *_foreign_products(folder / "foreign"),
             *_of_run(run, folder),
+            *(_begun_runs(folder / "begun") if begun else ()),
         ]
     names = [one.name for one in found]
     assert len(set(names)) == len(names)
@@ -153,11 +154,7 @@ def _hst1pass_rows(matches) -> str:
 def _star_lists(folder: Path) -> Iterator[Input]:
     """Campaign and self-calibration: lists, catalogue, log, pointing, initial distortion."""
     here = folder / "campaign"
-    good("simulate", "acs", "-o", here, "--exposures", 6, "--stars", 1500, "--seed", 3, "-q",
-         "--no-tables")  # fmt: skip
-    shutil.rmtree(here / "truth")
-    for name in ("catalog_early.parquet", "catalog_late.parquet"):
-        (here / name).unlink()
+    _simulated_campaign(here)
     commands = {"check": ["check", "@/campaign_f606w.toml"]}
     for name in ("exposures.ecsv", "catalog.parquet", "start_idc.fits", "lists/f606w-002.parquet"):
         yield Input(f"campaign-{Path(name).name}", "star lists", here, name, commands)
@@ -167,6 +164,14 @@ def _star_lists(folder: Path) -> Iterator[Input]:
     commanded(field_, 1.0, np.random.default_rng(1)).write(here / "commanded.ecsv")
     for name in ("lists.ecsv", "commanded.ecsv"):
         yield Input(f"selfcal-{name}", "star lists", here, name, CHECK)
+
+
+def _simulated_campaign(folder: Path) -> None:
+    good("simulate", "acs", "-o", folder, "--exposures", 6, "--stars", 1500, "--seed", 3, "-q",
+         "--no-tables")  # fmt: skip
+    shutil.rmtree(folder / "truth")
+    for name in ("catalog_early.parquet", "catalog_late.parquet"):
+        (folder / name).unlink()
 
 
 def _of_wise(folder: Path) -> Iterator[Input]:
@@ -246,6 +251,7 @@ def _products(folder: Path) -> Iterator[Input]:
             commands["rotate"] = ["wise", "rotate", f"@/{main}", "-o", "@/out.txt"]
         if key == "idctab":
             commands["pam"] = ["hst", "pam", f"@/{main}", "-o", "@/pam.fits"]
+            commands["handbook"] = ["hst", "handbook", f"@/{main}", "-o", "@/out"]
         for one in files:
             yield Input(f"{key}-{one.file_name}", "products", here, one.file_name, commands)
 
@@ -327,3 +333,48 @@ def _of_run(run: Path, folder: Path) -> Iterator[Input]:
         "inspect": ["inspect", "@/run/posterior.nc"],
     }
     yield Input("posterior.nc", "run folders", here, "run/posterior.nc", alone)
+
+
+def _begun_runs(folder: Path) -> Iterator[Input]:
+    """A self-calibration and a campaign that are fitted, and a band of WISE that is sampled."""
+    here = _begun(folder / "selfcal", "match", "fit")
+    commands = {
+        "fit": ["stage", "fit", "@/run", "-q"],
+        "match": ["stage", "match", "@/run", "-q"],
+        "inspect": ["inspect", "@/run"],
+    }
+    for name in ("run.json", "detections.h5", "solution.h5", "fit.nc", "gauge.ecsv",
+                 "matching.ecsv", "magnitude_errors.ecsv"):  # fmt: skip
+        yield Input(f"begun-selfcal-{name}", "run folders", here, f"run/{name}", commands)
+    here = _begun(folder / "campaign", "match", "fit")
+    for name in ("run.json", "pairs/part-00000.parquet", "hierarchy.h5", "exposure_terms.h5",
+                 "fit.nc", "matching.ecsv"):  # fmt: skip
+        label = Path(name).name
+        yield Input(f"begun-campaign-{label}", "run folders", here, f"run/{name}", commands)
+    here = _begun(folder / "band", "fit", "sample")
+    line = ["wise", "bands", "@/run", "-o", "@/out", "--no-published", "--bins", "6"]
+    for name in ("run.json", "posterior.nc", "fit.nc", "stars/part-00000.parquet"):
+        label = Path(name).name
+        yield Input(f"band-{label}", "run folders", here, f"run/{name}", {"bands": line})
+
+
+def _begun(folder: Path, *stages: str) -> Path:
+    """A folder with input of the kind that it is named for, and a run of some stages."""
+    given, run = folder / "input", folder / "run"
+    if folder.name == "selfcal":
+        write_selfcal(given, list_table(small()), products={"sip": {}})
+    elif folder.name == "campaign":
+        _simulated_campaign(given)
+        (given / "config.toml").write_text(CAMPAIGN, encoding="utf-8")
+    else:
+        rvb_job(given, rvb_pairs(150))
+    text = (given / "config.toml").read_text(encoding="utf-8")
+    for path in given.iterdir():
+        text = text.replace(f'"{path.name}"', f'"../input/{path.name}"')
+    if folder.name == "band":
+        text = text.replace("[detector]", "[detector]\nscale_mas = 5500.0")
+    run.mkdir()
+    (run / "config.toml").write_text(text, encoding="utf-8")
+    for stage in stages:
+        good("stage", stage, run, "-q")
+    return folder
