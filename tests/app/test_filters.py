@@ -54,7 +54,7 @@ INPUTS = ("catalog.parquet", "exposures.ecsv", "start_idc.fits", "lists", "run_f
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("filters") / "acs"
-    options = ("--exposures", 14, "--secondary-exposures", 8, "--stars", 4000, "--seed", 5, "-q")
+    options = ("--exposures", 14, "--secondary-exposures", 8, "--stars", 6000, "--seed", 5, "-q")
     good("simulate", "acs", "-o", folder, "--filters", "F606W,F814W", *options)
     return folder
 
