@@ -336,7 +336,7 @@ def _of_run(run: Path, folder: Path) -> Iterator[Input]:
 
 
 def _begun_runs(folder: Path) -> Iterator[Input]:
-    """A self-calibration and a campaign that are fitted, and a band of WISE that is sampled."""
+    """A self-calibration and a campaign that are fitted, and a band of WISE that is diagnosed."""
     here = _begun(folder / "selfcal", "match", "fit")
     commands = {
         "fit": ["stage", "fit", "@/run", "-q"],
@@ -351,7 +351,7 @@ def _begun_runs(folder: Path) -> Iterator[Input]:
                  "fit.nc", "matching.ecsv"):  # fmt: skip
         label = Path(name).name
         yield Input(f"begun-campaign-{label}", "run folders", here, f"run/{name}", commands)
-    here = _begun(folder / "band", "fit", "sample")
+    here = _begun(folder / "band", "fit", "sample", "diagnose")
     line = ["wise", "bands", "@/run", "-o", "@/out", "--no-published", "--bins", "6"]
     for name in ("run.json", "posterior.nc", "fit.nc", "stars/part-00000.parquet"):
         label = Path(name).name

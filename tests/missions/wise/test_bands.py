@@ -90,7 +90,7 @@ def compared(tmp_path_factory) -> Compared:
         run = folder / f"run_{name}"
         run.mkdir()
         (run / "config.toml").write_text(text, encoding="utf-8")
-        for stage in ("fit", "sample"):  # what comes after is not needed
+        for stage in ("fit", "sample", "diagnose"):  # what comes after is not needed
             good("stage", stage, run)
     optical = folder / "set" / "optical_w2.hdr"
     runs = [folder / "run_w4", folder / "run_w1"]  # the tables put them in order
@@ -288,7 +288,7 @@ def test_a_run_that_has_not_converged_is_said_on_top(compared, tmp_path):
     text = text.replace("target_ess = 100", "target_ess = 100000\nmax_steps = 20")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "config.toml").write_text(text, encoding="utf-8")
-    for stage in ("fit", "sample"):
+    for stage in ("fit", "sample", "diagnose"):
         cli("stage", stage, tmp_path / "run")
     result = good("wise", "bands", tmp_path / "run", "-o", tmp_path / "out", "--bins", BINS)
     assert "WARNING: W4 has not converged" in result.out
@@ -339,7 +339,7 @@ def test_a_folder_in_use_is_refused(compared):
 
 def test_stars_that_are_not_those_of_the_run_are_refused(tmp_path):
     config = write_job(tmp_path / "in", detector={"name": "D", "size": SIZE, "scale_mas": 50.0})
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample")
+    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "diagnose")
     stars = config.parent / "stars.ecsv"
     stars.write_text(stars.read_text(encoding="utf-8") + "\n", encoding="utf-8")
     words = ["stars.ecsv", "changed since the run began"]
@@ -349,7 +349,7 @@ def test_stars_that_are_not_those_of_the_run_are_refused(tmp_path):
 def test_bands_of_another_instrument_have_no_word_of_wise(tmp_path):
     detector = {"name": "blue", "size": SIZE, "scale_mas": 50.0}
     config = write_job(tmp_path / "in", detector=detector)
-    begin_stagewise(tmp_path / "run", config, "fit", "sample")
+    begin_stagewise(tmp_path / "run", config, "fit", "sample", "diagnose")
     good("wise", "bands", tmp_path / "run", "-o", tmp_path / "out", "--bins", 6)
     page = (tmp_path / "out" / "bands.html").read_text(encoding="utf-8")
     text = re.sub(r'src="data:[^"]*"', "", page)
@@ -361,7 +361,7 @@ def test_bands_of_another_instrument_have_no_word_of_wise(tmp_path):
 
 def test_a_missing_scale_is_refused(tmp_path):
     config = write_job(tmp_path / "in", detector={"name": "blue", "size": SIZE})
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample")
+    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "diagnose")
     words = ["size of a pixel", "detector.scale_mas"]
     refused(tmp_path, "wise", "bands", run, "-o", tmp_path / "out", words=words)
 
@@ -379,7 +379,7 @@ def test_several_chips_are_refused(tmp_path):
     ]
     settings = {"detector": {"name": "D", "scale_mas": 50.0}, "model": {"order": 2}}
     config = write_job(tmp_path / "in", table, chip=blocks, **settings)
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample")
+    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "diagnose")
     refused(
         tmp_path,
         "wise",

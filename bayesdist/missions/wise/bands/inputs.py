@@ -79,7 +79,7 @@ def _opened(path: str | Path) -> BandRun:
             do="give runs of matched stars, one for each band",
         )
     results = results_of(run)
-    run.require("bands", ("fit", "sample"))
+    run.require("bands", ("fit", "sample", "diagnose"))
     chips = results.posterior.model.chips
     if len(chips) > 1:
         raise InputError(

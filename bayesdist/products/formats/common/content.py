@@ -13,6 +13,7 @@ import io
 import os
 import re
 import warnings
+from codecs import BOM_UTF8
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -121,10 +122,10 @@ class Content:
 
     @cached_property
     def text(self) -> str:
-        """Text, one line below the other; empty for a FITS file."""
+        """Text, one line below the other and without a byte order mark; empty for a FITS file."""
         if self.is_fits or b"\0" in self.raw[:RECORD]:
             return ""
-        return self.raw.decode("latin-1").replace("\r\n", "\n")
+        return self.raw.removeprefix(BOM_UTF8).decode("latin-1").replace("\r\n", "\n")
 
     @cached_property
     def hdus(self) -> tuple[Hdu, ...]:
