@@ -15,6 +15,7 @@ __all__ = [
     "Scale",
     "broken_name",
     "count",
+    "counted",
     "display_scale",
     "interval",
     "ladder",
@@ -128,6 +129,20 @@ def broken_name(name: str) -> str:
             lines.append("")
         lines[-1] += part
     return "\n".join(lines)
+
+
+def counted(fraction: Any, error: Any, n: Any) -> str:
+    """Probability counted in n draws: a bound where none or all of them are counted."""
+    p, draws = _finite(fraction), _finite(n)
+    if p is None or draws is None or draws <= 0:
+        return MISSING
+    decimals = max(1, math.ceil(math.log10(draws)))
+    least = math.ceil(10**decimals / draws) / 10**decimals  # one draw, rounded up
+    if p * draws < 0.5:
+        return f"below {least:.{decimals}f}"
+    if (1 - p) * draws < 0.5:
+        return f"above {1 - least:.{decimals}f}"
+    return rounded(p, error)
 
 
 # -- lengths and their units ----------------------------------------------------------------------

@@ -66,15 +66,18 @@ def structure_checks(
 def score_checks(
     tests: Sequence[ScoreTest], correlated: Discrepancy | None = None
 ) -> Iterator[Check]:
-    """Checks of what targeted tests have found, each as a remark.
+    """Checks of what targeted tests have found, a remark for each remedy.
 
-    Verdicts stand where correlated errors hold what a test has found.
+    Verdicts stand where correlated errors hold what the tests have found.
     """
+    found: dict[str, list[ScoreTest]] = {}
     for test in tests:
         if test.significant:
-            sentence = f"{test.finding}: {test.remedy}"
-            doubt = "" if _held(correlated, test) else LARGER
-            yield Check(SCORE_TESTS, level="warn", sentence=sentence, doubt=doubt)
+            found.setdefault(test.remedy, []).append(test)
+    for remedy, several in found.items():
+        sentence = f"{'; '.join(test.finding for test in several)}: {remedy}"
+        doubt = "" if all(_held(correlated, test) for test in several) else LARGER
+        yield Check(SCORE_TESTS, level="warn", sentence=sentence, doubt=doubt)
 
 
 def _held(correlated: Discrepancy | None, test: ScoreTest) -> bool:

@@ -12,6 +12,7 @@ from scipy import stats
 from bayesdist.diagnose import score_tests
 from bayesdist.diagnose.checks import score_checks
 from bayesdist.diagnose.score import sample as sample_module
+from bayesdist.diagnose.score.questions import order_family
 from bayesdist.diagnose.score.result import Family, Outcome, corrected, noncentrality
 from bayesdist.diagnose.score.sample import SAMPLE, scored_sample
 from bayesdist.errors import InputError
@@ -143,6 +144,16 @@ def test_findings_name_another_one_that_may_explain_them():
     ]
     absent = replace(first, p_value=0.5)
     assert corrected([second, absent])[0].finding.startswith("b (")
+
+
+def test_orders_that_are_missing_have_one_remedy():
+    """Whoever raises the order to the highest that is missing has the others, too."""
+    orders = [replace(outcome(0.0), family=order_family(total, 4)) for total in (5, 6)]
+    [both] = score_checks(corrected(orders))
+    assert both.sentence.endswith(": raise model.order to 6")
+    assert "order 5" in both.sentence and "to 5" not in both.sentence
+    [one] = score_checks(corrected([orders[0], replace(orders[1], p_value=0.5)]))
+    assert one.sentence.endswith(": raise model.order to 5") and "order 6" not in one.sentence
 
 
 def test_drift_of_exposures_that_deviate_is_doubtful():

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from bayesdist.numbers import (
     MISSING,
     count,
+    counted,
     display_scale,
     interval,
     number,
@@ -89,3 +90,21 @@ def test_probabilities_that_a_double_holds_are_said():
     assert probability(0.0123) == "p = 0.012"
     assert probability(1e-300) == "p = 1.0\u202f×\u202f10⁻³⁰⁰"
     assert MISSING in probability(float("nan"))
+
+
+@pytest.mark.parametrize(
+    ("fraction", "n", "text"),
+    [
+        (0.0, 2000, "below 0.0005"),
+        (1.0, 2000, "above 0.9995"),
+        (0.0, 1512, "below 0.0007"),
+        (1.0, 300, "above 0.996"),
+        (0.909, 2000, "0.9090"),
+        (0.9995, 2000, "0.99950"),
+        (float("nan"), 2000, MISSING),
+    ],
+)
+def test_a_probability_counted_in_draws_is_never_zero_or_one(fraction, n, text):
+    """No draw of n leaves probabilities below 1 / n, rounded up."""
+    error = np.sqrt(fraction * (1 - fraction) / n)
+    assert counted(fraction, error, n) == text

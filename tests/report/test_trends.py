@@ -95,3 +95,15 @@ def test_pixel_scale_is_the_root_of_the_area():
     area = run.chips[0].area
     text = f"from {1e3 * np.sqrt(area.area.min() * area.reference_area):.6g} to"
     assert text in plot.text and "mas/pix" in plot.figure.axes[1].get_ylabel()
+
+
+def test_dates_of_one_night_are_in_days(converged):
+    stars = converged.stars
+    hours = np.array([0.0, 1.0, 2.0, 6.0])[stars.table.exposure % 4]
+    night = stars.table.with_columns(epoch=2020.194906 + hours / 24 / 365.25)
+    plot = plot_of(replace(converged, stars=replace(stars, table=night)), "residuals_by_property")
+    axes = [ax for ax in plot.figure.axes if "epoch" in ax.get_xlabel()]
+    assert len(axes) == 2
+    for ax in axes:
+        assert ax.get_xlabel() == "epoch [days after the first]"
+        np.testing.assert_allclose(_errorbars(ax)[0], np.array([0, 1, 2, 6]) / 24, atol=1e-6)

@@ -175,6 +175,18 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
     n = len(outcomes)
     outcomes = [_with_explanation(one, outcomes) for one in outcomes]
     significant = holm([one.p_value for one in outcomes]) <= SCORE_TESTS.value
+    # of a group the last finding has the remedy of all: a higher order holds the lower ones
+    remedies = {
+        one.family.group or one.name: one.family.remedy
+        for one, found in zip(outcomes, significant, strict=True)
+        if found
+    }
+    outcomes = [
+        replace(one, family=replace(one.family, remedy=remedies[one.family.group or one.name]))
+        if found
+        else one
+        for one, found in zip(outcomes, significant, strict=True)
+    ]
     # what is alone has to pass the first step
     return tuple(
         one.judged(bool(found), SCORE_TESTS.value / n)

@@ -261,6 +261,7 @@ def test_every_file_is_there_and_the_page_needs_no_other(compared):
     assert not re.search(r"<(?:link|script|iframe|img)[^>]*https:", page)
     assert page.count("<figure") == len([f for f in files if f.endswith(".png")])
     assert "NOT CONVERGED" not in page
+    assert page.index(record["verdict"]["headline"]) < page.index("Overview")
     assert page.count("SIMULATED DATA") == 2  # on the screen, and on each page of paper
     assert "W4" in compared.result.out and "bands.html" in compared.result.out
 
@@ -294,7 +295,8 @@ def test_a_run_that_has_not_converged_is_said_on_top(compared, tmp_path):
     assert "WARNING: W4 has not converged" in result.out
     page = (tmp_path / "out" / "bands.html").read_text(encoding="utf-8")
     assert page.index("NOT CONVERGED: W4") < page.index("Overview")
-    assert json.loads((tmp_path / "out" / "bands.json").read_text())["converged"] is False
+    record = json.loads((tmp_path / "out" / "bands.json").read_text())
+    assert record["converged"] is False and record["verdict"]["level"] == "fail"
 
 
 # -- what is refused ------------------------------------------------------------------------------

@@ -14,12 +14,12 @@ from bayesdist.missions.wise.assess.histograms import histogram
 from bayesdist.missions.wise.assess.published import printed_rows
 from bayesdist.missions.wise.bands.curves import CASES, histograms
 from bayesdist.missions.wise.bands.figures import (
-    FLOW,
     alignment,
     formal_uncertainty,
     residuals,
     vectors,
 )
+from bayesdist.missions.wise.bands.findings import verdict
 from bayesdist.missions.wise.bands.tables import as_printed
 
 
@@ -51,7 +51,9 @@ def test_all_bands_are_drawn_to_one_scale_in_arcsec():
     drawn = []
     for ax, (name, n) in zip(fig.axes, (("A", 1000), ("B", 500)), strict=True):
         q = arrows(ax)
-        assert q.scale == pytest.approx(1 / FLOW)  # ten axis pixels for each pixel of a vector
+        step = np.diff(np.unique(q.X))[0]
+        longest = np.hypot(q.U, q.V).max() / q.scale
+        assert 0.5 * step < longest <= 1.5 * step  # seen, and hardly beyond its neighbour
         reach = np.ptp(ax.get_xlim())
         drawn.append(np.max(np.abs(q.U)) / q.scale / reach)
         title = ax.get_title(loc="left")
@@ -85,6 +87,32 @@ def test_crosses_have_the_magnification_they_state(sigma, factor):
     assert {tuple(np.sign(e)) for e in ends} == {(1, 1), (-1, 1), (-1, -1), (1, -1)}
     radius = np.hypot(sigma, 2 * sigma)
     assert ax.get_title(loc="left").endswith(f"max radius {radius:.3g}\u202fpix")
+
+
+@pytest.mark.parametrize(
+    ("converged", "significant", "longer", "level", "words"),
+    [
+        (True, False, 1.001, "pass", "no structure is found"),
+        (True, True, 1.001, "warn", "structure is left in the residuals of W2"),
+        (True, False, 1.03, "warn", "is not the published one in W2"),
+        (False, True, 1.03, "fail", "not converged: W2"),
+    ],
+)
+def test_the_worst_band_decides_the_verdict(converged, significant, longer, level, words):
+    one, two = (
+        SimpleNamespace(
+            name=name,
+            partition=SimpleNamespace(significant=found),
+            correlation=SimpleNamespace(p_value=0.5),
+            printed=SimpleNamespace(longest_vector=3.0, longest_vector_here=3.0 * factor),
+            posterior_map=SimpleNamespace(radius_max=0.01),
+        )
+        for name, found, factor in (("W1", False, 1.0), ("W2", significant, longer))
+    )
+    failed = () if converged else (two,)
+    found = verdict(page_of(one, two, provisional=not converged, not_converged=failed))
+    assert found.level == level and words.casefold() in found.headline.casefold()
+    assert "W1" not in found.headline
 
 
 class Bins(SimpleNamespace):

@@ -11,7 +11,7 @@ from bayesdist.app.screen import table_text
 from bayesdist.app.tables.output import record_folder
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bands.context import BandsInput
-from bayesdist.missions.wise.bands.findings import overview_table
+from bayesdist.missions.wise.bands.findings import overview_table, verdict
 from bayesdist.missions.wise.bands.inputs import BandRun, open_bands
 from bayesdist.missions.wise.bands.measure import measure_bands
 from bayesdist.missions.wise.bands.optical import optical_models
@@ -102,4 +102,5 @@ def _text(output: Path, inputs: BandsInput) -> str:
         f"WARNING: {b.name} has not converged ({'; '.join(b.reasons)})"
         for b in inputs.not_converged
     ]
+    lines += ["", verdict(inputs).headline]
     return "\n".join([*lines, "", f"page: {output / 'bands.html'}"])

@@ -34,8 +34,6 @@ __all__ = [
 Float = NDArray[np.float64]
 Size = tuple[float, float]
 
-# magnifications in section 4 of WSDC D-T033
-FLOW, DIFFERENCE, OPTICAL = 10.0, 50.0, 20.0
 EVERY = 2  # every second vector of a map is drawn: more would hide each other in small panels
 FORMAL = 2000.0  # magnification in section 6 of WSDC D-T033
 SEEN = 0.15  # part of a grid step below which a cross is a dot
@@ -47,8 +45,7 @@ AXES = "xy"
 def vectors(inputs: BandsInput) -> Plot:
     """The distortion of each band without its constant."""
     bands = inputs.bands
-    arcsec = {b.name: b.arcsec for b in bands}
-    fig = _flows({b.name: b.vectors for b in bands}, arcsec, FLOW if inputs.wise else None)
+    fig = _flows({b.name: b.vectors for b in bands}, {b.name: b.arcsec for b in bands})
     return Plot(
         fig,
         "Distortion",
@@ -63,7 +60,7 @@ def differences(inputs: BandsInput) -> Plot:
     """Later bands minus the first one."""
     first = inputs.names[0]
     arcsec = dict.fromkeys(inputs.differences, inputs.bands[0].arcsec)
-    fig = _flows(inputs.differences, arcsec, DIFFERENCE if inputs.wise else None)
+    fig = _flows(inputs.differences, arcsec)
     return Plot(
         fig,
         "Differences of bands",
@@ -81,7 +78,7 @@ def minus_optical(inputs: BandsInput) -> Plot:
     found = {b.name: (b.minus_optical, b.arcsec) for b in inputs.bands}
     maps = {f"{name} − optical": v for name, (v, _) in found.items() if v is not None}
     arcsec = {f"{name} − optical": size for name, (_, size) in found.items()}
-    fig = _flows(maps, arcsec, OPTICAL if inputs.wise else None)
+    fig = _flows(maps, arcsec)
     return Plot(
         fig,
         "Bands minus the optical model",
@@ -90,9 +87,7 @@ def minus_optical(inputs: BandsInput) -> Plot:
     )
 
 
-def _flows(
-    maps: Mapping[str, VectorMap], arcsec: Mapping[str, float], magnification: float | None
-) -> Figure:
+def _flows(maps: Mapping[str, VectorMap], arcsec: Mapping[str, float]) -> Figure:
     """Vector-flow diagrams beside each other, as section 4 of WSDC D-T033.
 
     Panels are equally wide and vectors are longer by one factor than the arrays' own pixels: of
@@ -101,9 +96,7 @@ def _flows(
     arrows = {name: Arrows.of_map(v, EVERY) for name, v in maps.items()}
     longest = {name: float(np.hypot(*v.on_detector).max()) for name, v in maps.items()}
     sizes = {name: (float(v.x.max()), float(v.y.max())) for name, v in maps.items()}
-    M = magnification or min(
-        magnification_of(1.5 * one.step, longest[name]) for name, one in arrows.items()
-    )
+    M = min(magnification_of(1.5 * one.step, longest[name]) for name, one in arrows.items())
     panels = ArrayPanels(sizes)
     panels.frame(
         max(one.reach(M, sizes[name]) / max(sizes[name]) for name, one in arrows.items()) + 0.02

@@ -7,9 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from bayesdist.missions.wise.assess.account import LONGEST_DIFFERENCES
-from bayesdist.missions.wise.bands.context import BANDS, BandResult, BandsInput
+from bayesdist.missions.wise.bands.context import BANDS, BandResult, BandsInput, Printed
 from bayesdist.missions.wise.bands.curves import CASES, below_draws, chance_of
 from bayesdist.numbers import MISSING, count, number, percent, probability, size_of
+from bayesdist.report.sections.run.status import Verdict
 from bayesdist.report.texttable import TextTable, listing
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "provenance_table",
     "structure_table",
     "vector_table",
+    "verdict",
 ]
 
 SAME_VECTOR = 0.005  # of the printed maximum
@@ -48,17 +50,53 @@ def _overview(b: BandResult, *, wise: bool) -> Iterator[str]:
     here = b.printed
     yield number(b.vectors.length_max if here is None else here.longest_vector_here, 4)
     if wise and here is not None:
-        apart = here.longest_vector_here / here.longest_vector - 1
+        apart = _apart(here)
         yield number(here.longest_vector, 4)
-        error = 2 * b.posterior_map.radius_max / here.longest_vector
-        mark = "✗" if abs(apart) > error else "(within 2 σ)"
+        mark = "✗" if _differs(b, here) else "(within 2 σ)"
         yield f"{percent(apart, 2)} {'✓' if abs(apart) <= SAME_VECTOR else mark}"
     yield _length(b, float(b.posterior_map.per_axis.max()))
+
+
+def _apart(here: Printed) -> float:
+    """Fraction by which the longest vector is longer than the printed one."""
+    return here.longest_vector_here / here.longest_vector - 1
+
+
+def _differs(b: BandResult, here: Printed) -> bool:
+    """True if the longest vector is not the printed one, nor within twice its error of it."""
+    error = 2 * b.posterior_map.radius_max / here.longest_vector
+    return abs(_apart(here)) > max(SAME_VECTOR, error)
+
+
+def verdict(inputs: BandsInput) -> Verdict:
+    """Verdict on all bands: convergence, structure in the residuals, and published values."""
+    structure = [b.name for b in inputs.bands if _has_structure(b)]
+    printed = [(b, b.printed) for b in inputs.bands if b.printed is not None]
+    different = [b.name for b, here in printed if _differs(b, here)]
+    clauses = []
+    if inputs.provisional:
+        clauses.append(f"not converged: {', '.join(b.name for b in inputs.not_converged)}")
+    if structure:
+        clauses.append(f"structure is left in the residuals of {', '.join(structure)}")
+    if different:
+        clauses.append(f"the longest vector is not the published one in {', '.join(different)}")
+    level = "fail" if inputs.provisional else "warn" if clauses else "pass"
+    if not clauses:
+        clauses.append("all bands have converged, and no structure is found in their residuals")
+        if printed:
+            clauses.append("the longest vectors are those published")
+    headline = "; ".join(clauses)
+    sentences = ("Requirements are judged in the report of each band's run.",)
+    return Verdict(level, headline[:1].upper() + headline[1:], sentences)
 
 
 def _length(b: BandResult, value: float) -> str:
     unit = b.formal_map.unit
     return number(value, 3) if unit == "pix" else size_of(value, unit)
+
+
+def _has_structure(b: BandResult) -> bool:
+    return b.partition.significant or below_draws(b.correlation.p_value)
 
 
 def _structure(b: BandResult) -> str:

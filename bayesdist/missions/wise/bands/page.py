@@ -24,7 +24,7 @@ def write_bands(folder: Path, inputs: BandsInput) -> list[str]:
     paths = save_drawings(drawings, folder / "figures")
     overview, *parts = parts_of(BANDS, inputs, drawings)
     page = template("bands.html.jinja", __package__)
-    text = page.render(run=inputs, overview=overview, parts=parts)
+    text = page.render(run=inputs, overview=overview, parts=parts, verdict=findings.verdict(inputs))
     with atomic_path(folder / "bands.html") as temporary:
         temporary.write_text(text, encoding="utf-8")
     return ["bands.html", *(f"figures/{path.name}" for path in paths)]

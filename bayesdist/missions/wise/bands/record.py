@@ -14,14 +14,17 @@ from bayesdist.missions.wise.assess.account import RowAccount
 from bayesdist.missions.wise.assess.histograms import ResidualHistogram
 from bayesdist.missions.wise.assess.published import HEADS
 from bayesdist.missions.wise.bands.context import BandResult, BandsInput
+from bayesdist.missions.wise.bands.findings import verdict
 
 __all__ = ["record_of", "write_tables"]
 
 
 def record_of(inputs: BandsInput) -> dict[str, Any]:
     """Content of bands.json beside command and versions."""
+    found = verdict(inputs)
     return {
         "converged": not inputs.provisional,
+        "verdict": {"level": found.level, "headline": found.headline},
         "n_bins": inputs.n_bins,
         "optical": inputs.optical or None,
         "bands": [_band(b) for b in inputs.bands],

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 
-from bayesdist.numbers import count, display_scale, interval, number, percent, rounded
+from bayesdist.numbers import count, counted, display_scale, interval, number, percent, rounded
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.registry import Plot
@@ -53,7 +53,7 @@ def margin_table(r: ReportInput) -> TextTable:
             rounded(m.value, spread),
             interval(m.interval[0], m.interval[1], spread),
             f"{rounded(m.margin, spread)} ({percent(m.percent / 100, 2)})",
-            f"{number(m.probability_met)} ± {number(m.mc_error, 2)}",
+            counted(m.probability_met, m.mc_error, m.n_effective),
         )
         epoch = "" if m.epoch is None else f" at {m.epoch:.2f}"
         if asked.epochs is not None:
@@ -176,9 +176,10 @@ def _label(m: Margin) -> str:
 def _statement(m: Margin) -> str:
     scale = display_scale(m.unit, m.requirement.limit)
     limit = scale.text(m.requirement.limit)
+    met = counted(m.probability_met, m.mc_error, m.n_effective)
     return (
         f"{m.verdict}: {m.value * scale.factor:.3g} of {limit}\n"
-        f"P(≤ limit) = {m.probability_met:.3g}, asked {m.requirement.probability:.3g}"
+        f"P(≤ limit): {met}, asked {m.requirement.probability:.3g}"
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesdist.assess.circular import per_axis
 from bayesdist.checks import LEVELS, Check, warnings_of, worst
-from bayesdist.numbers import number, rounded, with_mas
+from bayesdist.numbers import counted, rounded, with_mas
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.sections.run.margins import VERDICT_LEVELS
@@ -80,7 +80,7 @@ def _margin_checks(r: ReportInput) -> tuple[Check, ...]:
             "Requirements",
             f"{m.requirement.name}: {m.requirement.statistic}, {m.verdict}",
             f"{rounded(m.value, (m.interval[1] - m.interval[0]) / 4)}\u202f{m.unit}, probability"
-            f" {number(m.probability_met)}",
+            f" {counted(m.probability_met, m.mc_error, m.n_effective)}",
             f"at most {m.requirement.limit:g}\u202f{m.unit}, with probability"
             f" {m.requirement.probability:g}",
             VERDICT_LEVELS[m.verdict],

@@ -40,6 +40,8 @@ Mask = NDArray[np.bool_]
 _POINTS = 1200  # single stars in a panel: more hide each other
 _MIN_STARS = 25  # in a bin on average
 _BINS, _FINE_BINS = 20, 100  # most bins along an axis
+_FEW_DAYS = 0.05  # years: dates in years would differ in their last digits alone
+_DAYS_PER_YEAR = 365.25
 _MARKERS = "osD^vP"  # of chips, beside colours
 
 
@@ -248,7 +250,13 @@ def _properties(r: ReportInput) -> list[tuple[str, Float]]:
         if values is not None:
             finite = values[np.isfinite(values) & r.stars.probably_true]
             if finite.size > 2 * _MIN_STARS and np.ptp(finite) > 0:
-                out.append((label, np.asarray(values, float)))
+                shown = np.asarray(values, float)
+                if values is table.epoch and np.ptp(finite) < _FEW_DAYS:
+                    label, shown = (
+                        "epoch [days after the first]",
+                        _DAYS_PER_YEAR * (shown - finite.min()),
+                    )
+                out.append((label, shown))
     return out
 
 
@@ -284,7 +292,7 @@ def residuals_by_property(r: ReportInput) -> Plot:
                 f"d{'uv'[axis]} against {what}: χ² {one.chi2[axis]:.0f} of {len(one.at)} bins"
             )
             ax.set_xlabel(label)
-            ax.xaxis.set_major_locator(MaxNLocator(_ticks(one.at)))
+            ax.xaxis.set_major_locator(MaxNLocator(5))
             guide_lines(ax)
         panels[0].set_ylabel(f"mean residual\n[{scale.unit}]")
         worst.append(f"{number(float(np.abs(one.mean / one.error).max()), 2)} ({what})")
@@ -298,12 +306,6 @@ def residuals_by_property(r: ReportInput) -> Plot:
         f" their errors: {listed}.{_sample_words(r)}",
         f"Mean residuals with errors; the largest in units of their errors: {listed}.",
     )
-
-
-def _ticks(values: Float) -> int:
-    """Intervals of an axis that its labels leave room for: dates of one night have ten digits."""
-    digits = np.log10(np.abs(values).max() / max(float(np.ptp(values)), 1e-300))
-    return 5 if digits < 4 else 2
 
 
 def _listed(names: Sequence[str]) -> str:
