@@ -175,8 +175,8 @@ def _of_table(
     if origin == 0:
         log.info("%s: 1 is added to its pixels: %s", source, why)
     whole = Detections(
-        values["x"] + 1 - origin,
-        values["y"] + 1 - origin,
+        values["x"] + (1 - origin),
+        values["y"] + (1 - origin),
         chip=column("chip").integers() if "chip" in found else COMPLETED,
         mag=values.get("mag"),
         q=values.get("q"),

@@ -15,10 +15,11 @@ from astropy.wcs import WCS
 
 import bayesdist as bd
 from bayesdist.calibration.calibration import Calibration, GaussianSolution
-from bayesdist.calibration.further import FurtherError
+from bayesdist.calibration.further import FurtherError, scaled
 from bayesdist.calibration.plane import Plane
 from bayesdist.calibration.sky_positions import sky_positions
 from bayesdist.errors import InputError
+from bayesdist.products.formats.common.document import BuildOptions
 from bayesdist.products.registry import build, product_settings, read_calibration
 
 from .support import cli
@@ -179,3 +180,61 @@ def test_planes_that_are_not_on_the_sky_are_refused(calibration, stars):
     found = bd.apply_to_sky(free, stars, point=POINT)
     expected = bd.apply_to_sky(calibration, stars)
     assert (found["dec"] == expected["dec"]).all()
+
+
+@pytest.mark.parametrize(
+    ("to", "name", "unit", "limit_mas"),
+    [("tpv", "tpv.head", "pix", 1e-3), ("tpv", "tpv.head", "arcsec", 1e-3),
+     ("cpdis", "cpdis.fits", "pix", 0.1)],
+)  # fmt: skip
+def test_a_header_of_a_given_crval_is_applied_where_others_have_it(
+    calibration, stars, tmp_path, to, name, unit, limit_mas
+):
+    """Of u, v with no sky: astropy.wcs has the positions, and (0, 0) on the plane the CRVAL."""
+    pixel = 0.26 if unit == "pix" else 1.0
+    model = replace(calibration.model, unit=unit)
+    mean, cov = calibration.solution.mean / pixel, calibration.solution.cov / pixel**2
+    free = replace(
+        calibration, solution=GaussianSolution(model, mean, cov), plane=Plane("free"),
+        further=scaled(calibration.further, 1 / pixel),
+    )  # fmt: skip
+    if to == "cpdis":
+        free = free.only(1)
+    settings = product_settings()[to](crval=POINT)
+    for one in build(to, free, settings, BuildOptions(None, 0.26 if unit == "pix" else None)):
+        (tmp_path / one.file_name).write_bytes(one.content)
+    mine = stars[stars["chip"] == 1]
+    expected = bd.apply_to_sky(calibration, mine, covariance=True)
+    found = bd.apply_to_sky(tmp_path / name, mine, covariance=True)
+    at = SkyCoord(found["ra"], found["dec"])
+    assert at.separation(SkyCoord(expected["ra"], expected["dec"])).mas.max() < limit_mas
+    np.testing.assert_allclose(found.meta["covariance"], expected.meta["covariance"], rtol=1e-6)
+    if to == "tpv":
+        text = (tmp_path / name).read_text().split("\nEND")[0]
+        wcs = WCS(fits.Header.fromstring(text, sep="\n"))
+    else:
+        with fits.open(tmp_path / name) as file:
+            header = file[1].header.copy()
+            del header["NAXIS"]  # an image without data
+            wcs = WCS(header, file)
+    theirs = wcs.pixel_to_world(mine["x"] - 1, mine["y"] - 1)
+    assert at.separation(theirs).mas.max() < limit_mas
+
+
+@pytest.mark.parametrize("to", ["tpv", "cpdis"])
+@pytest.mark.parametrize(
+    ("plane", "unit", "crval", "message"),
+    [(Plane("sky", point=POINT), "arcsec", POINT, "leave it out"),
+     (Plane(), "arcsec", (150.0, 91.0), "no right ascension and declination"),
+     (Plane(), "pix", POINT, "pixels of unknown size")],
+    ids=["two points", "no position", "no scale"],
+)  # fmt: skip
+def test_a_crval_that_cannot_be_is_refused(calibration, to, plane, unit, crval, message):
+    model = replace(calibration.model, unit=unit)
+    solution = replace(calibration.solution, model=model)
+    with pytest.raises(InputError, match=message):
+        build(
+            to,
+            replace(calibration, solution=solution, plane=plane),
+            product_settings()[to](crval=crval),
+        )

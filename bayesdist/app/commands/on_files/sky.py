@@ -196,7 +196,7 @@ def _with_sky(
 ) -> tuple[QTable, SkyPositions]:
     """Rows with the columns of their positions, and these."""
     plain = Table(rows)
-    x, y = (position_column(plain, c, name) + 1.0 - pixel_origin for c in columns)
+    x, y = (position_column(plain, c, name) + (1.0 - pixel_origin) for c in columns)
     sigma = None
     if centroids is not None:
         a, b = (position_column(plain, c, name) for c in centroids)

@@ -39,14 +39,12 @@ def cpdis_content(
     *,
     epoch: float | None = None,
     step: float | None = None,
-    crval: tuple[float, float] | None = None,
     scale_arcsec: float | None = None,
     notes: Sequence[str] = (),
 ) -> tuple[bytes, float]:
     """Bytes of a file, and its largest error in pixels: of rounding, and between its nodes.
 
-    `step` is pixels between nodes; by default as many as leave 1e-4 pixels, at least 4.  `crval`
-    (degrees) is of a plane whose place on the sky is not known.
+    `step` is pixels between nodes; by default as many as leave 1e-4 pixels, at least 4.
     """
     arcsec = ARCSEC[calibration.unit] if calibration.unit != "pix" else (scale_arcsec or 1.0)
     maps = calibration.with_tables(calibration.at(epoch, origin="stated"))
@@ -57,7 +55,7 @@ def cpdis_content(
         worst = max(worst, off)
         versions = (2 * k + 1, 2 * k + 2)
         cards = [
-            *_wcs_cards(calibration, linear * arcsec / 3600, crpix, crval),
+            *_wcs_cards(calibration, linear * arcsec / 3600, crpix),
             *_record_cards(table, versions),
             number_card("BDWORST", off, "[pix] of rounding and between nodes"),
             *(
@@ -143,14 +141,9 @@ def _sigma(one: ChipMap, linear: Float, table: LookupTable) -> Float | None:
     return np.sqrt(moved.diagonal(axis1=1, axis2=2)).T.reshape(2, *table.shape)
 
 
-def _wcs_cards(
-    calibration: Calibration,
-    cd: Float,
-    crpix: tuple[float, float],
-    crval: tuple[float, float] | None,
-) -> list[str]:
-    at = calibration.plane.point or crval or (0.0, 0.0)
-    known = calibration.plane.point or crval
+def _wcs_cards(calibration: Calibration, cd: Float, crpix: tuple[float, float]) -> list[str]:
+    known = calibration.plane.point
+    at = known or (0.0, 0.0)
     return [
         number_card("WCSAXES", 2),
         text_card("CTYPE1", "RA---TAN"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import PositiveFloat
 
 from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.placed import placed_at
 from bayesdist.products.formats.common.document import (
     BuildOptions,
     Built,
@@ -54,12 +55,15 @@ def _build(
     # no file that is read needs it
     from bayesdist.products.formats.cpdis.build import cpdis_content
 
+    calibration = placed_at(
+        calibration, settings.crval, options.scale_arcsec, where="products.cpdis"
+    )
     content, worst = cpdis_content(
         calibration,
         epoch=options.epoch,
         scale_arcsec=options.scale_arcsec,
         notes=[note for note in (*calibration.notes, calibration.plane.note) if note],
-        **settings.model_dump(),
+        step=settings.step,
     )
     return (Built("cpdis.fits", "CPDIS", content, calibration, None, {"tables_pix": worst}),)
 

@@ -34,15 +34,13 @@ def tpv_heads(
     calibration: Calibration,
     *,
     epoch: float | None = None,
-    crval: tuple[float, float] | None = None,
     scale_arcsec: float | None = None,
 ) -> tuple[TpvHead, ...]:
     """Headers of all chips at a date, with their cards.
 
     CD is the linear part at the reference pixel, and PV hold the rest, the constants too: so CRVAL
     is the point at which the plane touches the sky, whatever pixel lies there.  Without it CRVAL is
-    `crval`, or (0, 0), a placeholder.  InputError for an order above 7, a calibration with look-up
-    tables, or a plane that already has a point and is given another one.
+    (0, 0), a placeholder.  InputError for an order above 7, or a calibration with look-up tables.
     """
     where = "products.tpv"
     model, point = calibration.model, calibration.plane.point
@@ -56,14 +54,8 @@ def tpv_heads(
         raise InputError(
             "TPV has no look-up tables", where=where, do="convert it, which says what is lost"
         )
-    if point is not None and crval is not None:
-        raise InputError(
-            "a crval is given for a plane that lies on the sky already",
-            where=f"{where}.crval",
-            do="leave it out",
-        )
     arcsec = ARCSEC[model.unit] if model.unit != "pix" else (scale_arcsec or 1.0)
-    at = point or crval or (0.0, 0.0)
+    at = point or (0.0, 0.0)
     kind = "sky" if point is not None else calibration.plane.kind
     return tuple(
         _head(one, number, arcsec, at, kind, calibration)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.placed import placed_at
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import (
     PARAMETERS,
@@ -61,12 +62,8 @@ def _build(
     # no file that is read needs it
     from bayesdist.products.formats.tpv.build import tpv_cards, tpv_heads
 
-    heads = tpv_heads(
-        calibration,
-        epoch=options.epoch,
-        crval=settings.crval,
-        scale_arcsec=options.scale_arcsec,
-    )
+    calibration = placed_at(calibration, settings.crval, options.scale_arcsec, where="products.tpv")
+    heads = tpv_heads(calibration, epoch=options.epoch, scale_arcsec=options.scale_arcsec)
     cards = [card.rstrip() for head in heads for card in tpv_cards(head, SIDE)]
     return (
         Built(SIDE, PARAMETERS, parameters_content(calibration, options.epoch), calibration),
