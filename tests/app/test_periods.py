@@ -226,7 +226,7 @@ def test_the_report_shows_it(moved, tmp_path):
     text = section.text_content()
     assert "Time variation" in text and "The distortion changes" in text
     assert "Mean residuals of bins" in text and "Patterns of the residuals" in text
-    (image,) = section.xpath(".//figure/img")
+    (image,) = section.xpath(".//figure//img")
     assert "difference vectors between two periods" in image.get("alt")
     assert (run / "figures" / "period_differences.png").exists()
     # the stage by itself reads the pairs again, and says the same

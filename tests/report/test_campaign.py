@@ -68,7 +68,9 @@ def test_every_figure_of_the_plan_is_drawn_and_placed(run, campaign_plots, plan,
     section = tree.get_element_by_id("campaign")
     shown = [f.get("id") for f in section.xpath(".//figure")]
     assert shown == [f"figure-{name}" for name in plan]
-    for image in section.xpath(".//figure/img"):
+    images = section.xpath(".//figure//img")
+    assert len(images) == len(plan)
+    for image in images:
         png = base64.b64decode(image.get("src").split(",", 1)[1], validate=True)
         assert png.startswith(b"\x89PNG") and png.endswith(b"IEND\xaeB`\x82")
         assert len(image.get("alt")) > 20
