@@ -64,7 +64,8 @@ class EpochShift:
             f"the residuals go with the proper motions of the stars: the exposures were taken "
             f"{abs(self.years):.2f} +- {self.sigma:.2f} years {when} the epoch that the reference "
             f"positions have (the scatter falls from {self.before:.2g} to {self.after:.2g} "
-            f"{self.unit}); give data.epoch and data.catalogue_epoch"
+            f"{self.unit}); check the epochs of the exposures (data.epoch or a column) and of the "
+            "catalogue (column ref_epoch, or data.catalogue_epoch)"
         )
 
 
