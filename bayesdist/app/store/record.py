@@ -45,13 +45,18 @@ def as_json(value: Any) -> Any:
 
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file, replaced atomically."""
+    write_text(path, json_text(as_json(value)))
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, replaced atomically."""
     with atomic_path(path) as temporary:
-        temporary.write_text(json_text(value), encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8")
 
 
-def json_text(value: Any) -> str:
-    """A value as the text of a JSON file."""
-    return to_json(as_json(value), indent=1).decode() + "\n"
+def json_text(plain: Any) -> str:
+    """Plain JSON, as by `as_json`, as the text of a file."""
+    return to_json(plain, indent=1).decode() + "\n"
 
 
 def versions() -> dict[str, str]:
@@ -239,4 +244,5 @@ class Record:
         found = {name: asdict(one) for name, one in self.artefacts.items()}
         whole = {"schema": SCHEMA, **self.facts, "stages": self.stages, "artefacts": found}
         whole |= {"under_way": self.under_way, "checkpoints": self.checkpoints}
-        write_json(path, whole | {"sha256": digest_of(as_json(whole))})
+        plain = as_json(whole)
+        write_text(path, json_text(plain | {"sha256": digest_of(plain)}))

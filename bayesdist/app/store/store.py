@@ -21,7 +21,7 @@ from bayesdist.app.store.record import (
     Record,
     as_json,
     json_text,
-    write_json,
+    write_text,
 )
 from bayesdist.files import is_leftover, path_within, remove_leftovers, watched_writes
 from bayesdist.reading.regular import read_bytes
@@ -334,9 +334,9 @@ class ArtefactStore:
             path.unlink(missing_ok=True)
             return
         content = {"schema": SCHEMA, **self.head(record.facts), **sections}
-        text = json_text(content)
+        text = json_text(as_json(content))
         if not path.is_file() or read_bytes(path) != text.encode():
-            write_json(path, content)
+            write_text(path, text)
 
     # -- removing ---------------------------------------------------------------------------------
 

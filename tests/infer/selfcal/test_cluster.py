@@ -6,7 +6,6 @@ rounding alone.
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
 import sys
@@ -14,7 +13,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from distributed import LocalCluster
 
 from bayesdist.infer import Compute
 from bayesdist.infer.equations.priors import Prior
@@ -25,6 +23,7 @@ from bayesdist.infer.selfcal.pieces import StarPiece, in_pieces, log_density, sl
 from bayesdist.infer.selfcal.problem import StarPriors
 from bayesdist.infer.stars.shards import Pieces
 from tests.infer.selfcal import fields
+from tests.infer.workers import local_workers
 
 PIECE = 200  # detections: some ten pieces on three workers
 
@@ -46,13 +45,7 @@ def solution():
 @pytest.fixture(scope="module")
 def cluster():
     """Three workers that somebody else has started."""
-    with LocalCluster(
-        n_workers=3,
-        threads_per_worker=1,
-        memory_limit=0,
-        dashboard_address="127.0.0.1:0",
-        silence_logs=logging.CRITICAL,
-    ) as cluster:
+    with local_workers(3) as cluster:
         yield cluster
 
 

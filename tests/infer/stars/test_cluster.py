@@ -33,6 +33,7 @@ from bayesdist.infer.stars import cluster as cluster_module
 from bayesdist.infer.stars.cluster import ClusterShards
 from bayesdist.infer.stars.shards import Shards
 from tests.infer.support import TWO_CHIPS, simulated
+from tests.infer.workers import local_workers
 from tests.reduced import only_in_full
 
 PIECE = 500
@@ -51,13 +52,7 @@ def small_pieces() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[LocalCluster]:
     """Three workers that somebody else has started."""
-    with LocalCluster(
-        n_workers=3,
-        threads_per_worker=1,
-        memory_limit=0,
-        dashboard_address="127.0.0.1:0",
-        silence_logs=logging.CRITICAL,
-    ) as cluster:
+    with local_workers(3) as cluster:
         yield cluster
 
 
