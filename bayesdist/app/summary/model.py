@@ -6,9 +6,10 @@ import json
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from bayesdist.app.summary.rows import (
+    AddedErrorRow,
     BudgetRow,
     CoverageRow,
     HoldoutTest,
@@ -41,6 +42,23 @@ class Data(Part):
     )
 
 
+class AddedErrors(Part):
+    """Errors beyond the quoted ones that groups of matches have."""
+
+    grouping: str
+    by: str = Field(description="what the groups differ in; empty for one group")
+    evidence: dict[str, float] = Field(description="ln evidence gained, by grouping")
+    dispersion: float
+    groups: list[AddedErrorRow] = Field(description="along u and v by turns")
+
+    @field_validator("groups")
+    @classmethod
+    def _axes(cls, rows: list[AddedErrorRow]) -> list[AddedErrorRow]:
+        if [row.axis for row in rows] != ["u", "v"] * (len(rows) // 2):
+            raise ValueError("the axes are not u and v by turns")
+        return rows
+
+
 class Fit(Part):
     """The least-squares fit."""
 
@@ -53,6 +71,7 @@ class Fit(Part):
     condition: Number
     n_parameters: int
     error_scale: Number = Field(1.0, description="factor on the quoted errors")
+    added_errors: AddedErrors | None = None
 
 
 class Outliers(Part):

@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 __all__ = [
+    "AddedErrorRow",
     "BudgetRow",
     "CoverageRow",
     "HoldoutTest",
@@ -35,6 +36,19 @@ class MeanAndSd(Part):
 
     mean: Number
     sd: Number
+
+
+class AddedErrorRow(Part):
+    """Error beyond the quoted one that a group of matches has along an axis."""
+
+    label: str
+    axis: str
+    n: float = Field(description="good stars")
+    added: Number
+    added_error: Number
+    excess: Number = Field(description="beyond the smallest of all groups, which the jitter has")
+    variance: float = Field(description="square of `added`, as it was estimated")
+    variance_error: Number
 
 
 class MapRow(Part):
