@@ -35,7 +35,9 @@ def lint_idctab(tab: IdcTab) -> tuple[Finding, ...]:
 def _not_finite(tab: IdcTab) -> list[Finding]:
     out = []
     for rows, of in ((tab.rows, ""), (tab.sigma, " of SIGMA"), (tab.covariance, " of COVAR")):
-        for name in () if rows is None else rows.dtype.names or ():
+        if rows is None:
+            continue
+        for name in rows.dtype.names or ():
             column = rows[name].reshape(len(rows), -1)
             if column.dtype.kind == "f" and not np.isfinite(column).all():
                 bad = np.flatnonzero(~np.isfinite(column).all(axis=1))
