@@ -21,7 +21,6 @@ from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.kinds.stars import (
     fit_stars,
     match_stars,
-    priors_of,
     read_stars,
     sample_stars,
 )
@@ -30,7 +29,7 @@ from bayesdist.app.selfcal.inputs import read_selfcal, refuse_selfcal
 from bayesdist.app.selfcal.matched import load_matched_selfcal
 from bayesdist.app.selfcal.matching import match_dithers
 from bayesdist.app.selfcal.preview import selfcal_lines
-from bayesdist.app.selfcal.solved import read_solution, solved_of
+from bayesdist.app.selfcal.solved import load_selfcal
 from bayesdist.infer import Posterior
 
 __all__ = ["Kind", "kind_of"]
@@ -57,95 +56,68 @@ class Kind:
 
     Parameters
     ----------
-    rows : str
-        What a row of the data is, in words.
-    chooser : str
-        What leaves out rows that are far off, in words.
-    begins_with : str
-        Its first stage: 'match', or 'fit' where stars are matched already.
     read : callable
         Of (config, base): all that a run begins with, its inputs; paths are relative to `base`.
-    refuse : callable
-        Of (inputs, config, base): refuses what does not go together.
     match : callable
-        Of (inputs, config, base): stars that are fitted, and those that are held out.
+        Of (inputs, config): stars that are fitted, and those that are held out.
     fit : callable
         Of (matched, config, base, reader): the least-squares solution.
     sample : callable
         The posterior of the fit.
-    load_matched : callable
-        Of (folder, inputs, config, base, summary): the matches of an earlier stage, from a run's
-        folder and its summary.json.
+    load_matched : callable, optional
+        Of (folder, inputs, summary): the matches of an earlier stage, from a run's folder and its
+        summary.json; without it they are matched again.
     load_fitted : callable
-        Of (folder, matched, config, summary): the fit of an earlier stage; `matched` is called
-        where that needs the matches.
+        Of (folder, matched): the fit of an earlier stage; `matched` is called where that needs the
+        matches.
+    refuse : callable
+        Of inputs: refuses what does not go together; what is wrong with matched stars shows in
+        their fit.
     lines : callable
-        Of (inputs, config): what `check` says of the inputs; None where the fit says more.
+        Of inputs: what `check` says of them; None where the fit says more.
+    begins_with : str
+        Its first stage: 'match', or 'fit' where stars are matched already.
+    rows : str
+        What a row of the data is, in words.
+    chooser : str
+        What leaves out rows that are far off, in words.
     """
 
-    rows: str
-    chooser: str
-    begins_with: str
     read: Callable[[Any, Path], Any]
-    refuse: Callable[[Any, Any, Path], None]
-    match: Callable[[Any, Any, Path], Matched]
+    match: Callable[[Any, Any], Matched]
     fit: Callable[[Any, Any, Path, StarReader], Fitted]
-    sample: Sampler
-    load_matched: Callable[[Path, Any, Any, Path, Mapping[str, Any]], Matched]
-    load_fitted: Callable[[Path, Callable[[], Any], Any, Mapping[str, Any]], Fitted]
-    lines: Callable[[Any, Any], Iterator[str] | None]
+    sample: Sampler = sample_stars
+    load_matched: Callable[[Path, Any, Mapping[str, Any]], Matched] | None = None
+    load_fitted: Callable[[Path, Callable[[], Any]], Fitted] = lambda folder, _: load_fitted(folder)
+    refuse: Callable[[Any], None] = lambda inputs: None
+    lines: Callable[[Any], Iterator[str] | None] = lambda inputs: None
+    begins_with: str = "match"
+    rows: str = "stars"
+    chooser: str = "least-squares fit"
 
 
-MATCHES = Kind(
-    rows="stars",
-    chooser="least-squares fit",
-    begins_with="fit",
-    read=read_stars,
-    refuse=lambda inputs, config, base: None,  # what is wrong shows in their fit
-    match=lambda inputs, config, base: match_stars(inputs, config),
-    fit=lambda matched, config, base, reader: fit_stars(matched, config, base, reader=reader),
-    sample=sample_stars,
-    load_matched=lambda folder, inputs, config, base, summary: match_stars(inputs, config),
-    load_fitted=lambda folder, matched, config, summary: load_fitted(
-        folder, summary, priors=lambda model: priors_of(model, config)
-    ),
-    lines=lambda inputs, config: None,
-)
+MATCHES = Kind(read=read_stars, match=match_stars, fit=fit_stars, begins_with="fit")
 
 CAMPAIGN = Kind(
-    rows="stars",
-    chooser="least-squares fit",
-    begins_with="match",
     read=read_campaign,
-    refuse=lambda inputs, config, base: refuse_campaign(inputs),
-    match=lambda inputs, config, base: match_lists(inputs),
-    fit=lambda matched, config, base, reader: fit_campaign(matched),
-    sample=sample_stars,
-    load_matched=lambda folder, inputs, config, base, summary: load_matched_campaign(
-        folder, inputs, summary
-    ),
-    load_fitted=lambda folder, matched, config, summary: load_fitted(folder, summary, joint=True),
-    lines=lambda inputs, config: campaign_lines(inputs),
+    match=lambda inputs, _: match_lists(inputs),
+    fit=lambda matched, *_: fit_campaign(matched),
+    load_matched=load_matched_campaign,
+    refuse=refuse_campaign,
+    lines=campaign_lines,
 )
 
 SELFCAL = Kind(
+    read=read_selfcal,
+    match=lambda inputs, _: match_dithers(inputs),
+    fit=lambda matched, *_: fit_selfcal(matched),
+    sample=sample_detections,
+    load_matched=load_matched_selfcal,
+    load_fitted=load_selfcal,
+    refuse=refuse_selfcal,
+    lines=selfcal_lines,
     rows="detections",
     chooser="limits of residuals",
-    begins_with="match",
-    read=read_selfcal,
-    refuse=lambda inputs, config, base: refuse_selfcal(inputs),
-    match=lambda inputs, config, base: match_dithers(inputs),
-    fit=lambda matched, config, base, reader: fit_selfcal(matched),
-    sample=sample_detections,
-    load_matched=lambda folder, inputs, config, base, summary: load_matched_selfcal(
-        folder, inputs, summary
-    ),
-    load_fitted=lambda folder, matched, config, summary: load_fitted(
-        folder,
-        summary,
-        solved=lambda model: solved_of(matched(), model, read_solution(folder)),
-    ),
-    lines=lambda inputs, config: selfcal_lines(inputs),
 )
 
 

@@ -70,8 +70,7 @@ def test_a_fit_that_is_read_gives_the_same_stars(data, tmp_path):
     matched = match_stars(read_stars(config, path.parent), config)
     found = fit_stars(matched, config)
     found.save(tmp_path)
-    summary = as_json(fit_sections(found, matched.stars))
-    read = kind_of(config).load_fitted(tmp_path, lambda: matched, config, summary)
+    read = kind_of(config).load_fitted(tmp_path, lambda: matched)
     assert (found.errors.factor > 20) == (not data)
     for made, again in (
         (FitData(matched, found).stars, FitData(matched, read).stars),

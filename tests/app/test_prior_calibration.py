@@ -313,12 +313,12 @@ def test_a_run_goes_by_it(tmp_path):
     config = parse_config(CONFIG, "second.toml")
     kind = kind_of(config)
     assert "fit.nc" in hashes_of(config, tmp_path)
-    matched = kind.match(kind.read(config, tmp_path), config, tmp_path)
+    matched = kind.match(kind.read(config, tmp_path), config)
     found = kind.fit(matched, config, tmp_path, StarReader(config.resources()))
     expected = fitted(second, model, earlier(solution, model, frame="shift").loose())
     np.testing.assert_allclose(found.linear.mean, expected.mean, atol=1e-9)
     found.save(tmp_path)
-    again = kind.load_fitted(tmp_path, lambda: matched, config, {})
+    again = kind.load_fitted(tmp_path, lambda: matched)
     np.testing.assert_array_equal(again.priors.joint.precision, found.priors.joint.precision)
 
 

@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from bayesdist.app.campaign.inputs import Inputs
-from bayesdist.app.kinds.exposures import ExposureScatter
+from bayesdist.app.kinds.errors import ExposureScatter
 from bayesdist.assess.terms.parameters import EXPOSURE_SCATTER, ScaleError
 from bayesdist.infer.solution import Solution
 

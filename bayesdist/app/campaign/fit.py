@@ -14,8 +14,7 @@ from bayesdist.app.campaign.linear_terms import FIXED, line_sections
 from bayesdist.app.campaign.matched import CampaignMatched
 from bayesdist.app.campaign.reference import rate_priors
 from bayesdist.app.campaign.tables import fit_tables, scatter_by_magnitude, tables_section
-from bayesdist.app.kinds.errors import ErrorLaw
-from bayesdist.app.kinds.exposures import ExposureScatter
+from bayesdist.app.kinds.errors import ErrorLaw, ExposureScatter
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.data import centroid_errors
 from bayesdist.data.matches import Matches

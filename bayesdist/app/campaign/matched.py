@@ -12,7 +12,7 @@ from bayesdist.app.campaign.aberration import aberration_term
 from bayesdist.app.campaign.catalogue import errors_by_star
 from bayesdist.app.campaign.inputs import Inputs
 from bayesdist.app.config import CampaignConfig
-from bayesdist.app.kinds.exposures import ExposureScatter
+from bayesdist.app.kinds.errors import ExposureScatter
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.split import set_aside
 from bayesdist.app.kinds.star_lists import known_calibration

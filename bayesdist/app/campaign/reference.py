@@ -8,7 +8,7 @@ from bayesdist.app.campaign.gap import with_gap
 from bayesdist.app.config import Config
 from bayesdist.app.config.model import TablesBlock
 from bayesdist.app.config.other_runs import TABLES, rates_file, tables_file
-from bayesdist.app.kinds.table_file import read_tables
+from bayesdist.app.kinds.fitted import read_tables
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Posterior, load_posterior
 from bayesdist.infer.exposures.shared_drift import drift_priors

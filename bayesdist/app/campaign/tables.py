@@ -15,7 +15,7 @@ from bayesdist.app.campaign.matched import CampaignMatched
 from bayesdist.app.campaign.outrun import refuse_outrun_stars
 from bayesdist.app.campaign.reference import held_tables
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.table_file import StoredLookupTables
+from bayesdist.app.kinds.fitted import StoredLookupTables
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.errors import read_magnitude_errors
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.fitted import Fitted, required
+from bayesdist.app.kinds.fitted import Fitted, load_errors, required
 from bayesdist.app.store.inputs import input_name
 from bayesdist.app.store.rundir import PAIRS, RunDirectory, part_files
 from bayesdist.data import Matches, read_matches
@@ -92,8 +91,8 @@ def read_new_exposures(
     pairs = pairs.select(fresh)
     pairs = pairs.with_exposure_names(pairs.exposures)
     placed, errors = fitted.placed(pairs), fitted.errors.by_magnitude
-    if run is not None:
-        errors = read_magnitude_errors(run.path) or errors
+    if run is not None and "fit" in run.record.artefacts:
+        errors = load_errors(run.path).by_magnitude or errors
     if placed.mag is not None and errors is not None:
         placed = placed.with_errors(errors, in_quadrature=True)
     return NewExposures(

@@ -112,7 +112,6 @@ def fit_stars(
     matched: Matched,
     config: Config,
     base: Path = Path(),
-    *,
     reader: StarReader | None = None,
 ) -> Fitted:
     """The linear fit of matched stars, with the errors that its residuals ask for.

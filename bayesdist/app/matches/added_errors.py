@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
-
-import numpy as np
 
 from bayesdist.app.config import Config
 from bayesdist.data import Matches
@@ -17,7 +15,6 @@ from bayesdist.infer.catalogue.added_errors import ONE, GroupedErrors, grouped_e
 __all__ = [
     "added_errors_rows",
     "compared_errors",
-    "grouped_errors_of",
     "grouping_sentence",
     "knows_circle",
 ]
@@ -57,10 +54,7 @@ def knows_circle(config: Config) -> bool:
 
 
 def added_errors_rows(found: GroupedErrors) -> dict[str, Any]:
-    """Part 'added_errors' of the section 'fit' of summary.json.
-
-    Variances stand beside what they are the squares of: stages that follow take them to the bit.
-    """
+    """Part 'added_errors' of the section 'fit' of summary.json."""
     columns = {
         "n": found.n,
         "added": found.sigma,
@@ -80,27 +74,6 @@ def added_errors_rows(found: GroupedErrors) -> dict[str, Any]:
             for a, axis in enumerate("uv")
         ],
     }
-
-
-def grouped_errors_of(part: Mapping[str, Any] | None) -> GroupedErrors | None:
-    """Grouped errors from what `added_errors_rows` made; None for None."""
-    if part is None:
-        return None
-    groups = part["groups"]
-
-    def column(name: str) -> Any:
-        return np.array([row[name] for row in groups], float).reshape(-1, 2)
-
-    return GroupedErrors(
-        part["grouping"],
-        part["by"],
-        tuple(row["label"] for row in groups[::2]),
-        column("n"),
-        column("variance"),
-        column("variance_error"),
-        dict(part["evidence"]),
-        part["dispersion"],
-    )
 
 
 def grouping_sentence(found: GroupedErrors, unit: str) -> str:

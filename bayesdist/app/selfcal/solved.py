@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.app.kinds.fitted import FIT_AGAIN, Fitted, load_fitted
 from bayesdist.app.kinds.solved import SOLUTION, SelfCalibrated
 from bayesdist.app.selfcal.gauge import fixed_by, gauge_table, gauge_words
 from bayesdist.app.selfcal.matched import SelfcalMatched
@@ -20,7 +22,7 @@ from bayesdist.infer.selfcal.gauge import Decision
 from bayesdist.infer.selfcal.mode import gauge_of
 from bayesdist.model import DistortionModel
 
-__all__ = ["arrays_of", "read_solution", "solved_of"]
+__all__ = ["arrays_of", "load_selfcal", "solved_of"]
 
 Float = NDArray[np.float64]
 
@@ -43,15 +45,17 @@ def arrays_of(solution: SelfCalibrationMode, reference: Float) -> dict[str, NDAr
     }
 
 
-def read_solution(folder: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an earlier stage.
+def load_selfcal(folder: Path, matched: Callable[[], SelfcalMatched]) -> Fitted:
+    """The fit of an earlier stage, with its solution.
 
     Raises
     ------
     InputError
-        For a missing or damaged file.
+        For missing or damaged files.
     """
-    return read_arrays(folder / SOLUTION, "", ARRAYS, do="run the stage 'fit' again")
+    fitted = load_fitted(folder)
+    arrays = read_arrays(folder / SOLUTION, "", ARRAYS, do=FIT_AGAIN)
+    return replace(fitted, solved=solved_of(matched(), fitted.linear.model, arrays))
 
 
 def solved_of(

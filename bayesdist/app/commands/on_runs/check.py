@@ -42,7 +42,7 @@ def check(path: str | Path) -> str:
         run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
     with open_results(run) as results:
         rehearsed = rehearse(results)
-        lines = results.kind.lines(rehearsed.inputs, config) or _lines(rehearsed)
+        lines = results.kind.lines(rehearsed.inputs) or _lines(rehearsed)
         return "\n".join(lines)
 
 

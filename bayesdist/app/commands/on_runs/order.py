@@ -86,7 +86,7 @@ def _selected(
 ) -> tuple[OrderSelection, dict[int, str]]:
     """The comparison, and why the orders above those compared cannot be fitted."""
     failed: dict[int, str] = {}
-    matched = results.kind.match(results.inputs, results.config, results.base)
+    matched = results.kind.match(results.inputs, results.config)
     for top in sorted(orders, reverse=True):
         try:
             return _compared(results, matched, range(min(orders), top + 1), chip), failed
