@@ -27,8 +27,8 @@ from bayesdist.app.assessment.diagnosing import diagnose_run as diagnose
 from bayesdist.app.assessment.error_terms import errors_of_run as error_model
 from bayesdist.app.assessment.settings import assessment_rng, evaluation_settings
 from bayesdist.app.config import Config
-from bayesdist.app.kind import kind_of
 from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.products.export import export_files

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.app.config import load_config
-from bayesdist.app.kind import kind_of
 from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.pipeline import (
     diagnose,
     error_model,

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bayesdist.app.campaign.report import _residuals
+from bayesdist.app.kinds.campaign.report import _residuals
 from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.fitted import StoredLookupTables
 from bayesdist.data import Matches

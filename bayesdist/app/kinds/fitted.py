@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bayesdist.app.kinds.errors import ErrorLaw, ExposureScatter
 from bayesdist.app.kinds.solved import SelfCalibrated
-from bayesdist.app.tables.output import write_table
+from bayesdist.app.store.output import write_table
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.errors import InputError

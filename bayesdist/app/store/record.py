@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 from pydantic_core import to_json
 
 from bayesdist.app.store.keys import as_json, digest_of
-from bayesdist.app.summary import Sections
+from bayesdist.app.store.summary import Sections
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path, sha256_of
 from bayesdist.reading.documents import model_of, read_json

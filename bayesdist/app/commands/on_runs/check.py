@@ -10,8 +10,8 @@ from bayesdist.app.assessment.checks import in_circle
 from bayesdist.app.assessment.settings import idle_dates
 from bayesdist.app.config import Config, load_config
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.matches.added_errors import grouping_sentence
-from bayesdist.app.matches.plausibility import doubts_on_stars
+from bayesdist.app.kinds.matches.added_errors import grouping_sentence
+from bayesdist.app.kinds.matches.plausibility import doubts_on_stars
 from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results, open_results
 from bayesdist.app.screen import number

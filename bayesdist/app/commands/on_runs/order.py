@@ -15,11 +15,11 @@ from bayesdist.app.config import Config, load_config
 from bayesdist.app.kinds.errors import QUOTED
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.matched import Matched
-from bayesdist.app.kinds.stars import fit_stars, model_of, shards_of
+from bayesdist.app.kinds.matches.stars import fit_stars, model_of, shards_of
 from bayesdist.app.results import Results, open_results
 from bayesdist.app.screen import table_text
+from bayesdist.app.store.output import refuse_existing, write_table
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.tables.output import refuse_existing, write_table
 from bayesdist.data import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.files import atomic_path
