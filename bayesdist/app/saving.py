@@ -24,7 +24,7 @@ from bayesdist.app.tables.output import provenance_notes, write_table
 from bayesdist.app.tables.star_files import FOLDER, write_star_files
 from bayesdist.checks import warnings_of
 from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
-from bayesdist.diagnose.residuals.majority import majority_sentence
+from bayesdist.diagnose.residuals.quoted import majority_sentence
 from bayesdist.infer import save_posterior
 
 __all__ = [

@@ -9,8 +9,7 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.tables.output import write_table
-from bayesdist.data.added_errors import AddedErrors
-from bayesdist.data.magnitude_errors import MagnitudeErrors
+from bayesdist.data.magnitude_errors import AddedErrors, MagnitudeErrors
 from bayesdist.data.matches import Matches
 from bayesdist.reading.faults import restoring
 from bayesdist.reading.tables import read_ecsv
