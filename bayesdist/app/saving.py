@@ -28,7 +28,7 @@ from bayesdist.app.tables.star_files import FOLDER, write_star_files
 from bayesdist.checks import warnings_of
 from bayesdist.data import Matches
 from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
-from bayesdist.diagnose.residuals.majority import majority_sentence
+from bayesdist.diagnose.residuals.quoted import majority_sentence
 from bayesdist.infer import LinearFit, Posterior, save_posterior
 from bayesdist.infer.skew import Skew, skew_of
 

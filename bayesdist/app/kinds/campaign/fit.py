@@ -20,8 +20,12 @@ from bayesdist.data import centroid_errors
 from bayesdist.data.matches import Matches
 from bayesdist.infer import load
 from bayesdist.infer.exposures.alone import ExposureSolutions, fit_exposures
-from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
-from bayesdist.infer.exposures.trends import trend_p_values
+from bayesdist.infer.exposures.hierarchy import (
+    HierarchicalFit,
+    fit_hierarchical,
+    held_in_reference,
+    trend_p_values,
+)
 from bayesdist.infer.linear import Rejection
 from bayesdist.infer.nodes import corrected_matches, on_the_chips
 from bayesdist.infer.series import Series

@@ -9,7 +9,7 @@ from bayesdist.app.config.other_runs import POSTERIOR, calibration_file
 from bayesdist.app.kinds.fitted import FIT
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.diagnostics_files import load_diagnostics
-from bayesdist.assess.error_model import solution_with_errors
+from bayesdist.assess.adjusted import with_diagnosed_errors
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.prior import CalibrationPrior, prior_of_calibration
 from bayesdist.errors import InputError
@@ -65,5 +65,5 @@ def _calibration(path: Path, filter: str | None) -> Calibration:
         fit = load_fit(folder / FIT)
         found = load_diagnostics(run, fit, posterior)
         hierarchy = fit if run.config.campaign is not None else None
-        posterior = solution_with_errors(posterior, found, hierarchy)
+        posterior = with_diagnosed_errors(posterior, found, hierarchy)
     return calibration_of(posterior, str(folder))
