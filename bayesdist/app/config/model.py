@@ -6,8 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, PositiveFloat
 
-from bayesdist.app.config.detector import Pair
-from bayesdist.app.config.section import Epoch, Section
+from bayesdist.app.config.section import Epoch, Pair, Section
 from bayesdist.model import FRAME_KINDS, TimeDependence
 from bayesdist.model.basis import MAX_ORDER
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted, load_errors, required
-from bayesdist.app.store.inputs import input_name
+from bayesdist.app.store.made_from import input_name
 from bayesdist.app.store.rundir import PAIRS, RunDirectory, part_files
 from bayesdist.data import Matches, read_matches
 from bayesdist.errors import InputError

@@ -12,7 +12,7 @@ from astropy.table import Column, Table
 from astropy.units import Unit
 from numpy.typing import NDArray
 
-from bayesdist.app.kinds.solved import SelfCalibrated
+from bayesdist.app.kinds.fitted import SelfCalibrated
 from bayesdist.app.store.output import write_table
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.storage.write import write_columns
