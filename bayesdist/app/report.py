@@ -28,11 +28,7 @@ from bayesdist.model.grid import outline_pixels
 from bayesdist.reading.tables import read_ecsv
 from bayesdist.report.context import ChipResults, Product, ReportInput, SelfcalResults
 
-__all__ = [
-    "report",
-    "selfcal_results",
-    "title_of",
-]
+__all__ = ["report", "title_of"]
 
 
 log = logging.getLogger("bayesdist")

@@ -38,10 +38,7 @@ from bayesdist.infer.skew import Skew, skew_of
 from bayesdist.infer.stars.stars import in_table_order, prepare
 
 __all__ = [
-    "FOLDER",
     "fit_sections",
-    "log_fit",
-    "sample_sections",
     "save_diagnosed",
     "save_evaluation",
     "save_figures",

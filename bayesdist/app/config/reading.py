@@ -23,7 +23,6 @@ from bayesdist.reading.documents import toml_of
 from bayesdist.reading.regular import MOST_TEXT, read_text
 
 __all__ = [
-    "CONFIG",
     "KINDS",
     "Config",
     "config_of_record",

@@ -19,10 +19,7 @@ from bayesdist.infer.exposures.frame_choice import FrameChoice, frames_that_help
 from bayesdist.infer.stars.shards import Compute
 from bayesdist.model import DistortionModel
 
-__all__ = [
-    "FitData",
-    "StarReader",
-]
+__all__ = ["FitData", "StarReader"]
 
 
 class StarReader:

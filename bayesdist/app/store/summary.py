@@ -8,24 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = [
-    "BudgetRow",
-    "CoverageRow",
-    "HoldoutTest",
-    "MapRow",
-    "MarginRow",
-    "MeanAndSd",
-    "MisfitRow",
-    "Part",
-    "ProductRow",
-    "ScoreTestRow",
-    "Sections",
-    "StructureRow",
-    "Summary",
-    "ValidityRow",
-    "head_of",
-    "schema_text",
-]
+__all__ = ["Sections", "Summary", "head_of", "schema_text"]
 
 
 Number = float | None  # null where it is not finite, or not known

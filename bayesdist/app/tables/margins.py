@@ -13,14 +13,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.circular import per_axis
 
-__all__ = [
-    "judged_requirements",
-    "margin_rows",
-    "margin_table",
-    "margins_text",
-    "requirement_of",
-    "results_text",
-]
+__all__ = ["judged_requirements", "margin_rows", "margin_table", "margins_text", "results_text"]
 
 # of what a requirement is, beside chip and epoch
 SCOPE = ("region", "epochs", "relative", "separation", "magnitude")

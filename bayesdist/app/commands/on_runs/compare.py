@@ -27,12 +27,7 @@ from bayesdist.products.formats.common.document import MissingSizeError
 from bayesdist.report.comparison import difference_vectors
 from bayesdist.report.drawing import save_figures
 
-__all__ = [
-    "compare_files",
-    "comparison_summary",
-    "joined",
-    "write_comparison",
-]
+__all__ = ["compare_files", "joined"]
 
 
 def write_comparison(

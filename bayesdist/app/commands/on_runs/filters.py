@@ -18,12 +18,7 @@ from bayesdist.infer.transforms import linear_terms, lines, reference_gauge, wit
 from bayesdist.limits import DIFFERENCE
 from bayesdist.model import TimeDependence
 
-__all__ = [
-    "FilterComparison",
-    "compare_filters",
-    "comparison_table",
-    "draw_filters",
-]
+__all__ = ["FilterComparison", "compare_filters", "comparison_table", "draw_filters"]
 
 
 Float = NDArray[np.float64]

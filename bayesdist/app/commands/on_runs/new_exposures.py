@@ -20,7 +20,7 @@ from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.compare.monitoring import NewFit, fit_new, with_star_errors_of
 from bayesdist.infer.linear import Rejection
 
-__all__ = ["NewExposures", "fit_exposures_of", "read_new_exposures"]
+__all__ = ["fit_exposures_of", "read_new_exposures"]
 
 Float = NDArray[np.float64]
 

@@ -9,12 +9,7 @@ from bayesdist.infer.solution import ReferenceGauge, Solution, TransformedSoluti
 from bayesdist.infer.transforms import LinearTerms, lines, reference_gauge, without_frames
 from bayesdist.model import DistortionModel, TimeDependence
 
-__all__ = [
-    "FIXED",
-    "gap_priors",
-    "line_sections",
-    "with_gap",
-]
+__all__ = ["FIXED", "gap_priors", "line_sections", "with_gap"]
 
 
 CONSTANTS = (("u", 0, 0), ("v", 0, 0))

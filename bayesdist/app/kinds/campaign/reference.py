@@ -15,11 +15,7 @@ from bayesdist.infer.exposures.shared_drift import drift_priors
 from bayesdist.model import Chip, DistortionModel, LookupTable
 from bayesdist.products import read_d2im
 
-__all__ = [
-    "held_tables",
-    "rate_priors",
-    "rehearse_references",
-]
+__all__ = ["held_tables", "rate_priors", "rehearse_references"]
 
 
 def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tuple[LookupTable, ...]:

@@ -32,13 +32,7 @@ from bayesdist.infer.nodes import (
 from bayesdist.model import DistortionModel, LookupTable, corrected
 from bayesdist.model.grid import grid_pixels, mesh
 
-__all__ = [
-    "FittedTables",
-    "fit_tables",
-    "refuse_outrun_stars",
-    "scatter_by_magnitude",
-    "tables_section",
-]
+__all__ = ["fit_tables", "scatter_by_magnitude", "tables_section"]
 
 
 Float = NDArray[np.float64]

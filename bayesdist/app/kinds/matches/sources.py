@@ -17,7 +17,6 @@ from bayesdist.mission import load_object, missions
 from bayesdist.model import Chip
 
 __all__ = [
-    "IN_MEMORY",
     "MatchSource",
     "RunInput",
     "check_chips",
@@ -26,7 +25,6 @@ __all__ = [
     "load_matches",
     "mission_template",
     "read_configured",
-    "reading_options",
 ]
 
 

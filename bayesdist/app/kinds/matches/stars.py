@@ -50,7 +50,6 @@ __all__ = [
     "fit_stars",
     "match_stars",
     "model_of",
-    "priors_of",
     "read_stars",
     "sample_stars",
     "shards_of",

@@ -31,13 +31,7 @@ from bayesdist.infer.selfcal.gauge import Decision
 from bayesdist.infer.selfcal.mode import gauge_of, solve_in_gauge
 from bayesdist.model import DistortionModel
 
-__all__ = [
-    "arrays_of",
-    "fit_selfcal",
-    "load_selfcal",
-    "sample_detections",
-    "solved_of",
-]
+__all__ = ["fit_selfcal", "load_selfcal", "sample_detections"]
 
 
 Float = NDArray[np.float64]

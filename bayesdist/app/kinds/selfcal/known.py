@@ -22,11 +22,7 @@ from bayesdist.limits import GAUGE_CONTRADICTION
 from bayesdist.model import DistortionModel
 from bayesdist.reading.tables import read_table
 
-__all__ = [
-    "Commanded",
-    "GaugeConstraints",
-    "read_commanded",
-]
+__all__ = ["Commanded", "GaugeConstraints", "read_commanded"]
 
 
 Float = NDArray[np.float64]

@@ -24,15 +24,7 @@ from bayesdist.infer.selfcal.gauge import NamedDirection
 from bayesdist.infer.selfcal.tangent import places_of
 from bayesdist.model import DistortionModel
 
-__all__ = [
-    "calibrated",
-    "exposure_table",
-    "match_dithers",
-    "matching_facts",
-    "refuse_unconnected",
-    "rolled_180",
-    "selfcal_lines",
-]
+__all__ = ["match_dithers", "refuse_unconnected", "selfcal_lines"]
 
 
 log = logging.getLogger("bayesdist")

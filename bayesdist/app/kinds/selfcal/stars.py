@@ -19,7 +19,7 @@ from bayesdist.data.storage.write import write_columns
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.infer.selfcal import SelfCalibrationMode, StarCatalogue, star_catalogue
 
-__all__ = ["FLAGS", "star_table", "write_stars"]
+__all__ = ["star_table", "write_stars"]
 
 NAMES = ("u", "v", "pm_u", "pm_v", "parallax")
 FEW, DOUBTFUL, REFERENCE = 1, 2, 4
