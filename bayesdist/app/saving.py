@@ -24,6 +24,7 @@ from bayesdist.app.rehearsal import rehearse_solution
 from bayesdist.app.results import Results
 from bayesdist.app.store.output import provenance_notes, write_table
 from bayesdist.app.store.rundir import part_files
+from bayesdist.app.store.summary import Sampler
 from bayesdist.app.tables.diagnostics_files import write_diagnostics
 from bayesdist.app.tables.evaluation_files import write_evaluation
 from bayesdist.checks import warnings_of
@@ -265,25 +266,10 @@ def sample_sections(posterior: Posterior, *, in_circle: bool) -> dict[str, Any]:
     in_circle : bool
         Stars were matched in circles about nominal positions.
     """
-    c, i = posterior.convergence, posterior.sampler
     return {
         "outliers": _outliers(posterior, in_circle),
         "sampler": {
-            "method": i.method,
-            "exact": i.exact,
-            "converged": c.converged,
-            "reasons": list(c.reasons),
-            "rhat_max": c.rhat_max,
-            "ess_bulk_min": c.ess_bulk_min,
-            "ess_tail_min": c.ess_tail_min,
-            "pareto_k": c.pareto_k,
-            "importance_efficiency": c.importance_efficiency,
-            "ensembles": i.ensembles,
-            "walkers": i.walkers,
-            "steps": i.steps,
-            "passes": i.passes,
-            "acceptance": i.acceptance,
-            "wall_s": i.wall_s,
+            **Sampler.row(posterior.sampler, posterior.convergence),
             **_certificate(posterior),
         },
     }

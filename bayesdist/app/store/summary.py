@@ -19,6 +19,17 @@ class Part(BaseModel):
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
+    @classmethod
+    def row(cls, *objects: Any, **others: Any) -> dict[str, Any]:
+        """Row with these fields: of `others`, or else of the first object that has one."""
+        return {name: cls._value(name, objects, others) for name in cls.model_fields}
+
+    @staticmethod
+    def _value(name: str, objects: tuple[Any, ...], others: dict[str, Any]) -> Any:
+        if name in others:
+            return others[name]
+        return getattr(next(one for one in objects if hasattr(one, name)), name)
+
 
 class MeanAndSd(Part):
     """Posterior mean and standard deviation."""
