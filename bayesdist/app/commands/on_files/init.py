@@ -13,8 +13,7 @@ import numpy as np
 from bayesdist.app.commands.on_files.init_columns import column_lines, guessed_sigma, quoted
 from bayesdist.app.config import parse_config
 from bayesdist.app.config.data import data_sections
-from bayesdist.app.kinds.matches.reading import load_matches
-from bayesdist.app.kinds.matches.sources import mission_template
+from bayesdist.app.kinds.matches.sources import load_matches, mission_template
 from bayesdist.app.store.output import refuse_existing
 from bayesdist.data import FORMATS, Matches
 from bayesdist.data.formats.files import mission_formats
