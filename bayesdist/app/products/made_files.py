@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from bayesdist.app.assessment.settings import assessment_epoch
-from bayesdist.app.campaign.aberration import ABERRATION
 from bayesdist.app.config import Config
+from bayesdist.app.kinds.campaign.aberration import ABERRATION
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.assess.adjusted import with_diagnosed_errors

@@ -118,7 +118,8 @@ def test_an_exposure_without_stars_on_a_chip_is_left_out(some):
 
 def test_an_exposure_with_fewer_stars_than_terms_is_named():
     model, matches, _ = campaign(3, 60, 36, order=5, time=False)  # 18 stars, 21 terms
-    with pytest.raises(DegenerateError, match=r"none of 60 exposures .* 1\d stars lie on this chip"):
+    message = r"none of 60 exposures .* 1\d stars lie on this chip"
+    with pytest.raises(DegenerateError, match=message):
         fit_exposures(matches, model)
 
 
