@@ -18,7 +18,7 @@ from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.infer import Posterior
-from bayesdist.infer.catalogue.star_influence import StarErrors
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.solution import Solution
 from bayesdist.model import LookupTable
 

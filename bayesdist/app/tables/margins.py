@@ -11,7 +11,7 @@ from astropy.table import Table
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Margin, Requirement
-from bayesdist.assess.circular import per_axis
+from bayesdist.assess.maps import per_axis
 
 __all__ = [
     "judged_requirements",

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import norm
 
-from bayesdist.assess.comparison.compare import Comparison
+from bayesdist.assess.comparison.compare import Comparison, comparison_table
 from bayesdist.assess.comparison.gap import GapDifference
-from bayesdist.assess.comparison.tables import comparison_table
 from bayesdist.limits import DIFFERENCE
 from bayesdist.numbers import p_words
 

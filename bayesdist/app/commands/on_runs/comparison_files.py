@@ -9,10 +9,14 @@ from typing import Any
 from astropy.table import Table, vstack
 
 from bayesdist.app.store.output import record_folder, write_table
-from bayesdist.assess.comparison.compare import Comparison
+from bayesdist.assess.comparison.compare import (
+    Comparison,
+    comparison_table,
+    difference_table,
+    gap_table,
+)
 from bayesdist.assess.comparison.gap import GapDifference
 from bayesdist.assess.comparison.sentences import gap_verdict, verdict
-from bayesdist.assess.comparison.tables import comparison_table, difference_table, gap_table
 from bayesdist.report.comparison import difference_vectors
 from bayesdist.report.drawing import save_figures
 

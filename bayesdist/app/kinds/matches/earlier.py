@@ -9,7 +9,7 @@ from bayesdist.app.config.other_runs import POSTERIOR, calibration_file
 from bayesdist.app.kinds.fitted import FIT
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.diagnostics_files import load_diagnostics
-from bayesdist.assess.adjusted import with_diagnosed_errors
+from bayesdist.assess.error_model import with_diagnosed_errors
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.prior import CalibrationPrior, prior_of_calibration
 from bayesdist.errors import InputError
