@@ -12,9 +12,9 @@ from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
-from bayesdist.assess import SAMPLE
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.residuals.quoted import error_scale_sentence
+from bayesdist.diagnose.residuals.sample import SAMPLE
 from bayesdist.infer import LinearFit, Shards
 from bayesdist.infer.exposures.frame_choice import FrameChoice, frames_that_help
 from bayesdist.model import DistortionModel

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
-from bayesdist.assess import SAMPLE
 from bayesdist.data.matches import Matches
+from bayesdist.diagnose.residuals.sample import SAMPLE
 from bayesdist.infer import Shards, load
 from bayesdist.infer.stars.shards import Compute
 from bayesdist.model import DistortionModel

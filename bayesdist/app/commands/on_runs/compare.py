@@ -10,7 +10,6 @@ import numpy as np
 from bayesdist.app.commands.on_files.calibrations import calibration_at
 from bayesdist.app.commands.on_runs.comparison_files import write_comparison
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.assess import DEFAULT_GRID
 from bayesdist.assess.comparison.compare import Comparison, compare
 from bayesdist.assess.comparison.gap import (
     GapDifference,
@@ -20,6 +19,7 @@ from bayesdist.assess.comparison.gap import (
 from bayesdist.assess.comparison.sentences import comparison_lines, gap_lines, gap_verdict, verdict
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
+from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.products.formats.common.document import MissingSizeError
 
 __all__ = ["compare_files"]

@@ -22,10 +22,10 @@ from bayesdist.app.kinds.matches.reading import check_chips
 from bayesdist.app.kinds.matches.sources import read_configured
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.kinds.split import set_aside
-from bayesdist.assess import SAMPLE
 from bayesdist.calibration.prior import CalibrationPrior
 from bayesdist.data import Matches
 from bayesdist.diagnose.residuals.quoted import error_scale
+from bayesdist.diagnose.residuals.sample import SAMPLE
 from bayesdist.errors import ConfigError, DegenerateError, NotSettledError
 from bayesdist.infer import (
     GaussianPriors,
