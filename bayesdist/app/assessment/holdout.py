@@ -10,14 +10,13 @@ from astropy.table import Table
 
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.store.summary import CoverageRow, Holdout, HoldoutTest
-from bayesdist.assess.adjusted import with_diagnosed_errors
-from bayesdist.assess.error_model import ErrorModel
+from bayesdist.assess.error_model import ErrorModel, with_diagnosed_errors
 from bayesdist.assess.evaluation import EvaluationSettings
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
 from bayesdist.infer import Posterior
-from bayesdist.infer.catalogue.star_influence import StarInfluence, star_influence
+from bayesdist.infer.catalogue.star_errors import StarInfluence, star_influence
 
 __all__ = ["holdout_summary", "holdout_table", "predictive_of_run"]
 

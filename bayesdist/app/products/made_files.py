@@ -13,8 +13,8 @@ from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.kinds.campaign.aberration import ABERRATION
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.assess.adjusted import with_diagnosed_errors
 from bayesdist.assess.budget.budget import TOTAL
+from bayesdist.assess.error_model import with_diagnosed_errors
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE_IN_FIT
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.assess.terms.parameters import CATALOGUE, MOTIONS

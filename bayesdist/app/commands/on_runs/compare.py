@@ -12,7 +12,6 @@ from astropy.table import Table, vstack
 from bayesdist.app.commands.on_files.calibrations import calibration_at
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.assess import DEFAULT_GRID
 from bayesdist.assess.comparison.compare import Comparison, compare
 from bayesdist.assess.comparison.gap import (
     GapDifference,
@@ -23,6 +22,7 @@ from bayesdist.assess.comparison.sentences import comparison_lines, gap_lines, g
 from bayesdist.assess.comparison.tables import comparison_table, difference_table, gap_table
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
+from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.products.formats.common.document import MissingSizeError
 from bayesdist.report.comparison import difference_vectors
 from bayesdist.report.drawing import save_figures

@@ -62,7 +62,7 @@ def _fitted(matched: CampaignMatched) -> Fitted:
     rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs)
     joint = _joint(stars, affine, inputs, rejection)
     number = config.chips()[0].number
-    alone = fit_exposures(stars, affine, chip=number, skip=True, rejection=rejection)
+    alone = fit_exposures(stars, affine, chip=number, rejection=rejection)
     facts = {
         **line_sections(joint, number),
         "tables": tables_section(config, tables),
