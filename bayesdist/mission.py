@@ -43,7 +43,7 @@ class Mission:
         subclass of `bayesdist.app.config.Data`.
     match_sources : mapping of str to str
         How the matches of these formats are read: each a
-        `bayesdist.app.matches.sources.MatchSource`.
+        `bayesdist.app.kinds.matches.sources.MatchSource`.
     error_terms : mapping of str to str
         Kinds of `[[budget]]` rows with one sigma: each makes an error term of name, kind, sigma,
         solution and source, as `bayesdist.assess.terms.parameters.ScaleError`.

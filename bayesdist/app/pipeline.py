@@ -4,7 +4,7 @@ A configuration says what is asked for, and paths in it are relative to `base`::
 
     config, _ = load_config("job/config.toml")
     base = Path("job")
-    data = fit(match(read(config, base), config, base), config, base)
+    data = fit(match(read(config, base), config), config, base)
     posterior = sample(data, config)
     found = diagnose(posterior, data, config, base)
     errors = error_model(posterior, found, data, config)
@@ -27,8 +27,8 @@ from bayesdist.app.assessment.diagnosing import diagnose_run as diagnose
 from bayesdist.app.assessment.error_terms import errors_of_run as error_model
 from bayesdist.app.assessment.settings import assessment_rng, evaluation_settings
 from bayesdist.app.config import Config
-from bayesdist.app.kind import kind_of
 from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.products.export import export_files
@@ -70,13 +70,13 @@ def read(config: Config, base: Path) -> Any:
     """
     kind = kind_of(config)
     inputs = kind.read(config, base)
-    kind.refuse(inputs, config, base)
+    kind.refuse(inputs)
     return inputs
 
 
-def match(inputs: Any, config: Config, base: Path) -> Matched:
+def match(inputs: Any, config: Config) -> Matched:
     """Stars that are fitted and stars that are held out; `inputs` are from `read`."""
-    return kind_of(config).match(inputs, config, base)
+    return kind_of(config).match(inputs, config)
 
 
 def fit(matched: Matched, config: Config, base: Path, reader: StarReader | None = None) -> FitData:

@@ -29,7 +29,7 @@ def rehearse(results: Results) -> Results:
     What is wrong with the data or the configuration shows here, before hours of sampling.
     """
     kind, config, base = results.kind, results.config, results.base
-    kind.refuse(results.inputs, config, base)
+    kind.refuse(results.inputs)
     if kind.begins_with == "match":  # which takes long
         return results
     matched = results.matched

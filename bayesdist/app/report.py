@@ -8,10 +8,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.campaign.report import campaign_results
 from bayesdist.app.config import Config
+from bayesdist.app.kinds.campaign.report import campaign_results
+from bayesdist.app.kinds.selfcal.report import selfcal_results
 from bayesdist.app.results import Results
-from bayesdist.app.selfcal.report import selfcal_results
 from bayesdist.app.store import as_json
 from bayesdist.assess import VectorMap, distortion_vectors
 from bayesdist.assess.coefficients import coefficient_table

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from bayesdist.app.assessment.checks import run_checks
 from bayesdist.app.assessment.diagnosing import diagnose_fit_of_run, diagnose_run
 from bayesdist.app.assessment.error_terms import errors_of_run
 from bayesdist.app.assessment.settings import assessment_epoch, evaluation_settings
 from bayesdist.app.config import Config
-from bayesdist.app.kind import Kind, kind_of
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.kinds.kind import Kind, kind_of
 from bayesdist.app.kinds.matched import Matched
+from bayesdist.app.kinds.matches.sources import RunInput, input_of_run
 from bayesdist.app.kinds.reader import StarReader
-from bayesdist.app.matches.sources import RunInput, input_of_run
 from bayesdist.app.products.made_files import ProductInput, product_of, solution_of
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.diagnostics_files import load_diagnostics
@@ -31,6 +31,8 @@ from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import LinearFit, Posterior, load_posterior
 
 __all__ = ["Results", "open_results", "results_of"]
+
+T = TypeVar("T")
 
 # each rests on those before it
 ARTEFACTS = (
@@ -89,6 +91,14 @@ class Results:
 
     # -- artefacts --------------------------------------------------------------------------------
 
+    def _artefact(self, name: str, stage: str, load: Callable[[], T]) -> T:
+        """What this process has made, or what a stage has left in the folder, if undamaged."""
+        if self.made.get(name) is not None:
+            found: T = self.made[name]
+            return found
+        self.run.refuse_damaged(stage)
+        return load()
+
     @cached_property
     def config(self) -> Config:
         """The resolved configuration."""
@@ -116,22 +126,20 @@ class Results:
     @cached_property
     def matched(self) -> Matched:
         """Stars that are fitted and stars that are held out, as they were read or matched."""
-        found: Matched | None = self.made.get("matched")
-        if found is not None:
-            return found
-        self.run.refuse_damaged("match")
-        summary = self.run.summary
-        return self.kind.load_matched(self.run.path, self.inputs, self.config, self.base, summary)
+
+        def load() -> Matched:
+            if self.kind.load_matched is None:
+                return self.kind.match(self.inputs, self.config)
+            return self.kind.load_matched(self.run.path, self.inputs, self.run.summary)
+
+        return self._artefact("matched", "match", load)
 
     @cached_property
     def fitted(self) -> Fitted:
         """The least-squares solution, with what its stars were given."""
-        found: Fitted | None = self.made.get("fitted")
-        if found is not None:
-            return found
-        self.run.refuse_damaged("fit")
-        summary = self.run.summary
-        return self.kind.load_fitted(self.run.path, lambda: self.matched, self.config, summary)
+        return self._artefact(
+            "fitted", "fit", lambda: self.kind.load_fitted(self.run.path, lambda: self.matched)
+        )
 
     @cached_property
     def data(self) -> FitData:
@@ -141,11 +149,9 @@ class Results:
     @cached_property
     def posterior(self) -> Posterior:
         """The posterior as it was sampled."""
-        found: Posterior | None = self.made.get("posterior")
-        if found is not None:
-            return found
-        self.run.refuse_damaged("sample")
-        return load_posterior(self.run / "posterior.nc")
+        return self._artefact(
+            "posterior", "sample", lambda: load_posterior(self.run / "posterior.nc")
+        )
 
     @property
     def is_sampled(self) -> bool:
@@ -155,11 +161,9 @@ class Results:
     @cached_property
     def stored(self) -> Diagnostics | None:
         """Diagnostics as the run has them; None before."""
-        found: Diagnostics | None = self.made.get("stored")
-        if found is not None:
-            return found
-        self.run.refuse_damaged("diagnose")
-        return load_diagnostics(self.run, self.fit, self.posterior)
+        return self._artefact(
+            "stored", "diagnose", lambda: load_diagnostics(self.run, self.fit, self.posterior)
+        )
 
     @cached_property
     def diagnostics(self) -> Diagnostics:
@@ -171,11 +175,9 @@ class Results:
     @cached_property
     def evaluation(self) -> Evaluation:
         """Maps, budget, margins and validity periods, as the assessment has found them."""
-        found: Evaluation | None = self.made.get("evaluation")
-        if found is not None:
-            return found
-        self.run.refuse_damaged("evaluate")
-        return load_evaluation(self.run, self.fit, self.posterior)
+        return self._artefact(
+            "evaluation", "evaluate", lambda: load_evaluation(self.run, self.fit, self.posterior)
+        )
 
     @property
     def stored_evaluation(self) -> Evaluation | None:

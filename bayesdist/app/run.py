@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.app.config import load_config
-from bayesdist.app.kind import kind_of
 from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.pipeline import (
     diagnose,
     error_model,
@@ -152,7 +152,7 @@ def make_stages(
             evaluation, posterior, r.stored, r.data, config, base, run.path, source=source
         )
 
-    stage("match", "matched", lambda: match(r.inputs, config, base), save_matches)
+    stage("match", "matched", lambda: match(r.inputs, config), save_matches)
     stage("fit", "fitted", lambda: _fitted(r), save_fit)
     stage("sample", "posterior", lambda: _sampled(r), save_sampled)
     stage("diagnose", "stored", lambda: diagnose(r.posterior, r.data, config, base), save_diagnosed)

@@ -33,16 +33,20 @@ def with_shared_stars(posterior: Posterior, fit: LinearFit, stars: StarCovarianc
 
 def with_diagnosed_errors(
     posterior: Posterior,
-    diagnostics: Diagnostics,
+    diagnostics: Diagnostics | None,
     hierarchy: LinearFit | None = None,
     *,
     noise_alone: bool = False,
 ) -> Posterior:
     """Posterior whose draws are spread by all that diagnostics know of errors of its parameters.
 
-    `posterior` is as it was sampled.  `noise_alone` counts, of the correlated errors, those of the
-    stars as they scatter: what else there is stands in terms of its own.
+    So it is exported and shown; `posterior` is as it was sampled.  `hierarchy` is the fit of a
+    hierarchy of exposures, whose covariance has no noise of draws.  `noise_alone` counts, of the
+    correlated errors, those of the stars as they scatter: what else there is stands in terms of its
+    own.
     """
+    if diagnostics is None:
+        return posterior
     solution, stars, found = posterior, diagnostics.catalogue, diagnostics.correlated
     if stars is not None:
         needed = required(hierarchy, "errors of the catalogue need a joint fit")

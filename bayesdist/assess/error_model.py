@@ -33,7 +33,6 @@ __all__ = [
     "diagnosed_error_model",
     "error_budget",
     "error_model",
-    "solution_with_errors",
 ]
 
 Float = NDArray[np.float64]
@@ -167,16 +166,24 @@ def error_model(
     pixel_scale : float, optional
         Size of one pixel in mas; `pixel_scale_of` the solution by default.
 
-    Returns
-    -------
-    ErrorModel
-
     Raises
     ------
     InputError
         For a term whose unit needs a pixel scale that is not known.
     """
-    return _model(solution, SolutionErrors(solution), terms, aligned, pixel_scale)
+    if pixel_scale is None:
+        pixel_scale = pixel_scale_of(solution)
+    errors, others = SolutionErrors(solution), list[ErrorTerm]()
+    for term in terms:
+        if isinstance(term, SolutionErrors):
+            errors = replace(term, solution=solution)
+        elif isinstance(term, UserTerm):
+            others.append(term.in_unit(solution.model.unit, pixel_scale))
+        else:
+            others.append(term)
+    if not any(isinstance(term, Centroids) for term in others):
+        others.append(Centroids(None))  # a domain that names a magnitude asks for it
+    return ErrorModel(errors, tuple(others), aligned)
 
 
 def diagnosed_error_model(
@@ -186,10 +193,10 @@ def diagnosed_error_model(
     *,
     hierarchy: LinearFit | None = None,
     catalogue: str = "catalogue",
-    aligned: bool = False,
     single: bool = False,
     frames: bool = False,
     structure_left: bool = True,
+    aligned: bool = False,
     pixel_scale: float | None = None,
 ) -> ErrorModel:
     """The error model of a posterior, with what residuals say of it.
@@ -201,13 +208,11 @@ def diagnosed_error_model(
     diagnostics : Diagnostics
         Its correlated errors, and what errors of the catalogue do, count in.
     terms : sequence of ErrorTerm
-        As of `error_model`.
+        Other errors.
     hierarchy : LinearFit, optional
         Of a hierarchy of exposures: its covariance has no noise of draws.
     catalogue : str
         Name of the file that states the catalogue's errors.
-    aligned : bool
-        As of `ErrorModel`.
     single : bool
         Whether the star lies in a single exposure, whose deviation counts; else in the mean.
     frames : bool
@@ -215,50 +220,26 @@ def diagnosed_error_model(
     structure_left : bool
         Whether what the model leaves out at a position counts; not where errors of look-up tables
         stand for it.
-    pixel_scale : float, optional
+    aligned, pixel_scale
         As of `error_model`.
-
-    Returns
-    -------
-    ErrorModel
 
     Raises
     ------
     InputError
         As `error_model`.
     """
-    of_solution = _with_diagnosed(posterior, diagnostics, hierarchy, catalogue)
     measured: list[ErrorTerm] = []
     correlated = diagnostics.correlated
     if correlated is not None and correlated.structure:
         measured.append(StructureErrors(correlated, frames, structure_left))
     if correlated is not None and correlated.linear is not None:
         measured.append(Deviations(correlated, single, frames))
-    return _model(posterior, of_solution, terms, aligned, pixel_scale, measured)
-
-
-def _model(
-    solution: Solution,
-    of_solution: SolutionErrors,
-    terms: Sequence[ErrorTerm],
-    aligned: bool,
-    pixel_scale: float | None,
-    measured: Sequence[ErrorTerm] = (),
-) -> ErrorModel:
-    """The error model of a solution, of what was measured, and of other terms."""
-    if pixel_scale is None:
-        pixel_scale = pixel_scale_of(solution)
-    others = list(measured)
-    for term in terms:
-        if isinstance(term, SolutionErrors):
-            of_solution = replace(term, solution=solution)
-        elif isinstance(term, UserTerm):
-            others.append(term.in_unit(solution.model.unit, pixel_scale))
-        else:
-            others.append(term)
-    if not any(isinstance(term, Centroids) for term in others):
-        others.append(Centroids(None))  # a domain that names a magnitude asks for it
-    return ErrorModel(of_solution, tuple(others), aligned)
+    own = SolutionErrors(with_diagnosed_errors(posterior, diagnostics, hierarchy, noise_alone=True))
+    if diagnostics.catalogue is not None:
+        of_catalogue = catalogue_terms(posterior, diagnostics.catalogue, catalogue)
+        own = replace(own, without=posterior, catalogue=of_catalogue)
+    found = error_model(posterior, terms, aligned=aligned, pixel_scale=pixel_scale)
+    return replace(found, solution=own, terms=(*measured, *found.terms))
 
 
 def error_budget(
@@ -324,26 +305,3 @@ def error_budget(
     errors = error_model(solution, terms=terms, aligned=aligned, pixel_scale=pixel_scale)
     domain = EvaluationDomain.of_chips(solution.model, grid, chips=(chip,), epoch=epoch)
     return errors.at(domain, n=n_draws, rng=rng)
-
-
-def _with_diagnosed(
-    posterior: Posterior, diagnostics: Diagnostics, hierarchy: LinearFit | None, catalogue: str
-) -> SolutionErrors:
-    """Errors of the parameters with those of the catalogue, and of the stars as they scatter."""
-    solution = with_diagnosed_errors(posterior, diagnostics, hierarchy, noise_alone=True)
-    if diagnostics.catalogue is None:
-        return SolutionErrors(solution)
-    terms = catalogue_terms(posterior, diagnostics.catalogue, catalogue)
-    return SolutionErrors(solution, posterior, terms)
-
-
-def solution_with_errors(
-    posterior: Posterior, diagnostics: Diagnostics | None, hierarchy: LinearFit | None = None
-) -> Posterior:
-    """Solution that is exported and shown: all errors of the parameters are in its draws.
-
-    `posterior`: as it was sampled. `hierarchy`: as of `diagnosed_error_model`.
-    """
-    if diagnostics is None:
-        return posterior
-    return with_diagnosed_errors(posterior, diagnostics, hierarchy)

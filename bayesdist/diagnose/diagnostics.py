@@ -22,7 +22,6 @@ from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, time_varia
 from bayesdist.diagnose.residuals.binned import BinnedSums
 from bayesdist.diagnose.residuals.coverage import Coverage, coverage_of
 from bayesdist.diagnose.residuals.epoch_shift import EpochShift, epoch_shift
-from bayesdist.diagnose.residuals.majority import majority_sentence
 from bayesdist.diagnose.residuals.misfit import (
     MAX_BINS,
     STARS_PER_BIN,
@@ -31,6 +30,7 @@ from bayesdist.diagnose.residuals.misfit import (
     partitions_for,
     worst_misfit,
 )
+from bayesdist.diagnose.residuals.quoted import majority_sentence
 from bayesdist.diagnose.residuals.sample import StarSample, centroid_scatter, star_sample
 from bayesdist.diagnose.residuals.star_sums import StarSums, flagged_by_exposure, star_sums
 from bayesdist.diagnose.score.result import ScoreTest

@@ -7,9 +7,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from bayesdist.app.config import load_config
-from bayesdist.app.kinds.stars import fit_stars
-from bayesdist.app.matches import reading as app_matches
-from bayesdist.app.matches.reading import load_matches
+from bayesdist.app.kinds.matches import reading as app_matches
+from bayesdist.app.kinds.matches.reading import load_matches
+from bayesdist.app.kinds.matches.stars import fit_stars
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, read_matches, write_partitioned

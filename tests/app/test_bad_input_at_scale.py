@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bayesdist.app.matches import reading as app_matches
+from bayesdist.app.kinds.matches import reading as app_matches
 from tests.app.support import (
     begin_stagewise,
     model_of,

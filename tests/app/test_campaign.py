@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.app.exposures import series
-from bayesdist.app.kinds.table_file import read_tables
+from bayesdist.app.assessment import series
+from bayesdist.app.kinds.fitted import read_tables
 from bayesdist.data import read_exposures, read_matches
 from bayesdist.infer import load_posterior
 from bayesdist.infer.nodes import NodeGrid

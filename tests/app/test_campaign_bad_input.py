@@ -12,7 +12,7 @@ from astropy.io import fits
 from astropy.table import Table, vstack
 from astropy.time import Time
 
-from bayesdist.app.campaign.input_validation import frames_not_set, shear_warnings
+from bayesdist.app.kinds.campaign.input_validation import frames_not_set, shear_warnings
 from bayesdist.app.results import results_of
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches

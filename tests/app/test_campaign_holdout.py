@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.app.campaign.fit import fit_campaign
-from bayesdist.app.campaign.inputs import read_campaign
-from bayesdist.app.campaign.matching import match_lists
 from bayesdist.app.config import load_config
+from bayesdist.app.kinds.campaign.fit import fit_campaign
+from bayesdist.app.kinds.campaign.inputs import read_campaign
+from bayesdist.app.kinds.campaign.matching import match_lists
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.pipeline import diagnose
 from bayesdist.app.results import open_results, results_of

@@ -94,7 +94,7 @@ class Forked:
 def _in_short(arguments: list[str]) -> None:
     """The command without figures, and without tests of each term of a campaign against time."""
     from bayesdist.app import run
-    from bayesdist.app.exposures import series
+    from bayesdist.app.assessment import series
 
     run.report = lambda results, pdf: []
     series._verdict = lambda exposures, k, *options: {

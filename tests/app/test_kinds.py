@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from bayesdist.app.config import load_config
-from bayesdist.app.kind import kind_of
 from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.reader import StarReader
-from bayesdist.app.kinds.stars import (
+from bayesdist.app.kinds.kind import kind_of
+from bayesdist.app.kinds.matches.stars import (
     fit_stars,
     match_stars,
     read_stars,
     sample_stars,
 )
-from bayesdist.app.kinds.summary import fit_sections
+from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.results import open_results
+from bayesdist.app.saving import fit_sections
 from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import MagnitudeErrors
@@ -70,8 +70,7 @@ def test_a_fit_that_is_read_gives_the_same_stars(data, tmp_path):
     matched = match_stars(read_stars(config, path.parent), config)
     found = fit_stars(matched, config)
     found.save(tmp_path)
-    summary = as_json(fit_sections(found, matched.stars))
-    read = kind_of(config).load_fitted(tmp_path, lambda: matched, config, summary)
+    read = kind_of(config).load_fitted(tmp_path, lambda: matched)
     assert (found.errors.factor > 20) == (not data)
     for made, again in (
         (FitData(matched, found).stars, FitData(matched, read).stars),

@@ -25,7 +25,7 @@ def test_a_script_finds_what_a_run_finds(finished, tmp_path):
     before = snapshot(finished.path.parent)
     config, _ = load_config(finished.config)
     base = finished.config.parent
-    data = fit(match(read(config, base), config, base), config, base)
+    data = fit(match(read(config, base), config), config, base)
     posterior = sample(data, config)
     found = diagnose(posterior, data, config, base)
     errors = error_model(posterior, found, data, config)

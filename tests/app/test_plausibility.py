@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayesdist.app.config import parse_config
-from bayesdist.app.matches.plausibility import doubts_on_stars, refuse_empty_segments
+from bayesdist.app.kinds.matches.plausibility import doubts_on_stars, refuse_empty_segments
 from bayesdist.data import Matches
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence

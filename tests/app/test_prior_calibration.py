@@ -11,7 +11,7 @@ import pytest
 import bayesdist as bd
 from bayesdist.app.config import load_config
 from bayesdist.app.config.model import PriorCalibrationBlock
-from bayesdist.app.kinds.earlier import earlier_calibration
+from bayesdist.app.kinds.matches.earlier import earlier_calibration
 from bayesdist.app.store import Record
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.calibration.calibration import calibration_of
@@ -300,7 +300,7 @@ frame = "shift"
 def test_a_run_goes_by_it(tmp_path):
     """The fit of a configuration, saved and loaded, and the inputs that are recorded."""
     from bayesdist.app.config import parse_config
-    from bayesdist.app.kind import kind_of
+    from bayesdist.app.kinds.kind import kind_of
     from bayesdist.app.kinds.reader import StarReader
     from bayesdist.app.store.inputs import hashes_of
 
@@ -313,12 +313,12 @@ def test_a_run_goes_by_it(tmp_path):
     config = parse_config(CONFIG, "second.toml")
     kind = kind_of(config)
     assert "fit.nc" in hashes_of(config, tmp_path)
-    matched = kind.match(kind.read(config, tmp_path), config, tmp_path)
+    matched = kind.match(kind.read(config, tmp_path), config)
     found = kind.fit(matched, config, tmp_path, StarReader(config.resources()))
     expected = fitted(second, model, earlier(solution, model, frame="shift").loose())
     np.testing.assert_allclose(found.linear.mean, expected.mean, atol=1e-9)
     found.save(tmp_path)
-    again = kind.load_fitted(tmp_path, lambda: matched, config, {})
+    again = kind.load_fitted(tmp_path, lambda: matched)
     np.testing.assert_array_equal(again.priors.joint.precision, found.priors.joint.precision)
 
 

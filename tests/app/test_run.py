@@ -27,7 +27,7 @@ from bayesdist.app.config import CATALOGUE_WORDS, load_config, parse_config
 from bayesdist.app.report import title_of
 from bayesdist.app.screen import progress_bar
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.summary import Summary, schema_text
+from bayesdist.app.store.summary import Summary, schema_text
 from bayesdist.assess.terms.correlated import STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.data import read_matches
 from bayesdist.errors import InputError
@@ -190,7 +190,7 @@ def test_the_summary_has_what_the_design_lists(finished):
 
 def test_the_summary_is_as_its_schema_has_it(finished):
     """The model is that of the JSON Schema in the package, and the file fits it."""
-    there = Path(bayesdist.__file__).parent / "app" / "summary" / "schema.json"
+    there = Path(bayesdist.__file__).parent / "app" / "store" / "schema.json"
     assert there.read_text(encoding="utf-8") == schema_text()
     found = Summary.model_validate(summary_of(finished.path))
     assert (found.kind, found.detector, found.simulated) == ("data", "A", False)

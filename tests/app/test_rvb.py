@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from astropy.table import Table, vstack
 
-from bayesdist.app.matches import reading
+from bayesdist.app.kinds.matches import reading
 from bayesdist.app.store import Record
 from bayesdist.data import open_matches
 from bayesdist.infer import load_fit

@@ -12,9 +12,9 @@ from unittest import mock
 
 import numpy as np
 
-from bayesdist.app.campaign import fit as stage
-from bayesdist.app.campaign.matched import CampaignMatched
 from bayesdist.app.config import load_config
+from bayesdist.app.kinds.campaign import fit as stage
+from bayesdist.app.kinds.campaign.matched import CampaignMatched
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.results import Results, open_results
 from bayesdist.app.run import make_stages

@@ -344,11 +344,11 @@ def _begun_runs(folder: Path) -> Iterator[Input]:
         "inspect": ["inspect", "@/run"],
     }
     for name in ("run.json", "detections.h5", "solution.h5", "fit.nc", "gauge.ecsv",
-                 "matching.ecsv", "magnitude_errors.ecsv"):  # fmt: skip
+                 "matching.ecsv", "fit.h5"):  # fmt: skip
         yield Input(f"begun-selfcal-{name}", "run folders", here, f"run/{name}", commands)
     here = _begun(folder / "campaign", "match", "fit")
-    for name in ("run.json", "pairs/part-00000.parquet", "hierarchy.h5", "exposure_terms.h5",
-                 "fit.nc", "matching.ecsv"):  # fmt: skip
+    for name in ("run.json", "pairs/part-00000.parquet", "fit.h5", "fit.nc",
+                 "matching.ecsv"):  # fmt: skip
         label = Path(name).name
         yield Input(f"begun-campaign-{label}", "run folders", here, f"run/{name}", commands)
     here = _begun(folder / "band", "fit", "sample", "diagnose")

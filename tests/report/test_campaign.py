@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from lxml import html as lxml_html
 
-from bayesdist.app.campaign.checks import campaign_checks, campaign_remarks
-from bayesdist.app.campaign.report import held_parameters
+from bayesdist.app.kinds.campaign.checks import campaign_checks, campaign_remarks
+from bayesdist.app.kinds.campaign.report import held_parameters
 from bayesdist.assess import Misfit
 from bayesdist.diagnose.checks import structure_checks
 from bayesdist.infer import GaussianPriors, fit_linear

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from bayesdist.app.campaign.checks import campaign_checks, campaign_remarks
 from bayesdist.app.config import CATALOGUE_WORDS, Config
-from bayesdist.app.kind import kind_of
+from bayesdist.app.kinds.campaign.checks import campaign_checks, campaign_remarks
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.matches.added_errors import knows_circle
+from bayesdist.app.kinds.kind import kind_of
+from bayesdist.app.kinds.matches.added_errors import knows_circle
 from bayesdist.assess.checks import catalogue_checks, matching_checks, time_checks
 from bayesdist.assess.units import pixel_doubt
 from bayesdist.checks import LARGER, Check

@@ -11,8 +11,8 @@ from bayesdist.app.assessment.holdout import predictive_of_run
 from bayesdist.app.assessment.periods import period_settings
 from bayesdist.app.assessment.settings import assessment_rng, evaluation_settings
 from bayesdist.app.config import Config
-from bayesdist.app.kind import kind_of
 from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.kind import kind_of
 from bayesdist.diagnose.diagnostics import Diagnostics, diagnose, diagnose_fit, hold_out
 from bayesdist.infer import Posterior
 

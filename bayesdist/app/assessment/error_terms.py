@@ -8,15 +8,14 @@ import numpy as np
 
 from bayesdist.app.assessment.settings import assessment_epoch
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.exposures import ExposureScatter
+from bayesdist.app.kinds.errors import ExposureScatter
 from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.fitted import StoredLookupTables
 from bayesdist.app.kinds.matched import Matched
-from bayesdist.app.kinds.table_file import StoredLookupTables
 from bayesdist.assess import pixel_scale_of
 from bayesdist.assess.error_model import ErrorModel, diagnosed_error_model, error_model
-from bayesdist.assess.terms.between_nodes import interpolation_term
 from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorTerm
-from bayesdist.assess.terms.local import LocalErrors
+from bayesdist.assess.terms.local import LocalErrors, interpolation_term
 from bayesdist.assess.terms.parameters import ExposureVariation
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior

@@ -9,7 +9,8 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.assess.error_model import ErrorModel, solution_with_errors
+from bayesdist.assess.adjusted import with_diagnosed_errors
+from bayesdist.assess.error_model import ErrorModel
 from bayesdist.assess.evaluation import EvaluationSettings
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
@@ -42,13 +43,13 @@ def predictive_of_run(
     scatter = data.fitted.scatter
     if scatter is not None:
         return replace(
-            predictive_of(solution_with_errors(posterior, found, data.fit)),
+            predictive_of(with_diagnosed_errors(posterior, found, data.fit)),
             deviations=ExposureDeviations(scatter.kinds, scatter.tau),
             stars=_known_stars(data),
             local=errors.local_tables(settings.grid, settings.epoch),
             cell=_table_cell(data),
         )
-    out = predictive_of(solution_with_errors(posterior, found))
+    out = predictive_of(with_diagnosed_errors(posterior, found))
     rows = None if found.correlated is None else found.correlated.facts.get("structure")
     if not rows:
         return out

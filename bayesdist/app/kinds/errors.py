@@ -1,29 +1,23 @@
-"""The errors of the stars as a fit took them: one value for fitted and held-out stars alike."""
+"""Errors of stars as a fit took them, and the scatter of exposures that were fitted jointly."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import numpy as np
-from astropy.table import Table
+from numpy.typing import NDArray
 
-from bayesdist.app.tables.output import write_table
-from bayesdist.data.added_errors import AddedErrors
-from bayesdist.data.magnitude_errors import MagnitudeErrors
+from bayesdist.data.magnitude_errors import AddedErrors, MagnitudeErrors
 from bayesdist.data.matches import Matches
-from bayesdist.reading.faults import restoring
-from bayesdist.reading.tables import read_ecsv
+from bayesdist.infer import Posterior
+from bayesdist.infer.exposures.chip_offsets import Settling
 
-__all__ = ["QUOTED", "ErrorLaw", "read_magnitude_errors"]
-
-MAGNITUDE_ERRORS = "magnitude_errors.ecsv"
-COLUMNS = ("mag", "sigma_u", "sigma_v", "n", "scatter_u", "scatter_v")
+__all__ = ["QUOTED", "ErrorLaw", "ExposureScatter"]
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorLaw:
-    """Law by which errors of stars follow from those that their table quotes.
+    """Law by which errors of stars, fitted or held out, follow from those that their table quotes.
 
     Parameters
     ----------
@@ -52,22 +46,30 @@ class ErrorLaw:
             matches if self.added is None else matches.with_errors(self.added, in_quadrature=True)
         )
 
-    def save(self, folder: Path) -> None:
-        """Write the errors by magnitude; the rest is in the summary of the fit."""
-        errors = self.by_magnitude
-        if errors is not None:
-            table = Table({name: getattr(errors, name) for name in COLUMNS})
-            write_table(table, folder / MAGNITUDE_ERRORS)
-
 
 QUOTED = ErrorLaw()
 
 
-def read_magnitude_errors(folder: Path) -> MagnitudeErrors | None:
-    """Errors by magnitude in a run's folder; None where there are none."""
-    path = folder / MAGNITUDE_ERRORS
-    if not path.exists():
-        return None
-    with restoring(path, "a table of errors by magnitude", do="run the stage 'fit' again"):
-        table = read_ecsv(path)
-        return MagnitudeErrors(**{name: np.asarray(table[name], float) for name in COLUMNS})
+@dataclass(frozen=True, eq=False)
+class ExposureScatter:
+    """Scatter of the linear terms of exposures about those of the model.
+
+    Parameters
+    ----------
+    kinds : tuple of str
+        Kinds of deviation.
+    tau : ndarray, shape (n, k)
+        Draws of the scatter of each kind.
+    offsets : Settling
+        How the constant terms of chips follow from the shifts of single chips.
+    """
+
+    kinds: tuple[str, ...]
+    tau: NDArray[np.float64]
+    offsets: Settling
+
+    def averaged(self, posterior: Posterior, rng: np.random.Generator) -> Posterior:
+        """The posterior with the chips where the exposures have them on average."""
+        some = self.tau[rng.integers(len(self.tau), size=len(posterior.flat))]
+        theta = self.offsets.draws(posterior.flat, some, rng).reshape(posterior.theta.shape)
+        return replace(posterior, theta=theta)

@@ -2,46 +2,89 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.app.kinds.errors import ErrorLaw, read_magnitude_errors
-from bayesdist.app.kinds.exposures import (
-    FIT_AGAIN,
-    ExposureScatter,
-    read_hierarchy,
-    read_series,
-    write_hierarchy,
-    write_series,
-)
+from bayesdist.app.kinds.errors import ErrorLaw, ExposureScatter
 from bayesdist.app.kinds.solved import SelfCalibrated
-from bayesdist.app.kinds.table_file import StoredLookupTables, read_tables, write_tables
-from bayesdist.app.matches.added_errors import grouped_errors_of
+from bayesdist.app.store.output import write_table
 from bayesdist.data.matches import Matches
+from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, LinearFit, load_fit, save_fit
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
-from bayesdist.infer.equations.priors import JointPrior
 from bayesdist.infer.nodes import corrected_matches, inside_chips, on_the_chips
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.series import Series
-from bayesdist.model import DistortionModel
+from bayesdist.model import LookupTable
+from bayesdist.reading.faults import restoring
+from bayesdist.records import record_from_arrays, record_to_arrays
 
-__all__ = ["Fitted", "load_fitted", "required"]
+__all__ = [
+    "Fitted",
+    "StoredLookupTables",
+    "load_errors",
+    "load_fitted",
+    "read_tables",
+    "required",
+    "write_tables",
+]
 
-FIT, TABLES, PRIOR = "fit.nc", "tables.h5", "prior.h5"
-
-SECTIONS = (  # of summary.json, which only the making of the fit knows
-    *("gauge", "lines", "tables", "scatter"),
-    *("deviations", "exposures_skipped", "exposures_outlying", "selfcal"),
-)
-
+Float = NDArray[np.float64]
 T = TypeVar("T")
+
+FIT, PARTS, TABLES, MAGNITUDE_ERRORS = "fit.nc", "fit.h5", "tables.h5", "magnitude_errors.ecsv"
+RESTS_ON = ("errors", "priors", "grouped", "scatter", "alone", "facts")  # what fit.h5 holds
+FIT_AGAIN = "run the stage 'fit' again"
+
+
+@dataclass(frozen=True, eq=False)
+class StoredLookupTables:
+    """Look-up tables of a run, with their errors.
+
+    Parameters
+    ----------
+    tables : tuple of LookupTable
+        The detector's first.
+    position_sigma : mapping of int to ndarray, shape (ny, nx, 2)
+        By chip: errors of positions by those of all tables, in the unit of u, v.
+    between : mapping of int to BetweenNodes
+        By chip, where it has been measured: what all tables leave between their nodes.
+    """
+
+    tables: tuple[LookupTable, ...] = ()
+    position_sigma: Mapping[int, Float] = field(default_factory=dict)
+    between: Mapping[int, BetweenNodes] = field(default_factory=dict)
+
+
+def write_tables(path: Path, stored: StoredLookupTables) -> None:
+    """Write look-up tables to a file; without tables there is none."""
+    if stored.tables:
+        write_arrays(path, "", record_to_arrays(stored))
+    else:
+        path.unlink(missing_ok=True)
+
+
+def read_tables(path: Path, *, do: str) -> StoredLookupTables:
+    """Read what `write_tables` wrote; nothing where there is no file.
+
+    Raises
+    ------
+    InputError
+        For a damaged file, with `do` as the advice.
+    """
+    if not path.exists():
+        return StoredLookupTables()
+    arrays = read_arrays(path, "", do=do)
+    with restoring(path, "a file of look-up tables", do=do):
+        found: StoredLookupTables = record_from_arrays(arrays, StoredLookupTables)
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,71 +146,44 @@ class Fitted:
     def save(self, folder: Path) -> None:
         """Write the files of a run's folder that belong to it."""
         write_tables(folder / TABLES, self.tables)
-        self.errors.save(folder)
+        if self.errors.by_magnitude is not None:
+            write_table(Table(vars(self.errors.by_magnitude)), folder / MAGNITUDE_ERRORS)
         save_fit(self.linear, folder / FIT)
-        if self.scatter is not None:
-            write_hierarchy(folder, self.scatter, self.priors)
-        if self.priors.joint is not None:
-            joint = self.priors.joint
-            arrays = {"centre": joint.centre, "precision": joint.precision}
-            write_arrays(folder / PRIOR, "", arrays | {"rank": np.array([joint.rank])})
-        if self.alone is not None:
-            write_series(folder, self.alone)
+        parts = {name: getattr(self, name) for name in RESTS_ON}
+        write_arrays(folder / PARTS, "", record_to_arrays(parts))
         if self.solved is not None:
             self.solved.save(folder)
 
 
-def load_fitted(
-    folder: Path,
-    summary: Mapping[str, Any],
-    *,
-    joint: bool = False,
-    priors: Callable[[DistortionModel], GaussianPriors] = GaussianPriors.none,
-    solved: Callable[[DistortionModel], SelfCalibrated] | None = None,
-) -> Fitted:
-    """The fit of an earlier stage.
+def load_fitted(folder: Path) -> Fitted:
+    """The fit of an earlier stage, but for the solution of detections.
 
     Parameters
     ----------
     folder : Path
         Of the run.
-    summary : mapping
-        Content of summary.json.
-    joint : bool
-        Exposures were fitted jointly.
-    priors : callable
-        Of the model, where they were not.
-    solved : callable, optional
-        Of the model: the solution of detections, where the fit has one.
 
     Raises
     ------
     InputError
         For missing or damaged files.
     """
-    linear, known = load_fit(folder / FIT), summary.get("fit", {})
-    grouped = grouped_errors_of(known.get("added_errors"))
-    scatter, own_priors = read_hierarchy(folder) if joint else (None, priors(linear.model))
-    if (folder / PRIOR).exists():
-        arrays = read_arrays(folder / PRIOR, "", do=FIT_AGAIN)
-        earlier = JointPrior(arrays["centre"], arrays["precision"], int(arrays["rank"][0]))
-        own_priors = replace(own_priors, joint=earlier)
-    return Fitted(
-        linear,
-        ErrorLaw(
-            float(known.get("error_scale", 1.0)),
-            read_magnitude_errors(folder),
-            None if grouped is None else grouped.added,
-            with_catalogue=joint,
-        ),
-        own_priors,
-        grouped,
-        read_tables(folder / TABLES, do=FIT_AGAIN),
-        scatter,
-        read_series(folder) if joint else None,
-        None if solved is None else solved(linear.model),
-        {name: summary[name] for name in SECTIONS if name in summary},
-    )
+    tables = read_tables(folder / TABLES, do=FIT_AGAIN)
+    return Fitted(load_fit(folder / FIT), tables=tables, **_read_parts(folder))
+
+
+def load_errors(folder: Path) -> ErrorLaw:
+    """The errors of the stars of an earlier fit; InputError as `load_fitted`."""
+    errors: ErrorLaw = _read_parts(folder)["errors"]
+    return errors
+
+
+def _read_parts(folder: Path) -> dict[str, Any]:
+    """What a fit rests on, by name."""
+    arrays = read_arrays(folder / PARTS, "", do=FIT_AGAIN)
+    with restoring(folder / PARTS, "what a fit rests on", do=FIT_AGAIN):
+        found = record_from_arrays(arrays, dict)
+        return {name: found[name] for name in RESTS_ON}
 
 
 def required(part: T | None, what: str) -> T:

@@ -11,8 +11,8 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.app.kinds.exposures import ExposureScatter
-from bayesdist.app.tables.output import write_table
+from bayesdist.app.kinds.errors import ExposureScatter
+from bayesdist.app.store.output import write_table
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matches import Matches

@@ -10,7 +10,7 @@ from typing import Any
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.app.tables.output import write_table
+from bayesdist.app.store.output import write_table
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matches import Matches
 from bayesdist.infer.sampler.checkpoints import write_arrays

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from bayesdist.app.store.keys import Adjustable, differences
-from bayesdist.app.store.record import Artefact, Record, as_json, versions, write_json
+from bayesdist.app.store.keys import Adjustable, as_json, differences
+from bayesdist.app.store.record import Artefact, Record, versions, write_json
 from bayesdist.app.store.store import ArtefactStore, Made, Stage
 
 __all__ = [

@@ -1,18 +1,17 @@
-"""Keys of artefacts: a hash of what each was made from."""
+"""Values as plain JSON, and keys of artefacts: a hash of what each was made from."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, is_dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
+from pydantic_core import to_jsonable_python
 
-__all__ = ["Adjustable", "canonical", "difference", "differences", "digest_of", "shown"]
+__all__ = ["Adjustable", "as_json", "difference", "differences", "digest_of", "shown"]
 
 
 @dataclass(frozen=True)
@@ -22,39 +21,32 @@ class Adjustable:
     value: Any
 
 
-def canonical(value: Any) -> Any:
-    """A value as JSON, the same for values that are equal; TypeError for unknown content.
+def as_json(value: Any) -> Any:
+    """A value as plain JSON: null for what is not a finite number; TypeError for unknown content.
 
     Settings, dataclasses, arrays, paths, and mappings and sequences of these become mappings,
     lists, text, numbers and None.
     """
-    if isinstance(value, Adjustable):
-        return canonical(value.value)
-    if isinstance(value, BaseModel):
-        return canonical(value.model_dump())
-    if is_dataclass(value) and not isinstance(value, type):
-        return {one.name: canonical(getattr(value, one.name)) for one in fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): canonical(one) for key, one in value.items()}
+    return to_jsonable_python(value, inf_nan_mode="null", fallback=_plain)
+
+
+def _plain(value: Any) -> Any:
+    """What pydantic does not know, as lists, numbers and dictionaries."""
     if isinstance(value, np.ndarray | np.generic):
-        return canonical(value.tolist())
-    if isinstance(value, list | tuple):
-        return [canonical(one) for one in value]
-    if isinstance(value, Path):
-        return str(value)
-    if value is None or isinstance(value, str | bool | int | float):
-        return value
-    raise TypeError(f"{type(value).__name__} has no canonical form and cannot be in a key")
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return dict(value)
+    raise TypeError(f"{type(value).__name__} is no JSON and cannot be in a record or a key")
 
 
 def digest_of(value: Any) -> str:
-    """SHA-256 of a value's canonical form: 64 hexadecimal digits."""
-    text = json.dumps(canonical(value), sort_keys=True, separators=(",", ":"))
+    """SHA-256 of a value as plain JSON: 64 hexadecimal digits."""
+    text = json.dumps(as_json(value), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def differences(known: Any, now: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Dotted path, old and new value of whatever differs between two canonical values.
+    """Dotted path, old and new value of whatever differs between two values of plain JSON.
 
     Mappings are compared key by key, lists of equal length row by row where they hold mappings.
     """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import platform
 import sys
 from collections.abc import Mapping
@@ -11,36 +10,20 @@ from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 from pydantic_core import to_json
 
-from bayesdist.app.store.keys import digest_of
-from bayesdist.app.summary import Sections
+from bayesdist.app.store.keys import as_json, digest_of
+from bayesdist.app.store.summary import Sections
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path, sha256_of
 from bayesdist.reading.documents import model_of, read_json
 from bayesdist.version import __version__
 
-__all__ = ["SCHEMA", "Artefact", "FileMark", "Record", "as_json", "versions", "write_json"]
+__all__ = ["SCHEMA", "Artefact", "FileMark", "Record", "versions", "write_json"]
 
 SCHEMA = 2
 PACKAGES = ("arviz-stats", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
-
-
-def as_json(value: Any) -> Any:
-    """A value as plain JSON: arrays as lists, and null for what is not a finite number."""
-    if isinstance(value, Mapping):
-        return {str(k): as_json(v) for k, v in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [as_json(v) for v in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Path):
-        return str(value)
-    return value
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -23,7 +23,7 @@ from bayesdist.app.store.refusals import (
     refuse_inside_input,
     refuse_other_inputs,
 )
-from bayesdist.app.summary import head_of
+from bayesdist.app.store.summary import head_of
 from bayesdist.assess import Requirement
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.files import atomic_path, made_folder, remove_leftovers

@@ -12,14 +12,13 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Generic, TypeVar
 
-from bayesdist.app.store.keys import Adjustable, canonical, difference, digest_of
+from bayesdist.app.store.keys import Adjustable, as_json, difference, digest_of
 from bayesdist.app.store.lock import locked
 from bayesdist.app.store.record import (
     SCHEMA,
     Artefact,
     FileMark,
     Record,
-    as_json,
     json_text,
     write_text,
 )
@@ -147,7 +146,7 @@ class ArtefactStore:
         parts: dict[str, Any] = {"revision": self.stages[name].revision, "from": made}
         for one in made_from:
             if not isinstance(one, Made):
-                parts |= canonical(one)
+                parts |= as_json(one.value if isinstance(one, Adjustable) else one)
         return parts
 
     def harmed(self, artefact: Artefact, *, thorough: bool) -> str:
@@ -180,7 +179,7 @@ class ArtefactStore:
         """The artefact of a stage, which is made unless it stands; with `force` also where it does.
 
         `function` writes files into the folder, and sections by `summarise`; `made_from` are
-        `Made`, and mappings whose values have a canonical form.
+        `Made`, and mappings that can be plain JSON.
         """
         parts, record = self._parts(name, made_from), self.record
         key, known = digest_of(parts), record.artefacts.get(name)

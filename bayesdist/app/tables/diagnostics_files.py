@@ -16,7 +16,6 @@ from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.errors import InputError, required
 from bayesdist.infer import LinearFit, Posterior
-from bayesdist.infer.catalogue.star_errors import StarCovariance
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.reading.faults import restoring
 from bayesdist.records import record_from_arrays, record_to_arrays
@@ -24,7 +23,6 @@ from bayesdist.records import record_from_arrays, record_to_arrays
 __all__ = ["fingerprint_of", "load_diagnostics", "write_diagnostics"]
 
 CORRELATED = "discrepancy.h5"
-CATALOGUE = "catalogue_errors.h5"
 OTHERS = "diagnostics.h5"
 
 log = logging.getLogger("bayesdist")
@@ -46,9 +44,7 @@ def write_diagnostics(
     correlated = required(found.correlated, "correlated errors are diagnosed of a posterior only")
     arrays, facts = discrepancy_to_arrays(correlated)
     write_arrays(run / CORRELATED, fingerprint, arrays)
-    if found.catalogue is not None:
-        _save_catalogue(run, fingerprint, found.catalogue)
-    others = replace(found, correlated=None, catalogue=None)
+    others = replace(found, correlated=None)
     write_arrays(run / OTHERS, fingerprint, record_to_arrays(others))
     run.summarise(
         discrepancy=facts,
@@ -82,27 +78,7 @@ def load_diagnostics(run: RunDirectory, fit: LinearFit, posterior: Posterior) ->
         others = record_from_arrays(found, Diagnostics)
     with restoring(run / CORRELATED, "correlated errors", do=again):
         correlated = discrepancy_from_arrays(posterior.model, arrays)
-        return replace(
-            others,
-            correlated=replace(correlated, facts=facts),
-            catalogue=_load_catalogue(run, fingerprint),
-        )
-
-
-def _save_catalogue(run: RunDirectory, fingerprint: str, stars: StarCovariance) -> None:
-    motions = np.empty((0, 0)) if stars.motions is None else stars.motions
-    arrays = {"total": stars.total, "counted": stars.counted, "motions": motions}
-    write_arrays(run / CATALOGUE, fingerprint, arrays)
-
-
-def _load_catalogue(run: RunDirectory, fingerprint: str) -> StarCovariance | None:
-    if not (run / CATALOGUE).exists():
-        return None
-    names = ("total", "counted", "motions")
-    arrays = read_arrays(run / CATALOGUE, fingerprint, names, do="run the stage 'diagnose' again")
-    if not arrays["motions"].size:
-        del arrays["motions"]
-    return StarCovariance(**arrays)
+        return replace(others, correlated=replace(correlated, facts=facts))
 
 
 def _row(test: ScoreTest) -> dict[str, Any]:

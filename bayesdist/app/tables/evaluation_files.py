@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.store.output import provenance_notes, write_table
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.diagnostics_files import fingerprint_of
 from bayesdist.app.tables.margins import margin_rows, margin_table
-from bayesdist.app.tables.output import provenance_notes, write_table
 from bayesdist.assess import Margin
 from bayesdist.assess.budget.budget import ErrorBudget
 from bayesdist.assess.coefficients import coefficient_table

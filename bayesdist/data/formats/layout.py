@@ -12,9 +12,9 @@ import numpy as np
 from bayesdist.data.formats.files import input_files, kind_of
 from bayesdist.data.reading.columns import needed_columns
 from bayesdist.data.reading.table import own_epoch, with_sky_columns
+from bayesdist.data.tables.column import Columns
 from bayesdist.data.tables.names import origin_of
 from bayesdist.data.tables.parquet import describe_part
-from bayesdist.data.tables.quantities import Columns
 from bayesdist.reading.tables import read_table
 
 __all__ = ["TableLayout", "table_layout"]

@@ -15,9 +15,8 @@ from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky.positions import SKY_QUANTITIES, reference_sky
 from bayesdist.data.sky.tangent import onto_plane
 from bayesdist.data.tables.checks import refuse_half
-from bayesdist.data.tables.column import SourceColumn, year_of
+from bayesdist.data.tables.column import Quantities, SourceColumn, year_of
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
-from bayesdist.data.tables.quantities import Quantities
 from bayesdist.data.tables.units import check_unit
 from bayesdist.errors import InputError
 

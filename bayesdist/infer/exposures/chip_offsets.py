@@ -14,7 +14,7 @@ breaks.  No predicted position of any exposure changes by this.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -134,28 +134,3 @@ class Settling:
             z = rng.standard_normal((len(out), len(place.constants)))
             place.moved(out, tau[:, [place.kind]] * z @ root.T)
         return out
-
-    def to_arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Arrays by name, for a file."""
-        return {
-            f"settling.{k}.{name}": np.asarray(getattr(place, name))
-            for k, place in enumerate(self.places)
-            for name in ("kind", "constants", "shifts", "design", "used")
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> Settling:
-        """Transformation from the arrays of `to_arrays`, among which may be others."""
-        places: list[_Place] = []
-        while f"settling.{len(places)}.kind" in arrays:
-            of = f"settling.{len(places)}."
-            places.append(
-                _Place(
-                    int(arrays[of + "kind"].item()),
-                    arrays[of + "constants"].astype(np.int64),
-                    arrays[of + "shifts"].astype(np.int64),
-                    arrays[of + "design"].astype(float),
-                    arrays[of + "used"].astype(bool),
-                )
-            )
-        return cls(tuple(places))

@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesdist.app.commands.on_files.calibrations import calibration_at, images_of, notes_of
 from bayesdist.app.screen import number
-from bayesdist.app.tables.output import refuse_existing
+from bayesdist.app.store.output import refuse_existing
 from bayesdist.calibration.area import PixelAreaMap, pixel_area_map
 from bayesdist.calibration.subarray import FULL
 from bayesdist.errors import InputError

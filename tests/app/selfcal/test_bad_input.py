@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from astropy.table import Table, vstack
 
-from bayesdist.app.selfcal.matching import refuse_unconnected
+from bayesdist.app.kinds.selfcal.matching import refuse_unconnected
 from bayesdist.errors import InputError
 from tests.app.selfcal.support import list_table, small, write_selfcal
 from tests.app.support import cli, one_sentence, refused

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.app.selfcal.inputs import read_commanded
+from bayesdist.app.kinds.selfcal.inputs import read_commanded
 from bayesdist.errors import InputError
 
 

@@ -11,8 +11,8 @@ from astropy.table import Table
 from astropy.wcs import WCS
 from scipy import stats
 
-from bayesdist.app.selfcal.stars import star_table
-from bayesdist.app.tables.output import write_table
+from bayesdist.app.kinds.selfcal.stars import star_table
+from bayesdist.app.store.output import write_table
 from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.infer import load_fit
 from bayesdist.infer.selfcal import star_catalogue

@@ -13,10 +13,10 @@ from scipy import stats
 
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.selfcal.fit import fit_selfcal
+from bayesdist.app.kinds.selfcal.inputs import read_selfcal
+from bayesdist.app.kinds.selfcal.matching import match_dithers
 from bayesdist.app.results import results_of
-from bayesdist.app.selfcal.fit import fit_selfcal
-from bayesdist.app.selfcal.inputs import read_selfcal
-from bayesdist.app.selfcal.matching import match_dithers
 from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer import load_fit, load_posterior

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 from bayesdist.app.store import Record
 from bayesdist.app.store.keys import digest_of
 from bayesdist.app.store.record import SCHEMA
-from bayesdist.app.summary import Summary
+from bayesdist.app.store.summary import Summary
 from bayesdist.errors import InputError
 from bayesdist.reading.documents import model_of
 

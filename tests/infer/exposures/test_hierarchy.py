@@ -18,6 +18,7 @@ from bayesdist.infer.exposures.scatter import Scatter
 from bayesdist.infer.transforms import lines, reference_gauge
 from bayesdist.model import FRAME_KINDS
 from bayesdist.model.frames import CHIP_DEVIATIONS
+from bayesdist.records import record_from_arrays, record_to_arrays
 from tests.reduced import case_in_full
 
 from ..small_campaign import LINEAR, campaign, campaign_model, seen_by, true_lines
@@ -439,7 +440,7 @@ def test_settling_moves_no_star():
     names = np.array(model.names)
     shifts = still[:, [k for k, n in enumerate(names) if n.endswith("WFC1.shift_v")]]
     np.testing.assert_allclose(shifts.mean(axis=1), 0.0, atol=1e-12)
-    again = type(found.settling).from_arrays(found.settling.to_arrays())
+    again = record_from_arrays(record_to_arrays(found.settling))
     np.testing.assert_array_equal(again.mean(theta), still)
 
 

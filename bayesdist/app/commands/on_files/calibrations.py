@@ -11,7 +11,7 @@ from pydantic import TypeAdapter
 from bayesdist.app.products.made_files import further_errors
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.summary import Summary
+from bayesdist.app.store.summary import Summary
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.calibration.subarray import Subarray, subarray_at_corner, subarrays_of_image

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from bayesdist.app.commands.on_files.calibrations import calibration_at, on_the_sky
 from bayesdist.app.screen import number as digits
-from bayesdist.app.tables.output import refuse_existing
+from bayesdist.app.store.output import refuse_existing
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC

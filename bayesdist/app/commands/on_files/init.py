@@ -13,9 +13,9 @@ import numpy as np
 from bayesdist.app.commands.on_files.init_columns import column_lines, guessed_sigma, quoted
 from bayesdist.app.config import parse_config
 from bayesdist.app.config.data import data_sections
-from bayesdist.app.matches.reading import load_matches
-from bayesdist.app.matches.sources import mission_template
-from bayesdist.app.tables.output import refuse_existing
+from bayesdist.app.kinds.matches.reading import load_matches
+from bayesdist.app.kinds.matches.sources import mission_template
+from bayesdist.app.store.output import refuse_existing
 from bayesdist.data import FORMATS, Matches
 from bayesdist.data.formats.files import mission_formats
 from bayesdist.data.formats.layout import TableLayout, table_layout

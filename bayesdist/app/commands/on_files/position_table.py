@@ -10,7 +10,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.app.tables.output import refuse_existing
+from bayesdist.app.store.output import refuse_existing
 from bayesdist.calibration.apply import Positions
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path

@@ -10,8 +10,8 @@ from bayesdist.app.assessment.checks import in_circle
 from bayesdist.app.assessment.settings import idle_dates
 from bayesdist.app.config import Config, load_config
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.matches.added_errors import grouping_sentence
-from bayesdist.app.matches.plausibility import doubts_on_stars
+from bayesdist.app.kinds.matches.added_errors import grouping_sentence
+from bayesdist.app.kinds.matches.plausibility import doubts_on_stars
 from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results, open_results
 from bayesdist.app.screen import number
@@ -42,7 +42,7 @@ def check(path: str | Path) -> str:
         run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
     with open_results(run) as results:
         rehearsed = rehearse(results)
-        lines = results.kind.lines(rehearsed.inputs, config) or _lines(rehearsed)
+        lines = results.kind.lines(rehearsed.inputs) or _lines(rehearsed)
         return "\n".join(lines)
 
 

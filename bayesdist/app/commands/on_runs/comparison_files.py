@@ -8,7 +8,7 @@ from typing import Any
 
 from astropy.table import Table, vstack
 
-from bayesdist.app.tables.output import record_folder, write_table
+from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.assess.comparison.compare import Comparison
 from bayesdist.assess.comparison.gap import GapDifference
 from bayesdist.assess.comparison.sentences import gap_verdict, verdict

@@ -10,13 +10,13 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.commands.on_runs.comparison_files import joined
+from bayesdist.app.commands.on_runs.new_exposures import fit_exposures_of, read_new_exposures
 from bayesdist.app.config import Config, load_config
-from bayesdist.app.exposures.monitoring import fit_exposures_of, read_new_exposures
-from bayesdist.app.kinds.errors import read_magnitude_errors
-from bayesdist.app.matches.sources import read_configured
+from bayesdist.app.kinds.fitted import load_errors
+from bayesdist.app.kinds.matches.sources import read_configured
 from bayesdist.app.results import results_of
+from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.tables.output import record_folder, write_table
 from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_late
 from bayesdist.assess.comparison.tables import comparison_table, difference_table
 from bayesdist.assess.units import convert, pixel_scale_of
@@ -141,7 +141,7 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
     matches = read_configured(path, data, size=size, chips=config.chip)
     if data.sigma != "by_magnitude":
         return matches
-    errors = read_magnitude_errors(run.path)
+    errors = load_errors(run.path).by_magnitude
     if errors is None:
         raise InputError(
             "errors by magnitude are asked for, and the run has measured none",

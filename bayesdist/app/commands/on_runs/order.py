@@ -15,17 +15,16 @@ from bayesdist.app.config import Config, load_config
 from bayesdist.app.kinds.errors import QUOTED
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.matched import Matched
-from bayesdist.app.kinds.stars import fit_stars, model_of, shards_of
+from bayesdist.app.kinds.matches.stars import fit_stars, model_of, shards_of
 from bayesdist.app.results import Results, open_results
 from bayesdist.app.screen import table_text
+from bayesdist.app.store.output import refuse_existing, write_table
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.tables.output import refuse_existing, write_table
 from bayesdist.data import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.files import atomic_path
 from bayesdist.infer import Shards
-from bayesdist.infer.compare.one_frame import in_one_frame
-from bayesdist.infer.compare.order import select_order
+from bayesdist.infer.compare.order import in_one_frame, select_order
 from bayesdist.infer.compare.order_result import OrderSelection
 from bayesdist.infer.linear import Rejection
 from bayesdist.model import DistortionModel
@@ -86,7 +85,7 @@ def _selected(
 ) -> tuple[OrderSelection, dict[int, str]]:
     """The comparison, and why the orders above those compared cannot be fitted."""
     failed: dict[int, str] = {}
-    matched = results.kind.match(results.inputs, results.config, results.base)
+    matched = results.kind.match(results.inputs, results.config)
     for top in sorted(orders, reverse=True):
         try:
             return _compared(results, matched, range(min(orders), top + 1), chip), failed

@@ -13,7 +13,7 @@ from bayesdist.app.config import config_of_record
 from bayesdist.app.report import title_of
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.summary import head_of
+from bayesdist.app.store.summary import head_of
 from bayesdist.numbers import with_mas
 from bayesdist.report.overview import OverviewRow, write_overview
 

@@ -11,7 +11,7 @@ from astropy.table import Table
 
 from bayesdist.app.commands.patterns.config import PlanConfig, load_plan
 from bayesdist.app.screen import table_text
-from bayesdist.app.tables.output import record_folder, write_table
+from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.assess.planning.dithers import KINDS, PlannedPattern, compare_patterns
 from bayesdist.assess.planning.words import lacking, nearly_free
 

@@ -11,8 +11,8 @@ from astropy.table import Table
 from bayesdist.app.commands.on_files.calibrations import calibration_at
 from bayesdist.app.results import open_results
 from bayesdist.app.screen import table_text
+from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.tables.output import record_folder, write_table
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
 from bayesdist.missions.acs.handbook.numbers import detector_numbers

@@ -8,7 +8,7 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 
 from bayesdist.app.screen import table_text
-from bayesdist.app.tables.output import record_folder
+from bayesdist.app.store.output import record_folder
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bands.context import BandsInput
 from bayesdist.missions.wise.bands.findings import overview_table, verdict

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.tables.output import write_table
+from bayesdist.app.store.output import write_table
 from bayesdist.missions.wise.assess.account import RowAccount
 from bayesdist.missions.wise.assess.histograms import ResidualHistogram
 from bayesdist.missions.wise.assess.published import HEADS

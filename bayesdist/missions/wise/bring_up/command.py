@@ -10,7 +10,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.screen import table_text
-from bayesdist.app.tables.output import record_folder, write_table
+from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.data.detections import Detections
 from bayesdist.data.tables.column import SourceColumn, row_number
 from bayesdist.data.tables.names import find_columns

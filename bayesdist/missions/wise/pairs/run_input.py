@@ -8,8 +8,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from bayesdist.app.matches.reading import is_large
-from bayesdist.app.matches.sources import MatchSource
+from bayesdist.app.kinds.matches.reading import is_large
+from bayesdist.app.kinds.matches.sources import MatchSource
 from bayesdist.app.store.rundir import PAIRS, RunDirectory, part_files
 from bayesdist.data import Matches, open_matches, write_partitioned
 from bayesdist.errors import InputError

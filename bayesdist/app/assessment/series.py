@@ -1,0 +1,145 @@
+"""Linear terms against time: what the exposures show, and what may be predicted."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.config import Config
+from bayesdist.app.kinds.fitted import Fitted, required
+from bayesdist.app.store.output import write_table
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.errors import DegenerateError
+from bayesdist.infer.series import Series, SeriesPosterior, TrendModel, describe, fit_series
+
+__all__ = ["write_series_tables"]
+
+log = logging.getLogger("bayesdist")
+
+N_EPOCHS = 25  # epochs at which the drift is tabulated
+MAX_SWEEPS = 6000  # chips that scatter nearly alike make slow chains
+MIN_EXPOSURES = 8  # exposures below which nothing is said of time
+
+
+def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> None:
+    """Write series.ecsv and drift.ecsv, and a section of summary.json.
+
+    Parameters
+    ----------
+    run : RunDirectory
+    fitted : Fitted
+        With exposures that were each fitted alone.
+    config : Config
+    """
+    series = required(fitted.alone, "fits of single exposures")
+    time, seed = fitted.linear.model.time, config.sampler.seed
+    if time is None or len(series.names) < MIN_EXPOSURES:
+        return
+    trend = TrendModel("lines" if time.breaks else "line", time.breaks, reference=time.epoch0)
+    try:
+        posterior = fit_series(series, trend, seed=seed, max_sweeps=MAX_SWEEPS)
+    except DegenerateError as error:
+        if config.has_free_rates:
+            raise
+        log.info("diagnose: no drift from these exposures alone: %s", error.cause)
+        return
+    write_table(_exposures(series, posterior), run / "series.ecsv")
+    write_table(_predictions(posterior), run / "drift.ecsv")
+    outlying = [
+        name for name, p in zip(series.names, posterior.outlier_probability, strict=True) if p > 0.5
+    ]
+    verdicts = [_verdict(series, k, time.breaks, seed) for k in range(len(series.coefficients))]
+    run.summarise(
+        time_dependence={
+            "converged": posterior.convergence.converged,
+            "lines": _lines(posterior),
+            "scatter": dict(
+                zip(
+                    series.coefficients,
+                    posterior.scatter_sigma.mean(axis=0).tolist(),
+                    strict=True,
+                )
+            ),
+            "outlying_exposures": outlying,
+            "warnings": list(_disagreements(fitted.facts["exposures_outlying"], outlying)),
+            "breaks": _changes(posterior),
+            "verdicts": verdicts,
+        }
+    )
+    for row in verdicts:
+        log.info("diagnose: %s: %s", row["term"], row["claim"])
+
+
+def _disagreements(known: Sequence[str], outlying: Sequence[str]) -> Iterator[str]:
+    """Where the exposures alone and the joint fit, which knows of outlying ones, disagree."""
+    missed = [name for name in outlying if name not in known]
+    if missed:
+        yield (
+            f"{', '.join(missed)}, each fitted alone, {'lie' if len(missed) > 1 else 'lies'} off "
+            "the trend of the others, and the joint fit counts them as scatter"
+        )
+
+
+def _verdict(series: Series, k: int, breaks: tuple[float, ...], seed: int) -> dict[str, object]:
+    """Which trend one term takes, by held-out exposures."""
+    verdict = describe(series.only(series.coefficients[k]), breaks=breaks, seed=seed)
+    return {"term": series.coefficients[k], "claim": verdict.claim, "text": verdict.text}
+
+
+def _lines(posterior: SeriesPosterior) -> list[dict[str, object]]:
+    alpha, beta = posterior.alpha, posterior.beta
+    return [
+        {
+            "segment": s,
+            "term": name,
+            "epoch0": float(posterior.reference[s]),
+            "alpha": float(alpha[:, s, k].mean()),
+            "sigma_alpha": float(alpha[:, s, k].std(ddof=1)),
+            "beta": float(beta[:, s, k].mean()),
+            "sigma_beta": float(beta[:, s, k].std(ddof=1)),
+        }
+        for s in range(alpha.shape[1])
+        for k, name in enumerate(posterior.series.coefficients)
+    ]
+
+
+def _changes(posterior: SeriesPosterior) -> list[dict[str, object]]:
+    out: list[dict[str, object]] = []
+    for number in range(posterior.trend.n_breaks):
+        level, slope = posterior.change(number)
+        for k, name in enumerate(posterior.series.coefficients):
+            out.append(
+                {
+                    "break": posterior.trend.breaks[number],
+                    "term": name,
+                    "step": float(level.value[k]),
+                    "sigma_step": float(level.sigma[k]),
+                    "slope_change": float(slope.value[k]),
+                    "sigma_slope_change": float(slope.sigma[k]),
+                }
+            )
+    return out
+
+
+def _exposures(series: Series, posterior: SeriesPosterior) -> Table:
+    columns: dict[str, object] = {"exposure": list(series.names), "epoch": series.epoch}
+    sigma = np.sqrt(np.maximum(np.einsum("ekk->ek", series.cov), 0.0))
+    for k, name in enumerate(series.coefficients):
+        columns[name] = series.values[:, k]
+        columns[f"sigma_{name}"] = sigma[:, k]
+    columns["outlier_probability"] = posterior.outlier_probability
+    return Table(columns)
+
+
+def _predictions(posterior: SeriesPosterior) -> Table:
+    first, last = posterior.series.span
+    found = posterior.predict(np.linspace(first, last, N_EPOCHS))
+    columns: dict[str, object] = {"epoch": found.epoch}
+    for k, name in enumerate(posterior.series.coefficients):
+        columns[name] = found.mean[:, k]
+        columns[f"sigma_{name}"] = found.sigma[:, k]
+        columns[f"sigma_new_{name}"] = found.sigma_new[:, k]
+    return Table(columns)

@@ -1,1 +1,0 @@
-"""Exposures that were fitted jointly and each alone: series, drift, new ones, filters, releases."""

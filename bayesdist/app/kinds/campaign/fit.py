@@ -1,0 +1,140 @@
+"""The fit of a campaign: tables, errors, all exposures jointly, and every one alone."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+
+from bayesdist.app.kinds.campaign.gap import gap_priors, with_gap
+from bayesdist.app.kinds.campaign.input_validation import frames_not_set
+from bayesdist.app.kinds.campaign.inputs import Inputs
+from bayesdist.app.kinds.campaign.linear_terms import FIXED, line_sections
+from bayesdist.app.kinds.campaign.matched import CampaignMatched
+from bayesdist.app.kinds.campaign.reference import rate_priors
+from bayesdist.app.kinds.campaign.tables import fit_tables, scatter_by_magnitude, tables_section
+from bayesdist.app.kinds.errors import ErrorLaw, ExposureScatter
+from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.data import centroid_errors
+from bayesdist.data.matches import Matches
+from bayesdist.infer import load
+from bayesdist.infer.exposures.alone import ExposureSolutions, fit_exposures
+from bayesdist.infer.exposures.hierarchy import (
+    HierarchicalFit,
+    fit_hierarchical,
+    held_in_reference,
+    trend_p_values,
+)
+from bayesdist.infer.linear import Rejection
+from bayesdist.infer.nodes import corrected_matches, on_the_chips
+from bayesdist.infer.series import Series
+from bayesdist.limits import TREND
+from bayesdist.model import Chip, DistortionModel
+from bayesdist.model.frames import RIGID
+
+__all__ = ["fit_campaign"]
+
+SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
+
+
+def fit_campaign(matched: CampaignMatched) -> Fitted:
+    """Tables, errors, all exposures jointly, and every one alone.
+
+    Raises
+    ------
+    BayesdistError
+        For what the exposures do not determine, runs of other filters that do not fit to this one,
+        and stars that have outrun their catalogue.
+    """
+    with frames_not_set():
+        return _fitted(matched)
+
+
+def _fitted(matched: CampaignMatched) -> Fitted:
+    inputs, config, affine = matched.inputs, matched.inputs.config, matched.affine_model
+    tables = fit_tables(matched)
+    pairs = matched.stars
+    if tables.stored.tables:
+        pairs = on_the_chips(corrected_matches(tables.stored.tables, pairs), affine)
+    _, _, total = scatter_by_magnitude(pairs, affine, inputs)
+    errors = ErrorLaw(by_magnitude=centroid_errors(pairs, total), with_catalogue=True)
+    stars = errors.applied(pairs)
+    rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs)
+    joint = _joint(stars, affine, inputs, rejection)
+    number = config.chips()[0].number
+    alone = fit_exposures(stars, affine, chip=number, skip=True, rejection=rejection)
+    facts = {
+        **line_sections(joint, number),
+        "tables": tables_section(config, tables),
+        "scatter": {name: _scatter(joint, name) for name in joint.tau},
+        "deviations": {"warnings": _trends(joint, stars)},
+        "exposures_skipped": dict(alone.skipped),
+        "exposures_outlying": list(joint.outlying),
+    }
+    return Fitted(
+        joint.fit,
+        errors,
+        joint.priors,
+        tables=tables.stored,
+        scatter=ExposureScatter(joint.scatter.kinds, joint.tau_draws, joint.settling),
+        alone=_series(alone, joint.model.chips[0]),
+        facts=facts,
+    )
+
+
+def _joint(
+    stars: Matches, affine: DistortionModel, inputs: Inputs, rejection: Rejection
+) -> HierarchicalFit:
+    """All exposures jointly, deviating from the model as they are found to scatter."""
+    config = inputs.config
+    asked, scale = config.time(), config.detector.scale_mas
+    pixel = 1.0 if scale is None else inputs.pixel_arcsec / inputs.unit_arcsec
+    drifting = with_gap(replace(affine, time=asked))
+    held = held_in_reference(stars, drifting, config.chips()[0].number)
+    model = replace(held, chip_deviations=True)
+    with closing(load(model, stars, config.resources())) as shards:
+        return fit_hierarchical(
+            shards,
+            model,
+            priors=rate_priors(config, model, inputs.base) or gap_priors(model, asked, pixel),
+            pixel=pixel,
+            seed=config.sampler.seed,
+            rejection=rejection,
+        )
+
+
+def _series(alone: ExposureSolutions, reference: Chip) -> Series:
+    """Linear terms of all chips, and the constant in v, without those that the gauge fixes."""
+    fixed = {f"{prefix}{term}" for prefix in ("", f"{reference.name}.") for term in FIXED}
+    labels = [s for s in alone.labels if s.split(".")[-1] in SERIES and s not in fixed]
+    epoch, values, cov = alone.series(*labels)
+    return Series(epoch, values, cov, tuple(labels), alone.names, source="exposures")
+
+
+def _trends(joint: HierarchicalFit, stars: Matches) -> list[str]:
+    """Deviations that go with time although they are taken to scatter, each as a clause.
+
+    Only scale and shears: how the chips move against each other has a test of its own
+    (`bayesdist.diagnose.score.gap`).
+    """
+    if stars.epoch is None:
+        return []
+    model = joint.model
+    codes, rows = np.unique(stars.exposure, return_index=True)
+    dates = dict(zip((stars.exposure_names[k] for k in codes), stars.epoch[rows], strict=True))
+    typical = [k for k, name in enumerate(model.exposures) if name not in joint.outlying]
+    epoch = np.array([dates[model.exposures[k]] for k in typical])
+    values = joint.fit.mean[joint.index].reshape(len(joint.scatter.kinds), -1).T[typical]
+    breaks = () if model.time is None else model.time.breaks
+    p = trend_p_values(values, epoch, breaks)
+    return [
+        f"the {kind} of the exposures drifts with time (p = {one:.1g}), and is taken to scatter "
+        "between exposures: extend model.tdd.terms"
+        for kind, one in zip(joint.scatter.kinds, p, strict=True)
+        if kind.split(".")[-1] not in RIGID and one * len(p) < TREND.value
+    ]
+
+
+def _scatter(joint: HierarchicalFit, name: str) -> dict[str, object]:
+    return {"value": joint.tau[name], "interval_68": list(joint.tau_interval(0.68)[name])}

@@ -1,0 +1,134 @@
+"""The matched stars of a campaign: with the lists, catalogue and log that they are from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from bayesdist.app.config import CampaignConfig
+from bayesdist.app.kinds.campaign.aberration import aberration_term
+from bayesdist.app.kinds.campaign.catalogue import errors_by_star
+from bayesdist.app.kinds.campaign.inputs import Inputs
+from bayesdist.app.kinds.errors import ExposureScatter
+from bayesdist.app.kinds.matched import Matched
+from bayesdist.app.kinds.split import set_aside
+from bayesdist.app.kinds.star_lists import known_calibration
+from bayesdist.app.store.rundir import PAIRS, part_files
+from bayesdist.assess.terms.parameters import ScaleError
+from bayesdist.data import read_matches, write_partitioned
+from bayesdist.data.matches import Matches
+from bayesdist.diagnose.overlap import OverlapTest, overlap_test
+from bayesdist.infer import Posterior
+from bayesdist.infer.catalogue.star_influence import StarErrors
+from bayesdist.infer.solution import Solution
+from bayesdist.model import DistortionModel, LookupTable
+
+__all__ = ["CampaignMatched", "affine_model_of", "load_matched_campaign", "matched_campaign"]
+
+GAUGE_EXPOSURES = 1  # the first ones, which cannot be held out: they define the gauge
+
+
+@dataclass(frozen=True, eq=False)
+class CampaignMatched(Matched):
+    """Raw pixels beside aberration-neutral catalogue positions, with the catalogue's errors.
+
+    Parameters
+    ----------
+    inputs : Inputs
+        Catalogue, exposures and star lists.
+    pairs : Matches
+        All matches, fitted or held out.
+    """
+
+    section: ClassVar[str] = "matching"
+
+    stars: Matches
+    held: Matches | None = None
+    inputs: Inputs = field(kw_only=True)
+    pairs: Matches = field(kw_only=True)
+
+    @cached_property
+    def affine_model(self) -> DistortionModel:
+        """The configured polynomial with a free linear part of each exposure."""
+        return affine_model_of(self.inputs.config, self.stars)
+
+    def of_order(self, order: int) -> Self:
+        """Matches to be fitted by polynomials of another order."""
+        config = self.inputs.config.of_order(order)
+        return replace(self, inputs=replace(self.inputs, config=config))
+
+    @property
+    def tangent_point(self) -> None:
+        """None: u and v lie along the detector."""
+        return None
+
+    @property
+    def filter(self) -> str:
+        """The one filter of the exposures."""
+        return self.inputs.filter
+
+    @property
+    def star_errors(self) -> StarErrors | None:
+        """Errors of the catalogue by code of the star; None where it has none."""
+        return errors_by_star(self.inputs.catalog, self.inputs.largest_vafactor)
+
+    def aberration(self, scatter: ExposureScatter, solution: Solution) -> ScaleError:
+        """Error of the scale by velocity aberration, which is among the scatter."""
+        return aberration_term(scatter, self.inputs, solution)
+
+    def overlap(self, posterior: Posterior, tables: tuple[LookupTable, ...]) -> OverlapTest | None:
+        """Two exposures far apart in time laid on each other; None where none are known so."""
+        inputs, block = self.inputs, self.inputs.config.campaign
+        return overlap_test(
+            self.stars,
+            posterior,
+            known_calibration(inputs.base / block.initial_distortion, block.filter),
+            tables,
+            unit_arcsec=inputs.unit_arcsec,
+            pixel=inputs.pixel_arcsec,
+            rolls={one.name: one.pa_v3 for one in inputs.log},
+        )
+
+    def save(self, folder: Path) -> None:
+        """Write the files of a run's folder that belong to it."""
+        super().save(folder)
+        for stale in part_files(folder / PAIRS):
+            stale.unlink()
+        write_partitioned([self.pairs], folder / PAIRS)
+
+
+def matched_campaign(pairs: Matches, inputs: Inputs, **more: Any) -> CampaignMatched:
+    """Matches of a campaign, with what the configuration holds out set aside.
+
+    Raises
+    ------
+    InputError
+        As `set_aside`.
+    """
+    parts = set_aside(inputs.config, pairs, GAUGE_EXPOSURES)
+    return CampaignMatched(*parts, catalogue=inputs.catalog, inputs=inputs, pairs=pairs, **more)
+
+
+def affine_model_of(config: CampaignConfig, stars: Matches) -> DistortionModel:
+    """The configured polynomial with a free linear part of each exposure.
+
+    For tables and errors: whatever drifts or scatters in the linear terms is taken up.
+    """
+    return DistortionModel(
+        config.model.order,
+        config.chips(),
+        unit=stars.unit,
+        frames="affine",
+        exposures=stars.exposure_names,
+    )
+
+
+def load_matched_campaign(
+    folder: Path, inputs: Inputs, summary: Mapping[str, Any]
+) -> CampaignMatched:
+    """The matches of an earlier stage."""
+    pairs = read_matches(folder / PAIRS, unit=inputs.catalog.unit)
+    return matched_campaign(pairs, inputs, facts=summary.get("matching", {}))

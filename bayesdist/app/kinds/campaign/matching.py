@@ -1,0 +1,170 @@
+"""Star lists of a campaign, matched with its catalogue."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.kinds.campaign.catalogue import parities_of
+from bayesdist.app.kinds.campaign.input_validation import input_warnings, refuse_few, shear_warnings
+from bayesdist.app.kinds.campaign.inputs import Inputs
+from bayesdist.app.kinds.campaign.matched import CampaignMatched, matched_campaign
+from bayesdist.app.kinds.star_lists import StarLists, positions_by_chip, start_of
+from bayesdist.data import (
+    Detections,
+    ExposureLog,
+    Matches,
+    match_campaign,
+    neutralise_aberration,
+)
+from bayesdist.data.matching.campaign import CampaignMatches
+from bayesdist.errors import InputError
+from bayesdist.model import Chip
+from bayesdist.products import read_idctab
+
+__all__ = ["match_lists"]
+
+log = logging.getLogger("bayesdist")
+
+
+def match_lists(inputs: Inputs) -> CampaignMatched:
+    """Star lists matched with a catalogue, exposure by exposure.
+
+    Raises
+    ------
+    BayesdistError
+        For files that cannot be read or do not go together, chips without matches, and too few
+        exposures.
+    """
+    config, block, lists = inputs.config, inputs.config.campaign, inputs.star_lists
+    tab = read_idctab(inputs.base / block.initial_distortion)
+    parities = parities_of(block, inputs.catalog, tab)
+    for text in (*([inputs.plane] if inputs.plane else []), *inputs.catalog.notes):
+        log.info("match: catalogue: %s", text)
+    start = start_of(tab, inputs.unit_arcsec, block.filter)
+    found = match_campaign(
+        _gauge_first(lists, config.chips()[0].number),
+        inputs.log,
+        inputs.catalog,
+        lambda x, y, chip, epoch: positions_by_chip(start, x, y, chip),
+        cuts=lists.cuts,
+        radius=block.radius,
+        mirrored=parities,
+        skip=True,
+    )
+    _refuse_bare(found.table, config.chips(), inputs.catalog.source)
+    if found.left_out:
+        left = inputs.log.select(names=found.table.exposure_names)
+        refuse_few(left.values("epoch"), config.time())
+    table = _table(found, inputs.log)
+    warnings = [
+        *_doubtful_parity(found.mirrored, parities, f"{tab.instrument}/{tab.detector}"),
+        *found.warnings(inputs.log),
+        *input_warnings(inputs),
+        # as the stars show them, for the log need not have them
+        *shear_warnings(np.asarray(table["rotation"]), "of the matches"),
+    ]
+    pairs = neutralise_aberration(found.table, inputs.log)
+    facts = _facts(found, table, inputs, warnings)
+    matched = matched_campaign(pairs, inputs, facts=facts, table=table)
+    if matched.held is not None:
+        _refuse_bare(matched.stars, config.chips(), "what is not held out")
+        some = inputs.log.select(names=matched.stars.exposure_names)
+        refuse_few(some.values("epoch"), config.time() if config.has_free_rates else None)
+    _log(matched, int(table["detected"].sum()))
+    return matched
+
+
+def _table(found: CampaignMatches, exposures: ExposureLog) -> Table:
+    """One row for each exposure, with its VAFACTOR and roll angle."""
+    table = found.summary()
+    names = list(exposures.names)
+    order = [names.index(name) for name in table["exposure"]]
+    for name in ("vafactor", "pa_v3"):
+        table[name] = exposures.values(name)[order]
+    return table
+
+
+def _facts(
+    found: CampaignMatches, table: Table, inputs: Inputs, warnings: list[str]
+) -> dict[str, Any]:
+    """Section 'matching' of summary.json."""
+    false = np.sum(table["false_fraction"] * table["matched"]) / table["matched"].sum()
+    return {
+        "n_exposures": len(found.reports),
+        "n_detections": len(inputs.star_lists),
+        "n_pairs": len(found.table),
+        "n_catalog": len(inputs.whole_catalog),
+        "n_catalog_used": len(inputs.catalog),
+        "left_out": dict(found.left_out),
+        "completeness": {
+            "median": float(np.median(table["completeness"])),
+            "least": float(np.min(table["completeness"])),
+        },
+        "false_fraction": float(false),
+        "parity": "mirrored" if found.mirrored else "direct",
+        "tangent_point": inputs.catalog.tangent_point,
+        "radius": [float(table["radius_min"].min()), float(table["radius_max"].max())],
+        "warnings": warnings,
+    }
+
+
+def _log(matched: CampaignMatched, n_detected: int) -> None:
+    facts = matched.facts
+    log.info(
+        "match: %d pairs of %d detections in %d exposures, median completeness %.3f, %.2g false",
+        facts["n_pairs"],
+        n_detected,
+        facts["n_exposures"],
+        facts["completeness"]["median"],
+        facts["false_fraction"],
+    )
+    if matched.mirrored:
+        log.info(
+            "match: the catalogue is mirrored against the detector's axes: u is taken with the "
+            "opposite sign%s",
+            "" if facts["tangent_point"] is None else " and grows to the west",
+        )
+    for text in matched.warnings:
+        log.warning("match: WARNING: %s", text)
+
+
+def _doubtful_parity(mirrored: bool, parities: tuple[bool, ...], detector: str) -> list[str]:
+    """A warning, as a clause, of stars with another parity than the known distortion says."""
+    if mirrored == parities[0]:
+        return []
+    return [
+        f"the stars lie mirrored against what the detector of the known distortion, {detector}, "
+        "sees of the sky: x and y of the lists may be swapped, or the axes of the detector are not "
+        "those of this detector"
+    ]
+
+
+def _gauge_first(star_lists: StarLists, chip: int) -> tuple[Detections, ...]:
+    """The lists, led by one with enough stars on the reference chip.
+
+    The first exposure's stars there define the gauge of the joint fit.  The order stays where the
+    first list has at least half of what the others have.
+    """
+    lists = star_lists.lists
+    pairs = zip(lists, star_lists.passed, strict=True)
+    counts = np.array([int((one.chip[good] == chip).sum()) for one, good in pairs])
+    usual = np.median(counts[counts > 0]) if counts.any() else 0.0
+    if counts[0] >= 0.5 * usual:
+        return lists
+    first = int(np.argmax(counts >= usual))
+    return (lists[first], *lists[:first], *lists[first + 1 :])
+
+
+def _refuse_bare(pairs: Matches, chips: tuple[Chip, ...], where: str) -> None:
+    """Refuse pairs that leave a chip without any."""
+    for chip in chips:
+        if chip.number not in pairs.chip_numbers:
+            raise InputError(
+                f"no detection on chip {chip.name} is matched in any exposure",
+                where=where,
+                do="widen the cuts, or drop its [[chip]] block",
+            )

@@ -1,0 +1,100 @@
+"""Tables of the detector and drift that a run takes over from that of the reference filter."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bayesdist.app.config import Config
+from bayesdist.app.config.model import TablesBlock
+from bayesdist.app.config.other_runs import TABLES, rates_file, tables_file
+from bayesdist.app.kinds.campaign.gap import with_gap
+from bayesdist.app.kinds.fitted import read_tables
+from bayesdist.errors import InputError
+from bayesdist.infer import GaussianPriors, Posterior, load_posterior
+from bayesdist.infer.exposures.shared_drift import drift_priors
+from bayesdist.model import Chip, DistortionModel, LookupTable
+from bayesdist.products import read_d2im
+
+__all__ = [
+    "held_tables",
+    "rate_priors",
+    "rehearse_references",
+]
+
+
+def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tuple[LookupTable, ...]:
+    """The detector's tables that a run holds; none where it has none to hold.
+
+    Parameters
+    ----------
+    block : TablesBlock
+    chips : tuple of Chip
+        All of which must have a table.
+    base : Path
+
+    Raises
+    ------
+    InputError
+        For a run without tables, a file that is no D2IMFILE, and a chip without table.
+    """
+    if block.detector is None:
+        return ()
+    path = tables_file(base / block.detector)
+    if path.name == TABLES:
+        found = read_tables(path, do="run its stage 'fit' again").tables
+        tables = tuple(table for table in found if not table.filter)
+    else:
+        tables = read_d2im(path)
+    have = {table.chip for table in tables}
+    missing = [chip.name for chip in chips if chip.number not in have]
+    if missing:
+        raise InputError(
+            f"there is no table of the detector for chip {missing[0]}",
+            where=str(path),
+            do="name the run or the D2IMFILE of this detector in tables.detector",
+        )
+    numbers = {chip.number for chip in chips}
+    ours = (table for table in tables if table.chip in numbers)
+    return tuple(sorted(ours, key=lambda table: table.chip))
+
+
+def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianPriors | None:
+    """Priors on the drift of a model from the posterior of another run; None where it is free.
+
+    Raises
+    ------
+    InputError
+        For a folder that is no finished run, a run that has not converged, and one of other chips,
+        units, drifting terms, or reference dates.
+    """
+    tdd, chip = config.model.tdd, config.chips()[0].number
+    if tdd is None or config.has_free_rates:
+        return None
+    path = rates_file(base / tdd.rates)
+    posterior: Posterior = load_posterior(path)
+    if not posterior.convergence.converged:
+        raise InputError(
+            f"the run has not converged ({'; '.join(posterior.convergence.reasons)})",
+            where=str(path.parent),
+            do="resume it with more steps before its rates are used",
+        )
+    try:
+        named = drift_priors(posterior, model, chip=chip)
+    except InputError as error:
+        raise InputError(error.cause, where=str(path.parent), do=error.do) from error
+    return GaussianPriors.of(model, named)
+
+
+def rehearse_references(config: Config, unit: str, base: Path) -> None:
+    """Read all that a run takes over from others; nothing is fitted.
+
+    Raises
+    ------
+    InputError
+        As `held_tables` and `rate_priors`.
+    """
+    chips = config.chips()
+    held_tables(config.tables, chips, base)
+    if not config.has_free_rates:
+        model = with_gap(DistortionModel(config.model.order, chips, unit, config.time()))
+        rate_priors(config, model, base)

@@ -1,0 +1,128 @@
+"""The three kinds of runs, which differ in all that comes before the posterior."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from bayesdist.app.config import Config
+from bayesdist.app.kinds.campaign.fit import fit_campaign
+from bayesdist.app.kinds.campaign.input_validation import refuse_campaign
+from bayesdist.app.kinds.campaign.inputs import read_campaign
+from bayesdist.app.kinds.campaign.matched import load_matched_campaign
+from bayesdist.app.kinds.campaign.matching import match_lists
+from bayesdist.app.kinds.campaign.preview import campaign_lines
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.fitted import Fitted, load_fitted
+from bayesdist.app.kinds.matched import Matched
+from bayesdist.app.kinds.matches.stars import (
+    fit_stars,
+    match_stars,
+    read_stars,
+    sample_stars,
+)
+from bayesdist.app.kinds.reader import StarReader
+from bayesdist.app.kinds.selfcal.fit import fit_selfcal, sample_detections
+from bayesdist.app.kinds.selfcal.inputs import read_selfcal, refuse_selfcal
+from bayesdist.app.kinds.selfcal.matched import load_matched_selfcal
+from bayesdist.app.kinds.selfcal.matching import match_dithers
+from bayesdist.app.kinds.selfcal.preview import selfcal_lines
+from bayesdist.app.kinds.selfcal.solved import load_selfcal
+from bayesdist.infer import Posterior
+
+__all__ = ["Kind", "kind_of"]
+
+
+class Sampler(Protocol):
+    """The posterior of a fit; checkpoints are in the folder."""
+
+    def __call__(
+        self,
+        data: FitData,
+        config: Config,
+        *,
+        folder: Path | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Posterior: ...
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Matched stars, a campaign, or a self-calibration.
+
+    Each takes configurations, inputs and matches of its own types.
+
+    Parameters
+    ----------
+    read : callable
+        Of (config, base): all that a run begins with, its inputs; paths are relative to `base`.
+    match : callable
+        Of (inputs, config): stars that are fitted, and those that are held out.
+    fit : callable
+        Of (matched, config, base, reader): the least-squares solution.
+    sample : callable
+        The posterior of the fit.
+    load_matched : callable, optional
+        Of (folder, inputs, summary): the matches of an earlier stage, from a run's folder and its
+        summary.json; without it they are matched again.
+    load_fitted : callable
+        Of (folder, matched): the fit of an earlier stage; `matched` is called where that needs the
+        matches.
+    refuse : callable
+        Of inputs: refuses what does not go together; what is wrong with matched stars shows in
+        their fit.
+    lines : callable
+        Of inputs: what `check` says of them; None where the fit says more.
+    begins_with : str
+        Its first stage: 'match', or 'fit' where stars are matched already.
+    rows : str
+        What a row of the data is, in words.
+    chooser : str
+        What leaves out rows that are far off, in words.
+    """
+
+    read: Callable[[Any, Path], Any]
+    match: Callable[[Any, Any], Matched]
+    fit: Callable[[Any, Any, Path, StarReader], Fitted]
+    sample: Sampler = sample_stars
+    load_matched: Callable[[Path, Any, Mapping[str, Any]], Matched] | None = None
+    load_fitted: Callable[[Path, Callable[[], Any]], Fitted] = lambda folder, _: load_fitted(folder)
+    refuse: Callable[[Any], None] = lambda inputs: None
+    lines: Callable[[Any], Iterator[str] | None] = lambda inputs: None
+    begins_with: str = "match"
+    rows: str = "stars"
+    chooser: str = "least-squares fit"
+
+
+MATCHES = Kind(read=read_stars, match=match_stars, fit=fit_stars, begins_with="fit")
+
+CAMPAIGN = Kind(
+    read=read_campaign,
+    match=lambda inputs, _: match_lists(inputs),
+    fit=lambda matched, *_: fit_campaign(matched),
+    load_matched=load_matched_campaign,
+    refuse=refuse_campaign,
+    lines=campaign_lines,
+)
+
+SELFCAL = Kind(
+    read=read_selfcal,
+    match=lambda inputs, _: match_dithers(inputs),
+    fit=lambda matched, *_: fit_selfcal(matched),
+    sample=sample_detections,
+    load_matched=load_matched_selfcal,
+    load_fitted=load_selfcal,
+    refuse=refuse_selfcal,
+    lines=selfcal_lines,
+    rows="detections",
+    chooser="limits of residuals",
+)
+
+
+def kind_of(config: Config) -> Kind:
+    """The kind of run that a configuration is of."""
+    if config.campaign is not None:
+        return CAMPAIGN
+    return SELFCAL if config.selfcal is not None else MATCHES

@@ -1,0 +1,102 @@
+"""Errors that groups of stars have beyond the quoted ones: when and in which words."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from typing import Any
+
+from bayesdist.app.config import Config
+from bayesdist.data import Matches
+from bayesdist.errors import DegenerateError
+from bayesdist.infer import GaussianPriors, LinearFit
+from bayesdist.infer.catalogue.added_errors import ONE, GroupedErrors, grouped_errors
+
+__all__ = [
+    "added_errors_rows",
+    "compared_errors",
+    "grouping_sentence",
+    "knows_circle",
+]
+
+log = logging.getLogger("bayesdist")
+
+MOST_LISTED = 4  # groups that are listed one by one
+
+
+def compared_errors(
+    config: Config, fit: LinearFit, sample: Matches, priors: GaussianPriors
+) -> GroupedErrors | None:
+    """Jitters of groups of stars, or the one that will do, from a fit with the quoted errors.
+
+    None where that is not asked: where errors come from the residuals themselves, where the jitter
+    is given or is to be one, and where the match circle has cut the residuals.
+    """
+    if not config.compares_jitters or (knows_circle(config) and sample.has_nominal):
+        return None
+    by = config.outliers.jitter_by
+    try:
+        return grouped_errors(
+            sample,
+            fit,
+            by="" if by == "auto" else by,
+            outliers=config.outliers.model != "none",
+            priors=priors,
+        )
+    except DegenerateError as error:
+        log.info("fit: one jitter for all stars: groups are not compared, as %s", error.cause)
+        return None
+
+
+def knows_circle(config: Config) -> bool:
+    """Truth of a radius in which stars with nominal positions are said to have been matched."""
+    return config.data is not None and config.outliers.match_radius is not None
+
+
+def added_errors_rows(found: GroupedErrors) -> dict[str, Any]:
+    """Part 'added_errors' of the section 'fit' of summary.json."""
+    columns = {
+        "n": found.n,
+        "added": found.sigma,
+        "added_error": found.sigma_error,
+        "excess": found.excess,
+        "variance": found.variance,
+        "variance_error": found.error,
+    }
+    return {
+        "grouping": found.grouping,
+        "by": found.by,
+        "evidence": dict(found.evidence),
+        "dispersion": found.dispersion,
+        "groups": [
+            {"label": label, "axis": axis} | {k: float(v[g, a]) for k, v in columns.items()}
+            for g, label in enumerate(found.labels)
+            for a, axis in enumerate("uv")
+        ],
+    }
+
+
+def grouping_sentence(found: GroupedErrors, unit: str) -> str:
+    """Clause on errors beyond the quoted ones; `unit` is of u and v."""
+    evidence = ", ".join(f"{name} {gain:.3g}" for name, gain in found.evidence.items())
+    head = f"ln evidence gained by groups: {evidence}"
+    if found.grouping == ONE:
+        return f"one jitter for both axes ({head})"
+    each, joint = list(_each(found)), ", "
+    if len(each) > MOST_LISTED:
+        each, joint = [min(each), max(each)], " to "
+    sizes = joint.join(f"{value:.3g} +- {error:.2g} {unit} {where}" for value, error, where in each)
+    return (
+        f"the errors beyond the quoted ones differ by {found.grouping}: {sizes} ({head}); what "
+        "each has beyond the least was added to the quoted errors, and the jitter is the least"
+    )
+
+
+def _each(found: GroupedErrors) -> Iterator[tuple[float, float, str]]:
+    """Added error, its standard error, and whose it is."""
+    for g, label in enumerate(found.labels):
+        of = f"of {found.by} {label}" if found.by else ""
+        for a in range(2 if found.by_axis else 1):
+            along = f"along {'uv'[a]}" if found.by_axis else ""
+            where = " ".join(part for part in (along, of) if part)
+            yield float(found.sigma[g, a]), float(found.sigma_error[g, a]), where

@@ -1,0 +1,255 @@
+"""Matched stars: read, fitted and sampled."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from bayesdist.app.config import Config, MatchesConfig
+from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.kinds.matched import Matched
+from bayesdist.app.kinds.matches.added_errors import compared_errors, knows_circle
+from bayesdist.app.kinds.matches.earlier import earlier_calibration
+from bayesdist.app.kinds.matches.plausibility import doubts_on_stars, refuse_empty_segments
+from bayesdist.app.kinds.matches.reading import check_chips
+from bayesdist.app.kinds.matches.sources import read_configured
+from bayesdist.app.kinds.reader import StarReader
+from bayesdist.app.kinds.split import set_aside
+from bayesdist.assess import SAMPLE
+from bayesdist.calibration.prior import CalibrationPrior
+from bayesdist.data import Matches
+from bayesdist.diagnose.residuals.quoted import error_scale
+from bayesdist.errors import ConfigError, DegenerateError, NotSettledError
+from bayesdist.infer import (
+    GaussianPriors,
+    LinearFit,
+    Posterior,
+    Shards,
+    build_model,
+    fit_by_magnitude,
+    fit_linear,
+    sample,
+)
+from bayesdist.infer.exposures.frame_choice import frames_that_help
+from bayesdist.infer.linear import Rejection
+from bayesdist.model import DistortionModel
+
+__all__ = [
+    "fit_stars",
+    "match_stars",
+    "model_of",
+    "priors_of",
+    "read_stars",
+    "sample_stars",
+    "shards_of",
+]
+
+log = logging.getLogger("bayesdist")
+
+SAMPLING = 1  # of the random streams that follow from the one seed: that of the stage 'sample'
+
+
+def match_stars(stars: Matches, config: MatchesConfig) -> Matched:
+    """Matched stars of a configuration, those that are fitted and those that are held out.
+
+    Raises
+    ------
+    InputError
+        For files that cannot be read, and as `set_aside`.
+    ConfigError
+        For settings that do not go with nominal positions.
+    """
+    if stars.has_nominal:
+        try:  # columns may be found by their names
+            config.refuse_circle()
+        except ValueError as error:
+            cause, _, do = str(error).partition("; ")
+            raise ConfigError(cause, where=", ".join(stars.sources), do=do) from None
+    return Matched(*set_aside(config, stars))
+
+
+def read_stars(config: MatchesConfig, base: Path) -> Matches:
+    """The matched stars that a configuration names.
+
+    Raises
+    ------
+    InputError
+        For a configuration that names none, and for files that cannot be read.
+    """
+    data = config.data
+    return read_configured(data.paths(base), data, size=config.detector.size, chips=config.chip)
+
+
+def model_of(stars: Matches, config: Config) -> DistortionModel:
+    """The model that a configuration asks for, for these stars.
+
+    Raises
+    ------
+    InputError
+        For chips that only one side knows, and as `build_model`.
+    """
+    check_chips(config.chips(), stars.chip_numbers)
+    return build_model(
+        stars,
+        order=config.model.order,
+        size=config.detector.size,
+        reference_pixel=config.model.reference_pixel,
+        name=config.detector.name,
+        chips=config.chips(),
+        frames=config.model.frames,
+        time=config.time(),
+    )
+
+
+def fit_stars(
+    matched: Matched,
+    config: Config,
+    base: Path = Path(),
+    reader: StarReader | None = None,
+) -> Fitted:
+    """The linear fit of matched stars, with the errors that its residuals ask for.
+
+    Parameters
+    ----------
+    matched : Matched
+    config : Config
+    base : Path
+        That the file of an earlier calibration is relative to.
+    reader : StarReader, optional
+        Has the stars in the end, for the passes that follow.
+
+    Raises
+    ------
+    InputError
+        Where it cannot be made; with the frames of the exposures that would help.
+    """
+    if reader is None:
+        with closing(StarReader(config.resources())) as reader:
+            return fit_stars(matched, config, base, reader=reader)
+    model = model_of(matched.stars, config)
+    _refuse_implausible(matched.stars, reader.sample(matched.stars), model, config)
+    earlier = earlier_calibration(model, config, base)
+    try:
+        return _fitted(matched.stars, model, config, reader, earlier)
+    except (DegenerateError, NotSettledError) as error:
+        better = frames_that_help(matched.stars.sample(SAMPLE), model)
+        if better is None:
+            raise
+        raise type(error)(error.cause, where=error.where, do=better.sentence) from error
+
+
+def _refuse_implausible(
+    stars: Matches, some: Matches, model: DistortionModel, config: Config
+) -> None:
+    """Refuse what cannot be meant; `some` are a sample of the stars."""
+    doubts_on_stars(some, model, config)
+    if stars.in_memory and stars.epoch is not None:  # a sample may have none of a short segment
+        refuse_empty_segments(stars.epoch, model.time)
+
+
+def _fitted(
+    stars: Matches,
+    model: DistortionModel,
+    config: Config,
+    reader: StarReader,
+    earlier: CalibrationPrior | None,
+) -> Fitted:
+    """The fit with errors by magnitude, or with the quoted ones as far as they will do."""
+    priors = priors_of(model, config)
+    rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs, config.fit.radial_weight)
+    by_magnitude = config.data is not None and config.data.sigma == "by_magnitude"
+
+    def begun(priors: GaussianPriors) -> tuple[LinearFit, ErrorLaw]:
+        """First fit, with errors by magnitude or those that are quoted."""
+        if by_magnitude:
+            linear, _, errors = fit_by_magnitude(
+                stars, model, rejection=rejection, priors=priors, compute=reader.compute
+            )
+            return linear, ErrorLaw(by_magnitude=errors)
+        shards = shards_of(stars, model, config, QUOTED, reader)
+        return fit_linear(shards, model, rejection=rejection, priors=priors), QUOTED
+
+    if earlier is not None:
+        loose = replace(priors, joint=earlier.loose().joint)
+        # the covariance turns with the frame, which a first fit finds
+        turned = earlier.about(begun(loose)[0].mean) if earlier.turns else loose
+        priors = replace(priors, joint=turned.joint)
+        log.info(
+            "fit: the prior is %s, in %d of %d directions",
+            *(earlier.name, priors.n_informative, model.n_params),
+        )
+
+    def fitted(errors: ErrorLaw) -> LinearFit:
+        shards = shards_of(stars, model, config, errors, reader)
+        return fit_linear(shards, model, rejection=rejection, priors=priors)
+
+    linear, errors = begun(priors)
+    if by_magnitude:
+        return Fitted(linear, errors, priors)
+    factor = error_scale(linear, reader.sample(stars, errors))
+    if factor != 1.0:
+        errors = ErrorLaw(factor)
+        linear = fitted(errors)
+    grouped = compared_errors(config, linear, reader.sample(stars, errors), priors)
+    if grouped is not None and grouped.added is not None:
+        errors = ErrorLaw(factor, added=grouped.added)
+        linear = fitted(errors)
+    return Fitted(linear, errors, priors, grouped)
+
+
+def shards_of(
+    stars: Matches, model: DistortionModel, config: Config, errors: ErrorLaw, reader: StarReader
+) -> Shards:
+    """Stars as passes go over them, none of them outside the circle in which it was matched.
+
+    Raises
+    ------
+    InputError
+        Naming a star that is.
+    """
+    shards = reader.shards(model, stars, errors)
+    if knows_circle(config) and stars.has_nominal:
+        shards.survey.check_circle(config.outliers.match_radius)
+    return shards
+
+
+def priors_of(model: DistortionModel, config: Config) -> GaussianPriors:
+    """Priors of the parameters, as the configuration gives them.
+
+    Raises
+    ------
+    InputError
+        For a parameter that the model does not have.
+    """
+    return GaussianPriors.of(model, {p.parameter: (p.mean, p.sigma) for p in config.prior})
+
+
+def sample_stars(
+    data: FitData,
+    config: Config,
+    *,
+    folder: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Posterior:
+    """The posterior of a fit; of exposures that were fitted jointly with the chips averaged."""
+    posterior = sample(
+        data.fit,
+        data.shards,
+        outliers=config.mixture(),
+        priors=data.fitted.priors,
+        folder=folder,
+        progress=progress,
+        **config.sampler.model_dump(),
+    )
+    if data.fitted.scatter is None:
+        return posterior
+    return data.fitted.scatter.averaged(
+        posterior, np.random.default_rng([config.sampler.seed, SAMPLING])
+    )

@@ -1,0 +1,119 @@
+"""The gauge of a self-calibration: its directions, and what fixes them, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.kinds.selfcal.known import GaugeConstraints
+from bayesdist.infer.equations.priors import Prior
+from bayesdist.infer.selfcal.gauge import FAR, Gauge, NamedDirection, find_gauge
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode, curvatures
+from bayesdist.model import DistortionModel
+
+__all__ = ["CONVENTION", "fixed_by", "gauge_summary", "gauge_table", "gauge_words"]
+
+COLUMNS = ["name", "state", "sigma_detections", "sigma_fixed", "unit", "edge_pix", "fixed_by"]
+
+CONVENTION, DETECTIONS, REFERENCES = "convention", "detections", "reference stars"
+
+
+def fixed_by(
+    gauge: Gauge, solution: SelfCalibrationMode, pieces: GaugeConstraints
+) -> dict[str, str]:
+    """Source that fixes each property of the solution, by its name."""
+    problem, theta = solution.problem, solution.theta
+    alone, known = curvatures(problem, theta, solution.mixture, solution.stars)
+    found = {name: piece(theta) for name, piece in pieces.pieces.items()}
+    sigmas: dict[str, dict[str, float]] = {}
+    none = Prior.none(theta)
+    for name, information in found.items():
+        one = find_gauge(problem, theta, alone, information)
+        sigmas[name] = {d.name: d.sigma_fixed for d in one.directions}
+    if problem.priors.informed.any():
+        one = find_gauge(problem, theta, alone, none, known=known)
+        sigmas[REFERENCES] = {d.name: d.sigma_fixed for d in one.directions}
+    return {d.name: _fixed_by(d, sigmas) for d in gauge.directions}
+
+
+def _fixed_by(direction: NamedDirection, sigmas: Mapping[str, Mapping[str, float]]) -> str:
+    if not np.isfinite(direction.sigma_fixed):
+        return CONVENTION
+    limit = FAR * direction.sigma_fixed
+    found = [name for name, of in sigmas.items() if of[direction.name] < limit]
+    if direction.by_detections:
+        return DETECTIONS
+    return " and ".join(found) or "all together"
+
+
+def gauge_table(gauge: Gauge, fixed: Mapping[str, str], model: DistortionModel) -> Table:
+    """One row for each property of the solution, free ones first, then nearly free combinations."""
+    rows = [
+        _row(d, fixed) | {"edge_pix": d.edge_pix}
+        for d in sorted(gauge.directions, key=lambda d: (not d.free, not d.weak))
+    ]
+    rows += [
+        {
+            "name": f"combination led by {model.names[int(k)]}",
+            "state": "nearly free",
+            "sigma_detections": sigma,
+            "sigma_fixed": np.nan,
+            "unit": "pix at the edge",
+            "edge_pix": 1.0,
+            "fixed_by": "",
+        }
+        for sigma, k in gauge.weakest
+    ]
+    rows += [
+        {
+            "name": f"combination with {name}",
+            "state": "free",
+            "sigma_detections": np.inf,
+            "sigma_fixed": np.nan,
+            "unit": "",
+            "edge_pix": np.nan,
+            "fixed_by": "",
+        }
+        for name in gauge.unnamed
+    ]
+    return Table(rows)[COLUMNS]
+
+
+def _row(d: NamedDirection, fixed: Mapping[str, str]) -> dict[str, object]:
+    """Name of a property, how well it is known, and what fixes it."""
+    return {
+        "name": d.name,
+        "state": "free" if d.free else "nearly free" if d.weak else "known",
+        "sigma_detections": d.sigma,
+        "sigma_fixed": d.sigma_fixed,
+        "unit": d.unit,
+        "fixed_by": fixed[d.name],
+    }
+
+
+def gauge_summary(
+    gauge: Gauge, fixed: Mapping[str, str], model: DistortionModel
+) -> dict[str, object]:
+    """Part 'gauge' of the section 'selfcal' of summary.json; infinite sigmas are null there."""
+    return {
+        "n_free": int(gauge.null.shape[1]),
+        "n_by_convention": int(gauge.open.shape[1]),
+        "held": [model.names[k] for k in gauge.held],
+        "directions": [_row(d, fixed) for d in gauge.directions],
+        "unnamed": list(gauge.unnamed),
+        "sentences": list(gauge.sentences),
+    }
+
+
+def gauge_words(gauge: Gauge, fixed: Mapping[str, str], model: DistortionModel) -> str:
+    """In which gauge a product stands, in one sentence."""
+    by: dict[str, list[str]] = {}
+    for d in gauge.directions:
+        if d.free or d.weak:
+            by.setdefault(fixed[d.name], []).append(d.name.replace("_", " "))
+    parts = [f"{', '.join(names)} by {what}" for what, names in by.items()]
+    held = ", ".join(model.names[k] for k in gauge.held)
+    text = "Gauge of a self-calibration: " + ("; ".join(parts) or "all is known from detections")
+    return text + (f"; held: {held}." if held else ".")

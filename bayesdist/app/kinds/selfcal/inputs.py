@@ -1,0 +1,306 @@
+"""Inputs of a self-calibration: detections, and all that is known beside them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.app.config import SelfcalConfig
+from bayesdist.app.kinds.selfcal.commanded import Commanded, read_commanded
+from bayesdist.app.kinds.selfcal.known import GaugeConstraints
+from bayesdist.app.kinds.selfcal.start import started
+from bayesdist.app.kinds.star_lists import lists_of, refuse_other_chips
+from bayesdist.calibration.plane import ARCSEC
+from bayesdist.data import ReferenceCatalog, read_catalog, read_exposures
+from bayesdist.data.detections import Detections, detections_of
+from bayesdist.data.matching.frames import refuse_duplicates
+from bayesdist.data.sky.earth import parallax_factors
+from bayesdist.errors import InputError
+from bayesdist.infer.selfcal import ReferenceStars
+from bayesdist.infer.selfcal.problem import Problem, prepare
+from bayesdist.infer.selfcal.tangent import TangentPlane
+from bayesdist.model import DistortionModel
+
+__all__ = ["Inputs", "read_selfcal", "refuse_selfcal"]
+
+log = logging.getLogger("bayesdist")
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """Detections, and what is known of exposures and stars.
+
+    Parameters
+    ----------
+    config : SelfcalConfig
+    base : Path
+        Folder that its files are relative to.
+    detections : Detections
+        That pass the cuts; without star codes.
+    n_read : int
+        Detections of the lists.
+    rejected : mapping of str to int
+        Those that were cut, by reason.
+    dilation : ndarray, shape (E,), or None
+        VAFACTOR, where the log has it.
+    catalog : ReferenceCatalog or None
+        Reference stars, where there are any.
+    commanded : Commanded or None
+        Commanded offsets and rolls, where there are any.
+    """
+
+    config: SelfcalConfig
+    base: Path
+    detections: Detections
+    n_read: int
+    rejected: Mapping[str, int]
+    dilation: Float | None = None
+    catalog: ReferenceCatalog | None = None
+    commanded: Commanded | None = None
+
+    @property
+    def unit_arcsec(self) -> float | None:
+        """Size of the unit of u, v; None where nobody says what a pixel is."""
+        return _unit_arcsec(self.config)
+
+    @property
+    def jitter(self) -> float | None:
+        """The jitter in pixels that is held; None where it is fitted."""
+        jitter = self.config.outliers.jitter
+        return None if jitter == "fit" else float(jitter)
+
+    @property
+    def references(self) -> ReferenceStars | None:
+        """Reference stars among the detected ones; None where there are none."""
+        reference = self.config.gauge.reference
+        if self.catalog is None or reference is None:
+            return None
+        return ReferenceStars(self.catalog, reference.radius)
+
+    @property
+    def tangent_plane(self) -> TangentPlane | None:
+        """Tangent plane of the reference stars, or of the first exposure; None without a scale."""
+        if self.unit_arcsec is None:
+            return None
+        point = None if self.config.gauge.reference is None else (0.0, 0.0)
+        return TangentPlane(self.unit_arcsec, point)
+
+    @cached_property
+    def parallax_factors(self) -> Float | None:
+        """Parallax factors (E, 2) of exposures along u and v; None where stars have no parallax.
+
+        Raises
+        ------
+        InputError
+            Where the field's place on the sky is not known, or the exposures have no dates.
+        """
+        if self.config.selfcal.motion != "parallax":
+            return None
+        epoch = self.detections.epoch
+        if self.catalog is None or self.catalog.tangent_point is None:
+            raise InputError(
+                "asks for parallaxes, and nothing says where on the sky the field lies",
+                where="selfcal.motion",
+                do="give reference stars with ra and dec in gauge.reference",
+            )
+        if epoch is None:
+            raise InputError(
+                "asks for parallaxes, and the exposures have no dates",
+                where="selfcal.motion",
+                do="give an exposure log with epochs",
+            )
+        return parallax_factors(epoch, *self.catalog.tangent_point)
+
+    @cached_property
+    def start(self) -> tuple[DistortionModel, Float]:
+        """Model, and parameters (D,) by which the detections of a star lie near each other.
+
+        Raises
+        ------
+        InputError
+            As `started`.
+        """
+        given = self.detections, self.unit_arcsec, self.catalog, self.commanded
+        return started(self.config, self.base, *given)
+
+    def known_for(self, model: DistortionModel) -> GaugeConstraints:
+        """Constraints on the gauge beside the detections.
+
+        Raises
+        ------
+        InputError
+            As `GaugeConstraints.of`.
+        """
+        return GaugeConstraints.of(self.config, model, self.commanded, self.unit_arcsec)
+
+    def problem(
+        self, model: DistortionModel, detections: Detections, theta: Float, first: Float
+    ) -> Problem:
+        """Detections of stars, linearised at parameters (D,) near the solution.
+
+        Parameters
+        ----------
+        model : DistortionModel
+        detections : Detections
+            With codes of stars and errors.
+        theta : ndarray, shape (D,)
+        first : ndarray, shape (D,)
+            By which reference stars are found among the detected ones.
+        """
+        block = self.config.selfcal
+        problem = prepare(
+            model,
+            detections,
+            theta,
+            match_radius=block.match_radius,
+            min_detections=block.min_detections,
+            motion=block.motion,
+            parallax_factors=self.parallax_factors,
+            dilation=self.dilation,
+        )
+        references = self.references
+        if references is None:
+            return problem
+        return replace(problem, priors=references(problem, first))
+
+
+def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
+    """Read all that a self-calibration begins with; paths are relative to `base`.
+
+    Raises
+    ------
+    InputError
+        For files that cannot be read, a list of which nothing passes the cuts, a single exposure,
+        one that stands there twice, detections off the chips, exposures that the log does not have,
+        and as `read_commanded`.
+    """
+    block, gauge = config.selfcal, config.gauge
+    found = lists_of(block, base)
+    names = found.names
+    for name, one, good in zip(names, found.lists, found.passed, strict=True):
+        if not good.any():
+            raise InputError(
+                f"no detection of exposure {name} passes the cuts",
+                where=one.source,
+                do="widen them, or leave the exposure out",
+            )
+    used = [one.select(good) for one, good in zip(found.lists, found.passed, strict=True)]
+    if len(used) < 2:
+        raise InputError(
+            f"there is one exposure, {names[0]}, and distortion shows between exposures",
+            where=used[0].source,
+            do="give dithered exposures of one field",
+        )
+    refuse_other_chips(used, config.chips(), "selfcal.lists")
+    refuse_duplicates(
+        [np.column_stack([one.x, one.y, one.chip]) for one in used], names, source="selfcal.lists"
+    )
+    epoch, dilation = _of_log(config, base, names)
+    if epoch is None and all(one.epoch is not None for one in used):
+        epoch = np.concatenate([one.epoch for one in used if one.epoch is not None])
+    sigma = None if block.sigma == "measured" else float(block.sigma)
+    commanded, catalog = None, _read_references(config, base)
+    if gauge.offsets is not None:
+        commanded = read_commanded(
+            base / gauge.offsets, names, block.unit, config.detector.scale_mas, gauge.offset_sigma
+        )
+    return Inputs(
+        config,
+        base,
+        detections_of(used, epoch=epoch, sigma=sigma),
+        len(found),
+        found.cut,
+        dilation,
+        catalog,
+        commanded,
+    )
+
+
+def refuse_selfcal(inputs: Inputs) -> None:
+    """Refuse exposures that cannot be laid onto each other, and a start that cannot be read."""
+    model, _ = inputs.start
+    inputs.known_for(model)
+
+
+def _unit_arcsec(config: SelfcalConfig) -> float | None:
+    """Size of the unit of u and v; None for pixels of a size that nobody gives."""
+    scale = config.detector.scale_mas
+    return ARCSEC.get(config.selfcal.unit, None if scale is None else scale / 1000)
+
+
+def _of_log(
+    config: SelfcalConfig, base: Path, names: Sequence[str]
+) -> tuple[Float | None, Float | None]:
+    """Dates and VAFACTOR of the exposures, where there is a log."""
+    exposures = config.selfcal.exposures
+    if exposures is None:
+        return None, None
+    log = read_exposures(base / exposures)
+    found = [log[name] for name in names]
+    factors = np.array([np.nan if one.vafactor is None else one.vafactor for one in found])
+    known = np.isfinite(factors)
+    if known.any() and not known.all():
+        raise InputError(
+            f"exposure {names[int(np.argmin(known))]} has no vafactor, and others have",
+            where=log.source,
+            do="give it for all exposures, or for none",
+        )
+    return np.array([one.epoch for one in found]), factors if known.all() else None
+
+
+def _read_references(config: SelfcalConfig, base: Path) -> ReferenceCatalog | None:
+    """The reference stars, in the unit of u and v; None where there are none.
+
+    Raises
+    ------
+    InputError
+        As `read_catalog`, and for stars without errors.
+    """
+    block, unit_arcsec = config.gauge.reference, _unit_arcsec(config)
+    if block is None or unit_arcsec is None:  # the configuration asks for a scale with references
+        return None
+    catalog = read_catalog(
+        base / block.catalog,
+        block.columns,
+        unit=block.unit,
+        epoch=block.epoch,
+        tangent_point=block.tangent_point,
+    )
+    if catalog.sigma_u is None or catalog.sigma_v is None:
+        raise InputError(
+            "the reference stars have no errors",
+            where=catalog.source,
+            do="give the columns sigma_u and sigma_v, or ra_error and dec_error",
+        )
+    if not ((catalog.sigma_u > 0) & (catalog.sigma_v > 0)).all():
+        raise InputError(
+            "a reference star has the error zero", where=catalog.source, do="drop it, or correct it"
+        )
+    catalog = _with_motions(catalog)
+    own = ARCSEC.get(catalog.unit, unit_arcsec)
+    return catalog.rescaled(own / unit_arcsec, config.selfcal.unit)
+
+
+def _with_motions(catalog: ReferenceCatalog) -> ReferenceCatalog:
+    """Without stars whose motion has the error zero: where they are at other dates is not known.
+
+    So catalogues write motions that were not measured, beside those that were.
+    """
+    if catalog.sigma_pm_u is None or catalog.sigma_pm_v is None:
+        return catalog
+    measured = (catalog.sigma_pm_u > 0) & (catalog.sigma_pm_v > 0)
+    if not measured.all():
+        log.info(
+            "match: %d of %d reference stars have no measured motion and are left out",
+            len(catalog) - measured.sum(),
+            len(catalog),
+        )
+    return catalog.select(measured)

@@ -1,0 +1,271 @@
+"""Detections of a self-calibration become stars, exposure by exposure."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+from numpy.typing import NDArray
+
+from bayesdist.app.kinds.selfcal.inputs import Inputs
+from bayesdist.app.kinds.selfcal.matched import SelfcalMatched, selfcal_matched
+from bayesdist.data.detections import NO_STAR, Detections
+from bayesdist.data.matching.pairs import hull_of, inside_hull
+from bayesdist.errors import DegenerateError, InputError, NotSettledError
+from bayesdist.infer.selfcal import SelfCalibration
+from bayesdist.infer.selfcal.calibrate import self_calibrate
+from bayesdist.infer.selfcal.elimination import memberships
+from bayesdist.infer.selfcal.tangent import places_of
+from bayesdist.model import DistortionModel
+
+__all__ = [
+    "calibrated",
+    "exposure_table",
+    "match_dithers",
+    "matching_facts",
+    "refuse_unconnected",
+    "rolled_180",
+]
+
+log = logging.getLogger("bayesdist")
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+FEW_COMMON = 0.5  # of the usual fraction of common detections: an exposure that does not fit
+HALF_TURN = np.radians(10.0)  # from half a turn
+TURN_BACK = "turn its pixels back by 180 degrees if they were turned, or leave it out"
+AMBIGUOUS = 0.05  # fraction of groups that may be of one star or several, worth a warning
+
+
+def match_dithers(inputs: Inputs) -> SelfcalMatched:
+    """Detections of dithered exposures with their stars, and a first solution.
+
+    Raises
+    ------
+    BayesdistError
+        As `calibrated`, and for an exposure that hardly shares stars with the others.
+    """
+    found = calibrated(inputs, lambda text: log.info("match: %s", text))
+    table, facts = exposure_table(found, inputs), matching_facts(found, inputs)
+    refuse_unconnected(table)
+    for text in facts["warnings"]:
+        log.warning("match: WARNING: %s", text)
+    log.info(
+        "match: %d stars of %d of %d detections in %d exposures, %d ambiguous groups",
+        facts["n_stars"],
+        facts["detections"]["used"],
+        facts["detections"]["read"],
+        facts["n_exposures"],
+        facts["n_ambiguous"],
+    )
+    if inputs.tangent_plane is not None:
+        moved = facts["tangent_planes_pix"]
+        log.info("match: detections moved by up to %.2g pix onto one tangent plane", moved)
+    s = found.mode
+    return selfcal_matched(
+        inputs,
+        found.detections,
+        s.problem.model,
+        (s.theta, s.stars, s.mixture),
+        facts=facts,
+        table=table,
+    )
+
+
+def calibrated(inputs: Inputs, report: Callable[[str], None]) -> SelfCalibration:
+    """Stars and solution of a self-calibration.
+
+    Parameters
+    ----------
+    inputs : Inputs
+    report : callable
+        Called with what happens, in words.
+
+    Raises
+    ------
+    BayesdistError
+        As `self_calibrate`; where that does not settle and one exposure lies half a turn from
+        all the others, naming it.
+    """
+    (model, theta), block = inputs.start, inputs.config.selfcal
+    try:
+        return self_calibrate(
+            model,
+            inputs.detections,
+            theta,
+            prior_at=inputs.known_for(model),
+            match_radius=block.match_radius,
+            start_radius=block.start_radius,
+            min_detections=block.min_detections,
+            motion=block.motion,
+            parallax_factors=inputs.parallax_factors,
+            dilation=inputs.dilation,
+            jitter=inputs.jitter,
+            references=inputs.references,
+            plane=inputs.tangent_plane,
+            max_iterations=block.max_iterations,
+            log=report,
+        )
+    except (NotSettledError, DegenerateError) as error:
+        frames = [model.frame(theta, e)[0] for e in range(len(model.exposures))]
+        turned = rolled_180(np.array([np.arctan2(M[1, 0], M[0, 0]) for M in frames]))
+        if not turned:
+            raise
+        name = model.exposures[turned[0]]
+        raise InputError(
+            f"{error.cause}, and exposure {name} lies half a turn from all the others",
+            where="selfcal.lists",
+            do=TURN_BACK,
+        ) from error
+
+
+def rolled_180(rolls: Float) -> list[int]:
+    """Exposures that lie half a turn from all the others, of at least three."""
+    if len(rolls) < 3:
+        return []
+    off = np.abs(np.angle(np.exp(1j * (rolls[:, None] - rolls)))) - np.pi
+    np.fill_diagonal(off, 0.0)
+    return np.flatnonzero((np.abs(off) < HALF_TURN).all(axis=1)).tolist()
+
+
+def exposure_table(found: SelfCalibration, inputs: Inputs) -> Table:
+    """One row for each exposure: its detections, those in common with others, rms, and its frame.
+
+    'overlapping' are detections that lie where other exposures look, 'common' those of them that
+    are of a common star, 'fraction_common' is that fraction; rms in pixels.
+    """
+    s, d = found.mode, found.detections
+    p, model, E = s.problem, s.problem.model, len(d.exposure_names)
+    used = np.zeros(len(d), bool)
+    used[p.rows] = True
+    places = places_of(model, d, s.theta, inputs.dilation)
+    seen = _seen_by_others(model, s.theta, places, d.exposure)
+    total, overlap, common = (
+        np.bincount(d.exposure[which], minlength=E)
+        for which in (np.ones(len(d), bool), seen, used & seen)
+    )
+    w = memberships(p, s.theta, s.mixture, s.stars)
+    square = p.squares(s.theta, s.stars)
+    exposure = d.exposure[p.rows]
+    weight = np.bincount(exposure, w, minlength=E)
+    rms = np.sqrt(np.bincount(exposure, w * square, minlength=E) / np.maximum(2 * weight, 1e-9))
+    frames = [model.frame(s.theta, e) for e in range(E)]
+    units = {"rms": "pix", "shift_u": model.unit, "shift_v": model.unit, "rotation": "deg"}
+    columns = {
+        "exposure": list(d.exposure_names),
+        "detections": total,
+        "overlapping": overlap,
+        "common": common,
+        "fraction_common": common / np.maximum(overlap, 1),
+        "rms": rms,
+        "shift_u": [shift[0] for _, shift in frames],
+        "shift_v": [shift[1] for _, shift in frames],
+        "rotation": [np.degrees(np.arctan2(M[1, 0], M[0, 0])) for M, _ in frames],
+    }
+    return Table(columns, units=units)
+
+
+def refuse_unconnected(table: Table) -> None:
+    """Refuse an exposure that hardly shares stars with the others where they overlap.
+
+    `table` is as `exposure_table` makes it.
+
+    Raises
+    ------
+    InputError
+        Naming it, and whether it lies half a turn from the others.
+    """
+    share = np.asarray(table["fraction_common"], float)
+    if len(share) < 3:  # of two nobody knows which one is wrong
+        return
+    usual = np.array([np.nanmedian(np.delete(share, k)) for k in range(len(share))])
+    few = share < FEW_COMMON * usual
+    if not few.any():
+        return
+    k = int(np.nanargmin(np.where(few, share / usual, np.nan)))
+    name = str(table["exposure"][k])
+    half = k in rolled_180(np.radians(np.asarray(table["rotation"], float)))
+    turned = ", and it lies half a turn from all the others" if half else ""
+    raise InputError(
+        f"exposure {name} has {100 * share[k]:.0f} % of its detections where others look in "
+        f"common with them, and the usual share is {100 * usual[k]:.0f} %{turned}",
+        where="selfcal.lists",
+        do=TURN_BACK
+        if half
+        else "check its pixels and its commanded offset and roll, or leave it out",
+    )
+
+
+def matching_facts(found: SelfCalibration, inputs: Inputs) -> dict[str, Any]:
+    """Section 'selfcal' of summary.json: how detections became stars."""
+    d, friends, p = found.detections, found.friends, found.mode.problem
+    counts = np.bincount(d.star[d.star != NO_STAR], minlength=friends.n_stars)
+    few = (counts > 1) & (counts < inputs.config.selfcal.min_detections)
+    unused = {
+        "of a star that one exposure alone has": int((counts == 1).sum()),
+        "of a star with too few detections": int(counts[few].sum()),
+        "second detection of a star in an exposure": friends.n_dropped,
+        "in a chain of several stars": int((d.star == NO_STAR).sum()) - friends.n_dropped,
+    }
+    warnings = []
+    if friends.n_ambiguous > AMBIGUOUS * max(p.n_stars, 1):
+        warnings.append(
+            f"{friends.n_ambiguous} groups of detections are ambiguous beside {p.n_stars} stars: "
+            "the field is crowded for this match radius"
+        )
+    return {
+        "n_exposures": len(d.exposure_names),
+        "n_stars": p.n_stars,
+        "n_ambiguous": friends.n_ambiguous,
+        "n_doubled": friends.n_doubled,
+        "n_chains": friends.n_chains,
+        "iterations": found.iterations,
+        "match_radius": p.match_radius,
+        "tangent_planes_pix": _moved(d, inputs.detections),
+        "detections": {
+            "read": inputs.n_read,
+            "cut": dict(inputs.rejected),
+            "used": len(p),
+            "unused": {reason: count for reason, count in unused.items() if count},
+        },
+        "per_star": {"median": float(np.median(p.counts)), "most": int(p.counts.max())},
+        "warnings": warnings,
+    }
+
+
+def _moved(detections: Detections, raw: Detections) -> float:
+    """Largest distance, in pixels, by which a detection was moved onto the common tangent plane."""
+    return float(np.hypot(detections.x - raw.x, detections.y - raw.y).max())
+
+
+def _seen_by_others(
+    model: DistortionModel, theta: Float, places: Float, exposure: NDArray[np.int64]
+) -> Bool:
+    """Boolean mask (N,) of detections that lie on the sky where another exposure has a chip."""
+    E = len(model.exposures)
+    outlines = [
+        [hull_of(_corners(model, theta, e, chip.number, chip.size))[0] for chip in model.chips]
+        for e in range(E)
+    ]
+    out = np.zeros(len(places), bool)
+    for e in range(E):
+        rows = np.flatnonzero(exposure == e)
+        inside = np.zeros(len(rows), bool)
+        for other in range(E):
+            if other != e:
+                for outline in outlines[other]:
+                    inside |= inside_hull(places[rows], outline)
+        out[rows] = inside
+    return out
+
+
+def _corners(
+    model: DistortionModel, theta: Float, exposure: int, chip: int, size: tuple[float, float]
+) -> Float:
+    x, y = (0.5 + n * np.array(c) for n, c in zip(size, ([0, 1, 1, 0], [0, 0, 1, 1]), strict=True))
+    when = None if model.time is None else np.full(4, model.time.epoch0[0])
+    return model.predict(theta, x, y, exposure=np.full(4, exposure), chip=chip, epoch=when)

@@ -1,0 +1,187 @@
+"""Model and first parameters of a self-calibration, from its lists alone or from what is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.app.config import SelfcalConfig
+from bayesdist.app.config.detector import one_chip
+from bayesdist.app.kinds.selfcal.commanded import Commanded
+from bayesdist.app.kinds.star_lists import positions_by_chip, start_of
+from bayesdist.data import ReferenceCatalog
+from bayesdist.data.detections import Detections
+from bayesdist.data.matching.frames import mutual_frames
+from bayesdist.data.matching.linear_map import LinearMap, best_similarity
+from bayesdist.data.matching.similarity import Similarity, find_similarity, pattern_index
+from bayesdist.errors import InputError
+from bayesdist.infer import load_fit, load_posterior
+from bayesdist.infer.selfcal.start import (
+    Start,
+    chips_side_by_side,
+    fitted_polynomials,
+    start_parameters,
+    undistorted,
+)
+from bayesdist.model import Chip, DistortionModel
+
+__all__ = ["started"]
+
+Float = NDArray[np.float64]
+
+
+def started(
+    config: SelfcalConfig,
+    base: Path,
+    d: Detections,
+    unit_arcsec: float | None,
+    references: ReferenceCatalog | None,
+    commanded: Commanded | None,
+) -> tuple[DistortionModel, Float]:
+    """Model, and parameters (D,) by which the detections of a star lie near each other.
+
+    The sky lies as the reference stars do, or else as the commanded offsets, or else as the first
+    exposure.
+
+    Parameters
+    ----------
+    config : SelfcalConfig
+    base : Path
+        Folder that its files are relative to.
+    d : Detections
+    unit_arcsec : float or None
+        Size of the unit of u, v, where it is known.
+    references : ReferenceCatalog or None
+    commanded : Commanded or None
+
+    Raises
+    ------
+    InputError
+        Naming exposures that have no stars in common; for a start that cannot be read, and
+        reference stars that are not found again.
+    """
+    block, number = config.selfcal, int(d.chip[0])  # of a detector of one chip, as in the data
+    chips = config.chips()
+    if not chips:
+        pixel = config.model.reference_pixel
+        chips = (one_chip(config.detector, pixel, number, f"chip {number}"),)
+    start = _first(config, base, chips, unit_arcsec)
+    # each chip of each exposure by itself: without a start nobody knows how the chips lie
+    several = len(chips) > 1 and block.initial_distortion is None
+    exposure, chip, rows = _lists(d, apart=several)
+    names = [d.exposure_names[e] for e in exposure]
+    mags = None if d.mag is None else [d.mag[r] for r in rows]
+
+    def planes(of: Start) -> list[Float]:
+        return [positions_by_chip(of, d.x[r], d.y[r], d.chip[r]) for r in rows]
+
+    if several:
+        labels = [f"{name} chip {n}" for name, n in zip(names, chip, strict=True)]
+        apart = mutual_frames(planes(start), mags, labels, source="selfcal.lists")
+        start = chips_side_by_side(start, chips, apart, exposure, chip)
+        exposure, chip, rows = _lists(d, apart=False)
+        names, mags = list(d.exposure_names), None if d.mag is None else [d.mag[r] for r in rows]
+    on = planes(start)
+    onto = _onto_references(on[0], None if mags is None else mags[0], references)
+    if onto is not None:
+        on = [onto(plane) for plane in on]
+    frames = mutual_frames(on, mags, names, source="selfcal.lists")
+    if onto is None and commanded is not None and commanded.offsets is not None:
+        middles = np.stack([plane.mean(axis=0) for plane in on])
+        turned = _onto_offsets(frames.matrices, frames.shifts, middles[0], commanded.offsets)
+        if turned is not None:
+            onto, on = turned, [turned(plane) for plane in on]
+            frames = mutual_frames(on, mags, names, source="selfcal.lists")
+    middles = np.stack([plane.mean(axis=0) for plane in on])
+    model = DistortionModel(
+        config.model.order,
+        chips,
+        unit=block.unit,
+        time=config.time(),
+        frames=block.frames,
+        exposures=d.exposure_names,
+        origin=(float(middles[0, 0]), float(middles[0, 1])),
+    )
+    coefficients = fitted_polynomials(start, chips, model.order, onto)
+    return model, start_parameters(model, coefficients, frames, middles)
+
+
+def _lists(d: Detections, *, apart: bool) -> tuple[NDArray[np.int64], NDArray[np.int64], list]:
+    """Exposure and chip of each list, and the rows of its detections."""
+    found = []
+    for e in range(len(d.exposure_names)):
+        here = np.flatnonzero(d.exposure == e)
+        if not apart:
+            found.append((e, 0, here))
+            continue
+        found += [(e, int(n), here[d.chip[here] == n]) for n in np.unique(d.chip[here])]
+    exposure, number, rows = zip(*found, strict=True)
+    return np.array(exposure), np.array(number), list(rows)
+
+
+def _first(
+    config: SelfcalConfig, base: Path, chips: tuple[Chip, ...], unit_arcsec: float | None
+) -> Start:
+    """The known distortion: of an earlier run, an IDCTAB, or none."""
+    block, scale = config.selfcal, config.detector.scale_mas
+    pixel = 1.0
+    if block.unit != "pix" and scale is not None and unit_arcsec is not None:
+        pixel = scale / 1000 / unit_arcsec
+    if block.initial_distortion is None:
+        return undistorted(chips, pixel)
+    path = base / block.initial_distortion
+    if path.is_dir() or path.suffix == ".nc":
+        known = load_fit(path) if path.name == "fit.nc" else load_posterior(path)
+        if known.model.unit != block.unit:
+            raise InputError(
+                f"is in {known.model.unit}, and selfcal.unit is {block.unit!r}",
+                where=str(path),
+                do="calibrate in the same unit",
+            )
+
+        def earlier(x: Float, y: Float, chip: int) -> Float:
+            when = None if known.model.time is None else known.model.time.epoch0[0]
+            return np.asarray(known.model.predict(known.mean, x, y, chip=chip, epoch=when))
+
+        return earlier
+    if unit_arcsec is None:
+        raise InputError(
+            "an IDCTAB is in seconds of arc, and nobody says what a pixel is",
+            where=str(path),
+            do="give detector.scale_mas",
+        )
+    return start_of(path, unit_arcsec)
+
+
+def _onto_references(
+    plane: Float, mag: Float | None, references: ReferenceCatalog | None
+) -> LinearMap | None:
+    """Similarity from the first exposure onto the reference stars; a mirrored one is allowed."""
+    if references is None:
+        return None
+    index = pattern_index(np.column_stack([references.u, references.v]), references.mag)
+    given = {"source": "the first exposure", "reference_name": references.source}
+    use = mag if references.mag is not None else None
+
+    def found(mirrored: bool) -> Similarity:
+        return find_similarity(plane, index, mag=use, mirrored=mirrored, **given)
+
+    try:
+        return found(False).map
+    except InputError:
+        return found(True).map
+
+
+def _onto_offsets(
+    matrices: Float, shifts: Float, middle: Float, offsets: Float
+) -> LinearMap | None:
+    """Rotation and scale by which the exposures lie as they were commanded; None for one place."""
+    known = np.isfinite(offsets).all(axis=1)
+    if known.sum() < 2:
+        return None
+    places, asked = (matrices @ middle + shifts)[known], offsets[known]
+    if not np.ptp(places, axis=0).max() > 0:
+        return None
+    return LinearMap(best_similarity(places, asked).matrix, np.zeros(2), middle)

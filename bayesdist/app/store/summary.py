@@ -1,0 +1,415 @@
+"""summary.json, what scripts read of a run, as a model, of which the package has a JSON Schema."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+__all__ = [
+    "AddedErrorRow",
+    "BudgetRow",
+    "CoverageRow",
+    "HoldoutTest",
+    "MapRow",
+    "MarginRow",
+    "MeanAndSd",
+    "MisfitRow",
+    "Part",
+    "ProductRow",
+    "ScoreTestRow",
+    "Sections",
+    "StructureRow",
+    "Summary",
+    "ValidityRow",
+    "head_of",
+    "schema_text",
+]
+
+
+Number = float | None  # null where it is not finite, or not known
+
+
+class Part(BaseModel):
+    """A part of summary.json; a later version of the package may add keys to it."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+
+class MeanAndSd(Part):
+    """Posterior mean and standard deviation."""
+
+    mean: Number
+    sd: Number
+
+
+class AddedErrorRow(Part):
+    """Error beyond the quoted one that a group of matches has along an axis."""
+
+    label: str
+    axis: str
+    n: float = Field(description="good stars")
+    added: Number
+    added_error: Number
+    excess: Number = Field(description="beyond the smallest of all groups, which the jitter has")
+    variance: float = Field(description="square of `added`, as it was estimated")
+    variance_error: Number
+
+
+class MapRow(Part):
+    """Largest errors of positions over a chip."""
+
+    chip: int
+    sigma_u_max: Number
+    sigma_v_max: Number
+    sigma_max: Number = Field(None, description="largest per axis: rms of sigma_u and sigma_v")
+    ce68_max: Number = Field(None, description="largest radius of a circle that holds 68 %")
+    ce95_max: Number = Field(None, description="largest radius of a circle that holds 95 %")
+    radius_max: Number = Field(description="largest hypot(sigma_u, sigma_v)")
+    position_of_max: list[float] = Field(description="x and y, pixels")
+    radius_max_least_squares: Number
+    radius_max_relative: Number = Field(None, description="of relative positions, with a gauge")
+
+
+class MisfitRow(Part):
+    """Structure that the least-squares fit leaves in the residuals."""
+
+    chip: int | None = None
+    p_value: Number
+    partition: str = Field(description="the bins that tell most")
+    structure: Number = Field(description="rms of the structure, in the unit of u and v")
+    power: Number = Field(
+        description="fraction of the patterns that would be seen; below 1 where stars are fitted"
+    )
+
+
+class StructureRow(Part):
+    """Structure beyond the model on one axis of a chip."""
+
+    chip: int
+    axis: Literal["u", "v"]
+    rms: Number = Field(description="over the chip and the draws")
+    median: float = Field(description="of the draws' rms")
+    most: float = Field(description="95 % quantile of the draws' rms")
+    length_pix: Number = Field(description="correlation length, pixels")
+
+
+class ScoreTestRow(Part):
+    """A targeted test of the residuals for what the model lacks."""
+
+    name: str
+    statistic: Number
+    dof: Number
+    dof_residual: Number
+    p_value: Number
+    size: Number
+    smallest: Number = Field(description="size that would have been found")
+    unit: str
+    remedy: str
+    finding: str
+    significant: bool
+
+
+class CoverageRow(Part):
+    """Fraction of the stars within so many sigma of the prediction."""
+
+    axis: str
+    sigma: float
+    n: int
+    value: Number
+    expected: Number
+    interval: list[Number] = Field(description="95 %")
+
+
+class HoldoutTest(Part):
+    """A test of the stars that were held out."""
+
+    name: str
+    part: str
+    is_omnibus: bool = Field(description="all bins of the part at once")
+    where: str
+    n: int
+    value: Number
+    expected: Number
+    p_value: Number
+    p_corrected: Number = Field(description="Holm")
+
+
+class BudgetRow(Part):
+    """A row of the error budget: rms over all chips."""
+
+    name: str
+    kind: Literal["random", "systematic", "scale", "rotation", "local", "product"] | str
+    u: Number
+    v: Number
+    radial: Number
+    radial_error: Number = None
+    source: str = ""
+
+
+class WorstPosition(Part):
+    """Where a requirement is met worst."""
+
+    chip: int
+    x: float
+    y: float
+    rms: Number
+
+
+class MarginRow(Part):
+    """How a requirement is met."""
+
+    name: str
+    statistic: str
+    limit: float
+    value: Number
+    interval: list[Number] = Field(description="95 %")
+    margin: Number
+    margin_percent: Number = Field(description="of the limit")
+    unit: str
+    epoch: Number = Field(description="of a range the worst one")
+    chip: int | None = Field(description="null: all chips together")
+    region: str | list[list[float]]
+    epochs: list[float] | None
+    relative: bool
+    separation: Number
+    magnitude: Number
+    probability: float = Field(description="that is asked for")
+    probability_met: Number
+    mc_error: Number = Field(description="Monte-Carlo error of probability_met")
+    verdict: str
+    reason: str
+    rests_on: list[str]
+    worst: WorstPosition
+    remedy: str | None
+
+
+class ValidityRow(Part):
+    """Until when a requirement is met."""
+
+    name: str
+    probability: float
+    date: Number = Field(description="null: not before `until`")
+    interval: list[Number]
+    until: float
+    sentence: str
+
+
+class ProductRow(Part):
+    """A file for a pipeline, and what was verified on it as written."""
+
+    path: str
+    kind: str
+    findings: list[str]
+    forward_rms: Number = None
+    inverse_rms: Number = None
+    total_rms: Number = Field(None, description="total error for whoever uses the file forward")
+
+
+class Data(Part):
+    """What was read and used."""
+
+    n_rows: int
+    n_used: int
+    n_rejected: int
+    rejected: dict[str, int] = Field(description="rows by reason")
+    n_exposures: int
+    sources: list[str]
+    tangent_point: Annotated[list[float], Field(min_length=2, max_length=2)] | None = Field(
+        description="RA and Dec in degrees"
+    )
+
+
+class AddedErrors(Part):
+    """Errors beyond the quoted ones that groups of matches have."""
+
+    grouping: str
+    by: str = Field(description="what the groups differ in; empty for one group")
+    evidence: dict[str, float] = Field(description="ln evidence gained, by grouping")
+    dispersion: float
+    groups: list[AddedErrorRow] = Field(description="along u and v by turns")
+
+    @field_validator("groups")
+    @classmethod
+    def _axes(cls, rows: list[AddedErrorRow]) -> list[AddedErrorRow]:
+        if [row.axis for row in rows] != ["u", "v"] * (len(rows) // 2):
+            raise ValueError("the axes are not u and v by turns")
+        return rows
+
+
+class Fit(Part):
+    """The least-squares fit."""
+
+    order: int
+    chi2: Number
+    dof: int
+    rms_u: Number
+    rms_v: Number
+    unit: str
+    condition: Number
+    n_parameters: int
+    error_scale: Number = Field(1.0, description="factor on the quoted errors")
+    added_errors: AddedErrors | None = None
+
+
+class Outliers(Part):
+    """The outlier mixture."""
+
+    model: Literal["gaussian", "uniform", "none"]
+    unit: str
+    fraction: MeanAndSd | None = None
+    jitter: MeanAndSd | None = None
+    scale: MeanAndSd | None = None
+    n_flagged: int = Field(description="with a probability above 0.5")
+    match_circle: Number = None
+
+
+class Sampler(Part):
+    """How the posterior was drawn, and whether the chains have converged."""
+
+    method: str
+    exact: bool = Field(description="false of draws that stand for the posterior")
+    converged: bool
+    reasons: list[str] = Field(description="why it has not converged")
+    rhat_max: Number
+    ess_bulk_min: Number
+    ess_tail_min: Number
+    pareto_k: Number
+    importance_efficiency: Number
+    ensembles: int
+    walkers: int
+    steps: int
+    passes: int
+    acceptance: Number
+    wall_s: Number
+
+
+class Map(MapRow):
+    """Largest errors of positions: of all chips, and of each."""
+
+    unit: str
+    epoch: Number
+    chips: list[MapRow]
+
+
+class Misfit(MisfitRow):
+    """Structure in the residuals: of the worst chip, corrected for their number, and of each."""
+
+    unit: str
+    significant: bool
+    chips: list[MisfitRow] = Field(default_factory=list)
+
+
+class CorrelatedErrors(Part):
+    """What the model may leave out, as the residuals of all stars show it."""
+
+    structure: list[StructureRow]
+    unit: str
+    noise_ratio: Number = Field(description="variance by the stars' scatter over the formal one")
+
+
+class Holdout(Part):
+    """How the prediction holds for stars that were set aside."""
+
+    n: int
+    n_excluded: int = Field(description="stars of exposures with too few to be predicted")
+    exposures: list[str]
+    p_value: Number
+    verdict: str
+    level: Literal["pass", "warn", "fail"]
+    coverage: list[CoverageRow]
+    tests: list[HoldoutTest]
+
+
+class Periods(Part):
+    """Whether the distortion changes with time."""
+
+    verdict: str
+    significant: bool
+    unit: str
+    periods: list[dict[str, Any]]
+    first_vs_last: dict[str, Any]
+
+
+class Warned(Part):
+    """A section with warnings."""
+
+    warnings: list[str] = Field(default_factory=list)
+
+
+class Verdict(Part):
+    """The worst of all checks, requirements and validity periods, in words."""
+
+    level: Literal["pass", "warn", "fail"]
+    headline: str
+
+
+class Sections(Part):
+    """What the stages that have ended found, section by section."""
+
+    matching: Warned | None = Field(None, description="of a campaign")
+    selfcal: Warned | None = Field(None, description="of a self-calibration")
+    data: Data | None = None
+    fit: Fit | None = None
+    outliers: Outliers | None = None
+    sampler: Sampler | None = None
+    discrepancy: CorrelatedErrors | None = None
+    score_tests: list[ScoreTestRow] | None = None
+    holdout: Holdout | None = None
+    periods: Periods | None = None
+    map: Map | None = None
+    budget: list[BudgetRow] | None = None
+    misfit: Misfit | None = None
+    margins: list[MarginRow] | None = None
+    validity_periods: list[ValidityRow] | None = None
+    warnings: list[str] | None = None
+    products: list[ProductRow] | None = None
+    figures: list[str] | None = None
+    verdict: Verdict | None = Field(None, description="headline of the report")
+    gauge: dict[str, Any] | None = Field(None, description="exposures: what holds the solution")
+    lines: list[dict[str, Any]] | None = Field(None, description="linear terms against time")
+    tables: Warned | None = Field(None, description="look-up tables")
+    scatter: dict[str, Any] | None = Field(None, description="variation from exposure to exposure")
+    deviations: Warned | None = Field(None, description="exposures that deviate")
+    exposures_skipped: dict[str, Any] | None = None
+    exposures_outlying: list[Any] | None = None
+    time_dependence: Warned | None = Field(None, description="linear terms, exposure by exposure")
+
+
+class Summary(Sections):
+    """Content of summary.json: the run as a whole, and what the stages that have ended found."""
+
+    schema_: Literal[2] = Field(alias="schema")
+    bayesdist: str = Field(description="version of the package")
+    kind: Literal["data", "campaign", "selfcal"] = Field(description="what the run begins with")
+    detector: str = Field(description="name of detector or chips, and filter of a campaign")
+    began: str = Field(description="when the run began, UTC")
+    simulated: bool = Field(description="the input is simulated, as the configuration has it")
+
+
+def head_of(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """What summary.json says of the run as a whole.
+
+    Parameters
+    ----------
+    facts : mapping
+        Of run.json.
+    """
+    config = facts["config"]
+    kind = next(one for one in ("data", "campaign", "selfcal") if one in config)
+    chips = " and ".join(chip["name"] for chip in config["chip"])
+    parts = [config["detector"]["name"] or chips, config[kind].get("filter")]
+    return {
+        "bayesdist": facts["versions"]["bayesdist"],
+        "kind": kind,
+        "detector": ", ".join(part for part in parts if part),
+        "began": facts["created"],
+        "simulated": config[kind]["simulated"],
+    }
+
+
+def schema_text() -> str:
+    """Text of the JSON Schema of summary.json."""
+    return json.dumps(Summary.model_json_schema(), indent=1) + "\n"
