@@ -1,4 +1,9 @@
-"""FITS files of maps over the detector: errors of positions, and areas of pixels."""
+"""FITS files of maps over the detector: errors of positions, and areas of pixels.
+
+Of areas the image stands in the primary HDU for one chip, as the observatory's files have it, and
+in extensions SCI, 1 and on for several, in the order of an exposure's own.  Standard deviations
+follow as ERR.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Filters beside the reference: offsets of linear terms, whether all drift alike, and figures."""
+"""Filters beside the reference: offsets of linear terms, whether all drift alike, and figures.
+
+ACS ISR 2015-06, section 4.4.4 and Figures 25 and 26.
+"""
 
 from __future__ import annotations
 

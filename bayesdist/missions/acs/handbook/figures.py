@@ -24,11 +24,7 @@ from bayesdist.report.style import PALETTE, nice_below
 if TYPE_CHECKING:
     from bayesdist.assess import BinnedResiduals
 
-__all__ = [
-    "area_figure",
-    "non_linear_figure",
-    "residual_figure",
-]
+__all__ = ["area_figure", "non_linear_figure", "residual_figure"]
 
 Float = NDArray[np.float64]
 

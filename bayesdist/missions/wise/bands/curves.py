@@ -10,13 +10,7 @@ from bayesdist.numbers import probability
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import INK, PALETTE, WIDTH, legend_above, new_figure
 
-__all__ = [
-    "CASES",
-    "below_draws",
-    "chance_of",
-    "correlation",
-    "histograms",
-]
+__all__ = ["CASES", "below_draws", "chance_of", "correlation", "histograms"]
 
 # colour, width and dashes by case, drawn in this order
 CASES = {

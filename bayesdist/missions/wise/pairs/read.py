@@ -21,10 +21,10 @@ from bayesdist.data.reading.options import ReadOptions, check_sigma, refuse_miss
 from bayesdist.data.tables.column import Place, SourceColumn
 from bayesdist.data.tables.quantities import Columns, Quantities
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.pairs.array_check import ArrayCheck
 from bayesdist.missions.wise.pairs.files import (
     MAGNITUDES,
     RVB_ALIASES,
+    ArrayCheck,
     RvbFile,
     band_name,
     open_rvb_files,

@@ -1,4 +1,9 @@
-"""AST's dump of an object, and the mappings that it holds."""
+"""AST's dump of an object, and the mappings that it holds.
+
+A dump is of lines ``Begin CLASS``, ``Name = value``, ``IsA CLASS`` (what follows belongs to the
+class that is named next) and ``End CLASS``; what stands after a # is a comment, and an attribute
+whose value is an object has nothing behind its equals sign.
+"""
 
 from __future__ import annotations
 

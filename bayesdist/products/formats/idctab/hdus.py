@@ -1,4 +1,16 @@
-"""HDUs of an IDCTAB that is built, and the cards of its headers."""
+"""HDUs of an IDCTAB that is built, and the cards of its headers.
+
+Keywords of its primary header:
+
+==================  ==========================================================================
+BDVAFAC, BDUNIT     velocity aberration that was divided out; unit of u and v in the fit
+BDU0_c, BDV0_c      constant of chip c that went into V2REF and V3REF
+BDANGLE, BDSCALE    similarity from (u, v) to (Xc, Yc); sigmas BDANGSIG, BDSCASIG
+BDV2SIG, BDV3SIG    sigmas of V2 and V3 of (u, v) = (0, 0)
+BDAGRRMS, BDAGRMAX  distance to the reference table when the similarity is taken out
+BDCLOS_c            worst closure of the INVERSE rows of chip c
+==================  ==========================================================================
+"""
 
 from __future__ import annotations
 

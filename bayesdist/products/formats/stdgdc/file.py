@@ -1,4 +1,22 @@
-"""STDGDC files, and the frame of the corrected positions in them."""
+"""STDGDC files, and the frame of the corrected positions in them.
+
+Extensions in this order, the primary header giving their dimensions:
+
+1. XGC, YGC: corrected x and y of each pixel, in FITS 1-based pixels; between pixels bilinear
+2. (as the third) MGC: what is added to magnitudes for the area of the pixel
+3. XCG, YCG: pixel x and y of each corrected position: the inverse
+
+A file of ours has in addition, where no consumer looks: SXGC, SYGC, standard errors of XGC and YGC,
+CXYGC, their correlation, and BDPARAM, the parameters behind it all with their covariance.
+
+The corrected frame is that of the detector, without distortion:
+
+    corrected = reference + S^-1 ((u, v) - zero)
+
+where S is the similarity (a scale, a rotation, perhaps a mirror) nearest to the map at its
+reference pixel, so that the corrected frame lies along the detector and has its scale; the skew of
+the map stays in it.
+"""
 
 from __future__ import annotations
 

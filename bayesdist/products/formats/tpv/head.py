@@ -1,4 +1,11 @@
-"""Headers with CTYPE TPV, one of each chip, and the powers that PVi_m multiply."""
+"""Headers with CTYPE TPV, one of each chip, and the powers that PVi_m multiply.
+
+With (X, Y) = CD (p - CRPIX) in degrees and r its length, PV1_m multiplies the m-th of
+
+    1, X, Y, r, X^2, XY, Y^2, X^3, ..., Y^3, r^3, X^4, ...
+
+(after each odd order n comes r^n, up to the 7th order), and PV2_m the same with X and Y exchanged.
+"""
 
 from __future__ import annotations
 
