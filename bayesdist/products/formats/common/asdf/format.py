@@ -18,6 +18,7 @@ from bayesdist.products.formats.common.document import (
 )
 from bayesdist.products.formats.common.read_back import ReadBack
 
+# astropy.modeling, which these need, takes longer to import than other files to read
 if TYPE_CHECKING:
     from bayesdist.products.formats.common.asdf.build import ChipTransform
     from bayesdist.products.formats.common.asdf.distortion import DistortionFile

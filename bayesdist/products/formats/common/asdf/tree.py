@@ -49,9 +49,6 @@ class Detector:
     scale: float  # arcsec, nominal
 
 
-# astropy.modeling, which these need, takes longer to import than other files to read
-
-
 _START = b"#ASDF"
 
 
