@@ -254,7 +254,7 @@ def draw_filters(
     """
     # figures take seconds to import
     from bayesdist.report.drawing import save_figures
-    from bayesdist.report.filters import FilterTerm, filters_figure
+    from bayesdist.report.figures.filters import FilterTerm, filters_figure
 
     model = next(iter(fits.values())).linear.model
     time = model.time

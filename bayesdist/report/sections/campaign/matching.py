@@ -14,7 +14,7 @@ from bayesdist.numbers import count, number, percent, size_of
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import (
+from bayesdist.report.figures.style import (
     GUIDE,
     INK,
     PALETTE,

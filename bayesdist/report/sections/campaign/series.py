@@ -23,7 +23,7 @@ from bayesdist.report.sections.campaign.terms import (
     name_of_term,
     terms_of,
 )
-from bayesdist.report.style import CYCLE, INK, WIDTH, guide_lines, legend_above, new_figure
+from bayesdist.report.figures.style import CYCLE, INK, WIDTH, guide_lines, legend_above, new_figure
 
 if TYPE_CHECKING:
     from bayesdist.report.campaign import LinearSeries

@@ -14,7 +14,7 @@ from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.gauge import gauge_of_new_exposure
-from bayesdist.report.style import (
+from bayesdist.report.figures.style import (
     CYCLE,
     INK,
     LEVEL_COLORS,

@@ -22,9 +22,9 @@ from bayesdist.numbers import (
 )
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
-from bayesdist.report.corners import Column, corner_figure
+from bayesdist.report.figures.corners import Column, corner_figure
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import (
+from bayesdist.report.figures.style import (
     COLORBAR,
     CYCLE,
     DIVERGING,

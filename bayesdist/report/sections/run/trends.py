@@ -14,7 +14,7 @@ from bayesdist.numbers import count, display_scale, number
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import (
+from bayesdist.report.figures.style import (
     CYCLE,
     INK,
     OUTLINE,
