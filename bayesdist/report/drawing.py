@@ -26,8 +26,8 @@ from PIL import Image
 
 from bayesdist.files import atomic_path, made_folder
 from bayesdist.report.figures.figure_numbers import numbers_of
-from bayesdist.report.registry import Item, Plot, Registry
 from bayesdist.report.figures.style import figure_style, plain_ticks
+from bayesdist.report.registry import Item, Plot, Registry
 
 __all__ = [
     "DPI",

@@ -16,7 +16,14 @@ from bayesdist.numbers import size_of
 from bayesdist.report.figures.arrows import Arrows, vector_map
 from bayesdist.report.figures.mosaic import Mosaic
 from bayesdist.report.figures.panels import ChipPanels
-from bayesdist.report.figures.style import COLORBAR, PALETTE, WIDTH, figure_style, new_figure, nice_below
+from bayesdist.report.figures.style import (
+    COLORBAR,
+    PALETTE,
+    WIDTH,
+    figure_style,
+    new_figure,
+    nice_below,
+)
 
 if TYPE_CHECKING:
     from bayesdist.assess.comparison.compare import Comparison

@@ -24,8 +24,8 @@ from bayesdist.assess.comparison.tables import comparison_table, difference_tabl
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
 from bayesdist.products.formats.common.document import MissingSizeError
-from bayesdist.report.figures.comparison import difference_vectors
 from bayesdist.report.drawing import save_figures
+from bayesdist.report.figures.comparison import difference_vectors
 
 __all__ = ["compare_files", "joined"]
 

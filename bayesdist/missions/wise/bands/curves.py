@@ -7,8 +7,8 @@ import numpy as np
 from bayesdist.missions.wise.assess.residual_correlation import DRAWS
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput
 from bayesdist.numbers import probability
-from bayesdist.report.registry import Plot
 from bayesdist.report.figures.style import INK, PALETTE, WIDTH, legend_above, new_figure
+from bayesdist.report.registry import Plot
 
 __all__ = ["CASES", "below_draws", "chance_of", "correlation", "histograms"]
 

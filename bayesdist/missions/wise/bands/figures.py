@@ -15,8 +15,8 @@ from bayesdist.numbers import size_of
 from bayesdist.report.figures.arrows import Arrows, cross_map, magnification_of, spacing, vector_map
 from bayesdist.report.figures.fields import Grid, scalar_map
 from bayesdist.report.figures.panels import ArrayPanels
-from bayesdist.report.registry import Plot
 from bayesdist.report.figures.style import nice_below
+from bayesdist.report.registry import Plot
 
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap

@@ -16,8 +16,8 @@ from bayesdist.numbers import count, number
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.panels import chip_axes
-from bayesdist.report.registry import Plot
 from bayesdist.report.figures.style import CYCLE, INK, WIDTH, new_figure
+from bayesdist.report.registry import Plot
 from bayesdist.report.texttable import TextTable
 
 if TYPE_CHECKING:
