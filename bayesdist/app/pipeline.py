@@ -35,9 +35,9 @@ from bayesdist.app.products.made_files import product_input, product_of, solutio
 from bayesdist.app.products.product_terms import file_errors
 from bayesdist.app.report import report
 from bayesdist.assess import evaluation as assessed
-from bayesdist.assess import star_sample
 from bayesdist.assess.error_model import ErrorModel
 from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.diagnose.residuals.sample import star_sample
 from bayesdist.infer import Posterior
 
 __all__ = [

@@ -31,7 +31,7 @@ from bayesdist.checks import warnings_of
 from bayesdist.data import Matches
 from bayesdist.data.storage.write import write_columns
 from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
-from bayesdist.diagnose.residuals.majority import majority_sentence
+from bayesdist.diagnose.residuals.quoted import majority_sentence
 from bayesdist.files import made_folder, remove_leftovers
 from bayesdist.infer import LinearFit, Posterior, save_posterior
 from bayesdist.infer.posterior.memberships import memberships_of

@@ -1,4 +1,7 @@
-"""Everything that moves a position: a solution, and terms that are independent of each other."""
+"""Everything that moves a position: a solution, and terms that are independent of each other.
+
+Errors that its likelihood does not know of spread the draws of a solution.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.adjusted import with_diagnosed_errors
 from bayesdist.assess.budget.budget import ErrorBudget, budget_of
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors, generators
@@ -21,8 +23,10 @@ from bayesdist.assess.terms.parameters import catalogue_terms
 from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.assess.units import pixel_scale_of
 from bayesdist.diagnose.diagnostics import Diagnostics
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 from bayesdist.infer import LinearFit, Posterior
+from bayesdist.infer.catalogue.star_errors import StarCovariance
+from bayesdist.infer.equations.scaled import recolouring, scaled_cholesky
 from bayesdist.infer.solution import Solution
 from bayesdist.memory import require_memory
 from bayesdist.model import LookupTable
@@ -33,7 +37,8 @@ __all__ = [
     "diagnosed_error_model",
     "error_budget",
     "error_model",
-    "solution_with_errors",
+    "with_diagnosed_errors",
+    "with_shared_stars",
 ]
 
 Float = NDArray[np.float64]
@@ -167,16 +172,24 @@ def error_model(
     pixel_scale : float, optional
         Size of one pixel in mas; `pixel_scale_of` the solution by default.
 
-    Returns
-    -------
-    ErrorModel
-
     Raises
     ------
     InputError
         For a term whose unit needs a pixel scale that is not known.
     """
-    return _model(solution, SolutionErrors(solution), terms, aligned, pixel_scale)
+    if pixel_scale is None:
+        pixel_scale = pixel_scale_of(solution)
+    errors, others = SolutionErrors(solution), list[ErrorTerm]()
+    for term in terms:
+        if isinstance(term, SolutionErrors):
+            errors = replace(term, solution=solution)
+        elif isinstance(term, UserTerm):
+            others.append(term.in_unit(solution.model.unit, pixel_scale))
+        else:
+            others.append(term)
+    if not any(isinstance(term, Centroids) for term in others):
+        others.append(Centroids(None))  # a domain that names a magnitude asks for it
+    return ErrorModel(errors, tuple(others), aligned)
 
 
 def diagnosed_error_model(
@@ -186,10 +199,10 @@ def diagnosed_error_model(
     *,
     hierarchy: LinearFit | None = None,
     catalogue: str = "catalogue",
-    aligned: bool = False,
     single: bool = False,
     frames: bool = False,
     structure_left: bool = True,
+    aligned: bool = False,
     pixel_scale: float | None = None,
 ) -> ErrorModel:
     """The error model of a posterior, with what residuals say of it.
@@ -201,13 +214,11 @@ def diagnosed_error_model(
     diagnostics : Diagnostics
         Its correlated errors, and what errors of the catalogue do, count in.
     terms : sequence of ErrorTerm
-        As of `error_model`.
+        Other errors.
     hierarchy : LinearFit, optional
         Of a hierarchy of exposures: its covariance has no noise of draws.
     catalogue : str
         Name of the file that states the catalogue's errors.
-    aligned : bool
-        As of `ErrorModel`.
     single : bool
         Whether the star lies in a single exposure, whose deviation counts; else in the mean.
     frames : bool
@@ -215,50 +226,26 @@ def diagnosed_error_model(
     structure_left : bool
         Whether what the model leaves out at a position counts; not where errors of look-up tables
         stand for it.
-    pixel_scale : float, optional
+    aligned, pixel_scale
         As of `error_model`.
-
-    Returns
-    -------
-    ErrorModel
 
     Raises
     ------
     InputError
         As `error_model`.
     """
-    of_solution = _with_diagnosed(posterior, diagnostics, hierarchy, catalogue)
     measured: list[ErrorTerm] = []
     correlated = diagnostics.correlated
     if correlated is not None and correlated.structure:
         measured.append(StructureErrors(correlated, frames, structure_left))
     if correlated is not None and correlated.linear is not None:
         measured.append(Deviations(correlated, single, frames))
-    return _model(posterior, of_solution, terms, aligned, pixel_scale, measured)
-
-
-def _model(
-    solution: Solution,
-    of_solution: SolutionErrors,
-    terms: Sequence[ErrorTerm],
-    aligned: bool,
-    pixel_scale: float | None,
-    measured: Sequence[ErrorTerm] = (),
-) -> ErrorModel:
-    """The error model of a solution, of what was measured, and of other terms."""
-    if pixel_scale is None:
-        pixel_scale = pixel_scale_of(solution)
-    others = list(measured)
-    for term in terms:
-        if isinstance(term, SolutionErrors):
-            of_solution = replace(term, solution=solution)
-        elif isinstance(term, UserTerm):
-            others.append(term.in_unit(solution.model.unit, pixel_scale))
-        else:
-            others.append(term)
-    if not any(isinstance(term, Centroids) for term in others):
-        others.append(Centroids(None))  # a domain that names a magnitude asks for it
-    return ErrorModel(of_solution, tuple(others), aligned)
+    own = SolutionErrors(with_diagnosed_errors(posterior, diagnostics, hierarchy, noise_alone=True))
+    if diagnostics.catalogue is not None:
+        of_catalogue = catalogue_terms(posterior, diagnostics.catalogue, catalogue)
+        own = replace(own, without=posterior, catalogue=of_catalogue)
+    found = error_model(posterior, terms, aligned=aligned, pixel_scale=pixel_scale)
+    return replace(found, solution=own, terms=(*measured, *found.terms))
 
 
 def error_budget(
@@ -326,24 +313,67 @@ def error_budget(
     return errors.at(domain, n=n_draws, rng=rng)
 
 
-def _with_diagnosed(
-    posterior: Posterior, diagnostics: Diagnostics, hierarchy: LinearFit | None, catalogue: str
-) -> SolutionErrors:
-    """Errors of the parameters with those of the catalogue, and of the stars as they scatter."""
-    solution = with_diagnosed_errors(posterior, diagnostics, hierarchy, noise_alone=True)
-    if diagnostics.catalogue is None:
-        return SolutionErrors(solution)
-    terms = catalogue_terms(posterior, diagnostics.catalogue, catalogue)
-    return SolutionErrors(solution, posterior, terms)
+def with_shared_stars(posterior: Posterior, fit: LinearFit, stars: StarCovariance) -> Posterior:
+    """A posterior whose draws are spread by what the errors of the catalogue add.
+
+    The linear map that turns the covariance of the fit into the larger one is applied to the
+    deviations of the draws, so that they keep their shape: no noise could be added, as errors that
+    the fit takes for independent may cancel.  Where the posterior is as much wider than the fit as
+    its jitter says, so is the covariance that the map begins with.
+
+    `fit`: that `stars` was computed for. The result comes with other draws of theta and the same
+    mean; all else is as it was.
+    """
+    before = _covariance(posterior, fit)
+    return posterior.mapped(recolouring(before, before + stars.extra))
 
 
-def solution_with_errors(
-    posterior: Posterior, diagnostics: Diagnostics | None, hierarchy: LinearFit | None = None
+def with_diagnosed_errors(
+    posterior: Posterior,
+    diagnostics: Diagnostics | None,
+    hierarchy: LinearFit | None = None,
+    *,
+    noise_alone: bool = False,
 ) -> Posterior:
-    """Solution that is exported and shown: all errors of the parameters are in its draws.
+    """Posterior whose draws are spread by all that diagnostics know of errors of its parameters.
 
-    `posterior`: as it was sampled. `hierarchy`: as of `diagnosed_error_model`.
+    So it is exported and shown; `posterior` is as it was sampled.  `hierarchy` is the fit of a
+    hierarchy of exposures, whose covariance has no noise of draws.  `noise_alone` counts, of the
+    correlated errors, those of the stars as they scatter: what else there is stands in terms of its
+    own.
     """
     if diagnostics is None:
         return posterior
-    return with_diagnosed_errors(posterior, diagnostics, hierarchy)
+    solution, stars, found = posterior, diagnostics.catalogue, diagnostics.correlated
+    if stars is not None:
+        needed = required(hierarchy, "errors of the catalogue need a joint fit")
+        solution = with_shared_stars(posterior, needed, stars)
+    if found is None:
+        return solution
+    cov = found.noise if noise_alone else found.covariance
+    if hierarchy is None:
+        return solution.mapped(recolouring(found.formal, cov))
+    before = _covariance(posterior, hierarchy)
+    if stars is not None:
+        before = before + stars.extra
+    # frames follow as they are correlated with polynomials and drift
+    D = found.model.n_distortion
+    follow = np.linalg.solve(before[:D, :D], before[:D]).T
+    more = follow @ (cov - found.formal)[:D, :D] @ follow.T
+    return solution.mapped(recolouring(before, before + _least(before, (more + more.T) / 2)))
+
+
+def _covariance(posterior: Posterior, fit: LinearFit) -> Float:
+    """Covariance (D, D) of a posterior without the noise of its draws."""
+    formal = np.asarray(fit.cov, float)
+    wider = float(np.trace(np.linalg.solve(formal, posterior.cov))) / len(formal)
+    return wider * formal
+
+
+def _least(before: Float, more: Float) -> Float:
+    """Addition to a covariance, limited so that no direction loses more than half its variance."""
+    root = scaled_cholesky(before)
+    white = np.linalg.solve(root, np.linalg.solve(root, more).T)
+    values, vectors = np.linalg.eigh((white + white.T) / 2)
+    turned = root @ vectors
+    return np.asarray((turned * np.maximum(values, -0.5)) @ turned.T)

@@ -17,8 +17,8 @@ from bayesdist.assess.error_model import ErrorModel
 from bayesdist.assess.maps import RELATIVE, UncertaintyMap, uncertainty_map, with_local
 from bayesdist.assess.requirements.margins import Margin, judge
 from bayesdist.assess.requirements.requirement import Requirement
-from bayesdist.assess.requirements.rests_on import rests_on
 from bayesdist.assess.requirements.validity import ValidityPeriod, validity_period
+from bayesdist.assess.requirements.verdict import rests_on
 from bayesdist.assess.terms.centroid import centroids_of
 from bayesdist.assess.terms.correlated import StructureErrors
 from bayesdist.assess.terms.forms import Known
@@ -29,7 +29,7 @@ from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError, required
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.selfcal import gauge_free
-from bayesdist.infer.selfcal.relative import gauge_free_matrix
+from bayesdist.infer.selfcal.sky_moves import gauge_free_matrix
 from bayesdist.model import Chip
 from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.streams import restarted

@@ -23,9 +23,8 @@ from bayesdist.data.tables.checks import (
     refuse_half,
     without_missing,
 )
-from bayesdist.data.tables.column import SourceColumn, row_number
+from bayesdist.data.tables.column import Quantities, SourceColumn, row_number
 from bayesdist.data.tables.names import ALIASES, find_columns
-from bayesdist.data.tables.quantities import Quantities
 from bayesdist.data.tables.units import check_unit
 from bayesdist.errors import InputError
 from bayesdist.reading.tables import read_table

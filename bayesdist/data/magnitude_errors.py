@@ -1,8 +1,9 @@
-"""Errors by magnitude, from the residuals of a fit: for lists that carry none."""
+"""Errors by magnitude, from the residuals of a fit; and errors added to those that are quoted."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,11 +12,10 @@ from scipy.optimize import isotonic_regression
 
 from bayesdist.errors import InputError
 
-__all__ = ["MagnitudeErrors", "estimate", "no_magnitudes"]
+__all__ = ["AddedErrors", "MagnitudeErrors", "estimate", "no_magnitudes"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
-
 _MIN_STARS_IN_BIN = 40
 _MAX_BINS = 25
 _MIN_STARS = 10  # stars in all, below which the scatter is unknown
@@ -200,3 +200,30 @@ def _smoothed(log_sigma: Float, n: Int) -> Float:
     ]
     best = min([rising, *turned], key=chi2)
     return best if chi2(rising) - chi2(best) > _TURN else rising
+
+
+@dataclass(frozen=True, eq=False)
+class AddedErrors:
+    """Errors to be added in quadrature, by group; `other` is for stars of none of these groups.
+
+    A group is an axis, or an axis of the stars of one chip, exposure or filter.
+    """
+
+    by: str  # 'chip', 'exposure' or 'filter'; empty where all stars are of one group
+    labels: tuple[str, ...]  # length G: chip numbers or names; one empty text for one group
+    sigma: Float  # (G, 2), along u and v in their unit
+    other: Float  # (2,), of stars with another label, as of an exposure that was held out
+
+    def times(self, factor: float) -> AddedErrors:
+        """These errors multiplied by a factor."""
+        return replace(self, sigma=factor * self.sigma, other=factor * self.other)
+
+    def at(self, labels: Sequence[str], codes: Int) -> tuple[Float, Float]:
+        """Errors (N,) on u and v of stars, by the labels of their groups and codes (N,) into them.
+
+        `Matches.grouped` gives both.
+        """
+        row = {label: k for k, label in enumerate(self.labels)}
+        of_label = np.array([row.get(label, len(row)) for label in labels], np.int64)
+        added = np.vstack([self.sigma, self.other])[of_label[codes]]
+        return added[:, 0], added[:, 1]

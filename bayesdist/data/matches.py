@@ -11,12 +11,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.added_errors import AddedErrors
 from bayesdist.data.batches import batch_edges, every_kth
 from bayesdist.data.columns.checked import SIGMAS, MatchColumns, refuse_repeated
 from bayesdist.data.columns.joining import joined_arguments, joined_columns
 from bayesdist.data.columns.labels import Labels, merged_counts
-from bayesdist.data.magnitude_errors import MagnitudeErrors, no_magnitudes
+from bayesdist.data.magnitude_errors import AddedErrors, MagnitudeErrors, no_magnitudes
 from bayesdist.errors import InputError
 
 __all__ = ["BatchReader", "Matches"]

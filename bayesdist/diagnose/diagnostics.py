@@ -14,7 +14,7 @@ from bayesdist.checks import EITHER, Check
 from bayesdist.data import MagnitudeErrors, Matches
 from bayesdist.diagnose.checks import holdout_checks, score_checks, structure_checks
 from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors, estimate_discrepancy
-from bayesdist.diagnose.correlated.storage import as_stored
+from bayesdist.diagnose.correlated.result import as_stored
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_validation
 from bayesdist.diagnose.overlap import OverlapTest
@@ -22,7 +22,6 @@ from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, time_varia
 from bayesdist.diagnose.residuals.binned import BinnedSums
 from bayesdist.diagnose.residuals.coverage import Coverage, coverage_of
 from bayesdist.diagnose.residuals.epoch_shift import EpochShift, epoch_shift
-from bayesdist.diagnose.residuals.majority import majority_sentence
 from bayesdist.diagnose.residuals.misfit import (
     MAX_BINS,
     STARS_PER_BIN,
@@ -31,6 +30,7 @@ from bayesdist.diagnose.residuals.misfit import (
     partitions_for,
     worst_misfit,
 )
+from bayesdist.diagnose.residuals.quoted import majority_sentence
 from bayesdist.diagnose.residuals.sample import StarSample, centroid_scatter, star_sample
 from bayesdist.diagnose.residuals.star_sums import StarSums, flagged_by_exposure, star_sums
 from bayesdist.diagnose.score.result import ScoreTest

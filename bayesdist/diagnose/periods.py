@@ -26,7 +26,6 @@ from bayesdist.diagnose.residuals.misfit import STARS_PER_BIN
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import LinearFit
 from bayesdist.infer.compare.period_dates import sum_by_period
-from bayesdist.infer.compare.period_verdict import all_below, period_verdict
 from bayesdist.infer.compare.periods import (
     PeriodComparison,
     PeriodSums,
@@ -36,18 +35,20 @@ from bayesdist.infer.compare.periods import (
 from bayesdist.infer.compare.positions import PositionChange
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.limits import DIFFERENCE
+from bayesdist.numbers import p_words
 
 __all__ = [
     "PeriodPart",
     "PeriodSettings",
     "TimeVariation",
+    "all_below",
     "bins_for",
     "period_part",
+    "period_verdict",
     "time_variation",
 ]
 
 Int = NDArray[np.int64]
-
 MAX_BINS = 45  # along each side, as in Appendix C
 COMBINED = "combined"
 
@@ -248,3 +249,45 @@ def _residuals(
     }
     table = period_table(rows, rng=rng, arcsec_per_pixel=unit_arcsec or 1.0, absorbed=absorbed)
     return table if unit_arcsec else replace(table, unit=unit)
+
+
+def all_below(changes: Mapping[str, PositionChange], tolerance: float) -> bool:
+    """True if no period differs by more than a tolerance, with two sigma allowed for errors."""
+    # the largest value of a noisy field is biased high
+    return all(one.largest + 2 * one.sigma <= tolerance for one in changes.values())
+
+
+def period_verdict(
+    comparison: PeriodComparison,
+    changes: Mapping[str, PositionChange],
+    tolerance: float | None = None,
+) -> str:
+    """Sentence on the size, significance and importance of the change with time.
+
+    `changes` has every period against the combined model; differences of positions up to
+    `tolerance`, in the unit of u, v, do not matter.
+    """
+    chi2, dof, p = comparison.homogeneity
+    # the most significant, not the largest: the shortest period has the largest noise
+    name, most = max(changes.items(), key=lambda one: one[1].chi2)
+    unit = comparison.model.unit
+    head = "The distortion changes" if p < DIFFERENCE.value else "No change is seen"
+    out = (
+        f"{head} (chi-square {chi2:.4g} for {dof} degrees of freedom, {p_words(p, 2, 1e-12)}): "
+        f"{name} differs most from the combined model, by up to {most.largest:.2g} +- "
+        f"{most.sigma:.1g} {unit} at ({most.at[0]:.0f}, {most.at[1]:.0f}), where noise alone "
+        f"makes {most.noise_median:.2g} (95 %: {most.noise_95:.2g})"
+    )
+    if tolerance is None:
+        return out + "."
+    limit = f"the tolerance of {tolerance:g} {unit}"
+    if all_below(changes, tolerance):
+        return f"{out}; all periods are below {limit}."
+    beyond = [
+        name
+        for name, one in changes.items()
+        if one.p_value < DIFFERENCE.value and one.largest - 2 * one.sigma > tolerance
+    ]
+    if beyond:
+        return f"{out}; beyond {limit}: {', '.join(beyond)}."
+    return f"{out}; the data do not decide whether a period exceeds {limit}."

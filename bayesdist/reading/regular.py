@@ -16,6 +16,7 @@ __all__ = ["head_of", "opened", "read_bytes", "read_lines", "read_text"]
 PathLike = str | os.PathLike[str]
 
 MOST_HOLLOW = 1000  # times what was written: no file system compresses data as much
+PIECE = 2**24  # bytes that are read at once, where a file is longer than the system says
 MOST_TEXT = 2**28  # bytes of a configuration, or of a file of JSON
 
 _KINDS = {
@@ -97,7 +98,7 @@ def read_bytes(path: PathLike, *, most: int | None = None) -> bytes:
     with opened(path) as stream:
         size = os.fstat(stream.fileno()).st_size
         try:
-            raw = b"" if size > most else stream.read(most + 1)
+            raw = b"" if size > most else _up_to(stream, most, expected=size)
         except OSError as error:
             raise InputError(
                 f"cannot be read ({error.strerror or error})",
@@ -111,6 +112,19 @@ def read_bytes(path: PathLike, *, most: int | None = None) -> bytes:
             do="check that it is the file that is meant, or divide it",
         )
     return raw
+
+
+def _up_to(stream: io.BufferedReader, most: int, *, expected: int) -> bytes:
+    """Bytes of a stream, at most one beyond `most`; read at once where it has as many as expected.
+
+    Python allocates whatever is asked for before it reads.
+    """
+    parts, n = [], expected + 1
+    while n and (part := stream.read(n)):
+        parts.append(part)
+        most -= len(part)
+        n = min(max(most + 1, 0), PIECE)
+    return b"".join(parts)
 
 
 def read_text(path: PathLike, *, most: int | None = None) -> str:

@@ -30,7 +30,7 @@ def test_foreign_byte_order_and_type_become_float64():
 
 
 @pytest.mark.parametrize("name", ["x", "y", "u", "v", "epoch", "mag", "colour", "sigma_u"])
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e250])
 def test_values_that_are_not_finite_are_named(name, value):
     columns = {"sigma_u": np.ones(5), "sigma_v": np.ones(5), "epoch": np.full(5, 2e3)}
     columns |= {"mag": np.ones(5), "x": np.arange(5.0), "y": np.ones(5), "u": np.ones(5)}

@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bayesdist.data import MagnitudeErrors, Matches, batches, open_matches, read_matches
-from bayesdist.data.added_errors import AddedErrors
+from bayesdist.data.magnitude_errors import AddedErrors
 from bayesdist.data.storage.write import write_partitioned
 from bayesdist.data.tables import repeated as duplicates_module
 from bayesdist.errors import FormatError, InputError

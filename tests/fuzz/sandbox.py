@@ -27,7 +27,7 @@ from tests.sketches import sketched
 
 SECONDS = 20.0  # of processor time
 WAIT = 120.0  # seconds of the clock: the machine may be busy
-MEMORY = 3 << 30  # beyond what the process has mapped when it begins
+MEMORY = 2 << 30  # beyond what the process has mapped when it begins
 BATCH = 40
 # answers that depend on the machine, or count rows
 TIMES = re.compile(r"^cost .*$|\d+(\.\d+)? (s|ms|min)\b.*$|\d+ positions", re.MULTILINE)

@@ -266,6 +266,15 @@ def test_faults_are_found(written, edit, level, where, message):
     ), [str(f) for f in found]
 
 
+def test_a_side_file_that_is_gone_is_missed(written, tmp_path):
+    table = tmp_path / written[0].name
+    table.write_bytes(written[0].read_bytes())
+    document = registry.open_document(table)
+    assert [f.level for f in document.lint() if f.where == "covariance"] == ["warning"]
+    found = document.calibration()
+    assert found.errors == "none" and f"{written[1].name}, which is not here" in found.notes[0]
+
+
 def test_a_side_file_of_another_table_lends_no_errors(written, tmp_path):
     table, side = (tmp_path / path.name for path in written)
     text = written[0].read_text().splitlines()

@@ -14,9 +14,8 @@ from bayesdist.app.kinds.fitted import StoredLookupTables
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.assess import pixel_scale_of
 from bayesdist.assess.error_model import ErrorModel, diagnosed_error_model, error_model
-from bayesdist.assess.terms.between_nodes import interpolation_term
 from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorTerm
-from bayesdist.assess.terms.local import LocalErrors
+from bayesdist.assess.terms.local import LocalErrors, interpolation_term
 from bayesdist.assess.terms.parameters import ExposureVariation
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior

@@ -10,13 +10,13 @@ from astropy.table import Table
 
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.store.summary import CoverageRow, Holdout, HoldoutTest
-from bayesdist.assess.error_model import ErrorModel, solution_with_errors
+from bayesdist.assess.error_model import ErrorModel, with_diagnosed_errors
 from bayesdist.assess.evaluation import EvaluationSettings
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
 from bayesdist.infer import Posterior
-from bayesdist.infer.catalogue.star_influence import StarInfluence, star_influence
+from bayesdist.infer.catalogue.star_errors import StarInfluence, star_influence
 
 __all__ = ["holdout_summary", "holdout_table", "predictive_of_run"]
 
@@ -39,13 +39,13 @@ def predictive_of_run(
     scatter = data.fitted.scatter
     if scatter is not None:
         return replace(
-            predictive_of(solution_with_errors(posterior, found, data.fit)),
+            predictive_of(with_diagnosed_errors(posterior, found, data.fit)),
             deviations=ExposureDeviations(scatter.kinds, scatter.tau),
             stars=_known_stars(data),
             local=errors.local_tables(settings.grid, settings.epoch),
             cell=_table_cell(data),
         )
-    out = predictive_of(solution_with_errors(posterior, found))
+    out = predictive_of(with_diagnosed_errors(posterior, found))
     rows = None if found.correlated is None else found.correlated.facts.get("structure")
     if not rows:
         return out

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.matched import Matched
-from bayesdist.assess import SAMPLE
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.residuals.quoted import error_scale_sentence
+from bayesdist.diagnose.residuals.sample import SAMPLE
 from bayesdist.infer import LinearFit, Shards, load
 from bayesdist.infer.exposures.frame_choice import FrameChoice, frames_that_help
 from bayesdist.infer.stars.shards import Compute

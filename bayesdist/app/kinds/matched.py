@@ -22,7 +22,7 @@ from bayesdist.data.matches import Matches
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
-from bayesdist.infer.catalogue.star_influence import StarErrors
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.solution import Solution
 from bayesdist.limits import HELD_OUT
 from bayesdist.model import LookupTable

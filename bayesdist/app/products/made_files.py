@@ -14,7 +14,7 @@ from bayesdist.app.kinds.campaign.aberration import ABERRATION
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.assess.budget.budget import TOTAL
-from bayesdist.assess.error_model import solution_with_errors
+from bayesdist.assess.error_model import with_diagnosed_errors
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE_IN_FIT
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.assess.terms.parameters import CATALOGUE, MOTIONS
@@ -133,7 +133,9 @@ def solution_of(posterior: Posterior, found: Diagnostics | None, fitted: Fitted)
 
     Neither catalogue nor matches are needed for it.
     """
-    return solution_with_errors(posterior, found, None if fitted.scatter is None else fitted.linear)
+    return with_diagnosed_errors(
+        posterior, found, None if fitted.scatter is None else fitted.linear
+    )
 
 
 def product_of(

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 __all__ = ["Sections", "Summary", "head_of", "schema_text"]
 
@@ -36,6 +36,19 @@ class MeanAndSd(Part):
 
     mean: Number
     sd: Number
+
+
+class AddedErrorRow(Part):
+    """Error beyond the quoted one that a group of matches has along an axis."""
+
+    label: str
+    axis: str
+    n: float = Field(description="good stars")
+    added: Number
+    added_error: Number
+    excess: Number = Field(description="beyond the smallest of all groups, which the jitter has")
+    variance: float = Field(description="square of `added`, as it was estimated")
+    variance_error: Number
 
 
 class MapRow(Part):
@@ -202,6 +215,23 @@ class Data(Part):
     )
 
 
+class AddedErrors(Part):
+    """Errors beyond the quoted ones that groups of matches have."""
+
+    grouping: str
+    by: str = Field(description="what the groups differ in; empty for one group")
+    evidence: dict[str, float] = Field(description="ln evidence gained, by grouping")
+    dispersion: float
+    groups: list[AddedErrorRow] = Field(description="along u and v by turns")
+
+    @field_validator("groups")
+    @classmethod
+    def _axes(cls, rows: list[AddedErrorRow]) -> list[AddedErrorRow]:
+        if [row.axis for row in rows] != ["u", "v"] * (len(rows) // 2):
+            raise ValueError("the axes are not u and v by turns")
+        return rows
+
+
 class Fit(Part):
     """The least-squares fit."""
 
@@ -214,6 +244,7 @@ class Fit(Part):
     condition: Number
     n_parameters: int
     error_scale: Number = Field(1.0, description="factor on the quoted errors")
+    added_errors: AddedErrors | None = None
 
 
 class Outliers(Part):

@@ -12,7 +12,7 @@ from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import MarginRow, WorstPosition
 from bayesdist.assess import Margin, Requirement
-from bayesdist.assess.circular import per_axis
+from bayesdist.assess.maps import per_axis
 
 __all__ = ["judged_requirements", "margin_rows", "margin_table", "margins_text", "results_text"]
 

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import beta
 
+from bayesdist.assess.checks import visits_of
 from bayesdist.checks import LARGER, Check, doubts_of
+from bayesdist.diagnose.correlated import Discrepancy
+from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.limits import CONFIDENCE
+from bayesdist.model import DistortionModel
 
-__all__ = ["counting_error", "verdict_of"]
+__all__ = ["counting_error", "rests_on", "verdict_of"]
+
+Float = NDArray[np.float64]
 
 
 def counting_error(fraction: float, n: float) -> float:
@@ -51,3 +59,77 @@ def verdict_of(
         "undecided": reason,
     }[verdict]
     return "undecided", f"{texts}; {alone}"
+
+
+def rests_on(
+    model: DistortionModel,
+    diagnostics: Diagnostics,
+    epoch: float | None,
+    *,
+    given: Sequence[str] = (),
+    aligned: bool = False,
+    single: bool = False,
+    dates: Float,
+) -> tuple[str, ...]:
+    """Clauses on what a verdict at an epoch assumes, or has measured.
+
+    `epoch`: decimal years. `given`: names of the errors that the user gives. `aligned`, `single`:
+    as of `error_model`. `dates`: of the matches, decimal years.
+    """
+    out, correlated = [f"a polynomial of order {model.order}"], diagnostics.correlated
+    if correlated is not None:
+        out.append(_structure(correlated, model.unit))
+    out.append(f"errors given by the user: {', '.join(given) or 'none'}")
+    out.append(_exposures(model, correlated, aligned=aligned, single=single))
+    if correlated is not None and correlated.facts.get("exposures_measured") is False:
+        out.append("no variation between exposures, which is not measured")
+    visits = visits_of(dates)
+    if epoch is not None and visits.size:
+        first, last = float(visits.min()), float(visits.max())
+        beyond = max(first - epoch, epoch - last)
+        text = f"{visits.size} dates from {first:.2f} to {last:.2f}"
+        out.append(text + (f", judged {beyond:.1f} years beyond" if beyond > 0 else ""))
+    tests = diagnostics.score_tests
+    passed = [t for t in tests if not t.significant]
+    if tests:
+        sizes = (t.smallest for t in passed if np.isfinite(t.smallest) and t.unit == model.unit)
+        least = max(sizes, default=None)
+        text = f"{len(passed)} of {len(tests)} tests of the residuals that found nothing"
+        if least is not None:
+            text += f", and would have seen {least:.2g} {model.unit} rms"
+        out.append(text)
+    held = diagnostics.holdout
+    out.append("no held-out stars" if held is None else held.verdict)
+    return tuple(out)
+
+
+def _structure(correlated: Discrepancy, unit: str) -> str:
+    """Clause on the structure beyond the polynomial that counts."""
+    rows = correlated.facts.get("structure", [])
+    if not rows:
+        return "look-up tables, with their errors"
+    median, most = (
+        float(np.sqrt(np.mean([row[key] ** 2 for row in rows]))) for key in ("median", "most")
+    )
+    return (
+        f"structure beyond it of {median:.2g} {unit} rms on an axis, at most {most:.2g} with 95 % "
+        "probability, from residuals and prior"
+    )
+
+
+def _exposures(
+    model: DistortionModel, correlated: Discrepancy | None, *, aligned: bool, single: bool
+) -> str:
+    """Of which exposures the position is one."""
+    n = len(model.exposures)
+    if aligned:
+        return f"a position in a new exposure, which deviates as {n} exposures do"
+    linear = None if correlated is None else correlated.linear
+    if linear is None or "shape" not in linear.scatter:
+        return f"{n} exposures" if n > 1 else "one exposure, or the mean of several"
+    size = float(np.median(linear.scatter["shape"]))
+    what = f"whose {'scale and shears' if 'scale' in linear.kinds else 'shears'}"
+    what += f" scatter by {size:.1g}"
+    if single:
+        return f"a position in a single exposure, as {linear.n_exposures} exposures, {what}"
+    return f"a position in the mean of {linear.n_exposures} exposures, {what}"

@@ -17,9 +17,8 @@ from bayesdist.data.reading.columns import columns_read, is_on_sky, match_column
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky.positions import MOTIONS, SPARED, sky_columns
 from bayesdist.data.tables.checks import absent, without_missing
-from bayesdist.data.tables.column import row_number
+from bayesdist.data.tables.column import Quantities, row_number
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns
-from bayesdist.data.tables.quantities import Quantities
 from bayesdist.errors import InputError
 
 __all__ = ["matches_from_table", "own_epoch", "sky_positions", "with_sky_columns"]

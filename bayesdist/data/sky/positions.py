@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.data.sky.tangent import mean_direction
-from bayesdist.data.tables.column import SourceColumn
-from bayesdist.data.tables.quantities import Quantities
+from bayesdist.data.tables.column import Quantities, SourceColumn
 from bayesdist.errors import InputError
 
 __all__ = ["MOTIONS", "SKY_QUANTITIES", "SPARED", "ReferenceSky", "reference_sky", "sky_columns"]

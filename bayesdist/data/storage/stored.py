@@ -22,9 +22,8 @@ from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky.positions import sky_columns
 from bayesdist.data.sky.tangent import direction_of, direction_sum
 from bayesdist.data.tables.checks import refuse_half
-from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.column import Quantities, SourceColumn
 from bayesdist.data.tables.parquet import ParquetPart, RowBlock
-from bayesdist.data.tables.quantities import Quantities
 from bayesdist.data.tables.repeated import buckets_for, first_repetition
 from bayesdist.errors import InputError
 

@@ -27,6 +27,7 @@ __all__ = [
 Bool = NDArray[np.bool_]
 
 NOT_FINITE = ("refuse", "reject")
+LARGEST = 1e30  # of a value: its square over that of an error is still a number
 COMPLETED: Any = None  # default of what a table of columns fills in itself: then it is there
 
 
@@ -96,13 +97,15 @@ def check_values(
     The row is named by its `place`.
     """
     for name, values in columns.items():
-        good, must = np.isfinite(values), "finite"
+        good, must = np.abs(values) < LARGEST, "finite"
         if name in positive:
             good, must = good & (values > 0), "finite and positive"
         elif name in not_negative:
             good, must = good & (values >= 0), "finite and not negative"
         if not good.all():
             bad = int(np.argmin(good))
+            if LARGEST <= abs(values[bad]) < np.inf:
+                must = f"below {LARGEST:g}"
             raise InputError(
                 f"value is {values[bad]:g}, and must be {must}",
                 where=f"{place(bad)}, column {name!r}",

@@ -1,10 +1,10 @@
-"""One column of a table to one array, or an error that names file, row and column."""
+"""Columns of a table, by quantity, to one array each, or an error of file, row and column."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import astropy.units as apu
 import numpy as np
@@ -13,16 +13,25 @@ from astropy.time import Time
 from numpy.typing import NDArray
 
 from bayesdist.data.tables.checks import absent
+from bayesdist.data.tables.names import known_unit
 from bayesdist.data.tables.units import conversion, unit_of
 from bayesdist.errors import InputError
 
-__all__ = ["EncodedColumn", "Place", "SourceColumn", "encoded", "row_number", "year_of"]
+__all__ = [
+    "Columns",
+    "EncodedColumn",
+    "Place",
+    "Quantities",
+    "SourceColumn",
+    "encoded",
+    "row_number",
+    "year_of",
+]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Place = Callable[[int], str]  # name of a row in an error, by its index in the arrays
 Array = TypeVar("Array", Float, Int)
-
 _YEARS = (1800.0, 2200.0)  # epochs outside are a wrong unit, not a date
 
 
@@ -306,3 +315,39 @@ def _all_numbers(texts: Iterable[Any]) -> bool:
 def year_of(date: float | str, *, where: str) -> float:
     """Decimal year of a year or an ISO date; anything else is refused."""
     return float(SourceColumn(np.array([date]), where, "epoch").years()[0])
+
+
+class Columns(Protocol):
+    """Named columns of one length, as an astropy Table has them."""
+
+    @property
+    def colnames(self) -> Sequence[str]:
+        """Names."""
+
+    def __len__(self) -> int:
+        """Rows."""
+
+    def __getitem__(self, name: str) -> Any:
+        """Values as `SourceColumn` takes them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Quantities:
+    """Columns of a table by quantity."""
+
+    table: Columns
+    found: Mapping[str, str]  # column of each quantity
+    source: str  # file, for errors
+    place: Place = row_number  # name of a row, by its index
+    names: Sequence[str] = ()  # all columns of the file: they tell which catalogue it is
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.found
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def __getitem__(self, key: str) -> SourceColumn:
+        name = self.found[key]
+        unit = known_unit(name, self.names or self.table.colnames)
+        return SourceColumn(self.table[name], self.source, name, self.place, unit)

@@ -1,4 +1,4 @@
-"""Quoted errors that are far too small: the factor, and its sentence.
+"""Quoted errors that are far too small, and matches most of which are false, with their sentences.
 
 Jitter takes up errors that are a few times too small.  Where they are far smaller, what they say of
 single stars would be lost beside it, so all of them are multiplied by what the residuals show.
@@ -11,10 +11,11 @@ from scipy.stats import chi2
 
 from bayesdist.data.matches import Matches
 from bayesdist.infer.linear import LinearFit
+from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.stars.stars import prepare
-from bayesdist.limits import QUOTED_ERRORS
+from bayesdist.limits import FALSE_MAJORITY, QUOTED_ERRORS, WIDENED_ERRORS
 
-__all__ = ["error_scale", "error_scale_sentence"]
+__all__ = ["error_scale", "error_scale_sentence", "majority_sentence"]
 
 LOW_QUANTILE = 0.1  # of the matches
 
@@ -46,3 +47,46 @@ def error_scale_sentence(factor: float, sigma: float, unit: str, *, by_magnitude
         f"the residuals scatter {factor:.3g} times as widely as the quoted errors say (median "
         f"{sigma / factor:.3g} {unit}), and all errors were multiplied by that: {do}"
     )
+
+
+def majority_sentence(
+    fit: LinearFit,
+    posterior: Posterior | None = None,
+    *,
+    quoted: float | None = None,
+    things: str = "pairs",
+) -> str:
+    """Warning that most pairs are false, as a clause; empty where they are not.
+
+    Rejection and mixture both take the true matches to be those that lie together.  Where false
+    ones are the rule, a chance alignment, or their own mean, may be what was fitted; the posterior
+    is then that of a wrong mode and says nothing of the others.  A mixture whose outliers have
+    another shape than the false matches may settle where all pairs are true and their errors large:
+    that shows in the jitter.
+
+    `quoted` is the usual quoted error of one axis, in the unit of u, v; `things` is the word for
+    the matches.
+    """
+    if posterior is not None and "f" in posterior.hyper:
+        fraction = float(posterior.hyper["f"].mean())
+        if not FALSE_MAJORITY.met_by(fraction):
+            return (
+                f"the mixture takes {100 * fraction:.0f} % of the {things} for false ones: with "
+                "more false than true ones the solution may rest on chance alignments"
+            )
+    if posterior is not None and quoted and "j" in posterior.hyper:
+        jitter = float(posterior.hyper["j"].mean())
+        if jitter > WIDENED_ERRORS.value * quoted:
+            return (
+                f"the mixture adds {jitter:.3g} {posterior.unit} to the errors of all {things}, "
+                f"{jitter / quoted:.2g} times the quoted one: either that is far too small, or "
+                f"most {things} are false ones that were taken for true"
+            )
+    share = fit.n_rejected / fit.n_rows
+    if not FALSE_MAJORITY.met_by(share):
+        return (
+            f"the fit left out {100 * share:.0f} % of the {things}: most of them are "
+            "false, or the quoted errors are far too small, and the solution may rest on "
+            "chance alignments"
+        )
+    return ""

@@ -19,8 +19,12 @@ from scipy import stats
 from scipy.linalg import cho_solve
 
 from bayesdist.diagnose.clusters import add_over, sums_over
-from bayesdist.diagnose.score.directions import independent_directions, squares_of
-from bayesdist.diagnose.score.projection import Projection, weighted
+from bayesdist.diagnose.score.projection import (
+    Projection,
+    independent_directions,
+    squares_of,
+    weighted,
+)
 from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import Block
 from bayesdist.diagnose.significance import chi_square_of, hotelling_p

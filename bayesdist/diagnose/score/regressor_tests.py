@@ -22,12 +22,13 @@ from scipy import stats
 from scipy.linalg import block_diag
 
 from bayesdist.diagnose.clusters import add_over
-from bayesdist.diagnose.score.directions import (
+from bayesdist.diagnose.score.projection import (
+    LARGEST_LEVERAGE,
+    Projection,
     beside_others,
     independent_directions,
     squares_of,
 )
-from bayesdist.diagnose.score.projection import LARGEST_LEVERAGE, Projection
 from bayesdist.diagnose.score.regressors import Regressors, one_of_each
 from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import Block

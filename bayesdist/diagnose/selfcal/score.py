@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.diagnose.correlated.deviations import deviation_columns
-from bayesdist.diagnose.score.directions import (
+from bayesdist.diagnose.score.exposures import EXPOSURES
+from bayesdist.diagnose.score.motions import MOTIONS, SHORTEST, StarResiduals, motion_outcome
+from bayesdist.diagnose.score.noise import noise_tests
+from bayesdist.diagnose.score.projection import (
     beside_others,
     independent_directions,
     squares_of,
 )
-from bayesdist.diagnose.score.exposures import EXPOSURES
-from bayesdist.diagnose.score.motions import MOTIONS, SHORTEST, StarResiduals, motion_outcome
-from bayesdist.diagnose.score.noise import noise_tests
 from bayesdist.diagnose.score.regressors import (
     Functions,
     Regressors,

@@ -20,17 +20,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm, truncnorm
 
 from bayesdist.diagnose.clusters import squares_over, sums_over
-from bayesdist.diagnose.tables.mean_square import MeanSquare
 from bayesdist.errors import DegenerateError
 from bayesdist.model import Chip
 
-__all__ = ["BetweenNodes", "between_nodes"]
+__all__ = ["BetweenNodes", "MeanSquare", "between_nodes"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
-
 FINE, COARSE = 8, 4  # cells along a side of the squares between nodes
 AREA_RATIO = (FINE / COARSE) ** 2  # areas of the cells
 MIN_PAIRS = 30  # pairs of stars
@@ -250,3 +249,47 @@ class _NodeCells:
         """Square (cells,) that each cell lies in."""
         j, i = np.divmod(np.arange(self.number), self.shape[0])
         return j // self.parts * (self.shape[0] // self.parts) + i // self.parts
+
+
+@dataclass(frozen=True, eq=False)
+class MeanSquare:
+    """Mean squares of two axes, given their measurements and that none is negative."""
+
+    measured: Float  # (2,) of u and v; noise may have carried one below zero
+    error: Float  # (2,) standard deviations of these numbers, independent of each other
+
+    @property
+    def mean(self) -> Float:
+        """Mean (2,) of N(measured, error^2) cut off below zero.
+
+        The less is known, the larger it is: ignorance of an error does not make it smaller.
+        """
+        return self._moments[0]
+
+    @property
+    def relative_error(self) -> float:
+        """Relative error of the radial rms."""
+        mean, variance = self._moments
+        whole = mean.sum()
+        return float(np.sqrt(variance.sum()) / (2 * whole)) if whole > 0 else 0.0
+
+    def relative_draws(self, n: int, rng: np.random.Generator) -> Float:
+        """Draws (n, 2) of the mean squares relative to their mean."""
+        mean, variance = self._moments
+        out = np.ones((n, 2))
+        for axis in np.flatnonzero(variance > 0):
+            centre, width = self.measured[axis], self.error[axis]
+            cut = truncnorm(-centre / width, np.inf, centre, width)
+            out[:, axis] = cut.rvs(n, random_state=rng) / mean[axis]
+        return out
+
+    @property
+    def _moments(self) -> tuple[Float, Float]:
+        exact = self.error <= 0
+        error = np.where(exact, 1.0, self.error)
+        z = self.measured / error
+        # density over probability, in logarithms: z is far below zero where errors are too small
+        ratio = np.exp(norm.logpdf(z) - norm.logcdf(z))
+        mean = np.where(exact, np.maximum(self.measured, 0.0), error * (z + ratio))
+        variance = error**2 * np.maximum(1 - ratio * (z + ratio), 0.0)
+        return mean, np.where(exact, 0.0, variance)

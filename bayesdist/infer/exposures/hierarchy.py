@@ -23,7 +23,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
@@ -40,10 +41,9 @@ from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.transforms import bare_model, reference_gauge
 from bayesdist.model import DistortionModel
 
-__all__ = ["HierarchicalFit", "fit_hierarchical", "held_in_reference"]
+__all__ = ["HierarchicalFit", "fit_hierarchical", "held_in_reference", "trend_p_values"]
 
 Float = NDArray[np.float64]
-
 SCALE = 1e-4  # of the prior on tau: variation of the scale by velocity aberration in a year
 # A focal plane that breathes moves its chips too: then the gap's deviations repeat those of scale
 # and shear, and taken as independent they would halve the error of a drift.  At four times their
@@ -52,6 +52,7 @@ CAUTION = 4.0
 MOST_OUTLYING = 0.2  # fraction of the exposures beyond which they are the rule
 # smallest sum over E deviations of a kind of the parts that the data determine
 LEAST_DETERMINED = 0.5
+FEWEST_FREE = 3  # degrees of freedom left by the lines
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,3 +348,28 @@ def _require_determined(scatter: Scatter, model: DistortionModel) -> None:
                 "'shift_rotation_scale')"
             ),
         )
+
+
+def trend_p_values(values: Float, epoch: Float, breaks: ArrayLike = ()) -> Float:
+    """Probability (k,) of lines in time as steep by chance, for each kind of deviation (E, k).
+
+    An F test of a line in each segment against a constant.  Its noise is the scatter of the
+    exposures about the lines, which has all noise of the deviations.  `breaks` are the dates at
+    which segments begin; 1 where there are too few exposures.
+    """
+    segment = np.searchsorted(np.asarray(breaks, float), epoch, side="right")
+    constant = (segment[:, None] == np.unique(segment)).astype(float)
+    middle = constant.T @ epoch / constant.sum(axis=0)
+    lines = constant * (epoch[:, None] - middle)
+    lines = lines[:, np.ptp(lines, axis=0) > 0]
+    free = len(epoch) - constant.shape[1] - lines.shape[1]
+    if free < FEWEST_FREE or not lines.shape[1]:
+        return np.ones(values.shape[1])
+    flat, bent = (
+        values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
+        for design in (constant, np.column_stack([constant, lines]))
+    )
+    left = (bent**2).sum(axis=0)
+    gain = np.maximum((flat**2).sum(axis=0) - left, 0.0)
+    ratio = np.divide(gain / lines.shape[1], left / free, out=np.zeros_like(gain), where=left > 0)
+    return np.asarray(stats.f.sf(ratio, lines.shape[1], free))

@@ -26,7 +26,7 @@ from bayesdist.infer.selfcal.gauge import Gauge, NamedDirection
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.posterior import sample_selfcal
 from bayesdist.infer.selfcal.prior import ReferenceStars, pointing_prior, tie
-from bayesdist.infer.selfcal.relative import gauge_free
+from bayesdist.infer.selfcal.sky_moves import gauge_free
 from bayesdist.infer.selfcal.tangent import TangentPlane
 
 __all__ = [

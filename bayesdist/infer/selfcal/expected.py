@@ -16,7 +16,7 @@ from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.elimination import Mixture, expand
 from bayesdist.infer.selfcal.gauge import Gauge, find_gauge
 from bayesdist.infer.selfcal.problem import Problem, prepare
-from bayesdist.infer.selfcal.relative import gauge_free_matrix
+from bayesdist.infer.selfcal.sky_moves import gauge_free_matrix
 from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
 

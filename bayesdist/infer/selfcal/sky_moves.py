@@ -1,4 +1,4 @@
-"""Moves of the whole sky as changes of a solution's parameters, and properties of a solution."""
+"""Moves of the whole sky as changes of a solution's parameters, and solutions without them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = [
@@ -14,6 +15,8 @@ __all__ = [
     "PARALLAX",
     "POINTS",
     "functionals",
+    "gauge_free",
+    "gauge_free_matrix",
     "largest_roll_difference",
     "moves",
     "parameter_scale",
@@ -21,7 +24,6 @@ __all__ = [
 ]
 
 Float = NDArray[np.float64]
-
 # of the linear maps of the sky
 GENERATORS = {
     "scale": np.array([[1.0, 0.0], [0.0, 1.0]]),
@@ -174,3 +176,37 @@ def largest_roll_difference(model: DistortionModel, theta: Float) -> float:
         off = (a - b) % np.pi
         worst = max(worst, min(off, np.pi - off))
     return float(worst)
+
+
+def gauge_free_matrix(model: DistortionModel, theta: Float, null: Float) -> Float:
+    """Matrix S (D, D) that removes from a change of the parameters its part along free directions.
+
+    Two solutions of the same detections in different gauges differ by a move along directions that
+    detections leave free.  Without it, errors are common to all gauges (an S-transformation: Baarda
+    1973; Teunissen 1985).
+
+    S null = 0, `null` (D, d) being `Gauge.null`: the positions of all chips in the first exposure
+    that S d makes are those of d without the combination of free directions that is nearest to
+    them, by least squares over the area of the chips.
+    """
+    D = model.n_params
+    if not null.shape[1]:
+        return np.eye(D)
+    rows = []
+    for chip in model.chips:
+        x, y, area = chip.quadrature(model.order + 1)  # exact for squares of the polynomials
+        where = {"exposure": np.zeros(len(x), np.int64), "chip": np.full(len(x), chip.number)}
+        if model.time is not None:
+            where["epoch"] = np.full(len(x), model.time.epoch0[0])
+        J = model.jacobian(theta, x, y, **where)
+        rows.append((np.sqrt(area)[:, None, None] * J).reshape(-1, D))
+    J = np.concatenate(rows)
+    return np.asarray(np.eye(D) - null @ np.linalg.pinv(J @ null) @ J)
+
+
+def gauge_free(solution: Solution, null: Float) -> Solution:
+    """Solution whose errors are those of relative positions on the detector; its mean stays.
+
+    `null` (D, d) are the free directions at it.
+    """
+    return solution.mapped(gauge_free_matrix(solution.model, solution.mean, null))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bayesdist.data import Matches
-from bayesdist.data.added_errors import AddedErrors
+from bayesdist.data.magnitude_errors import AddedErrors
 from bayesdist.errors import InputError
 from bayesdist.infer import build_model, fit_linear
 from bayesdist.infer.catalogue.added_errors import DECISIVE, grouped_errors

@@ -8,10 +8,10 @@ from astropy.time import Time
 from scipy.stats import kstest, ncx2
 
 from bayesdist.data import Matches, batches
+from bayesdist.diagnose.periods import period_verdict
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import Rejection, fit_linear
 from bayesdist.infer.compare.period_dates import mjd_periods, sum_by_period
-from bayesdist.infer.compare.period_verdict import period_verdict
 from bayesdist.infer.compare.periods import (
     PeriodComparison,
     compare_periods,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.infer.exposures.trends import trend_p_values
+from bayesdist.infer.exposures.hierarchy import trend_p_values
 
 EPOCH = np.linspace(2002.0, 2012.0, 20)
 

@@ -9,7 +9,7 @@ from scipy.optimize import minimize_scalar
 
 from bayesdist.diagnose.selfcal.score import selfcal_score_tests
 from bayesdist.infer.selfcal import self_calibrate
-from bayesdist.infer.selfcal.relative import gauge_free_matrix
+from bayesdist.infer.selfcal.sky_moves import gauge_free_matrix
 from bayesdist.infer.selfcal.tangent import TangentPlane
 from bayesdist.model import Chip, DistortionModel
 from tests.infer.selfcal.wide import (

@@ -18,7 +18,7 @@ from bayesdist.app.results import results_of
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_late
-from bayesdist.assess.comparison.tables import comparison_table, difference_table
+from bayesdist.assess.comparison.compare import comparison_table, difference_table
 from bayesdist.assess.units import convert, pixel_scale_of
 from bayesdist.data import Matches, input_files
 from bayesdist.diagnose.diagnostics import misfits_of, residual_sums

@@ -24,8 +24,7 @@ from bayesdist.data import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.files import atomic_path
 from bayesdist.infer import Shards
-from bayesdist.infer.compare.one_frame import in_one_frame
-from bayesdist.infer.compare.order import select_order
+from bayesdist.infer.compare.order import in_one_frame, select_order
 from bayesdist.infer.compare.order_result import OrderSelection
 from bayesdist.infer.linear import Rejection
 from bayesdist.model import DistortionModel

@@ -19,8 +19,12 @@ from bayesdist.data import centroid_errors
 from bayesdist.data.matches import Matches
 from bayesdist.infer import load
 from bayesdist.infer.exposures.alone import ExposureSolutions, fit_exposures
-from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
-from bayesdist.infer.exposures.trends import trend_p_values
+from bayesdist.infer.exposures.hierarchy import (
+    HierarchicalFit,
+    fit_hierarchical,
+    held_in_reference,
+    trend_p_values,
+)
 from bayesdist.infer.linear import Rejection
 from bayesdist.infer.nodes import corrected_matches, on_the_chips
 from bayesdist.infer.series import Series
@@ -58,7 +62,7 @@ def _fitted(matched: CampaignMatched) -> Fitted:
     rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs)
     joint = _joint(stars, affine, inputs, rejection)
     number = config.chips()[0].number
-    alone = fit_exposures(stars, affine, chip=number, skip=True, rejection=rejection)
+    alone = fit_exposures(stars, affine, chip=number, rejection=rejection)
     facts = {
         **line_sections(joint, number),
         "tables": tables_section(config, tables),

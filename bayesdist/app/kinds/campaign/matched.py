@@ -21,7 +21,7 @@ from bayesdist.data import read_matches, write_partitioned
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.overlap import OverlapTest, overlap_test
 from bayesdist.infer import Posterior
-from bayesdist.infer.catalogue.star_influence import StarErrors
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel, LookupTable
 

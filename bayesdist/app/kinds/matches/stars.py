@@ -21,12 +21,12 @@ from bayesdist.app.kinds.matches.plausibility import doubts_on_stars, refuse_emp
 from bayesdist.app.kinds.matches.sources import check_chips, read_configured
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.diagnostics_files import load_diagnostics
-from bayesdist.assess import SAMPLE
-from bayesdist.assess.error_model import solution_with_errors
+from bayesdist.assess.error_model import with_diagnosed_errors
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.prior import CalibrationPrior, prior_of_calibration
 from bayesdist.data import Matches
 from bayesdist.diagnose.residuals.quoted import error_scale
+from bayesdist.diagnose.residuals.sample import SAMPLE
 from bayesdist.errors import ConfigError, DegenerateError, InputError, NotSettledError
 from bayesdist.infer import (
     GaussianPriors,
@@ -305,5 +305,5 @@ def _calibration(path: Path, filter: str | None) -> Calibration:
         fit = load_fit(folder / FIT)
         found = load_diagnostics(run, fit, posterior)
         hierarchy = fit if run.config.campaign is not None else None
-        posterior = solution_with_errors(posterior, found, hierarchy)
+        posterior = with_diagnosed_errors(posterior, found, hierarchy)
     return calibration_of(posterior, str(folder))

@@ -19,7 +19,7 @@ from bayesdist.missions.acs.handbook.numbers import acs_detector, detector_numbe
 from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 
 if TYPE_CHECKING:
-    from bayesdist.assess import BinnedResiduals
+    from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
 __all__ = ["handbook"]
 

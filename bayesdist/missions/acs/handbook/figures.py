@@ -22,7 +22,7 @@ from bayesdist.report.figures.panels import OneArray
 from bayesdist.report.figures.style import PALETTE, nice_below
 
 if TYPE_CHECKING:
-    from bayesdist.assess import BinnedResiduals
+    from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
 __all__ = ["area_figure", "non_linear_figure", "residual_figure"]
 

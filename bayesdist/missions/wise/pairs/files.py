@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from bayesdist.data.batches import BATCH
 from bayesdist.data.formats.files import input_files
-from bayesdist.data.tables.column import Place, SourceColumn, row_number
+from bayesdist.data.tables.column import Columns, Place, SourceColumn, row_number
 from bayesdist.data.tables.names import BASIC, find_columns
 from bayesdist.data.tables.parquet import ParquetPart, describe_part
-from bayesdist.data.tables.quantities import Columns
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.published import WISE_BANDS
 from bayesdist.reading.tables import read_table

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from bayesdist.data.matches import Matches
 from bayesdist.data.reading.columns import match_columns
 from bayesdist.data.reading.options import ReadOptions, check_sigma, refuse_missing_errors
-from bayesdist.data.tables.column import Place, SourceColumn
-from bayesdist.data.tables.quantities import Columns, Quantities
+from bayesdist.data.tables.column import Columns, Place, Quantities, SourceColumn
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs.files import (
     MAGNITUDES,

@@ -44,7 +44,7 @@ class Hdu:
     cards: tuple[str, ...]  # header cards without END, 80 characters each
     data: bytes = b""  # as in the file, padded to whole records or not
     number: int = 0  # index in the file, from 0
-    state: str = "whole"  # 'whole', 'none' where announced data are missing, or 'cut'
+    state: str = "whole"  # 'whole', 'none' where announced data are missing, or 'cut' within it
 
     @property
     def header(self) -> fits.Header:
@@ -235,18 +235,19 @@ def _walked(raw: bytes) -> Iterable[Hdu]:
     """HDUs one after the other, with their data between them or not."""
     number, at = 0, 0
     while raw[at : at + 9] in HDU_STARTS:
-        cards, after = list[str](), at
-        while after < len(raw):
+        cards, after, ended = list[str](), at, False
+        while after < len(raw) and not ended:
             card = raw[after : after + 80].decode("latin-1")
             after += 80
-            if card[:8].rstrip() == "END":
-                break
-            cards.append(card.ljust(80))
+            ended = card[:8].rstrip() == "END"
+            if not ended:
+                cards.append(card.ljust(80))
         begin = at + padded(after - at)
         size = data_size(header_of(cards))
         state, at = "whole", begin + padded(size or 0)
         if size is None or begin + size > len(raw):
             follows = raw[begin : begin + 9] == HDU_STARTS[1]
-            state, at = ("none", begin) if follows or len(raw) <= begin else ("cut", len(raw))
+            alone = len(raw) <= begin and (ended or not number)  # some write a header without END
+            state, at = ("none", begin) if follows or alone else ("cut", len(raw))
         yield Hdu(tuple(cards), raw[begin:at], number, state)
         number += 1

@@ -12,12 +12,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field, TypeAdapter
 
 from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of_maps
 from bayesdist.calibration.further import further_from, further_records, scaled
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import Chip, DistortionModel, LookupTable
+from bayesdist.reading.documents import model_of
 from bayesdist.version import __version__
 
 __all__ = ["at_date", "calibration_from", "record_of"]
@@ -25,7 +27,59 @@ __all__ = ["at_date", "calibration_from", "record_of"]
 Float = NDArray[np.float64]
 
 VERSION = 1
-_PARTS = ("parameters", "gauge", "provenance", "chip", "plane")
+Pair = tuple[float, float]
+
+
+class _Parameters(BaseModel):
+    order: int
+    unit: str
+    values: Any  # numbers, as an array or a list
+
+
+class _Chip(BaseModel):
+    number: int | None
+    name: str
+    size: Pair
+    reference_pixel: Pair
+
+
+class _Plane(BaseModel):
+    kind: str
+    v2v3: Pair | None = None
+    v3_angle: float | None = None
+    parity: int | None = None
+
+
+class _Table(BaseModel):
+    filter: str
+    first: Pair
+    step: Pair
+    sigma: Any = None
+
+
+class _Provenance(BaseModel):
+    instrument: str = ""
+    detector: str = ""
+    filter: str = ""
+    converged: bool | None = None
+    notes: list[str] = []
+
+
+class _Record(BaseModel):
+    """A record as it is read; what else it has is for people."""
+
+    parameters: _Parameters
+    gauge: str
+    provenance: _Provenance
+    chip: _Chip
+    plane: _Plane
+    errors: str = "none"
+    covariance: Any = None
+    tables: list[_Table] = []
+    further_errors: list[Any] = Field(default_factory=list)
+
+
+_RECORD = TypeAdapter(_Record)
 
 
 def at_date(
@@ -184,20 +238,16 @@ def calibration_from(
             where=where,
             do="use the version of bayesdist that wrote it",
         )
-    missing = [part for part in _PARTS if part not in record]
-    if missing:
-        raise FormatError(
-            f"{', '.join(missing)} is missing", where=where, do="fetch the file again"
-        )
-    given, chip, plane = record["parameters"], record["chip"], record["plane"]
-    number = 1 if chip["number"] is None else int(chip["number"])
-    known = Chip(number, str(chip["name"]), _pair(chip["size"]), _pair(chip["reference_pixel"]))
-    model = DistortionModel(int(given["order"]), (known,), str(given["unit"]))
-    mean = np.array(given["values"], float)
-    errors = str(record.get("errors", "none"))
+    known = model_of(_RECORD, record, where, do="fetch the file again")
+    given, chip = known.parameters, known.chip
+    number = 1 if chip.number is None else chip.number
+    model = DistortionModel(
+        given.order, (Chip(number, chip.name, chip.size, chip.reference_pixel),), given.unit
+    )
+    mean = np.array(given.values, float)
     cov = np.zeros((model.n_params, model.n_params))
-    if errors != "none":
-        cov = np.array(record["covariance"], float)
+    if known.errors != "none":
+        cov = np.array(known.covariance, float)
     if mean.shape != (model.n_params,) or cov.shape != (model.n_params,) * 2:
         raise FormatError(
             f"{mean.size} parameters and a covariance of {' x '.join(map(str, cov.shape))} do not "
@@ -205,41 +255,21 @@ def calibration_from(
             where=where,
             do="fetch the file again",
         )
-    entries, filter = record.get("tables", []), str(record["provenance"].get("filter", ""))
     tables = tuple(
-        LookupTable(
-            number, values, str(e["filter"]), _pair(e["first"]), _pair(e["step"]), e.get("sigma")
-        )
-        for e, values in zip(entries, table_values, strict=True)
+        LookupTable(number, values, one.filter, one.first, one.step, one.sigma)
+        for one, values in zip(known.tables, table_values, strict=True)
     )
-    v2v3 = plane.get("v2v3")
+    source = known.provenance
     return Calibration(
         name,
         GaussianSolution(model, mean, cov),
-        Plane(
-            str(plane["kind"]),
-            v2v3=None if v2v3 is None else _pair(v2v3),
-            v3_angle=plane.get("v3_angle"),
-            parity=plane.get("parity"),
-        ),
-        instrument=str(record["provenance"].get("instrument", "")),
-        detector=str(record["provenance"].get("detector", "")),
-        filter=filter,
-        errors=errors,
-        numbered=chip["number"] is not None,
+        Plane(**known.plane.model_dump()),
+        instrument=source.instrument,
+        detector=source.detector,
+        filter=source.filter,
+        errors=known.errors,
+        numbered=chip.number is not None,
         before=tables,
-        notes=_notes(record["provenance"]),
-        further=further_from(record.get("further_errors", ()), where),
+        notes=(*source.notes, *(["has not converged"] if source.converged is False else [])),
+        further=further_from(known.further_errors, where),
     )
-
-
-def _pair(values: Sequence[float]) -> tuple[float, float]:
-    a, b = values
-    return float(a), float(b)
-
-
-def _notes(provenance: Mapping[str, Any]) -> tuple[str, ...]:
-    notes = [str(note) for note in provenance.get("notes", ())]
-    if provenance.get("converged") is False:
-        notes.append("has not converged")
-    return tuple(notes)

@@ -34,11 +34,15 @@ def lint_idctab(tab: IdcTab) -> tuple[Finding, ...]:
 
 def _not_finite(tab: IdcTab) -> list[Finding]:
     out = []
-    for name in tab.columns:
-        column = tab.rows[name]
-        if column.dtype.kind == "f" and not np.isfinite(column).all():
-            bad = np.flatnonzero(~np.isfinite(column))
-            out.append(Finding("error", f"{rows_text(bad)}, column {name}", "not a finite number"))
+    for rows, of in ((tab.rows, ""), (tab.sigma, " of SIGMA"), (tab.covariance, " of COVAR")):
+        if rows is None:
+            continue
+        for name in rows.dtype.names or ():
+            column = rows[name].reshape(len(rows), -1)
+            if column.dtype.kind == "f" and not np.isfinite(column).all():
+                bad = np.flatnonzero(~np.isfinite(column).all(axis=1))
+                where = f"{rows_text(bad)}{of}, column {name}"
+                out.append(Finding("error", where, "not a finite number"))
     return out
 
 

@@ -21,6 +21,7 @@ from bayesdist.products.formats.common.document import BuildOptions
 from bayesdist.products.formats.common.record import at_date, record_of
 from bayesdist.products.formats.siaf.table import (
     COLUMNS,
+    COVARIANCE,
     KEYWORDS,
     NAMES,
     SIDE,
@@ -78,7 +79,7 @@ def siaf_files(
         f"from {calibration.name}" + ("" if date is None else f", at {date:g}"),
         *calibration.notes,
         *(["Look-up tables are left out."] if tables else []),
-        f"The covariance of Sci2Idl is in {side_name(name)}.",
+        f"{COVARIANCE} {side_name(name)}.",
         *(f"{k} = {v!r}" for k, v in zip(KEYWORDS, (*size, *reference), strict=True)),
     ]
     lines = _lines(aperture, rows_order, columns)

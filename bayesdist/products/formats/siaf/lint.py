@@ -12,7 +12,13 @@ from bayesdist.errors import BayesdistError
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.formats.common.document import Finding
 from bayesdist.products.formats.common.record import calibration_from
-from bayesdist.products.formats.siaf.table import AGREEMENT, Row, SiafTable, departure
+from bayesdist.products.formats.siaf.table import (
+    AGREEMENT,
+    Row,
+    SiafTable,
+    departure,
+    side_name,
+)
 
 __all__ = ["lint_siaf"]
 
@@ -124,7 +130,11 @@ def _exchanged(table: SiafTable, columns: tuple[int, int]) -> Iterator[Row]:
 
 def _record(table: SiafTable) -> Iterator[Finding]:
     if table.record is None:
-        yield Finding("note", "covariance", "there is no side file: no uncertainty is stated")
+        if table.names_side_file:
+            missing = f"{side_name(table.name)}, the covariance, is not here"
+            yield Finding("warning", "covariance", missing)
+        else:
+            yield Finding("note", "covariance", "there is no side file: no uncertainty is stated")
         return
     try:
         far = departure(table, calibration_from(table.record, table.name))

@@ -35,6 +35,7 @@ from bayesdist.reading.faults import reason_of
 __all__ = [
     "AGREEMENT",
     "COLUMNS",
+    "COVARIANCE",
     "HIGHEST",
     "KEYWORDS",
     "NAMES",
@@ -57,6 +58,7 @@ HIGHEST = 9  # order: powers have one digit each in siaf_index
 SIDE = "siaf_covariance"  # first key of a side file
 AGREEMENT = 1e-6  # pixels: as far as table and side file may differ
 _STATED = re.compile(r"#\s*(XSciSize|YSciSize|XSciRef|YSciRef)\s*=\s*(\S+)")
+COVARIANCE = "The covariance of Sci2Idl is in"  # before the name of the side file, in our comments
 # Columns and rows of the full apertures, by the beginning of their names.
 _SIZES = {
     "NRC": (2048.0, 2048.0), "NIS": (2048.0, 2048.0), "FGS": (2048.0, 2048.0),
@@ -83,6 +85,7 @@ class SiafTable:
     rows: tuple[Row, ...]
     stated: Mapping[str, float]  # KEYWORDS
     record: Mapping[str, Any] | None = None  # see `common.record`
+    names_side_file: bool = False
 
     @property
     def order(self) -> int:
@@ -206,7 +209,8 @@ def table_of(content: Content) -> SiafTable:
         if (m := _STATED.match(line))
     }
     table = SiafTable(content.name, apertures[0], tuple(rows), stated)
-    return replace(table, record=record_beside(content.name))
+    named = any(line.startswith(f"# {COVARIANCE} ") for line in lines)
+    return replace(table, record=record_beside(content.name), names_side_file=named)
 
 
 def _row(cells: Mapping[str, str], number: int, where: str) -> Row:
@@ -298,6 +302,8 @@ def siaf_calibration(table: SiafTable, choice: Choice) -> Calibration:
             inverses = {} if inverse is None else {found.numbers[0]: inverse}
             return replace(found, inverses=inverses)
         notes = (f"the side file is {far:.2g} px from the table: without its covariance",)
+    elif table.names_side_file:
+        notes = (f"its covariance is in {side_name(table.name)}, which is not here",)
     size = table.size or choice.size
     if size is None:
         raise MissingSizeError(

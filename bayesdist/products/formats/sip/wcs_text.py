@@ -26,6 +26,7 @@ from bayesdist.products.formats.sip.wcs_sky import (
     first_line,
     pv_keywords,
 )
+from bayesdist.reading.fits import RECORD
 
 __all__ = ["coefficient_lines", "describe_wcs"]
 
@@ -110,6 +111,7 @@ def describe_wcs(file: Content, extra: Sequence[Finding] = ()) -> list[str]:
     HDUs that repeat the system of an earlier one are named with it.  FormatError for SIP keywords
     that are missing or no numbers.
     """
+    extra = [*extra, *_truncated(file)]
     shown: dict[tuple[tuple[str, str], ...], list[Hdu]] = {}
     several = sum(holds_wcs(hdu.header) for hdu in file.hdus) > 1
     for hdu in file.hdus:
@@ -129,6 +131,19 @@ def describe_wcs(file: Content, extra: Sequence[Finding] = ()) -> list[str]:
 
 def _extent(header: fits.Header) -> tuple[str, str]:
     return "size", str(image_size(header))
+
+
+def _truncated(file: Content) -> Iterator[Finding]:
+    last = file.hdus[-1]
+    where = f"HDU {last.number}"
+    if last.state == "cut":
+        yield Finding("error", where, "the file ends before this HDU does: it is truncated")
+    elif file.is_fits and last.state == "whole" and len(file.raw) % RECORD:
+        yield Finding(
+            "warning", where,
+            f"the file ends within a record of {RECORD} bytes: it is truncated, and what "
+            "followed is lost",
+        )  # fmt: skip
 
 
 def _label(hdu: Hdu) -> str:
@@ -157,8 +172,6 @@ def _hdu_lines(
         text.lines.append(f"  same in   {', '.join(_label(other) for other in others)}")
     if hdu.state == "none":
         text.lines.append("  data      none: a header alone")
-    elif hdu.state == "cut":
-        text.add_finding("error", "data", "the file ends before its data do: it is truncated")
     systems = _systems(file, hdu, text)
     for wcs in systems:
         key = wcs.wcs.alt.strip()

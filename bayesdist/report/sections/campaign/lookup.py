@@ -24,7 +24,7 @@ from bayesdist.report.sections.run.residuals import residual_panels
 from bayesdist.report.texttable import TextTable, listing
 
 if TYPE_CHECKING:
-    from bayesdist.assess import BinnedResiduals
+    from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
 __all__ = [
     "binned_of",

@@ -28,7 +28,7 @@ from bayesdist.report.figures.style import PALETTE, WIDTH, legend_above, new_fig
 from bayesdist.report.registry import Plot
 
 if TYPE_CHECKING:
-    from bayesdist.assess import BinnedResiduals
+    from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
 __all__ = [
     "MixtureCurve",
