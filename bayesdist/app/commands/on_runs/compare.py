@@ -29,8 +29,8 @@ from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
 from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.products.formats.common.document import MissingSizeError
-from bayesdist.report.comparison import difference_vectors
 from bayesdist.report.drawing import save_figures
+from bayesdist.report.figures.comparison import difference_vectors
 
 __all__ = ["compare_files", "joined"]
 

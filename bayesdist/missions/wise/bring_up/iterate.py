@@ -21,7 +21,7 @@ from bayesdist.missions.wise.bring_up.pairs import Field
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.model import Chip, DistortionModel
 
-__all__ = ["BringUp", "Round", "bring_up"]
+__all__ = ["BringUp", "bring_up"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
