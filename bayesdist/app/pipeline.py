@@ -27,10 +27,9 @@ from bayesdist.app.assessment.diagnosing import diagnose_run as diagnose
 from bayesdist.app.assessment.error_terms import errors_of_run as error_model
 from bayesdist.app.assessment.settings import assessment_rng, evaluation_settings
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.fit_data import FitData, StarReader
 from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matched import Matched
-from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.products.export import export_files
 from bayesdist.app.products.made_files import product_input, product_of, solution_of
 from bayesdist.app.products.product_terms import file_errors

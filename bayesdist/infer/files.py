@@ -8,13 +8,16 @@ files, in the parts of `stars/`.
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import h5netcdf
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,10 +33,7 @@ from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.model import DistortionModel
 from bayesdist.reading.documents import json_of
 from bayesdist.reading.faults import restoring
-from bayesdist.reading.hdf5 import NETCDF_ENGINE, netcdf_dataset, netcdf_tree
-
-if TYPE_CHECKING:
-    import xarray as xr
+from bayesdist.reading.hdf5 import netcdf_dataset, netcdf_tree
 
 __all__ = ["load_fit", "load_posterior", "save_fit", "save_posterior"]
 
@@ -79,27 +79,39 @@ def save_posterior(
     >>> np.array_equal(bd.load_posterior("posterior.nc").theta, posterior.theta)
     True
     """
-    import xarray as xr
-
     c = posterior.convergence
-    n_theta = len(posterior.model.names)
-    parameter = ("parameter", list(posterior.model.names))
-    sampled = ("sampled", list(c.names))
+    names, units = posterior.model.names, posterior.model.units
     groups = {
-        "posterior": xr.Dataset(
+        "": _Group(
+            attrs={
+                "schema": SCHEMA,
+                "creator": "bayesdist",
+                "model": json.dumps(posterior.model.to_dict()),
+                "mixture": json.dumps(asdict(posterior.mixture)),
+                "provenance": json.dumps(dict(provenance or {}), default=str),
+                "certificate": json.dumps(posterior.certificate and asdict(posterior.certificate)),
+                "n_parameters": len(names),
+                "own_places": int(posterior.own_places),
+                **{name: getattr(posterior, name) for name in POSTERIOR_NUMBERS},
+            }
+        ),
+        "posterior": _Group(
             {
                 "theta": (("chain", "draw", "parameter"), posterior.theta),
                 **{k: (("chain", "draw"), v) for k, v in posterior.hyper.items()},
+                "parameter": (("parameter",), names),
             },
-            coords={"parameter": parameter, "unit": ("parameter", list(posterior.model.units))},
+            coordinates={"unit": ("parameter", units)},
         ),
-        "sample_stats": xr.Dataset(
+        "sample_stats": _Group(
             {"lp": (("chain", "draw"), posterior.log_prob)},
             attrs=asdict(posterior.sampler) | {"exact": int(posterior.sampler.exact)},
         ),
-        "diagnostics": xr.Dataset(
-            {name: ("sampled", getattr(c, name)) for name in DIAGNOSTICS},
-            coords={"sampled": sampled},
+        "diagnostics": _Group(
+            {
+                **{name: (("sampled",), getattr(c, name)) for name in DIAGNOSTICS},
+                "sampled": (("sampled",), c.names),
+            },
             attrs={
                 "pareto_k": c.pareto_k,
                 "importance_efficiency": c.importance_efficiency,
@@ -111,32 +123,18 @@ def save_posterior(
         ),
     }
     if matches is not None and len(matches) <= MOST_STARS:
-        groups["observed_data"] = xr.Dataset({"u": ("star", matches.u), "v": ("star", matches.v)})
+        groups["observed_data"] = _Group({"u": (("star",), matches.u), "v": (("star",), matches.v)})
         groups["constant_data"] = _constants(posterior, matches)
         # of one draw only where the stars' positions are unknowns too
         few = posterior.log_prob.size * len(matches) * 8 <= LARGEST
         if few and not posterior.own_places:
             values = star_log_likelihood(posterior, matches)
-            groups["log_likelihood"] = xr.Dataset({"uv": (("chain", "draw", "star"), values)})
-    tree = xr.DataTree.from_dict({f"/{name}": data for name, data in groups.items()})
-    tree.attrs = {
-        "schema": SCHEMA,
-        "creator": "bayesdist",
-        "model": json.dumps(posterior.model.to_dict()),
-        "mixture": json.dumps(asdict(posterior.mixture)),
-        "provenance": json.dumps(dict(provenance or {}), default=str),
-        "certificate": json.dumps(posterior.certificate and asdict(posterior.certificate)),
-        "n_parameters": n_theta,
-        "own_places": int(posterior.own_places),
-        **{name: getattr(posterior, name) for name in POSTERIOR_NUMBERS},
-    }
-    _write(tree, path)
+            groups["log_likelihood"] = _Group({"uv": (("chain", "draw", "star"), values)})
+    _write(groups, path)
 
 
-def _constants(posterior: Posterior, matches: Matches) -> xr.Dataset:
+def _constants(posterior: Posterior, matches: Matches) -> _Group:
     """Columns of the matches that the posterior was made from."""
-    import xarray as xr
-
     columns = {
         "x": matches.x,
         "y": matches.y,
@@ -150,8 +148,8 @@ def _constants(posterior: Posterior, matches: Matches) -> xr.Dataset:
     for name in ("epoch", "mag", "colour"):
         if getattr(matches, name) is not None:
             columns[name] = getattr(matches, name)
-    return xr.Dataset(
-        {name: ("star", values) for name, values in columns.items()},
+    return _Group(
+        {name: (("star",), values) for name, values in columns.items()},
         attrs={"unit": matches.unit, "exposure_names": json.dumps(matches.exposure_names)},
     )
 
@@ -255,16 +253,15 @@ def _plain(value: object) -> object:
 
 def save_fit(fit: LinearFit, path: str | Path) -> None:
     """Write a linear fit to a netCDF file, which is replaced atomically."""
-    import xarray as xr
-
-    names = list(fit.model.names)
-    data = xr.Dataset(
+    names = fit.model.names
+    data = _Group(
         {
-            "mean": ("parameter", fit.mean),
+            "mean": (("parameter",), fit.mean),
             "cov": (("parameter", "parameter_2"), fit.cov),
-            "clip": ("parameter", fit.clip.theta),
+            "clip": (("parameter",), fit.clip.theta),
+            "parameter": (("parameter",), names),
+            "parameter_2": (("parameter_2",), names),
         },
-        coords={"parameter": names, "parameter_2": names},
         attrs={
             "creator": "bayesdist",
             "model": json.dumps(fit.model.to_dict()),
@@ -274,7 +271,7 @@ def save_fit(fit: LinearFit, path: str | Path) -> None:
             **{name: getattr(fit, name) for name in FIT_NUMBERS},
         },
     )
-    _write(data, path)
+    _write({"": data}, path)
 
 
 def load_fit(path: str | Path) -> LinearFit:
@@ -306,14 +303,46 @@ def load_fit(path: str | Path) -> LinearFit:
         )
 
 
-def _write(data: xr.Dataset | xr.DataTree, path: str | Path) -> None:
-    """Write a dataset or a tree, replaced atomically.
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """A group of a netCDF file: variables with the names of their dimensions, and attributes.
 
-    The file is built in memory: on a full disk HDF5 itself would crash when it is closed.
+    `coordinates` belong to the variables that have their dimension, and are none themselves.
     """
-    content = data.to_netcdf(engine=NETCDF_ENGINE)
+
+    variables: Mapping[str, tuple[tuple[str, ...], Any]] = field(default_factory=dict)
+    attrs: Mapping[str, Any] = field(default_factory=dict)
+    coordinates: Mapping[str, tuple[str, Any]] = field(default_factory=dict)
+
+
+def _write(groups: Mapping[str, _Group], path: str | Path) -> None:
+    """Write the groups of a file, '' at its top, replaced atomically.
+
+    By h5netcdf itself: xarray, by which they are read, takes a second to import.  The file is built
+    in memory: on a full disk HDF5 itself would crash when it is closed.
+    """
+    buffer = io.BytesIO()
+    with h5netcdf.File(buffer, "w") as file:
+        for name, group in groups.items():
+            _fill(file.create_group(name) if name else file, group)
     with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
+        temporary.write_bytes(buffer.getvalue())
+
+
+def _fill(target: h5netcdf.Group, group: _Group) -> None:
+    """Write one group of a file."""
+    target.attrs.update(group.attrs)
+    coordinates = {name: ((along,), values) for name, (along, values) in group.coordinates.items()}
+    for name, (along, content) in {**group.variables, **coordinates}.items():
+        values = np.asarray(content)
+        if values.dtype.kind == "U":
+            values = values.astype(h5py.string_dtype())
+        for one, size in zip(along, values.shape, strict=True):
+            target.dimensions.setdefault(one, size)
+        variable = target.create_variable(name, along, values.dtype, values)
+        of = [one for one, (where, _) in group.coordinates.items() if where in along]
+        if of and name not in (*of, *along):
+            variable.attrs["coordinates"] = " ".join(of)
 
 
 @contextmanager

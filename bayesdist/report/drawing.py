@@ -170,7 +170,10 @@ def _inked(page: Pixels) -> tuple[int, int, int, int] | None:
 
 def _png(pixels: Pixels) -> bytes:
     image = Image.fromarray(pixels)
-    few = image.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    # colours are chosen on every other pixel each way, in a fourth of the time
+    some = Image.fromarray(np.ascontiguousarray(pixels[::2, ::2]))
+    colors = some.quantize(256, method=Image.Quantize.MEDIANCUT)
+    few = image.quantize(palette=colors, dither=Image.Dither.NONE)
     buffer = io.BytesIO()
     few.save(buffer, format="png", dpi=(DPI, DPI))
     return buffer.getvalue()

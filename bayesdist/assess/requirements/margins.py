@@ -246,7 +246,13 @@ def judge(
                 strict=True,
             )
         ]
-        margins.append(_of_extremes(extremes, varying, doubts))
+        worse = min(range(len(ways)), key=lambda k: extremes[k].probability_met)
+        margin = _of_extremes(extremes, extremes[worse], varying, doubts)
+        if extremes[worse].verdict == "missed" and not doubts:
+            worst_epoch = next(one for one in case if one.epoch == margin.epoch)
+            remedy = required_reduction(ways[worse], r, worst_epoch, factor)
+            margin = replace(margin, remedy=remedy)
+        margins.append(margin)
     return tuple(margins)
 
 
@@ -326,10 +332,9 @@ def _chips_of(
 
 
 def _of_extremes(
-    margins: Sequence[Margin], names: Sequence[str], doubts: Sequence[Check]
+    margins: Sequence[Margin], worse: Margin, names: Sequence[str], doubts: Sequence[Check]
 ) -> Margin:
-    """The less favourable margin, with a verdict that holds for all of them."""
-    worse = min(margins, key=lambda m: m.probability_met)
+    """The least favourable margin, `worse`, with a verdict that holds for all of them."""
     if worse.verdict != "missed" or all(m.verdict == "missed" for m in margins):
         return worse
     better = max(margins, key=lambda m: m.probability_met)
@@ -368,9 +373,6 @@ def _margin(
     verdict, reason = verdict_of(met, n_effective, asked, doubts)
     axis = requirement.statistic[0] if requirement.statistic[:2] in ("u_", "v_") else ""
     position = errors.worst(worst_epoch, axis)
-    remedy = None
-    if verdict == "missed" and not doubts:
-        remedy = required_reduction(errors, requirement, worst_epoch, factor)
     return Margin(
         requirement=requirement,
         value=float(median),
@@ -385,5 +387,4 @@ def _margin(
         n_effective=n_effective,
         draws=draws,
         worst=replace(position, rms=factor * position.rms),
-        remedy=remedy,
     )

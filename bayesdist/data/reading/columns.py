@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -23,6 +23,7 @@ from bayesdist.errors import InputError
 __all__ = [
     "columns_read",
     "is_on_sky",
+    "lacking_columns",
     "match_columns",
     "needed_columns",
     "nominal_columns",
@@ -30,6 +31,7 @@ __all__ = [
     "numbered_chips",
     "plane_unit",
     "position_unit",
+    "present_columns",
     "text_labels",
 ]
 
@@ -94,24 +96,17 @@ def is_on_sky(
     return bool(sky) or not on_plane or "b" in {name.lower() for name in names}
 
 
-def needed_columns(
+def present_columns(
     names: Iterable[str],
     columns: Mapping[str, str] | None,
     *,
     source: str,
     read_sigma: bool = True,
 ) -> dict[str, str]:
-    """Column of each quantity that is read: x, y, either u, v or ra, dec, and others there are."""
+    """Column of each quantity that is there: x, y, either u, v or ra, dec, and others."""
     names = list(names)
     found = find_columns(names, columns, ALIASES, source=source, pairs=PAIRS)
     on_sky = is_on_sky(names, found, columns, source)
-    for key in ("x", "y") if on_sky else ("x", "y", "u", "v"):
-        if key not in found:
-            raise InputError(
-                f"no column for {key!r} among {', '.join(names) or 'none'}",
-                where=source,
-                do=f"name it in the option 'columns' (bayesdist init --columns {key}=NAME)",
-            )
     unread = {"u", "v"} if on_sky else {"ra", "dec", *SKY_QUANTITIES}
     if not read_sigma:
         unread |= {"sigma_u", "sigma_v"}
@@ -120,6 +115,33 @@ def needed_columns(
     if "mag" in found:
         unread.add("flux")
     return {key: name for key, name in found.items() if key not in unread}
+
+
+def lacking_columns(found: Container[str]) -> list[str]:
+    """Quantities that matches need, and `present_columns` has not found."""
+    return [key for key in ("x", "y") if key not in found] + [
+        key for key in ("u", "v") if key not in found and "ra" not in found
+    ]
+
+
+def needed_columns(
+    names: Iterable[str],
+    columns: Mapping[str, str] | None,
+    *,
+    source: str,
+    read_sigma: bool = True,
+) -> dict[str, str]:
+    """Column of each quantity that is read, as of `present_columns`; refused where one lacks."""
+    names = list(names)
+    found = present_columns(names, columns, source=source, read_sigma=read_sigma)
+    for key in lacking_columns(found):
+        do = f"name it in the option 'columns' (bayesdist init --columns {key}=NAME)"
+        if "x" in found and "y" in found:
+            do += ", or make the file one of the lists of a [campaign] or [selfcal]"
+        raise InputError(
+            f"no column for {key!r} among {', '.join(names) or 'none'}", where=source, do=do
+        )
+    return found
 
 
 def columns_read(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.commands.on_runs.comparison_files import joined
+from bayesdist.app.commands.on_runs.compare import joined
 from bayesdist.app.commands.on_runs.new_exposures import fit_exposures_of, read_new_exposures
 from bayesdist.app.config import Config, load_config
 from bayesdist.app.kinds.fitted import load_errors

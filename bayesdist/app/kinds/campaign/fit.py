@@ -7,10 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesdist.app.kinds.campaign.gap import gap_priors, with_gap
 from bayesdist.app.kinds.campaign.input_validation import frames_not_set
 from bayesdist.app.kinds.campaign.inputs import Inputs
-from bayesdist.app.kinds.campaign.linear_terms import FIXED, line_sections
+from bayesdist.app.kinds.campaign.linear_terms import FIXED, gap_priors, line_sections, with_gap
 from bayesdist.app.kinds.campaign.matched import CampaignMatched
 from bayesdist.app.kinds.campaign.reference import rate_priors
 from bayesdist.app.kinds.campaign.tables import fit_tables, scatter_by_magnitude, tables_section
