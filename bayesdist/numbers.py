@@ -121,6 +121,11 @@ def probability(p: Any) -> str:
     return f"p = {number(p, 2)}"
 
 
+def p_words(p: float, digits: int = 1, least: float = 1e-300) -> str:
+    """Probability in a sentence of ASCII text: 'p = 0.02'; below `least` that bound."""
+    return f"p < {least:g}" if p < least else f"p = {p:.{digits}g}"
+
+
 def broken_name(name: str) -> str:
     """Long name of a parameter on several lines, broken after its points."""
     lines = [""]

@@ -1,10 +1,11 @@
-"""Random numbers that several results share."""
+"""Random numbers that several results share, and those that follow from given bits."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-__all__ = ["restarted"]
+__all__ = ["mixed", "restarted"]
 
 
 def restarted(rng: np.random.Generator) -> np.random.Generator:
@@ -27,3 +28,11 @@ def restarted(rng: np.random.Generator) -> np.random.Generator:
     if not isinstance(seeds, np.random.SeedSequence):
         raise TypeError("the generator is not made from a seed")
     return np.random.default_rng(np.random.SeedSequence(seeds.entropy, spawn_key=seeds.spawn_key))
+
+
+def mixed(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Bits that depend on all bits: the finaliser of SplitMix64 (Steele, Lea and Flood 2014)."""
+    out = bits + np.uint64(0x9E3779B97F4A7C15)
+    out = (out ^ (out >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    out = (out ^ (out >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return np.asarray(out ^ (out >> np.uint64(31)))

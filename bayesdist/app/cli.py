@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 import click
 
-from bayesdist.app.commands.groups import LazyGroup
+from bayesdist.app.commands.options import LazyGroup
 from bayesdist.app.screen import open_streams
 from bayesdist.errors import BayesdistError, RenamedError
 from bayesdist.mission import load_mission, mission_names, missions

@@ -27,18 +27,17 @@ from bayesdist.app.assessment.diagnosing import diagnose_run as diagnose
 from bayesdist.app.assessment.error_terms import errors_of_run as error_model
 from bayesdist.app.assessment.settings import assessment_rng, evaluation_settings
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.fit_data import FitData, StarReader
 from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matched import Matched
-from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.products.export import export_files
 from bayesdist.app.products.made_files import product_input, product_of, solution_of
 from bayesdist.app.products.product_terms import file_errors
 from bayesdist.app.report import report
 from bayesdist.assess import evaluation as assessed
-from bayesdist.assess import star_sample
 from bayesdist.assess.error_model import ErrorModel
 from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.diagnose.residuals.sample import star_sample
 from bayesdist.infer import Posterior
 
 __all__ = [

@@ -11,11 +11,11 @@ from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.products.made_files import made_files, product_input
 from bayesdist.app.results import Results
-from bayesdist.assess import Requirement, star_sample
+from bayesdist.assess import Requirement
 from bayesdist.assess.evaluation import budget_over
 from bayesdist.assess.requirements.margins import judge
 from bayesdist.assess.terms.centroid import centroid_errors
-from bayesdist.diagnose.residuals.sample import centroid_scatter
+from bayesdist.diagnose.residuals.sample import centroid_scatter, star_sample
 from bayesdist.errors import InputError
 
 __all__ = ["rehearse", "rehearse_solution"]

@@ -1,4 +1,4 @@
-"""The report of a run: figures and report.html."""
+"""The report of a run: what it shows, figures, and report.html."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.campaign.report import campaign_results
-from bayesdist.app.kinds.selfcal.report import selfcal_results
+from bayesdist.app.kinds.fitted import Fitted, required
 from bayesdist.app.results import Results
 from bayesdist.app.store import as_json
+from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import VectorMap, distortion_vectors
 from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.evaluation import Evaluation
@@ -21,9 +24,12 @@ from bayesdist.checks import Check
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
 from bayesdist.model import Chip
-from bayesdist.report.context import ChipResults, Product, ReportInput
+from bayesdist.model.grid import outline_pixels
+from bayesdist.reading.tables import read_ecsv
+from bayesdist.report.context import ChipResults, Product, ReportInput, SelfcalResults
 
 __all__ = ["report", "title_of"]
+
 
 log = logging.getLogger("bayesdist")
 
@@ -180,3 +186,39 @@ def _vector_grid(size: tuple[float, float]) -> tuple[int, int]:
     longest = max(size)
     nx, ny = (max(3, round(VECTOR_GRID * s / longest)) for s in size)
     return nx, ny
+
+
+def selfcal_results(
+    run: RunDirectory, fitted: Fitted, posterior: Posterior, epoch: float | None
+) -> SelfcalResults:
+    """Content that a self-calibration adds to the report of its run.
+
+    Parameters
+    ----------
+    run : RunDirectory
+        That has been assessed.
+    fitted : Fitted
+    posterior : Posterior
+        As it was sampled.
+    epoch : float or None
+        Of the assessment, decimal years.
+    """
+    model, theta = fitted.linear.model, posterior.mean
+    solved = required(fitted.solved, "solution of detections")
+    outlines = []
+    for e in range(len(model.exposures)):
+        for chip in model.chips:
+            x, y = outline_pixels(chip.size)
+            when = None if model.time is None else np.full(len(x), epoch)
+            place = {"exposure": np.full(len(x), e), "chip": chip.number, "epoch": when}
+            outlines.append(model.predict(theta, x, y, **place))
+    names = model.names
+    return SelfcalResults(
+        words=solved.gauge_words,
+        gauge=read_ecsv(run / "gauge.ecsv"),
+        matching=read_ecsv(run / "matching.ecsv"),
+        stars=read_ecsv(run / "stars.ecsv"),
+        outlines=tuple(outlines),
+        held=tuple(names[k] for k in solved.gauge.held),
+        summary=run.summary["selfcal"],
+    )

@@ -14,12 +14,11 @@ from bayesdist.app.assessment.diagnosing import diagnose_fit_of_run, diagnose_ru
 from bayesdist.app.assessment.error_terms import errors_of_run
 from bayesdist.app.assessment.settings import assessment_epoch, evaluation_settings
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.fit_data import FitData, StarReader
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.kind import Kind, kind_of
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.matches.sources import RunInput, input_of_run
-from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.products.made_files import ProductInput, product_of, solution_of
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.diagnostics_files import load_diagnostics

@@ -39,7 +39,7 @@ from bayesdist.errors import InputError, NotConvergedError
 from bayesdist.infer import Posterior
 from bayesdist.infer.checks import convergence_check
 
-__all__ = ["continue_stage", "initialized", "make_stages", "run"]
+__all__ = ["continue_stage", "make_stages", "run"]
 
 ASSESS = ("diagnose", "evaluate")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from bayesdist.app.assessment.checks import frames_doubt, in_circle
@@ -22,20 +23,23 @@ from bayesdist.app.kinds.selfcal.stars import write_stars
 from bayesdist.app.rehearsal import rehearse_solution
 from bayesdist.app.results import Results
 from bayesdist.app.store.output import provenance_notes, write_table
+from bayesdist.app.store.rundir import part_files
+from bayesdist.app.store.summary import Sampler
 from bayesdist.app.tables.diagnostics_files import write_diagnostics
 from bayesdist.app.tables.evaluation_files import write_evaluation
-from bayesdist.app.tables.star_files import FOLDER, write_star_files
 from bayesdist.checks import warnings_of
 from bayesdist.data import Matches
+from bayesdist.data.storage.write import write_columns
 from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
 from bayesdist.diagnose.residuals.quoted import majority_sentence
+from bayesdist.files import made_folder, remove_leftovers
 from bayesdist.infer import LinearFit, Posterior, save_posterior
+from bayesdist.infer.posterior.memberships import memberships_of
 from bayesdist.infer.skew import Skew, skew_of
+from bayesdist.infer.stars.stars import in_table_order, prepare
 
 __all__ = [
     "fit_sections",
-    "log_fit",
-    "sample_sections",
     "save_diagnosed",
     "save_evaluation",
     "save_figures",
@@ -43,6 +47,7 @@ __all__ = [
     "save_matches",
     "save_products",
     "save_sampled",
+    "write_star_files",
 ]
 
 
@@ -261,25 +266,10 @@ def sample_sections(posterior: Posterior, *, in_circle: bool) -> dict[str, Any]:
     in_circle : bool
         Stars were matched in circles about nominal positions.
     """
-    c, i = posterior.convergence, posterior.sampler
     return {
         "outliers": _outliers(posterior, in_circle),
         "sampler": {
-            "method": i.method,
-            "exact": i.exact,
-            "converged": c.converged,
-            "reasons": list(c.reasons),
-            "rhat_max": c.rhat_max,
-            "ess_bulk_min": c.ess_bulk_min,
-            "ess_tail_min": c.ess_tail_min,
-            "pareto_k": c.pareto_k,
-            "importance_efficiency": c.importance_efficiency,
-            "ensembles": i.ensembles,
-            "walkers": i.walkers,
-            "steps": i.steps,
-            "passes": i.passes,
-            "acceptance": i.acceptance,
-            "wall_s": i.wall_s,
+            **Sampler.row(posterior.sampler, posterior.convergence),
             **_certificate(posterior),
         },
     }
@@ -308,3 +298,37 @@ def _certificate(posterior: Posterior) -> dict[str, object]:
     if c is None:
         return {}
     return {"certificate": asdict(c) | {"granted": c.granted, "statement": c.statement}}
+
+
+FOLDER = "stars"
+
+
+def write_star_files(matches: Matches, fit: LinearFit, posterior: Posterior, folder: Path) -> None:
+    """Write residuals and memberships of each star by batches, in place of parts that are there."""
+    made_folder(folder)
+    remove_leftovers(folder)
+    for path in part_files(folder):
+        path.unlink()
+    for k, batch in enumerate(matches.batches()):
+        _write_part(batch, fit, posterior, folder / f"part-{k:05d}.parquet")
+
+
+def _write_part(table: Matches, fit: LinearFit, posterior: Posterior, path: Path) -> None:
+    stars, order = prepare(posterior.model, table)
+    said = memberships_of(posterior, stars).in_table_order(order)
+    u, v = in_table_order(stars.residuals(posterior.mean), order).T
+    columns = {
+        "source": (table.source, table.sources),
+        "row": table.row,
+        "x": table.x,
+        "y": table.y,
+        "chip": table.chip_number,
+        "residual_u": u,
+        "residual_v": v,
+        "used": in_table_order(fit.clip.keeps_of(stars), order),
+        "outlier_probability": said.outlier_probability,
+        "log_likelihood": said.log_likelihood,
+        "log_likelihood_variance": said.log_likelihood_variance,
+    }
+    unit = posterior.unit
+    write_columns(path, columns, {"x": "pix", "y": "pix", "residual_u": unit, "residual_v": unit})

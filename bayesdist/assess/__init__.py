@@ -20,27 +20,6 @@ _HOMES = {
     "bayesdist.assess.terms.local": ("LocalErrors",),
     "bayesdist.assess.units": ("UNITS", "convert", "pixel_scale_of"),
     "bayesdist.assess.vectors": ("VectorMap", "distortion_vectors"),
-    "bayesdist.diagnose.residuals.binned": (
-        "BinnedResiduals",
-        "BinnedSums",
-        "binned_residuals",
-        "binned_sums",
-        "residual_statistics",
-    ),
-    "bayesdist.diagnose.residuals.misfit": (
-        "Misfit",
-        "misfit_of",
-        "partitions_for",
-        "worst_misfit",
-    ),
-    "bayesdist.diagnose.residuals.sample": ("SAMPLE", "StarSample", "star_sample"),
-    "bayesdist.diagnose.residuals.star_sums": (
-        "ExposureSums",
-        "StarSums",
-        "flagged_by_exposure",
-        "star_sums",
-    ),
-    "bayesdist.model.grid": ("DEFAULT_GRID", "grid_pixels"),
 }
 
 __all__ = sorted(name for names in _HOMES.values() for name in names)

@@ -1,4 +1,7 @@
-"""Everything that moves a position: a solution, and terms that are independent of each other."""
+"""Everything that moves a position: a solution, and terms that are independent of each other.
+
+Errors that its likelihood does not know of spread the draws of a solution.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.adjusted import with_diagnosed_errors
 from bayesdist.assess.budget.budget import ErrorBudget, budget_of
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors, generators
@@ -21,8 +23,10 @@ from bayesdist.assess.terms.parameters import catalogue_terms
 from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.assess.units import pixel_scale_of
 from bayesdist.diagnose.diagnostics import Diagnostics
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 from bayesdist.infer import LinearFit, Posterior
+from bayesdist.infer.catalogue.star_errors import StarCovariance
+from bayesdist.infer.equations.scaled import recolouring, scaled_cholesky
 from bayesdist.infer.solution import Solution
 from bayesdist.memory import require_memory
 from bayesdist.model import LookupTable
@@ -33,6 +37,8 @@ __all__ = [
     "diagnosed_error_model",
     "error_budget",
     "error_model",
+    "with_diagnosed_errors",
+    "with_shared_stars",
 ]
 
 Float = NDArray[np.float64]
@@ -305,3 +311,69 @@ def error_budget(
     errors = error_model(solution, terms=terms, aligned=aligned, pixel_scale=pixel_scale)
     domain = EvaluationDomain.of_chips(solution.model, grid, chips=(chip,), epoch=epoch)
     return errors.at(domain, n=n_draws, rng=rng)
+
+
+def with_shared_stars(posterior: Posterior, fit: LinearFit, stars: StarCovariance) -> Posterior:
+    """A posterior whose draws are spread by what the errors of the catalogue add.
+
+    The linear map that turns the covariance of the fit into the larger one is applied to the
+    deviations of the draws, so that they keep their shape: no noise could be added, as errors that
+    the fit takes for independent may cancel.  Where the posterior is as much wider than the fit as
+    its jitter says, so is the covariance that the map begins with.
+
+    `fit`: that `stars` was computed for. The result comes with other draws of theta and the same
+    mean; all else is as it was.
+    """
+    before = _covariance(posterior, fit)
+    return posterior.mapped(recolouring(before, before + stars.extra))
+
+
+def with_diagnosed_errors(
+    posterior: Posterior,
+    diagnostics: Diagnostics | None,
+    hierarchy: LinearFit | None = None,
+    *,
+    noise_alone: bool = False,
+) -> Posterior:
+    """Posterior whose draws are spread by all that diagnostics know of errors of its parameters.
+
+    So it is exported and shown; `posterior` is as it was sampled.  `hierarchy` is the fit of a
+    hierarchy of exposures, whose covariance has no noise of draws.  `noise_alone` counts, of the
+    correlated errors, those of the stars as they scatter: what else there is stands in terms of its
+    own.
+    """
+    if diagnostics is None:
+        return posterior
+    solution, stars, found = posterior, diagnostics.catalogue, diagnostics.correlated
+    if stars is not None:
+        needed = required(hierarchy, "errors of the catalogue need a joint fit")
+        solution = with_shared_stars(posterior, needed, stars)
+    if found is None:
+        return solution
+    cov = found.noise if noise_alone else found.covariance
+    if hierarchy is None:
+        return solution.mapped(recolouring(found.formal, cov))
+    before = _covariance(posterior, hierarchy)
+    if stars is not None:
+        before = before + stars.extra
+    # frames follow as they are correlated with polynomials and drift
+    D = found.model.n_distortion
+    follow = np.linalg.solve(before[:D, :D], before[:D]).T
+    more = follow @ (cov - found.formal)[:D, :D] @ follow.T
+    return solution.mapped(recolouring(before, before + _least(before, (more + more.T) / 2)))
+
+
+def _covariance(posterior: Posterior, fit: LinearFit) -> Float:
+    """Covariance (D, D) of a posterior without the noise of its draws."""
+    formal = np.asarray(fit.cov, float)
+    wider = float(np.trace(np.linalg.solve(formal, posterior.cov))) / len(formal)
+    return wider * formal
+
+
+def _least(before: Float, more: Float) -> Float:
+    """Addition to a covariance, limited so that no direction loses more than half its variance."""
+    root = scaled_cholesky(before)
+    white = np.linalg.solve(root, np.linalg.solve(root, more).T)
+    values, vectors = np.linalg.eigh((white + white.T) / 2)
+    turned = root @ vectors
+    return np.asarray((turned * np.maximum(values, -0.5)) @ turned.T)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
+from bayesdist.streams import mixed
 
 __all__ = [
     "HELD_OUT",
@@ -45,9 +46,9 @@ class HoldoutSpec:
         else:
             # -0.0 and 0.0 are one position
             keys = [(a + 0.0).view(np.uint64) for a in (table.x, table.y)]
-        bits = np.full(len(table), _mixed(np.array([self.seed], np.uint64))[0])
+        bits = np.full(len(table), mixed(np.array([self.seed], np.uint64))[0])
         for key in keys:
-            bits = _mixed(bits ^ key)
+            bits = mixed(bits ^ key)
         chosen = (bits >> np.uint64(11)) * 2.0**-53 < self.fraction
         whole = [name in set(self.exposures) for name in table.exposure_names]
         return np.asarray(chosen | np.array(whole, bool)[table.exposure])
@@ -113,11 +114,3 @@ def _refuse_nothing(held: int, n: int, where: str) -> None:
         where=where,
         do="correct holdout.fraction and holdout.exposures",
     )
-
-
-def _mixed(bits: Bits) -> Bits:
-    """Bits that depend on all bits: the finaliser of SplitMix64 (Steele, Lea and Flood 2014)."""
-    out = bits + np.uint64(0x9E3779B97F4A7C15)
-    out = (out ^ (out >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    out = (out ^ (out >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return np.asarray(out ^ (out >> np.uint64(31)))

@@ -23,7 +23,7 @@ from bayesdist.data.formats.files import (
 from bayesdist.data.formats.hst1pass import is_matchup, read_hst1pass, read_matchup
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.table import match_table
-from bayesdist.data.reading.chips import numbered, text_labels
+from bayesdist.data.reading.columns import numbered, text_labels
 from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
 from bayesdist.data.reading.table import matches_from_table, sky_positions
 from bayesdist.data.sky.tangent import mean_direction

@@ -14,7 +14,7 @@ from bayesdist.checks import EITHER, Check
 from bayesdist.data import MagnitudeErrors, Matches
 from bayesdist.diagnose.checks import holdout_checks, score_checks, structure_checks
 from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors, estimate_discrepancy
-from bayesdist.diagnose.correlated.storage import as_stored
+from bayesdist.diagnose.correlated.result import as_stored
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_validation
 from bayesdist.diagnose.overlap import OverlapTest

@@ -35,6 +35,7 @@ from bayesdist.infer.compare.periods import (
 from bayesdist.infer.compare.positions import PositionChange
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.limits import DIFFERENCE
+from bayesdist.numbers import p_words
 
 __all__ = [
     "PeriodPart",
@@ -272,7 +273,7 @@ def period_verdict(
     unit = comparison.model.unit
     head = "The distortion changes" if p < DIFFERENCE.value else "No change is seen"
     out = (
-        f"{head} (chi-square {chi2:.4g} for {dof} degrees of freedom, {_probability(p)}): "
+        f"{head} (chi-square {chi2:.4g} for {dof} degrees of freedom, {p_words(p, 2, 1e-12)}): "
         f"{name} differs most from the combined model, by up to {most.largest:.2g} +- "
         f"{most.sigma:.1g} {unit} at ({most.at[0]:.0f}, {most.at[1]:.0f}), where noise alone "
         f"makes {most.noise_median:.2g} (95 %: {most.noise_95:.2g})"
@@ -290,7 +291,3 @@ def period_verdict(
     if beyond:
         return f"{out}; beyond {limit}: {', '.join(beyond)}."
     return f"{out}; the data do not decide whether a period exceeds {limit}."
-
-
-def _probability(p: float) -> str:
-    return "p < 1e-12" if p < 1e-12 else f"p = {p:.2g}"

@@ -6,16 +6,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import beta, chi2
 
-__all__ = ["chi_square_of", "clopper_pearson", "holm", "hotelling_p", "p_words"]
+__all__ = ["chi_square_of", "clopper_pearson", "holm", "hotelling_p"]
 
 Float = NDArray[np.float64]
 
 MIN_P = 1e-300  # tails underflow: no probability is zero
-
-
-def p_words(p: float) -> str:
-    """Words for a probability: 'p = 0.02'."""
-    return f"p < {MIN_P:g}" if p < MIN_P else f"p = {p:.1g}"
 
 
 def holm(p_values: ArrayLike) -> Float:

@@ -19,6 +19,7 @@ from bayesdist.products import formats
 from bayesdist.products.formats.common.content import Content, read_content, readable
 from bayesdist.products.formats.common.document import (
     PARAMETERS,
+    Builder,
     BuildOptions,
     Built,
     Choice,
@@ -114,9 +115,14 @@ def product_settings() -> dict[str, type[FormatSettings]]:
 
 def format_of(key: str) -> Format:
     """Format of a key that can be built; InputError where there is none."""
+    return _builder_of(key)[0]
+
+
+def _builder_of(key: str) -> tuple[Format, Builder]:
+    """Format of a key, and what builds its files."""
     for one in all_formats():
         if one.key == key and one.build is not None:
-            return one
+            return one, one.build
     raise InputError(
         f"there is no format {key!r} that can be built",
         do=f"choose one of {', '.join(product_settings())}",
@@ -130,8 +136,7 @@ def build(
     options: BuildOptions = BuildOptions(),  # noqa: B008
 ) -> tuple[Built, ...]:
     """Files of a format, built and not written; values that the format cannot hold are refused."""
-    one = format_of(key)
-    assert one.build is not None
+    one, made = _builder_of(key)
     if calibration.model.order > one.highest_order:
         raise InputError(
             f"the order is {calibration.model.order}, and polynomials of {one.title} go "
@@ -141,7 +146,7 @@ def build(
         )
     if one.holds_tables and not calibration.before:
         calibration = replace(calibration, before=options.tables)
-    return one.build(calibration, settings, options)
+    return made(calibration, settings, options)
 
 
 def read_back(

@@ -17,7 +17,8 @@ from bayesdist.report.panels import Panels
 from bayesdist.report.style import CYCLE, INK, PALE, PALETTE, figure_style, nice_below
 
 if TYPE_CHECKING:
-    from bayesdist.assess import BinnedResiduals, UncertaintyMap, VectorMap
+    from bayesdist.assess import UncertaintyMap, VectorMap
+    from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
 __all__ = [
     "CHANCE",

@@ -14,9 +14,9 @@ from bayesdist.model import Chip, LookupTable
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from bayesdist.assess import BinnedResiduals
     from bayesdist.data import MagnitudeErrors
     from bayesdist.diagnose.overlap import OverlapTest
+    from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
 __all__ = [
     "CampaignResults",

@@ -16,15 +16,7 @@ from bayesdist.report.mosaic import Mosaic
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from bayesdist.assess import (
-        AreaMap,
-        BinnedResiduals,
-        ExposureSums,
-        Margin,
-        StarSample,
-        UncertaintyMap,
-        VectorMap,
-    )
+    from bayesdist.assess import AreaMap, Margin, UncertaintyMap, VectorMap
     from bayesdist.assess.budget.budget import ErrorBudget
     from bayesdist.assess.budget.surface import BudgetSurface
     from bayesdist.assess.requirements.validity import ValidityPeriod
@@ -32,6 +24,9 @@ if TYPE_CHECKING:
     from bayesdist.diagnose import ScoreTest
     from bayesdist.diagnose.holdout.validation import HoldoutValidation
     from bayesdist.diagnose.periods import TimeVariation
+    from bayesdist.diagnose.residuals.binned import BinnedResiduals
+    from bayesdist.diagnose.residuals.sample import StarSample
+    from bayesdist.diagnose.residuals.star_sums import ExposureSums
     from bayesdist.infer import LinearFit, Posterior
     from bayesdist.infer.catalogue.added_errors import GroupedErrors
     from bayesdist.model import Chip

@@ -7,8 +7,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from bayesdist.app.config import load_config
-from bayesdist.app.kinds.matches import reading as app_matches
-from bayesdist.app.kinds.matches.reading import load_matches
+from bayesdist.app.kinds.matches import sources as app_matches
+from bayesdist.app.kinds.matches.sources import load_matches
 from bayesdist.app.kinds.matches.stars import fit_stars
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
@@ -114,7 +114,7 @@ def test_no_stage_takes_all_rows_into_memory(job, tmp_path, on_disk, monkeypatch
     monkeypatch.setattr(
         Matches, "_complete", lambda self: (sizes.append(np.size(self.x)), complete(self))[1]
     )
-    for name in ("kinds.fit_data", "kinds.reader", "kinds.stars", "report"):
+    for name in ("kinds.fit_data", "kinds.matches.stars", "report"):
         monkeypatch.setattr(f"bayesdist.app.{name}.SAMPLE", 900, raising=False)
     monkeypatch.setattr("bayesdist.infer.linear.MEDIAN_STARS", 900)
     good("init", tmp_path / "c.toml", "--matches", job.parent / "stars")

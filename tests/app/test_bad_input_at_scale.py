@@ -15,7 +15,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bayesdist.app.kinds.matches import reading as app_matches
+from bayesdist.app import saving
+from bayesdist.app.kinds.matches import sources as app_matches
 from tests.app.support import (
     begin_stagewise,
     model_of,
@@ -187,7 +188,7 @@ def test_a_part_that_is_damaged_between_two_stages(job, tmp_path):
 
 def test_a_part_that_is_damaged_while_it_is_read(job, tmp_path, monkeypatch):
     """After the scan, before the passes: found when the piece is read, with its row group."""
-    from bayesdist.app.kinds import stars
+    from bayesdist.app.kinds.matches import stars
 
     model_of = stars.model_of
     path = job.parent / "stars" / "b.parquet"
@@ -210,25 +211,24 @@ def test_a_part_that_is_damaged_while_it_is_read(job, tmp_path, monkeypatch):
 
 def test_a_part_that_vanishes_before_it_is_written_about(job, tmp_path, monkeypatch):
     """When what is said of each star is written: the draws stay, and the stage can be repeated."""
-    from bayesdist.app.tables import star_files
     from tests.app.support import cli, good
 
     run = begin_stagewise_here(job, tmp_path)
     path, kept = job.parent / "stars" / "b.parquet", tmp_path / "kept.parquet"
-    real = star_files._write_part
+    real = saving._write_part
 
     def vanish(*arguments):
         real(*arguments)
         path.rename(kept)
 
     monkeypatch.setattr("bayesdist.data.batches.BATCH", PART)
-    monkeypatch.setattr(star_files, "_write_part", vanish)
+    monkeypatch.setattr(saving, "_write_part", vanish)
     result = cli("stage", "sample", run, "-q")
     assert result.code == 1
     one_sentence(result.err, "b.parquet", "does not exist")
     assert [p.name for p in (run / "stars").iterdir()] == ["part-00000.parquet"]
     assert "sample" not in json.loads((run / "run.json").read_text())["stages"]
-    monkeypatch.setattr(star_files, "_write_part", real)
+    monkeypatch.setattr(saving, "_write_part", real)
     shutil.move(kept, path)
     good("stage", "sample", run)
     parts = [pq.read_table(p) for p in sorted((run / "stars").iterdir())]

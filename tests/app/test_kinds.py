@@ -9,7 +9,7 @@ import pytest
 
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.errors import ErrorLaw
-from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.fit_data import FitData, StarReader
 from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matches.stars import (
     fit_stars,
@@ -17,7 +17,6 @@ from bayesdist.app.kinds.matches.stars import (
     read_stars,
     sample_stars,
 )
-from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.results import open_results
 from bayesdist.app.saving import fit_sections
 from bayesdist.app.store import as_json

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import tomllib
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from astropy.table import Table
 
+from bayesdist.app.config.campaign import CampaignBlock
 from bayesdist.data import read_matches, tangent_plane
 from bayesdist.infer import load_posterior
 from tests.app.layouts import LAYOUTS, POINT, SCALE, SIGMA, field_of, gaia_table, plane_of, sky_of
@@ -31,10 +33,11 @@ def begun(name, folder):
     layout, field = BY_NAME[name], field_of()
     layout.write(field, folder / name)
     config = folder / "my.toml"
-    if layout.options:  # what has to be given is named
-        words = ["--columns x=NAME"]
-        refused(folder, "init", config, "--matches", folder / name, words=words)
-    good("init", config, "--matches", folder / name, *layout.options)
+    if layout.options:  # what has to be given is named, beside the candidates
+        assert "incomplete draft" in good("init", config, "--matches", folder / name).out
+        assert "--columns x=NAME,y=NAME" in config.read_text()
+        assert "col_px (" in config.read_text() and "row_px (" in config.read_text()
+    good("init", config, "--matches", folder / name, "--force", *layout.options)
     return layout, field, config
 
 
@@ -112,6 +115,44 @@ def test_init_names_integer_columns_that_may_be_chips(tmp_path):
     assert "GUESSED" in (tmp_path / "b.toml").read_text()
     arguments = ("--matches", tmp_path / "s.csv", "--columns", "chip")
     refused(tmp_path, "init", tmp_path / "c.toml", *arguments, words=["'chip' is not KEY=NAME"])
+
+
+def als(field, path):
+    """A list of DAOPHOT's ALLSTAR."""
+    head = " NL   NX   NY  LOWBAD HIGHBAD  THRESH     AP1  PH/ADU  RNOISE    FRAD\n"
+    head += "  1  2048  1024    10.0 60000.0   10.0    3.0    1.5   5.0  4.0\n\n"
+    rest = "   0.010   100.00      4.     1.00    0.010\n"
+    rows = zip(range(1, 1 + len(field.x)), field.x, field.y, field.mag, strict=True)
+    path.write_text(head + "".join(f"{k:7d} {x:8.3f} {y:8.3f} {m:8.3f}{rest}"
+                                   for k, x, y, m in rows))  # fmt: skip
+
+
+def xymq(field, path):
+    """A list of hst1pass by its suffix alone."""
+    np.savetxt(path, np.column_stack([field.x, field.y, field.mag, 0 * field.x]), fmt="%.4f")
+
+
+@pytest.mark.parametrize(("name", "write"), [("phot.als", als), ("phot.xymq", xymq)])
+def test_a_star_list_becomes_a_draft_that_can_be_used(tmp_path, name, write):
+    """A self-calibration as it stands; the comments have all that a campaign needs."""
+    field, rng = field_of(), np.random.default_rng(4)
+    for k, (dx, dy) in enumerate(((0, 0), (31, 7), (-9, 23))):
+        x, y = (z + d + rng.normal(0, SIGMA, len(z)) for z, d in ((field.x, dx), (field.y, dy)))
+        inside = (x > 0.5) & (y > 0.5) & (x < 2048.5) & (y < 1024.5)
+        one = replace(field, x=x[inside], y=y[inside], mag=field.mag[inside])
+        write(one, tmp_path / f"{k}{name}")
+    config = tmp_path / "my.toml"
+    out = good("init", config, "--matches", tmp_path / f"0{name}").out
+    assert "incomplete draft: no columns are known as reference positions" in out
+    text = config.read_text()
+    assert "size = [2048, 1024]" in text
+    refused(tmp_path, "check", config, words=["there is one exposure"])
+    config.write_text(text.replace(f'lists = "0{name}"', f'lists = "?{name}"'))
+    out = good("check", config).out
+    assert "exposures    3" in out and "stars        " in out
+    commented = text.partition("# [campaign]")[2].partition("# 3.")[0]
+    keys = {line.partition("=")[0].strip("# ") for line in commented.splitlines() if "=" in line}
+    assert keys == {k for k, one in CampaignBlock.model_fields.items() if one.is_required()}
 
 
 def test_positions_that_the_image_itself_gives_are_pointed_out(tmp_path):

@@ -14,7 +14,7 @@ import click
 import numpy as np
 import pytest
 
-from bayesdist.app.commands.groups import LazyGroup
+from bayesdist.app.commands.options import LazyGroup
 from bayesdist.mission import GROUP, Mission, load_object
 from tests.app.several import encoded, results_of
 from tests.app.support import REPOSITORY, one_sentence

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.app.kinds.matches import reading as app_matches
+from bayesdist.app.kinds.matches import sources as app_matches
 from bayesdist.data import write_partitioned
 from bayesdist.simulate import simulate_matches
 from tests.app.support import (

@@ -11,7 +11,7 @@ from astropy.table import Table
 from astropy.time import Time
 from lxml import html as lxml_html
 
-from bayesdist.app.kinds.matches import reading as app_matches
+from bayesdist.app.kinds.matches import sources as app_matches
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, write_partitioned
 from bayesdist.diagnose.periods import PeriodSettings, time_variation

@@ -11,7 +11,7 @@ import pytest
 import bayesdist as bd
 from bayesdist.app.config import load_config
 from bayesdist.app.config.model import PriorCalibrationBlock
-from bayesdist.app.kinds.matches.earlier import earlier_calibration
+from bayesdist.app.kinds.matches.stars import earlier_calibration
 from bayesdist.app.store import Record
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.calibration.calibration import calibration_of
@@ -300,9 +300,9 @@ frame = "shift"
 def test_a_run_goes_by_it(tmp_path):
     """The fit of a configuration, saved and loaded, and the inputs that are recorded."""
     from bayesdist.app.config import parse_config
+    from bayesdist.app.kinds.fit_data import StarReader
     from bayesdist.app.kinds.kind import kind_of
-    from bayesdist.app.kinds.reader import StarReader
-    from bayesdist.app.store.inputs import hashes_of
+    from bayesdist.app.store.made_from import hashes_of
 
     rng, model = np.random.default_rng(9), model_of(3)
     theta = truth_of(model, rng)

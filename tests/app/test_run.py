@@ -773,6 +773,14 @@ def test_demo(tmp_path, full):
     for word in ("Error budget", "Margins", "report.html", "converged"):
         assert word in done.stdout
     run = tmp_path / "demo" / "run"
+    # u, v count from the middle of the detector, and the header gives them without a placeholder
+    assert "CRVAL" not in done.stderr + done.stdout and "stwcs" not in done.stderr + done.stdout
+    header = WCS(fits.Header.fromtextfile(run / "sip.hdr"))
+    pixels = np.array([[508.5, 508.5], [1.0, 1016.0], [700.0, 20.0]])
+    posterior = load_posterior(run)
+    there = posterior.model.predict(posterior.mean, *pixels.T)
+    np.testing.assert_allclose(header.all_pix2world(pixels, 1), there, atol=1e-6)
+    assert np.abs(there[0]).max() < 1
     summary = summary_of(run)
     assert summary["sampler"]["converged"] is True
     assert min(summary["sampler"]["ess_bulk_min"], summary["sampler"]["ess_tail_min"]) >= 400

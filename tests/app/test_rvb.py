@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from astropy.table import Table, vstack
 
-from bayesdist.app.kinds.matches import reading
+from bayesdist.app.kinds.matches import sources
 from bayesdist.app.store import Record
 from bayesdist.data import open_matches
 from bayesdist.infer import load_fit
@@ -26,7 +26,7 @@ STAGES = ("fit", "sample", "assess", "export")
 @pytest.fixture
 def on_disk(monkeypatch):
     """Parquet of more than 100 rows is left on disk."""
-    monkeypatch.setattr(reading, "IN_MEMORY", 100)
+    monkeypatch.setattr(sources, "IN_MEMORY", 100)
 
 
 def counted(table: Table) -> dict[str, int]:

@@ -14,8 +14,10 @@ from astropy.wcs import WCS
 
 from bayesdist.app.results import results_of
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.assess import area_map, binned_residuals, misfit_of, uncertainty_map
+from bayesdist.assess import area_map, uncertainty_map
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
+from bayesdist.diagnose.residuals.binned import binned_residuals
+from bayesdist.diagnose.residuals.misfit import misfit_of
 from bayesdist.infer import load_fit, load_posterior, residuals
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.products import read_idctab

@@ -11,8 +11,8 @@ import xarray as xr
 from scipy.special import logsumexp
 from scipy.stats import norm
 
+from bayesdist.app.saving import write_star_files
 from bayesdist.app.store.rundir import RunDirectory, part_files
-from bayesdist.app.tables import star_files
 from bayesdist.data import batches, read_matches
 from bayesdist.infer import load_fit, load_posterior
 from bayesdist.reading.parquet import parquet_units
@@ -85,7 +85,7 @@ def test_one_part_for_each_piece(finished, matches, part, tmp_path, monkeypatch)
     folder = tmp_path / "stars"
     assert batches.BATCH > 400
     monkeypatch.setattr("bayesdist.data.batches.BATCH", 90)
-    star_files.write_star_files(matches, fit, posterior, folder)
+    write_star_files(matches, fit, posterior, folder)
     parts = part_files(folder)
     assert [p.name for p in parts] == [f"part-{k:05d}.parquet" for k in range(5)]
     both = [pq.read_table(p).to_pydict() for p in parts]
@@ -97,7 +97,7 @@ def test_one_part_for_each_piece(finished, matches, part, tmp_path, monkeypatch)
             assert joined == values
     (folder / "notes.txt").write_text("mine")
     monkeypatch.setattr("bayesdist.data.batches.BATCH", 1000)
-    star_files.write_star_files(matches, fit, posterior, folder)
+    write_star_files(matches, fit, posterior, folder)
     assert sorted(snapshot(folder)) == ["notes.txt", "part-00000.parquet"]
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.assess import Requirement, binned_sums, partitions_for
+from bayesdist.assess import Requirement
+from bayesdist.diagnose.residuals.binned import binned_sums
 from bayesdist.diagnose.residuals.coverage import coverage_of
+from bayesdist.diagnose.residuals.misfit import partitions_for
 from bayesdist.infer.stars.survey import _hull
 from bayesdist.limits import UNCOVERED_BY_CHANCE
 from bayesdist.model import Chip

@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
 
-from bayesdist.assess import grid_pixels, uncertainty_map
+from bayesdist.assess import uncertainty_map
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel, basis
+from bayesdist.model.grid import grid_pixels
 
 
 def mesh_of(m):

@@ -15,8 +15,8 @@ from bayesdist.assess.planning.dithers import (
     PlannedStars,
     PriorInformation,
     compare_patterns,
+    lacking,
 )
-from bayesdist.assess.planning.words import lacking
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal import self_calibrate
 from bayesdist.model import Chip

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bayesdist.assess.regions import check_region, in_region, region_words
+from bayesdist.assess.domain import check_region, in_region, region_words
 from bayesdist.errors import InputError
 
 SIZE = (101.0, 51.0)

@@ -11,7 +11,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 from bayesdist.data import ReadOptions, matches_from_table, open_matches, read_matches
-from bayesdist.data.reading.chips import numbered
+from bayesdist.data.reading.columns import numbered
 from bayesdist.data.tables.names import ALIASES
 from bayesdist.errors import InputError
 from bayesdist.reading.tables import read_table

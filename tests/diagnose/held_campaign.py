@@ -15,8 +15,7 @@ from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive
 from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_validation
 from bayesdist.infer import OutlierMixture, Rejection, load
-from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
-from bayesdist.infer.catalogue.star_influence import star_influence
+from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance, star_influence
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical

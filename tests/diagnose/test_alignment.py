@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from bayesdist.assess import residual_statistics
 from bayesdist.diagnose.residuals import (
     STATISTICS,
     BinValues,
@@ -19,6 +18,7 @@ from bayesdist.diagnose.residuals import (
     pattern_changes,
     period_table,
 )
+from bayesdist.diagnose.residuals.binned import residual_statistics
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import build_model, fit_linear, residuals
 from bayesdist.infer.stars.likelihood import Clip

@@ -18,8 +18,7 @@ from bayesdist.data.holdout import HoldoutSpec, split_matches
 from bayesdist.diagnose.holdout.frames import frames_for
 from bayesdist.diagnose.holdout.validation import holdout_validation
 from bayesdist.errors import InputError
-from bayesdist.infer.catalogue.star_errors import star_covariance
-from bayesdist.infer.catalogue.star_influence import star_influence
+from bayesdist.infer.catalogue.star_errors import star_covariance, star_influence
 from bayesdist.report.sections.run.holdout import holdout_coverage, holdout_table
 from tests.diagnose.held_campaign import field, judged, solved
 

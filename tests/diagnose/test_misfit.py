@@ -9,8 +9,8 @@ import pytest
 from numpy.polynomial import legendre
 from scipy.stats import binom
 
-from bayesdist.assess import Misfit, binned_sums, misfit_of, partitions_for
-from bayesdist.diagnose.residuals.misfit import worst_misfit
+from bayesdist.diagnose.residuals.binned import binned_sums
+from bayesdist.diagnose.residuals.misfit import Misfit, misfit_of, partitions_for, worst_misfit
 from bayesdist.model import Chip
 from tests.reduced import case_in_full
 

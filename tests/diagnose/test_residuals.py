@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.stats import binned_statistic_2d
 
-from bayesdist.assess import binned_residuals, residual_statistics
 from bayesdist.diagnose.residuals import pair_statistics
+from bayesdist.diagnose.residuals.binned import binned_residuals, residual_statistics
 from bayesdist.errors import InputError
 
 SIZE = (1016.0, 508.0)

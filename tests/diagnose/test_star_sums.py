@@ -7,14 +7,10 @@ import pickle
 import numpy as np
 import pytest
 
-from bayesdist.assess import (
-    binned_residuals,
-    binned_sums,
-    flagged_by_exposure,
-    star_sample,
-    star_sums,
-)
 from bayesdist.data import Matches
+from bayesdist.diagnose.residuals.binned import binned_residuals, binned_sums
+from bayesdist.diagnose.residuals.sample import star_sample
+from bayesdist.diagnose.residuals.star_sums import flagged_by_exposure, star_sums
 from bayesdist.infer import (
     OutlierMixture,
     fit_linear,

@@ -325,6 +325,8 @@ DEFECTS = [
     (lambda h: drop(h, "CRVAL2"), "warning", "registration: CRVAL2 missing"),
     (lambda h: drop(h, "CDELT1"), "error", "CDELT1 missing: nodes are taken to be 1 pixel apart"),
     (lambda h: h["DX", 1].header.set("CRVAL1", 500.0), "warning", "the nodes span pixels 500 to"),
+    (lambda h: h["DX", 1].header.set("CDELT1", 32.0), "error",
+     "DX and DY differ in shape or registration: DX has 64 x 32 nodes from pixel (32.5, 32.5), 32"),
     (swap, "warning", "the chips may be swapped"),
     (lambda h: drop(h, "CCDCHIP"), "error", "no CCDCHIP"),
     (put_nan, "error", "DY,2: 1 nodes are not finite"),

@@ -8,9 +8,9 @@ from functools import lru_cache
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.assess import binned_residuals
 from bayesdist.data import MagnitudeErrors
 from bayesdist.diagnose.overlap import OverlapTest, _binned, align
+from bayesdist.diagnose.residuals.binned import binned_residuals
 from bayesdist.model import LookupTable
 from bayesdist.report.campaign import (
     CampaignResults,

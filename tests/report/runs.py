@@ -19,15 +19,14 @@ from bayesdist.assess import (
     area_map,
     check_requirements,
     distortion_vectors,
-    flagged_by_exposure,
-    star_sample,
-    star_sums,
     uncertainty_map,
 )
 from bayesdist.assess.solution import chip_places
 from bayesdist.checks import Check
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.data.matches import Matches
+from bayesdist.diagnose.residuals.sample import star_sample
+from bayesdist.diagnose.residuals.star_sums import flagged_by_exposure, star_sums
 from bayesdist.infer.checks import fit_checks, sampling_checks
 from bayesdist.infer.convergence import Convergence, Limits
 from bayesdist.infer.linear import LinearFit, fit_linear, residuals

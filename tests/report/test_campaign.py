@@ -12,8 +12,8 @@ from lxml import html as lxml_html
 
 from bayesdist.app.kinds.campaign.checks import campaign_checks, campaign_remarks
 from bayesdist.app.kinds.campaign.report import held_parameters
-from bayesdist.assess import Misfit
 from bayesdist.diagnose.checks import structure_checks
+from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.infer import GaussianPriors, fit_linear
 from bayesdist.missions.acs.published import LINES, published_lines
 from bayesdist.missions.acs.simulate.distortion import DRIFT

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from bayesdist.assess import binned_residuals
+from bayesdist.diagnose.residuals.binned import binned_residuals
 from bayesdist.report.arrows import CHANCE, significant_cells
 from bayesdist.report.sections.run.residuals import MixtureCurve
 

@@ -9,20 +9,16 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.assess.adjusted import with_diagnosed_errors
-from bayesdist.assess.error_model import ErrorModel
+from bayesdist.app.store.summary import CoverageRow, Holdout, HoldoutTest
+from bayesdist.assess.error_model import ErrorModel, with_diagnosed_errors
 from bayesdist.assess.evaluation import EvaluationSettings
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
 from bayesdist.infer import Posterior
-from bayesdist.infer.catalogue.star_influence import StarInfluence, star_influence
+from bayesdist.infer.catalogue.star_errors import StarInfluence, star_influence
 
-__all__ = [
-    "holdout_summary",
-    "holdout_table",
-    "predictive_of_run",
-]
+__all__ = ["holdout_summary", "holdout_table", "predictive_of_run"]
 
 TOGETHER = 1.5  # steps between nodes over which tables err as one: what their covariance comes to
 
@@ -113,36 +109,9 @@ def holdout_table(found: HoldoutValidation) -> Table:
 
 def holdout_summary(found: HoldoutValidation) -> dict[str, Any]:
     """Section 'holdout' of summary.json."""
-    return {
-        "n": found.n,
-        "n_excluded": found.n_left_out,
-        "exposures": list(found.exposures),
-        "p_value": found.p_value,
-        "verdict": found.verdict,
-        "level": found.level,
-        "coverage": [
-            {
-                "axis": c.axis,
-                "sigma": c.level,
-                "n": c.n,
-                "value": c.value,
-                "expected": c.expected,
-                "interval": list(c.interval),
-            }
-            for c in found.coverage
-        ],
-        "tests": [
-            {
-                "name": t.name,
-                "part": t.part,
-                "is_omnibus": t.is_omnibus,
-                "where": t.where,
-                "n": t.n,
-                "value": t.value,
-                "expected": t.expected,
-                "p_value": t.p_value,
-                "p_corrected": t.p_corrected,
-            }
-            for t in found.tests
-        ],
-    }
+    return Holdout.row(
+        found,
+        n_excluded=found.n_left_out,
+        coverage=[CoverageRow.row(one, sigma=one.level) for one in found.coverage],
+        tests=[HoldoutTest.row(one) for one in found.tests],
+    )

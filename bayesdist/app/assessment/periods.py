@@ -10,9 +10,10 @@ from astropy.time import Time
 
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.assess import SAMPLE, convert, pixel_scale_of
+from bayesdist.assess import convert, pixel_scale_of
 from bayesdist.data import Matches
 from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, bins_for
+from bayesdist.diagnose.residuals.sample import SAMPLE
 from bayesdist.errors import InputError
 
 if TYPE_CHECKING:

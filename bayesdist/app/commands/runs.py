@@ -39,8 +39,7 @@ def init(
     """Write a commented configuration for a table of matched stars."""
     from bayesdist.app.commands.on_files.init import init as write_configuration
 
-    n = write_configuration(config, matches, columns=columns, size=size, force=force)
-    click.echo(f"{config}: for {n} matches; read it, then 'bayesdist check' it")
+    click.echo(write_configuration(config, matches, columns=columns, size=size, force=force))
 
 
 @command()

@@ -5,15 +5,16 @@ from __future__ import annotations
 from bayesdist.app.config.assess import CATALOGUE_WORDS
 from bayesdist.app.config.campaign import CampaignConfig
 from bayesdist.app.config.data import Data, MatchesConfig
-from bayesdist.app.config.detector import ChipBlock
-from bayesdist.app.config.kinds import KINDS, Config
 from bayesdist.app.config.reading import (
+    KINDS,
+    Config,
     config_of_record,
     load_config,
     load_requirements,
     load_text,
     parse_config,
 )
+from bayesdist.app.config.section import ChipBlock
 from bayesdist.app.config.selfcal import SelfcalConfig
 
 __all__ = [

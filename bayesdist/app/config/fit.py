@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
-from bayesdist.app.config.detector import Pair
-from bayesdist.app.config.section import Section
+from bayesdist.app.config.section import Pair, Section
 from bayesdist.diagnose.correlated import DiscrepancyPriors
 from bayesdist.infer import Compute, OutlierMixture
 

@@ -6,9 +6,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, PositiveFloat
 
-from bayesdist.app.config.detector import Pair
-from bayesdist.app.config.section import Epoch, Section
-from bayesdist.model import FRAME_KINDS, TimeDependence
+from bayesdist.app.config.section import Epoch, Pair, Section
+from bayesdist.model import TimeDependence
 from bayesdist.model.basis import MAX_ORDER
 
 __all__ = [
@@ -20,6 +19,9 @@ __all__ = [
     "SelfcalModel",
     "TablesBlock",
 ]
+
+
+FrameKind = Literal["none", "shift", "shift_rotation", "shift_rotation_scale", "affine"]
 
 
 class _Drift(Section):
@@ -57,7 +59,7 @@ class Polynomials(Section):
 class MatchedModel(Polynomials):
     """Structure of the distortion model, with the frames of the exposures."""
 
-    frames: Literal[FRAME_KINDS] = "none"  # type: ignore[valid-type]  # names of the model
+    frames: FrameKind = "none"
     tdd: Tdd | None = None
 
 
@@ -89,9 +91,7 @@ class PriorCalibrationBlock(Section):
     """An earlier calibration of the detector, which is the prior of this one."""
 
     source: str
-    frame: Literal["none", "shift", "shift_rotation", "shift_rotation_scale", "affine"] | None = (
-        None
-    )
+    frame: FrameKind | None = None
     filter: str | None = None
     epoch: float | None = None
     change_pix: Annotated[float, Field(ge=0)] = 0.0

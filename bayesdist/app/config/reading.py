@@ -1,4 +1,4 @@
-"""Configurations and other files of sections, read and checked."""
+"""Configurations of the three kinds and other files of sections, read and checked."""
 
 from __future__ import annotations
 
@@ -6,20 +6,25 @@ import json
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Discriminator, Field, Tag, TypeAdapter, ValidationError
 
 from bayesdist.app.config.assess import RequirementBlock
+from bayesdist.app.config.campaign import CampaignConfig
+from bayesdist.app.config.data import MatchesConfig
 from bayesdist.app.config.errors import as_config_error
-from bayesdist.app.config.kinds import CONFIG, KINDS, Config
+from bayesdist.app.config.run import RunConfig
 from bayesdist.app.config.section import Section
+from bayesdist.app.config.selfcal import SelfcalConfig
 from bayesdist.assess import Requirement
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.reading.documents import toml_of
 from bayesdist.reading.regular import MOST_TEXT, read_text
 
 __all__ = [
+    "KINDS",
+    "Config",
     "config_of_record",
     "load_config",
     "load_requirements",
@@ -27,6 +32,39 @@ __all__ = [
     "parse_config",
     "validated",
 ]
+
+
+# by the section that says of which kind a configuration is
+KINDS: dict[str, type[RunConfig]] = {
+    "data": MatchesConfig,
+    "campaign": CampaignConfig,
+    "selfcal": SelfcalConfig,
+}
+
+
+def _kind_of(raw: Any) -> str | None:
+    """The section that says of which kind a configuration is; None where not just one does."""
+    found = [kind for kind in KINDS if isinstance(raw, dict) and raw.get(kind) is not None]
+    return found[0] if len(found) == 1 else None
+
+
+Config: TypeAlias = MatchesConfig | CampaignConfig | SelfcalConfig
+
+CONFIG: TypeAdapter[Config] = TypeAdapter(
+    Annotated[
+        Annotated[MatchesConfig, Tag("data")]
+        | Annotated[CampaignConfig, Tag("campaign")]
+        | Annotated[SelfcalConfig, Tag("selfcal")],
+        Discriminator(
+            _kind_of,
+            custom_error_type="no_kind",
+            custom_error_message=(
+                "a run begins with [data], matched stars, with [campaign], star lists and a "
+                "catalogue, or with [selfcal], star lists alone; give one"
+            ),
+        ),
+    ]
+)
 
 
 # numbers of configurations: in all units beyond whatever is meant, and far from overflow

@@ -14,7 +14,6 @@ from bayesdist.app.config.assess import (
     RequirementBlock,
     require_own_names,
 )
-from bayesdist.app.config.detector import ChipBlock, Detector, chips_of, require_detector
 from bayesdist.app.config.fit import (
     CampaignOutliers,
     ComputeBlock,
@@ -27,7 +26,7 @@ from bayesdist.app.config.fit import (
 from bayesdist.app.config.model import CampaignModel, MatchedModel, SelfcalModel
 from bayesdist.app.config.other_runs import FREE
 from bayesdist.app.config.products import Products
-from bayesdist.app.config.section import Section
+from bayesdist.app.config.section import ChipBlock, Detector, Section, chips_of, require_detector
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.terms.given import said_by_user

@@ -1,12 +1,28 @@
-"""A table of the configuration file."""
+"""Tables of the configuration file: what one is, and the detector with its chips."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Sequence
+from typing import Annotated, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
-__all__ = ["Epoch", "RightAscensionDeclination", "Section", "Unit"]
+from bayesdist.model import Chip
+
+__all__ = [
+    "ChipBlock",
+    "Detector",
+    "Epoch",
+    "Pair",
+    "RightAscensionDeclination",
+    "Section",
+    "Unit",
+    "chips_of",
+    "one_chip",
+    "reference_first",
+    "require_detector",
+]
+
 
 Unit = Literal["pix", "arcsec", "mas", "deg"]
 Epoch = Annotated[float, Field(ge=1800, le=2200)]  # decimal years; others are days, or slips
@@ -19,3 +35,80 @@ class Section(BaseModel):
     """A table of the file; keys that it does not know are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+Pair = tuple[PositiveFloat, PositiveFloat]
+Block = TypeVar("Block", bound="ChipBlock")
+
+
+class Detector(Section):
+    """A detector of one chip."""
+
+    name: str = ""
+    mission: str = ""
+    instrument: str = ""
+    filter: str = ""
+    size: Pair | None = None
+    scale_mas: PositiveFloat | None = None
+
+
+class ChipBlock(Section):
+    """One of several chips."""
+
+    number: int
+    name: str
+    size: Pair
+    reference_pixel: Pair
+    reference: bool = False
+
+
+def require_detector(
+    chips: Sequence[ChipBlock], detector: Detector, reference_pixel: Pair | None
+) -> None:
+    """Refuse chips that contradict each other, or no detector at all.
+
+    Raises
+    ------
+    ValueError
+        As validators raise it.
+    """
+    if sum(c.reference for c in chips) > 1:
+        raise ValueError("reference = true stands in several [[chip]] blocks; keep it in one")
+    for key in ("number", "name"):
+        values = [getattr(c, key) for c in chips]
+        twice = next((v for v in values if values.count(v) > 1), None)
+        if twice is not None:
+            raise ValueError(f"two [[chip]] blocks have the {key} {twice!r}; give each its own")
+    if chips and (detector.size or reference_pixel):
+        raise ValueError(
+            "[[chip]] blocks stand in place of detector.size and model.reference_pixel; "
+            "give one of the two"
+        )
+    if not chips and detector.size is None:
+        raise ValueError("detector.size is missing; give it, or [[chip]] blocks")
+
+
+def reference_first(chips: Sequence[Block]) -> list[Block]:
+    """The blocks with the reference chip in front: it defines the frame."""
+    return sorted(chips, key=lambda c: not c.reference)
+
+
+def chips_of(chips: Sequence[ChipBlock]) -> tuple[Chip, ...]:
+    """Chips of the model."""
+    blocks = reference_first(chips)
+    return tuple(Chip(c.number, c.name, c.size, c.reference_pixel) for c in blocks)
+
+
+def one_chip(detector: Detector, reference_pixel: Pair | None, number: int, name: str) -> Chip:
+    """The chip of a detector that has one; its middle where no pixel is named.
+
+    Raises
+    ------
+    ValueError
+        For a detector without a size.
+    """
+    if detector.size is None:
+        raise ValueError("detector.size is missing; give columns and rows")
+    nx, ny = detector.size
+    middle = ((nx + 1) / 2, (ny + 1) / 2)
+    return Chip(number, detector.name or name, detector.size, reference_pixel or middle)

@@ -12,8 +12,8 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.kinds.errors import ErrorLaw, ExposureScatter
-from bayesdist.app.kinds.solved import SelfCalibrated
 from bayesdist.app.store.output import write_table
+from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.errors import InputError
@@ -21,13 +21,16 @@ from bayesdist.infer import GaussianPriors, LinearFit, load_fit, save_fit
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.nodes import corrected_matches, inside_chips, on_the_chips
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
+from bayesdist.infer.selfcal import Gauge, SelfCalibrationMode
 from bayesdist.infer.series import Series
 from bayesdist.model import LookupTable
 from bayesdist.reading.faults import restoring
 from bayesdist.records import record_from_arrays, record_to_arrays
 
 __all__ = [
+    "SOLUTION",
     "Fitted",
+    "SelfCalibrated",
     "StoredLookupTables",
     "load_errors",
     "load_fitted",
@@ -35,6 +38,51 @@ __all__ = [
     "required",
     "write_tables",
 ]
+
+
+SOLUTION, GAUGE = "solution.h5", "gauge.ecsv"
+
+
+@dataclass(frozen=True, eq=False)
+class SelfCalibrated:
+    """The mode of a self-calibration, with its gauge and matches.
+
+    Parameters
+    ----------
+    mode : SelfCalibrationMode
+    gauge : Gauge
+        What the detections leave free, and what fixes it.
+    fixed : mapping of str to str
+        What fixes each property of the solution.
+    gauge_words : str
+        In which gauge the solution stands, as a sentence.
+    gauge_table : astropy.table.Table
+        One row for each property of the solution.
+    matches : Matches
+        Detections beside their stars.
+    arrays : mapping
+        From which the solution is made again.
+    contradictions : tuple of str
+        Where what is known beside the detections does not go with them, as sentences.
+    references : ReferenceCatalog or None
+        Stars that a catalogue has, too.
+    """
+
+    mode: SelfCalibrationMode
+    gauge: Gauge
+    fixed: Mapping[str, str]
+    gauge_words: str
+    gauge_table: Table
+    matches: Matches
+    arrays: Mapping[str, NDArray[Any]]
+    contradictions: tuple[str, ...] = ()
+    references: ReferenceCatalog | None = None
+
+    def save(self, folder: Path) -> None:
+        """Write the files of a run's folder that belong to it."""
+        write_arrays(folder / SOLUTION, "", self.arrays)
+        write_table(self.gauge_table, folder / GAUGE)
+
 
 Float = NDArray[np.float64]
 T = TypeVar("T")

@@ -14,7 +14,7 @@ from bayesdist.app.kinds.campaign.inputs import read_campaign
 from bayesdist.app.kinds.campaign.matched import load_matched_campaign
 from bayesdist.app.kinds.campaign.matching import match_lists
 from bayesdist.app.kinds.campaign.preview import campaign_lines
-from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.fit_data import FitData, StarReader
 from bayesdist.app.kinds.fitted import Fitted, load_fitted
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.matches.stars import (
@@ -23,13 +23,10 @@ from bayesdist.app.kinds.matches.stars import (
     read_stars,
     sample_stars,
 )
-from bayesdist.app.kinds.reader import StarReader
-from bayesdist.app.kinds.selfcal.fit import fit_selfcal, sample_detections
+from bayesdist.app.kinds.selfcal.fit import fit_selfcal, load_selfcal, sample_detections
 from bayesdist.app.kinds.selfcal.inputs import read_selfcal, refuse_selfcal
 from bayesdist.app.kinds.selfcal.matched import load_matched_selfcal
-from bayesdist.app.kinds.selfcal.matching import match_dithers
-from bayesdist.app.kinds.selfcal.preview import selfcal_lines
-from bayesdist.app.kinds.selfcal.solved import load_selfcal
+from bayesdist.app.kinds.selfcal.matching import match_dithers, selfcal_lines
 from bayesdist.infer import Posterior
 
 __all__ = ["Kind", "kind_of"]

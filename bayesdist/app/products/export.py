@@ -11,8 +11,7 @@ from typing import Any
 from bayesdist.app.assessment.error_terms import published_tables
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.app.products.made_files import ProductInput, further_errors, made_files
-from bayesdist.app.products.release_files import write_files
+from bayesdist.app.products.made_files import ProductInput, further_errors, made_files, write_files
 from bayesdist.app.products.sky_closure import sky_closure
 from bayesdist.assess.budget.budget import with_product
 from bayesdist.assess.terms.forms import PRODUCT

@@ -1,31 +1,36 @@
-"""Calibration files of a solution as the configuration asks for them, not yet written."""
+"""Calibration files of a solution as the configuration asks for them; released sets of files."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from bayesdist.app.assessment.settings import assessment_epoch
 from bayesdist.app.config import Config
+from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.kinds.campaign.aberration import ABERRATION
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.assess.adjusted import with_diagnosed_errors
 from bayesdist.assess.budget.budget import TOTAL
+from bayesdist.assess.error_model import with_diagnosed_errors
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE_IN_FIT
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.assess.terms.parameters import CATALOGUE, MOTIONS
 from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.further import FurtherError
+from bayesdist.calibration.orientation import lay_on
 from bayesdist.calibration.plane import Plane
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
 from bayesdist.infer.solution import Solution
+from bayesdist.infer.transforms import reference_gauge, without_frames
 from bayesdist.model import LookupTable
+from bayesdist.products import Period, read_calibration, write_release
 from bayesdist.products.formats.common.document import BuildOptions, Built
-from bayesdist.products.registry import build
+from bayesdist.products.registry import build, lint
 
 __all__ = [
     "ProductInput",
@@ -35,7 +40,9 @@ __all__ = [
     "product_input",
     "product_of",
     "solution_of",
+    "write_files",
 ]
+
 
 # rows of a budget that the covariance of the exported solution holds, or another row
 IN_COVARIANCE = (
@@ -164,3 +171,77 @@ def ingredients(product: ProductInput) -> tuple[Calibration, BuildOptions]:
     notes = (product.gauge,) if product.gauge else ()
     found = replace(found, notes=notes, further=product.further)
     return found, BuildOptions(product.epoch, product.scale_arcsec, product.tables)
+
+
+def write_files(
+    block: ReleaseBlock,
+    chip: int,
+    base: Path,
+    folder: Path,
+    solutions: Mapping[str, Solution],
+    tables: Sequence[LookupTable],
+    history: Sequence[str] = (),
+) -> list[dict[str, Any]]:
+    """Write the files of one filter or several, as the configuration of one run says.
+
+    Parameters
+    ----------
+    block : ReleaseBlock
+        Its section [products.release].
+    chip : int
+        Number of the chip whose axes and zero point define the gauge.
+    base : Path
+        Folder that its files are relative to.
+    folder : Path
+    solutions : mapping of filter to Solution
+        The configuration's own first: V2 and V3 lie as the reference says of it.
+    tables : sequence of LookupTable
+        The detector's, and those of filters.
+    history : sequence of str
+        Lines for HISTORY of all files.
+
+    Returns
+    -------
+    list of dict
+        One entry for each file: path, kind, findings, and of an IDCTAB period and lost.
+    """
+    calibrations = {
+        filter: calibration_of(
+            reference_gauge(without_frames(solution), chip), filter, filter=filter
+        )
+        for filter, solution in solutions.items()
+    }
+    first = next(iter(calibrations.values()))
+    time = first.model.time
+    orientation = lay_on(
+        first,
+        read_calibration(base / block.reference),
+        chip=chip,
+        epoch=None if time is None else time.epoch0[0],
+        scale_arcsec=block.scale_arcsec,
+    )
+    written = write_release(
+        folder,
+        block.name,
+        calibrations,
+        orientation,
+        [Period(**one.model_dump()) for one in block.period],
+        tables=tables,
+        instrument=block.instrument,
+        detector=block.detector,
+        scale_arcsec=block.scale_arcsec,
+        limit_mas=block.limit_mas,
+        history=history,
+    )
+    out: list[dict[str, Any]] = []
+    for period, path in written.idctabs.items():
+        lost = [asdict(one) for one in written.lost.get(period, ())]
+        out.append(_entry(path, "IDCTAB") | {"period": period, "lost": lost})
+    others = [] if written.d2im is None else [("D2IMFILE", written.d2im)]
+    others += [("NPOLFILE", path) for path in written.npol.values()]
+    return out + [_entry(path, kind) for kind, path in others]
+
+
+def _entry(path: Path, kind: str) -> dict[str, Any]:
+    findings = [f"{f.level}: {f.where}: {f.message}" for f in lint(path)]
+    return {"path": path.name, "kind": kind, "findings": findings}

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
 from bayesdist.app.config.products import ReleaseBlock
-from bayesdist.app.products.made_files import ProductInput, ingredients, made_files
-from bayesdist.app.products.release_files import write_files
+from bayesdist.app.products.made_files import ProductInput, ingredients, made_files, write_files
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import MEASURED, PRODUCT, Known, Row
 from bayesdist.calibration.calibration import Calibration

@@ -20,7 +20,7 @@ from bayesdist.diagnose.residuals.sample import StarSample
 from bayesdist.limits import SKY_CLOSURE
 from bayesdist.products.formats.sip.positions import sky_of_header
 
-__all__ = ["SkyClosure", "sky_closure"]
+__all__ = ["sky_closure"]
 
 Float = NDArray[np.float64]
 

@@ -8,17 +8,18 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
 
 __all__ = ["LOCK", "locked"]
 
-try:
-    import fcntl
-except ImportError:  # systems that know no such locks
-    fcntl = None  # type: ignore[assignment]
+# some systems know no such locks
+fcntl: Any = import_module("fcntl") if find_spec("fcntl") else None
 
 LOCK = ".bayesdist.lock"
 LONGEST = 200  # bytes that are read of it

@@ -1,14 +1,17 @@
-"""Ingredients of the stages of a run: settings, inputs, and the stages before them."""
+"""Ingredients of the stages of a run: inputs by name, settings, and the stages before them."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from bayesdist.app.config import Config
 from bayesdist.app.store import Adjustable, Made, Stage, as_json, differences
-from bayesdist.app.store.inputs import input_name
+from bayesdist.data import input_files
+from bayesdist.files import sha256_of
 from bayesdist.version import __version__
 
 __all__ = [
@@ -16,12 +19,56 @@ __all__ = [
     "LIMITS",
     "NEEDS",
     "STAGES",
+    "base_of",
     "changes",
+    "hashes_of",
+    "input_name",
     "is_adjustable",
     "made_from_of",
+    "places_of",
     "settings_of",
     "with_seed",
 ]
+
+
+def input_name(path: Path, *bases: Path) -> str:
+    """Name of an input: relative to the first of some folders that it is below, else its path.
+
+    As a name it is that of the configuration: '../data/x' stays so.
+    """
+    for base in bases:
+        with suppress(ValueError):
+            return path.relative_to(base).as_posix()
+    return str(path)
+
+
+def hashes_of(config: Config, base: Path, *before: Path) -> dict[str, str]:
+    """SHA-256 of every file that a configuration names, by its name.
+
+    `base` is the folder that names are relative to, `before` are those that it was.
+    """
+    base = base.resolve()
+    others = [*config.files_of_products(base), *config.files_of_priors(base)]
+    named = [*input_files(config.named_files(base)), *others]
+    return {input_name(path, base, *before): sha256_of(path) for path in named}
+
+
+def places_of(base: Path, run: Path) -> dict[str, str]:
+    """Facts of a record on where inputs are: by themselves, and as seen from the run."""
+    base = base.resolve()
+    places = {"base": str(base)}
+    with suppress(ValueError):  # another drive
+        places["base_from_run"] = Path(os.path.relpath(base, run.resolve())).as_posix()
+    return places
+
+
+def base_of(facts: Mapping[str, Any], run: Path) -> Path:
+    """Folder that inputs are relative to, by the facts of a record."""
+    recorded = Path(facts["base"])
+    names = [name for name in facts["inputs"] if not Path(name).is_absolute()]
+    beside = (run / facts.get("base_from_run", recorded)).resolve()
+    return beside if names and all((beside / name).exists() for name in names) else recorded
+
 
 # stages in order; `revision` is raised when the numbers of a stage change
 STAGES = {

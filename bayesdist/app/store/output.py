@@ -17,13 +17,7 @@ from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 from bayesdist.infer import Posterior
 
-__all__ = [
-    "atomic_directory",
-    "provenance_notes",
-    "record_folder",
-    "refuse_existing",
-    "write_table",
-]
+__all__ = ["provenance_notes", "record_folder", "refuse_existing", "write_table"]
 
 
 def refuse_existing(path: Path, force: bool) -> None:

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.app.config import Config, load_config, load_text, parse_config
-from bayesdist.app.store.inputs import input_name
 from bayesdist.app.store.keys import shown
 from bayesdist.app.store.lock import LOCK
-from bayesdist.app.store.made_from import changes, is_adjustable, with_seed
+from bayesdist.app.store.made_from import changes, input_name, is_adjustable, with_seed
 from bayesdist.errors import InputError
 from bayesdist.files import is_leftover
 

@@ -14,8 +14,15 @@ from bayesdist.app.config import (
     load_config,
 )
 from bayesdist.app.store import ArtefactStore, Made, Record, as_json, versions
-from bayesdist.app.store.inputs import base_of, hashes_of, places_of
-from bayesdist.app.store.made_from import STAGES, changes, made_from_of, with_seed
+from bayesdist.app.store.made_from import (
+    STAGES,
+    base_of,
+    changes,
+    hashes_of,
+    made_from_of,
+    places_of,
+    with_seed,
+)
 from bayesdist.app.store.refusals import (
     refuse_another_solution,
     refuse_edited,

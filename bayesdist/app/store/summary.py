@@ -8,25 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-__all__ = [
-    "AddedErrorRow",
-    "BudgetRow",
-    "CoverageRow",
-    "HoldoutTest",
-    "MapRow",
-    "MarginRow",
-    "MeanAndSd",
-    "MisfitRow",
-    "Part",
-    "ProductRow",
-    "ScoreTestRow",
-    "Sections",
-    "StructureRow",
-    "Summary",
-    "ValidityRow",
-    "head_of",
-    "schema_text",
-]
+__all__ = ["Sections", "Summary", "head_of", "schema_text"]
 
 
 Number = float | None  # null where it is not finite, or not known
@@ -36,6 +18,17 @@ class Part(BaseModel):
     """A part of summary.json; a later version of the package may add keys to it."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
+
+    @classmethod
+    def row(cls, *objects: Any, **others: Any) -> dict[str, Any]:
+        """Row with these fields: of `others`, or else of the first object that has one."""
+        return {name: cls._value(name, objects, others) for name in cls.model_fields}
+
+    @staticmethod
+    def _value(name: str, objects: tuple[Any, ...], others: dict[str, Any]) -> Any:
+        if name in others:
+            return others[name]
+        return getattr(next(one for one in objects if hasattr(one, name)), name)
 
 
 class MeanAndSd(Part):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.diagnose.correlated.storage import discrepancy_from_arrays, discrepancy_to_arrays
+from bayesdist.diagnose.correlated.result import discrepancy_from_arrays, discrepancy_to_arrays
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.diagnose.score.result import ScoreTest

@@ -12,6 +12,7 @@ from astropy.table import Table
 
 from bayesdist.app.store.output import provenance_notes, write_table
 from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.store.summary import ValidityRow
 from bayesdist.app.tables.diagnostics_files import fingerprint_of
 from bayesdist.app.tables.margins import margin_rows, margin_table
 from bayesdist.assess import Margin
@@ -26,7 +27,7 @@ from bayesdist.products.maps_file import write_maps
 from bayesdist.reading.faults import restoring
 from bayesdist.records import record_from_arrays, record_to_arrays
 
-__all__ = ["load_evaluation", "save_margins", "validity_rows", "write_evaluation"]
+__all__ = ["load_evaluation", "save_margins", "write_evaluation"]
 
 FILE = "evaluation.h5"
 COLUMNS = ("epoch", "probability", "low", "high", "value")
@@ -120,7 +121,13 @@ def _write_margins(
     table.meta = dict(head)
     write_table(table, run / "margins.ecsv")
     _write_validity(run / "validity_periods.ecsv", validity)
-    run.summarise(margins=margin_rows(margins), validity_periods=validity_rows(validity))
+    dates = [
+        ValidityRow.row(
+            one, one.requirement, probability=one.requirement.probability, until=one.epoch[-1]
+        )
+        for one in validity
+    ]
+    run.summarise(margins=margin_rows(margins), validity_periods=dates)
 
 
 def _write_validity(path: Path, validity: Sequence[ValidityPeriod]) -> None:
@@ -143,21 +150,6 @@ def _write_validity(path: Path, validity: Sequence[ValidityPeriod]) -> None:
         "holds": "while the drift goes on as the model has it",
     }
     write_table(table, path)
-
-
-def validity_rows(validity: Sequence[ValidityPeriod]) -> list[dict[str, Any]]:
-    """Dates as plain rows, for files and for the screen."""
-    return [
-        {
-            "name": h.requirement.name,
-            "probability": h.requirement.probability,
-            "date": h.date,
-            "interval": list(h.interval),
-            "until": float(h.epoch[-1]),
-            "sentence": h.sentence,
-        }
-        for h in validity
-    ]
 
 
 def _map_summary(found: Evaluation) -> dict[str, Any]:

@@ -10,17 +10,11 @@ from astropy.table import Table
 
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.store.summary import MarginRow, WorstPosition
 from bayesdist.assess import Margin, Requirement
-from bayesdist.assess.circular import per_axis
+from bayesdist.assess.maps import per_axis
 
-__all__ = [
-    "judged_requirements",
-    "margin_rows",
-    "margin_table",
-    "margins_text",
-    "requirement_of",
-    "results_text",
-]
+__all__ = ["judged_requirements", "margin_rows", "margin_table", "margins_text", "results_text"]
 
 # of what a requirement is, beside chip and epoch
 SCOPE = ("region", "epochs", "relative", "separation", "magnitude")
@@ -29,27 +23,13 @@ SCOPE = ("region", "epochs", "relative", "separation", "magnitude")
 def margin_rows(margins: Sequence[Margin]) -> list[dict[str, Any]]:
     """Margins as plain rows, for files and for the screen."""
     return [
-        {
-            "name": m.requirement.name,
-            "statistic": m.requirement.statistic,
-            "limit": m.requirement.limit,
-            "value": m.value,
-            "interval": list(m.interval),
-            "margin": m.margin,
-            "margin_percent": m.percent,
-            "unit": m.unit,
-            "epoch": m.epoch,
-            "chip": m.requirement.chip,
-            **{key: getattr(m.requirement, key) for key in SCOPE},
-            "probability": m.requirement.probability,
-            "probability_met": m.probability_met,
-            "mc_error": m.mc_error,
-            "verdict": m.verdict,
-            "reason": m.reason,
-            "rests_on": list(m.rests_on),
-            "worst": {"chip": m.worst.chip, "x": m.worst.x, "y": m.worst.y, "rms": m.worst.rms},
-            "remedy": None if m.remedy is None else m.remedy.sentence,
-        }
+        MarginRow.row(
+            m,
+            m.requirement,
+            margin_percent=m.percent,
+            worst=WorstPosition.row(m.worst),
+            remedy=None if m.remedy is None else m.remedy.sentence,
+        )
         for m in margins
     ]
 

@@ -8,13 +8,13 @@ import numpy as np
 from scipy.stats import f as fisher
 
 from bayesdist.assess.comparison.compare import Comparison, compare
-from bayesdist.assess.comparison.sentences import probability
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.infer.compare.change_date import ChangeDate
 from bayesdist.infer.compare.monitoring import Change
 from bayesdist.limits import DIFFERENCE
 from bayesdist.model.grid import DEFAULT_GRID
+from bayesdist.numbers import p_words
 
 __all__ = ["Monitored", "change_maps", "is_late"]
 
@@ -94,7 +94,7 @@ class Monitored:
         )
         stated = (
             f"chi-square {test.chi2:.4g} for {test.dof} degrees of freedom, "
-            f"{probability(self.p_either)}"
+            f"{p_words(self.p_either, 2, 1e-12)}"
         )
         if self.date is not None and len(self.date.gain) > 1:
             stated += " with the search over dates"

@@ -5,19 +5,14 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import norm
 
-from bayesdist.assess.comparison.compare import Comparison
+from bayesdist.assess.comparison.compare import Comparison, comparison_table
 from bayesdist.assess.comparison.gap import GapDifference
-from bayesdist.assess.comparison.tables import comparison_table
 from bayesdist.limits import DIFFERENCE
+from bayesdist.numbers import p_words
 
-__all__ = ["comparison_lines", "gap_lines", "gap_verdict", "probability", "verdict"]
+__all__ = ["comparison_lines", "gap_lines", "gap_verdict", "verdict"]
 
 IDENTICAL = 1e-9  # pixels
-
-
-def probability(p: float) -> str:
-    """A probability as it is read."""
-    return "p < 1e-12" if p < 1e-12 else f"p = {p:.2g}"
 
 
 def verdict(found: Comparison, pixel_mas: float | None = None) -> str:
@@ -39,7 +34,7 @@ def verdict(found: Comparison, pixel_mas: float | None = None) -> str:
         return f"The calibrations differ by {size}; {_why_untested(found)}."
     test = (
         f"chi-square {found.field.chi2:.4g} for {found.field.dof} degrees of freedom, "
-        f"{probability(found.field.p_value)}"
+        f"{p_words(found.field.p_value, 2, 1e-12)}"
     )
     if found.differs:
         return f"The calibrations differ significantly: {size} ({test})."
@@ -140,7 +135,7 @@ def gap_verdict(gap: GapDifference) -> str:
         return f"Chip {gap.chip} lies {size} {chips}; neither gives errors of the gap."
     test = (
         f"shift, rotation and scale together: chi-square {gap.test.chi2:.4g} for {gap.test.dof} "
-        f"degrees of freedom, {probability(gap.test.p_value)}"
+        f"degrees of freedom, {p_words(gap.test.p_value, 2, 1e-12)}"
     )
     if gap.errors_of != "both":
         test += f", on the errors of {gap.errors_of} alone"

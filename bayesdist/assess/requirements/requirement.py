@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from bayesdist.assess.regions import (
+from bayesdist.assess.domain import (
     WHOLE,
     Region,
     check_region,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bayesdist.data.formats.files import input_files, kind_of
-from bayesdist.data.reading.columns import needed_columns
+from bayesdist.data.reading.columns import lacking_columns, present_columns
 from bayesdist.data.reading.table import own_epoch, with_sky_columns
 from bayesdist.data.tables.column import Columns
 from bayesdist.data.tables.names import origin_of
@@ -36,6 +36,12 @@ class TableLayout:
     why: str  # reason for the origin; empty where there is none
     like_chips: dict[str, int]  # number of values of unused columns that may be chips
     dated: bool  # True where the header has the date of the exposure
+    spans: dict[str, tuple[float, float]]  # least and largest value of unused columns of numbers
+
+    @property
+    def lacking(self) -> list[str]:
+        """Quantities that matches need, and of which no column is known."""
+        return lacking_columns(self.taken)
 
 
 def table_layout(
@@ -46,8 +52,8 @@ def table_layout(
 ) -> TableLayout | None:
     """Layout of a file of matches, or of the first of several; None of files with fixed columns.
 
-    Arguments and errors are as for `read_matches`; `read_sigma` is True where columns of errors are
-    read.
+    Arguments and errors are as for `read_matches`, but that columns may be lacking; `read_sigma` is
+    True where columns of errors are read.
     """
     file = input_files(path)[0]
     if kind_of(file, columns) != "table":
@@ -60,17 +66,27 @@ def table_layout(
         whole = with_sky_columns(read_table(file))
         table, header = whole, whole.meta
     names = tuple(table.colnames)
-    taken = needed_columns(names, columns, source=str(file), read_sigma=read_sigma)
-    origin, why = origin_of(taken["x"], names, header)
-    found = {name: _values_like_chips(table[name]) for name in names}
+    taken = present_columns(names, columns, source=str(file), read_sigma=read_sigma)
+    origin, why = origin_of(taken.get("x", ""), names, header)
+    unused = {name: table[name] for name in names if name not in taken.values()}
     return TableLayout(
         names,
         taken,
         origin,
         why,
-        {k: n for k, n in found.items() if n and k not in taken.values()},
+        {name: n for name, one in unused.items() if (n := _values_like_chips(one))},
         own_epoch(header) is not None,
+        {name: span for name, one in unused.items() if (span := _span(one)) is not None},
     )
+
+
+def _span(column: Any) -> tuple[float, float] | None:
+    """Least and largest value of a column of numbers."""
+    values = np.ma.compressed(np.ma.asarray(getattr(column, "value", column)))
+    if values.dtype.kind not in "iuf":
+        return None
+    finite = values[np.isfinite(values)]
+    return (float(finite.min()), float(finite.max())) if finite.size else None
 
 
 def _values_like_chips(column: Any) -> int:

@@ -111,9 +111,10 @@ def match_campaign(
     cuts: StarCuts | None = None,
     radius: float | None = None,
     mirrored: Sequence[bool] = (False,),
-    skip: bool = False,
 ) -> CampaignMatches:
     """Match the star lists of many exposures with a catalogue.
+
+    Exposures that do not match or lose all their detections to the cuts are left out, and counted.
 
     Parameters
     ----------
@@ -138,9 +139,6 @@ def match_campaign(
         tried where the first matches no exposure.  East of a sky with north up is to the left: a
         detector that is read out as the sky is seen has the parity that is opposite to (u, v) of a
         tangent plane.
-    skip : bool, optional
-        True to leave out, and count, exposures that do not match or lose all their detections to
-        the cuts.  More than a fifth of them, or the first two, are an error all the same.
 
     Returns
     -------
@@ -149,9 +147,9 @@ def match_campaign(
     Raises
     ------
     InputError
-        When an exposure is not in the log, stands in two lists, loses all its detections to the
-        cuts, or shows another field: then with the best number of coincidences, and with the scale
-        or the mirror image that would match.  When in most exposures one chip does not match where
+        When an exposure is not in the log or stands in two lists.  When more than a fifth of them
+        are left out, the first two, or one that would match by another scale or as a mirror image:
+        with the best number of coincidences.  When in most exposures one chip does not match where
         another does.
     """
     check_campaign(lists, log, catalog)
@@ -186,7 +184,7 @@ def match_campaign(
             if good.any() and not found and not failed:
                 reason = mismatch_reason(plane, one.mag, views[0].index)
             failed[one.name] = error
-            if reason or not skip or too_many(len(failed), len(found), len(lists)):
+            if reason or too_many(len(failed), len(found), len(lists)):
                 raise failure(failed, reason, len(lists), mirrored) from error
             continue
         found.append(pairs)

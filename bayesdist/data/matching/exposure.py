@@ -12,7 +12,13 @@ from scipy.spatial import cKDTree
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.exposures import Exposure
-from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, best_similarity, iterated_map
+from bayesdist.data.matching.linear_map import (
+    MIN_PAIRS,
+    LinearMap,
+    best_similarity,
+    iterated_map,
+    smooth_map,
+)
 from bayesdist.data.matching.pairs import (
     beats_chance,
     chance_rate,
@@ -29,7 +35,6 @@ from bayesdist.data.matching.similarity import (
     find_similarity,
     grown_map,
 )
-from bayesdist.data.matching.smooth_map import smooth_map
 from bayesdist.errors import InputError
 
 __all__ = ["ExposureMatch", "match_exposure"]

@@ -1,12 +1,18 @@
-"""Linear maps between two lists of positions, iterated with the pairs that they bring together."""
+"""Maps between two lists of positions, fitted to the pairs that they bring together.
+
+Linear ones are iterated; what a known distortion leaves is a cubic of each chip, for the matching
+alone.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -15,19 +21,25 @@ __all__ = [
     "MIN_PAIRS",
     "LinearMap",
     "RobustFit",
+    "SmoothMap",
     "best_similarity",
     "iterated_map",
     "robust_fit",
+    "smooth_map",
 ]
 
 Float = NDArray[np.float64]
 Solution = TypeVar("Solution")
-
 MAX_SAMPLE = 20_000  # detections that the iterations use
 _FIRST_SAMPLE = 150  # detections of the first round
 _MAX_ROUNDS = 25
 MIN_PAIRS = 6  # pairs: with fewer, a linear map fits their noise
 _CLIP = 3.0  # times the median distance: 3.5 sigma of a circular normal
+Int = NDArray[np.int64]
+_ORDER = 3
+_POWERS = [(i, j) for i in range(_ORDER + 1) for j in range(_ORDER + 1 - i)]
+_MIN_PAIRS_ON_CHIP = 20 * len(_POWERS)  # pairs of a chip; with fewer, their noise is fitted
+_MAX_PAIRS_FITTED = 4000  # pairs in a fit: with more, their noise does not matter any more
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,3 +151,55 @@ def _robust_linear(p: Float, q: Float) -> tuple[Float, Float] | None:
     if found is None or found.use.sum() < MIN_PAIRS:
         return None
     return np.asarray(found.solution[:2].T), np.asarray(found.solution[2])
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothMap:
+    """Displacement by chip and position; none for chips with too few pairs."""
+
+    low: Float  # (2,), smallest position
+    high: Float  # (2,), largest position
+    coefficients: dict[int, Float]  # (10, 2) of each chip, of products of Legendre polynomials
+
+    def __call__(self, points: Float, chip: Int) -> Float:
+        """Displacements (N, 2) at points (N, 2)."""
+        out = np.zeros_like(points)
+        for number, values in self.coefficients.items():
+            here = chip == number
+            out[here] = _terms(points[here], self.low, self.high) @ values
+        return out
+
+
+def smooth_map(points: Float, chip: Int, residual: Float, index: Int) -> SmoothMap:
+    """Cubics through the residuals of pairs, chip by chip, without those far off.
+
+    `points` (N, 2) and `chip` (N,) are of all detections, `residual` (n, 2) is what must be added
+    to those of `index` (n,).
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    coefficients: dict[int, Float] = {}
+    for number in np.unique(chip).tolist():
+        here = np.flatnonzero(chip[index] == number)
+        if len(here) < _MIN_PAIRS_ON_CHIP:
+            continue
+        here = here[:: -(-len(here) // _MAX_PAIRS_FITTED)]
+        fit = partial(_cubic, _terms(points[index[here]], low, high), residual[here])
+        found = robust_fit(fit, len(here), least=_MIN_PAIRS_ON_CHIP, rounds=6)
+        if found is not None:
+            coefficients[number] = found.solution
+    return SmoothMap(low, high, coefficients)
+
+
+def _cubic(design: Float, wanted: Float, use: NDArray[np.bool_]) -> tuple[Float, Float]:
+    """Coefficients by least squares, and distances of all pairs from them."""
+    # Legendre polynomials leave normal equations well conditioned
+    normal, right = design[use].T @ design[use], design[use].T @ wanted[use]
+    values = np.linalg.pinv(normal, hermitian=True) @ right
+    return values, np.hypot(*(wanted - design @ values).T)
+
+
+def _terms(points: Float, low: Float, high: Float) -> Float:
+    """Products of Legendre polynomials up to the third order in all."""
+    t = 2.0 * (points - low) / np.maximum(high - low, np.finfo(float).tiny) - 1.0
+    a, b = legvander(t[:, 0], _ORDER), legvander(t[:, 1], _ORDER)
+    return np.stack([a[:, i] * b[:, j] for i, j in _POWERS], axis=-1)

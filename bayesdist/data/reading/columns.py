@@ -1,21 +1,21 @@
-"""Columns of a table to the arrays of a Matches."""
+"""Columns of a table to the arrays of a Matches; chips that it knows by name get numbers."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.reading.chips import numbered_chips
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky.positions import SKY_QUANTITIES, reference_sky
 from bayesdist.data.sky.tangent import onto_plane
 from bayesdist.data.tables.checks import refuse_half
-from bayesdist.data.tables.column import Quantities, SourceColumn, year_of
+from bayesdist.data.tables.column import EncodedColumn, Quantities, SourceColumn, year_of
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
 from bayesdist.data.tables.units import check_unit
 from bayesdist.errors import InputError
@@ -23,14 +23,20 @@ from bayesdist.errors import InputError
 __all__ = [
     "columns_read",
     "is_on_sky",
+    "lacking_columns",
     "match_columns",
     "needed_columns",
     "nominal_columns",
+    "numbered",
+    "numbered_chips",
     "plane_unit",
     "position_unit",
+    "present_columns",
+    "text_labels",
 ]
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
 
 def position_unit(pair: tuple[SourceColumn, SourceColumn], unit: str | None) -> str:
@@ -90,24 +96,17 @@ def is_on_sky(
     return bool(sky) or not on_plane or "b" in {name.lower() for name in names}
 
 
-def needed_columns(
+def present_columns(
     names: Iterable[str],
     columns: Mapping[str, str] | None,
     *,
     source: str,
     read_sigma: bool = True,
 ) -> dict[str, str]:
-    """Column of each quantity that is read: x, y, either u, v or ra, dec, and others there are."""
+    """Column of each quantity that is there: x, y, either u, v or ra, dec, and others."""
     names = list(names)
     found = find_columns(names, columns, ALIASES, source=source, pairs=PAIRS)
     on_sky = is_on_sky(names, found, columns, source)
-    for key in ("x", "y") if on_sky else ("x", "y", "u", "v"):
-        if key not in found:
-            raise InputError(
-                f"no column for {key!r} among {', '.join(names) or 'none'}",
-                where=source,
-                do=f"name it in the option 'columns' (bayesdist init --columns {key}=NAME)",
-            )
     unread = {"u", "v"} if on_sky else {"ra", "dec", *SKY_QUANTITIES}
     if not read_sigma:
         unread |= {"sigma_u", "sigma_v"}
@@ -116,6 +115,33 @@ def needed_columns(
     if "mag" in found:
         unread.add("flux")
     return {key: name for key, name in found.items() if key not in unread}
+
+
+def lacking_columns(found: Container[str]) -> list[str]:
+    """Quantities that matches need, and `present_columns` has not found."""
+    return [key for key in ("x", "y") if key not in found] + [
+        key for key in ("u", "v") if key not in found and "ra" not in found
+    ]
+
+
+def needed_columns(
+    names: Iterable[str],
+    columns: Mapping[str, str] | None,
+    *,
+    source: str,
+    read_sigma: bool = True,
+) -> dict[str, str]:
+    """Column of each quantity that is read, as of `present_columns`; refused where one lacks."""
+    names = list(names)
+    found = present_columns(names, columns, source=source, read_sigma=read_sigma)
+    for key in lacking_columns(found):
+        do = f"name it in the option 'columns' (bayesdist init --columns {key}=NAME)"
+        if "x" in found and "y" in found:
+            do += ", or make the file one of the lists of a [campaign] or [selfcal]"
+        raise InputError(
+            f"no column for {key!r} among {', '.join(names) or 'none'}", where=source, do=do
+        )
+    return found
 
 
 def columns_read(
@@ -263,3 +289,56 @@ def _sigma(column: SourceColumn, unit: str) -> Float:
         bad = int(np.argmin(good))
         raise column.fail(bad, f"sigma is {sigma[bad]:g}, and must be positive")
     return sigma
+
+
+def text_labels(column: SourceColumn) -> tuple[str, ...]:
+    """Names of the chips in a column; none where they are numbers."""
+    values = column.values
+    plain = values.labels if isinstance(values, EncodedColumn) else np.asarray(values)
+    if plain.dtype.kind not in "SUO":
+        return ()
+    names = column.labels()[1]
+    return () if all(re.fullmatch(r"[+-]?\d+", name) for name in names) else names
+
+
+def numbered(names: Iterable[str]) -> dict[str, int]:
+    """Numbers from 1 for names in their order, digits by their value: S2 before S10."""
+
+    def key(name: str) -> list[tuple[int, int, str]]:
+        parts = re.findall(r"\d+|\D+", name)
+        return [(0, int(one), "") if one.isdigit() else (1, 0, one) for one in parts]
+
+    return {name: k for k, name in enumerate(sorted(set(names), key=key), 1)}
+
+
+def numbered_chips(
+    column: SourceColumn, chips: Mapping[str, int] | None
+) -> tuple[Int, tuple[int, ...], tuple[str, ...]]:
+    """Codes (N,) of the chips, their numbers in rising order, and their names where they have such.
+
+    `chips` gives the number of each name; by default from 1 in the order of the names.  Numbers
+    that are not whole and names without a number are refused.
+    """
+    names = text_labels(column)
+    if not names:
+        numbers, codes = np.unique(column.integers(), return_inverse=True)
+        return codes, tuple(numbers.tolist()), ()
+    number_of = numbered(names) if chips is None else chips
+    if not number_of:
+        raise InputError(
+            f"holds names of chips ({names[0]!r}), and tables on disk need their numbers first",
+            where=column.where,
+            do="give [[chip]] blocks of these names, or write numbers",
+        )
+    own, labels = column.labels()
+    for name in labels:
+        if name not in number_of:
+            raise InputError(
+                f"chip {name!r} is none of {', '.join(number_of)}",
+                where=column.where,
+                do="add a [[chip]] block of this name, or leave these rows out",
+            )
+    every = np.array([number_of[name] for name in labels], np.int64)
+    numbers, codes = np.unique(every[own], return_inverse=True)
+    name_of = {number_of[name]: name for name in labels}
+    return codes, tuple(numbers.tolist()), tuple(name_of[number] for number in numbers.tolist())

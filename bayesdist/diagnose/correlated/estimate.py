@@ -11,10 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import Matches
-from bayesdist.diagnose.correlated.cells import CellSums, cell_sums, cells_per_side
 from bayesdist.diagnose.correlated.deviations import MAX_EXPOSURES, linear_deviations
 from bayesdist.diagnose.correlated.functions import StructureFunctions
-from bayesdist.diagnose.correlated.information import Information
+from bayesdist.diagnose.correlated.information import (
+    CellSums,
+    Information,
+    cell_sums,
+    cells_per_side,
+)
 from bayesdist.diagnose.correlated.neighbours import SharedVariance, shared_variances
 from bayesdist.diagnose.correlated.noise import not_narrower, score_excess
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from bayesdist.data.matches import Matches
-from bayesdist.infer.catalogue.star_influence import StarInfluence
+from bayesdist.infer.catalogue.star_errors import StarInfluence
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.stars.stars import errors_of
 from bayesdist.model import DistortionModel, Groups, LookupTable

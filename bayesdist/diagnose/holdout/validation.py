@@ -20,9 +20,10 @@ from bayesdist.diagnose.holdout.tests import (
     axis_coverage,
     deviation_tests,
 )
-from bayesdist.diagnose.significance import holm, p_words
+from bayesdist.diagnose.significance import holm
 from bayesdist.errors import InputError
 from bayesdist.limits import HELD_OUT, HELD_OUT_DOUBTFUL, HELD_OUT_UNUSUAL
+from bayesdist.numbers import p_words
 
 __all__ = ["HoldoutValidation", "holdout_validation"]
 

@@ -10,8 +10,13 @@ from bayesdist.diagnose.residuals.binned import (
     binned_sums,
 )
 from bayesdist.diagnose.residuals.changes import PatternChange, pattern_changes
-from bayesdist.diagnose.residuals.pairs import pair_statistics
-from bayesdist.diagnose.residuals.rows import STATISTICS, StatisticsRow, bin_row, pair_row
+from bayesdist.diagnose.residuals.rows import (
+    STATISTICS,
+    StatisticsRow,
+    bin_row,
+    pair_row,
+    pair_statistics,
+)
 from bayesdist.diagnose.residuals.tables import StatisticsTable, period_table
 
 __all__ = [

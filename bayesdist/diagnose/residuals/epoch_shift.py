@@ -20,6 +20,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
+from bayesdist.data.magnitude_errors import MAD_TO_SIGMA
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.sample import ScoredSample, scored_sample
@@ -40,7 +41,6 @@ MAX_ITERATIONS = 30
 # error of a motion over the scatter of motions, at most: larger ones are often quoted too small
 WELL_KNOWN = 0.2
 BIWEIGHT = 4.685  # robust standard deviations, beyond which a star has no weight (Tukey)
-NORMAL = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def epoch_shift(table: Matches, solution: Solution) -> EpochShift | None:
 def _scatter(values: Float) -> float:
     """Robust standard deviation about the median of each axis, both together."""
     middle = np.median(values, axis=1, keepdims=True)
-    return NORMAL * float(np.median(np.abs(values - middle)))
+    return MAD_TO_SIGMA * float(np.median(np.abs(values - middle)))
 
 
 def _left_over(sample: ScoredSample, weight: Float, *fields: Float) -> Iterator[Float]:

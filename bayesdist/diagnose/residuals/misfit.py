@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, BinnedSums
-from bayesdist.diagnose.significance import p_words
 from bayesdist.limits import STRUCTURE, STRUCTURE_SEEN
 from bayesdist.model import Chip
 from bayesdist.model.basis import polynomial_terms
-from bayesdist.numbers import size_of
+from bayesdist.numbers import p_words, size_of
 
 __all__ = [
     "MAX_BINS",

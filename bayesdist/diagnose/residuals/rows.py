@@ -3,6 +3,10 @@
 Means of bins hold the mean errors of their stars beside what the model leaves.  Two questions are
 answered of every statistic.  Its error: how much it would change with other stars in the same
 bins.  Its noise-free value: what it would be with infinitely many of them.
+
+Differences between all pairs of bins are never listed: 45 x 45 bins have four million.  Their mean,
+sigma and extremes have closed forms; an order statistic is found by counting: how many differences
+lie below a limit is one search in a sorted list for each value.
 """
 
 from __future__ import annotations
@@ -14,15 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.diagnose.residuals.binned import BinValues
-from bayesdist.diagnose.residuals.pairs import pair_statistics
 from bayesdist.errors import DegenerateError
 
-__all__ = ["STATISTICS", "StatisticsRow", "bin_row", "pair_row"]
+__all__ = ["STATISTICS", "StatisticsRow", "bin_row", "pair_row", "pair_statistics"]
 
 Float = NDArray[np.float64]
-
 STATISTICS = ("mean", "sigma", "min", "max", "median", "p01", "p99")
-
 DRAWS = 300  # of bins with fresh noise: errors to 4 %
 _FEWEST_BINS = 3
 # percentiles of pairs in the draws need not be finer than this part of their spread
@@ -175,3 +176,54 @@ def _row(
     return StatisticsRow(
         label, dict(value), error, free, variance, variance_error, n, good.size - n
     )
+
+
+def pair_statistics(values: Float, *, tolerance: float = 0.0) -> dict[str, float]:
+    """Statistics of v_i - v_j over all i and j: the columns of Table 5-3 of WSDC D-T033.
+
+    The n^2 differences contain each value against itself, and are as often the one way as the
+    other: mean and median vanish.
+
+    `values` (n,) are finite and not empty, `tolerance` is the allowed error of percentiles, 0 for
+    rounding. By name: mean, sigma (about the mean, over n^2), min, max, median, p01, p99;
+    percentiles interpolate between neighbours as `numpy.percentile` does.
+    """
+    a = np.sort(values)
+    extent, p99 = float(a[-1] - a[0]), _percentile(a, 99, tolerance)
+    return {
+        "mean": 0.0,
+        "sigma": float(np.hypot(a.std(), a.std())),
+        "min": -extent,
+        "max": extent,
+        "median": 0.0,
+        "p01": -p99,
+        "p99": p99,
+    }
+
+
+def _percentile(a: Float, percent: int, tolerance: float) -> float:
+    whole, part = divmod((a.size**2 - 1) * percent, 100)
+    low = _order_statistic(a, whole, tolerance)
+    if not part:
+        return low
+    return low + (_order_statistic(a, whole + 1, tolerance) - low) * part / 100
+
+
+def _order_statistic(a: Float, rank: int, tolerance: float) -> float:
+    """Difference with so many others at or below it, by bisection; a is sorted."""
+    low, high = a[0] - a[-1], a[-1] - a[0]
+    finest = np.spacing(max(high, abs(a[0]), abs(a[-1])))
+    if _count(a, low) > rank:
+        return float(low)
+    while high - low > max(tolerance, 2 * finest):
+        middle = (low + high) / 2
+        if _count(a, middle) > rank:
+            high = middle
+        else:
+            low = middle
+    return float(high)
+
+
+def _count(a: Float, limit: float) -> int:
+    """Number of differences at or below a limit."""
+    return int(a.size**2 - np.searchsorted(a, a - limit, side="left").sum())

@@ -10,8 +10,9 @@ from typing import Literal
 import numpy as np
 from scipy import special, stats
 
-from bayesdist.diagnose.significance import holm, p_words
+from bayesdist.diagnose.significance import holm
 from bayesdist.limits import SCORE_TESTS
+from bayesdist.numbers import p_words
 
 __all__ = [
     "POWER",

@@ -34,12 +34,14 @@ from bayesdist.data.magnitude_errors import AddedErrors
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.by_magnitude import (
-    LEAST_WEIGHT,
+    FALSE,
+    false_matches,
+    refitted,
     residuals_of,
     variances_of,
 )
 from bayesdist.infer.equations.priors import GaussianPriors
-from bayesdist.infer.linear import NO_REJECTION, LinearFit, fit_linear
+from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.stars.likelihood import good_probability, log_densities
 from bayesdist.model import DistortionModel
 
@@ -55,7 +57,6 @@ DECISIVE = 3.0  # ln evidence, odds of 20 to 1, needed for errors that differ be
 MATERIAL = 0.01  # of the errors of typical stars: groups that differ by less are not separated
 SETTLED, TURNS = 1e-3, 50  # change of ln variance at which the maximisation ends; most iterations
 HALVINGS = 45  # of the range in which an added variance lies
-FALSE = 0.02, 50.0  # prior mean of the fraction of false matches, worth so many stars
 WIDER = 5.0  # false matches scatter at least this many times as wide as typical good ones
 SHRUNK = 3  # fewest labels whose scatter can be estimated
 
@@ -212,23 +213,17 @@ def _maximised(
         var = quoted + variance[code]
         good = good_probability(square, var, f, wide) if outliers else np.ones(len(table))
         if outliers:
-            bad = 1.0 - good
-            f = float((bad.sum() + FALSE[0] * FALSE[1]) / (len(bad) + FALSE[1]))
-            least = WIDER**2 * float(np.median(var))
-            wide = max(least, float((bad * square).sum() / max(2.0 * bad.sum(), 1e-300)))
+            f, wide = false_matches(good, square, WIDER**2 * float(np.median(var)))
         before, variance = variance, _maxima(quoted, square, good, code, n_groups)
         var = quoted + variance[code]
-        sigma_u, sigma_v = np.sqrt(var / np.maximum(good, LEAST_WEIGHT))
-        weighted = table.with_errors((sigma_u, sigma_v))
-        fit = fit_linear(weighted, model, rejection=NO_REJECTION, priors=priors)
-        residual = residuals_of(fit, table) ** 2
-        square = residual + variances_of(fit, table)
+        fit, residual = refitted(table, model, var, good, priors)
+        square = residual**2 + variances_of(fit, table)
         if (np.abs(variance - before) < SETTLED * (typical + variance)).all():
             break
     if outliers:
-        each = np.logaddexp(*log_densities(residual, var, f, wide))
+        each = np.logaddexp(*log_densities(residual**2, var, f, wide))
     else:
-        each = -0.5 * (residual / var + np.log(var)).sum(axis=0)
+        each = -0.5 * (residual**2 / var + np.log(var)).sum(axis=0)
     # the determinant of the fit's normal matrix makes the likelihood the restricted one
     value = float(each.sum() + 0.5 * np.linalg.slogdet(fit.cov)[1])
     return _State(fit, square, f, wide, variance, good, value)

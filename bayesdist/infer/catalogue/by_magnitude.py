@@ -25,8 +25,10 @@ from bayesdist.infer.stars.stars import groups_of, in_table_order, prepare
 from bayesdist.model import DistortionModel
 
 __all__ = [
-    "LEAST_WEIGHT",
+    "FALSE",
+    "false_matches",
     "fit_by_magnitude",
+    "refitted",
     "residuals_of",
     "variances_of",
 ]
@@ -116,14 +118,9 @@ def _law(
     for _ in range(TURNS):
         var = law.at_stars(nodes)
         good = good_probability(square, var, f, wide)
-        weight = np.sqrt(np.maximum(good, LEAST_WEIGHT))
-        sigma_u, sigma_v = np.sqrt(var) / weight
-        weighted = stars.with_errors((sigma_u, sigma_v))
-        fit = fit_linear(weighted, model, rejection=NO_REJECTION, priors=priors)
-        square = residuals_of(fit, stars) ** 2 + variances_of(fit, stars)
-        bad = 1.0 - good
-        f = float((bad.sum() + FALSE[0] * FALSE[1]) / (len(bad) + FALSE[1]))
-        wide = max(narrowest, float((bad * square).sum() / max(2.0 * bad.sum(), 1e-300)))
+        fit, residual = refitted(stars, model, var, good, priors)
+        square = residual**2 + variances_of(fit, stars)
+        f, wide = false_matches(good, square, narrowest)
         before, nodes = nodes, law.climbed(nodes, good, square)
         if np.abs(nodes - before).max() < SETTLED:
             break
@@ -139,6 +136,30 @@ def _scatter(bins: MagnitudeErrors, mag: Float, good: Float, square: Float) -> F
     n = np.bincount(nearest, weights=good, minlength=count)
     sums = [np.bincount(nearest, weights=good * axis, minlength=count) for axis in square]
     return np.sqrt(np.array(sums) / np.maximum(n, 1e-300))
+
+
+def refitted(
+    stars: Matches,
+    model: DistortionModel,
+    variance: Float,
+    good: Float,
+    priors: GaussianPriors | None,
+) -> tuple[LinearFit, Float]:
+    """Fit of stars with variances (2, N), each as far as it is good (N,); and residuals (2, N)."""
+    sigma_u, sigma_v = np.sqrt(variance) / np.sqrt(np.maximum(good, LEAST_WEIGHT))
+    weighted = stars.with_errors((sigma_u, sigma_v))
+    fit = fit_linear(weighted, model, rejection=NO_REJECTION, priors=priors)
+    return fit, residuals_of(fit, stars)
+
+
+def false_matches(good: Float, square: Float, least: float) -> tuple[float, float]:
+    """Most probable fraction of false matches, and their variance along an axis, `least` or more.
+
+    `good` (N,) are the probabilities of true ones, `square` (2, N) the squares of the residuals.
+    """
+    bad = 1.0 - good
+    fraction = float((bad.sum() + FALSE[0] * FALSE[1]) / (len(bad) + FALSE[1]))
+    return fraction, max(least, float((bad * square).sum() / max(2.0 * bad.sum(), 1e-300)))
 
 
 def residuals_of(fit: LinearFit, stars: Matches) -> Float:

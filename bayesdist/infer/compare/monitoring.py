@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
-from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
-from bayesdist.infer.catalogue.star_influence import star_influence
+from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance, star_influence
 from bayesdist.infer.compare.frame_fields import frame_between, frame_fields, mean_squares, without
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target

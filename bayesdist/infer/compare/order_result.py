@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from bayesdist.numbers import p_words
+
 __all__ = ["HeldOutOrders", "OrderSelection", "OrderSurfaces"]
 
 Float = NDArray[np.float64]
@@ -184,8 +186,8 @@ class OrderSelection:
             rms = float(np.hypot(*self.surfaces.rms[k]))
             noise = float(np.hypot(*self.surfaces.noise))
             parts.append(
-                f"The bins keep {rms:.2g} {self.unit} rms where noise is {noise:.2g} ({_p(p)}): "
-                f"order {self.order} does not describe all that is there."
+                f"The bins keep {rms:.2g} {self.unit} rms where noise is {noise:.2g} "
+                f"({p_words(p, 2)}): order {self.order} does not describe all that is there."
             )
         return " ".join(parts)
 
@@ -199,8 +201,8 @@ class OrderSelection:
         return (
             f"Order {low} is {word}: order {self.order} differs from it by {lost:.2g} {self.unit} "
             f"rms (a pair has {self.pair_rms:.2g}), the residual surface asks for it with "
-            f"F = {F:.3g} ({_p(p)}), and it predicts held-out stars better by {gain:.4g} +- "
-            f"{error:.2g} in log density."
+            f"F = {F:.3g} ({p_words(p, 2)}), and it predicts held-out stars better by {gain:.4g} "
+            f"+- {error:.2g} in log density."
         )
 
     def _of_the_chosen(self) -> str:
@@ -223,8 +225,3 @@ class OrderSelection:
 def _clear(held_out: HeldOutOrders, low: int, high: int) -> bool:
     gain, error = held_out.difference(low, high)
     return gain > CLEAR * error
-
-
-def _p(p: float) -> str:
-    """Probability as text, also below the smallest float."""
-    return f"p = {p:.2g}" if p > 0 else "p < 1e-300"

@@ -19,6 +19,7 @@ from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.sums import Sums
 from bayesdist.model.grid import cell_index
+from bayesdist.streams import mixed
 
 __all__ = ["FoldStatistics", "bin_sums", "departures", "fold_sums", "held_out_gain", "truncated"]
 
@@ -66,18 +67,10 @@ def fold_sums(stars: Stars, theta: Float, clip: Clip, folds: int) -> FoldStatist
     The subset of a star follows from the digits of its own numbers, so that it depends neither on
     the order of the rows nor on the chunks into which the data are cut.
     """
-    mixed = np.zeros(len(stars), np.uint64)
+    bits = np.zeros(len(stars), np.uint64)
     for column in (stars.X, stars.Y, stars.u, stars.v):
-        mixed = _scrambled(mixed ^ np.ascontiguousarray(column).view(np.uint64))
-    return _sums(stars, (mixed % np.uint64(folds)).astype(np.int64), folds, theta, clip)
-
-
-def _scrambled(z: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Finaliser of SplitMix64 (Steele, Lea and Flood 2014): every bit depends on every bit."""
-    z = z + np.uint64(0x9E3779B97F4A7C15)
-    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return z ^ (z >> np.uint64(31))
+        bits = mixed(bits ^ np.ascontiguousarray(column).view(np.uint64))
+    return _sums(stars, (bits % np.uint64(folds)).astype(np.int64), folds, theta, clip)
 
 
 def _sums(stars: Stars, code: Int, n: int, theta: Float, clip: Clip) -> FoldStatistics:

@@ -93,10 +93,9 @@ def fit_exposures(
     model: DistortionModel,
     *,
     chip: int = 2,
-    skip: bool = False,
     rejection: Rejection = DEFAULT_REJECTION,
 ) -> ExposureSolutions:
-    """Fit every exposure independently.
+    """Fit every exposure independently; those that cannot be fitted are left out, and counted.
 
     Parameters
     ----------
@@ -107,8 +106,6 @@ def fit_exposures(
         ignored.
     chip : int
         Number of the reference chip.
-    skip : bool
-        True to leave out and count exposures that cannot be fitted; else they are an error.
     rejection : Rejection
         As of `fit_linear`.
 
@@ -121,8 +118,7 @@ def fit_exposures(
     InputError
         For matches without epochs.
     DegenerateError
-        Naming exposure and chip: no stars on a chip, too few, or badly spread ones; when no
-        exposure is left.
+        When no exposure has stars enough on each chip, well spread.
     """
     if matches.epoch is None:
         raise InputError(
@@ -142,9 +138,6 @@ def fit_exposures(
             _require_stars(table, alone)
             fit = fit_linear(table, alone, rejection=rejection)
         except DegenerateError as error:
-            where = f"exposure {name}" + (f", {error.where}" if error.where else "")
-            if not skip:
-                raise DegenerateError(error.cause, where=where, do=error.do) from error
             skipped[name] = error.cause
             continue
         view = reference_gauge(fit, chip)
@@ -180,5 +173,5 @@ def _require_stars(table: Matches, model: DistortionModel) -> None:
                 if n
                 else "no star lies on this chip",
                 where=f"chip {chip.name}",
-                do="leave the exposure out (skip), or lower model.order",
+                do="lower model.order",
             )

@@ -1,8 +1,13 @@
 """Coefficients of many exposures against time: lines, breaks, scatter, predictions."""
 
-from bayesdist.infer.series.compare import Comparison, compare, serial_correlation
+from bayesdist.infer.series.compare import (
+    Comparison,
+    FilterDependence,
+    compare,
+    filter_dependence,
+    serial_correlation,
+)
 from bayesdist.infer.series.design import Design
-from bayesdist.infer.series.filters import FilterDependence, filter_dependence
 from bayesdist.infer.series.fit import fit_series
 from bayesdist.infer.series.heldout import HeldOut, block_folds, exposure_folds, held_out
 from bayesdist.infer.series.posterior import Change, Prediction, SeriesPosterior

@@ -4,6 +4,10 @@ A difference counts where it is at least 4 and at least as many of its standard 
 t needs for 95 %: below 4 standard errors are too small themselves (Sivula et al. 2020).  Where the
 exposures are correlated in time, whole blocks of them are held out: an exposure's neighbours would
 predict it, and an irregular drift would pass for a line.
+
+Filters (ACS ISR 2015-06, section 4.4.4) are compared by common slopes with an offset for each,
+against slopes of their own: each further filter's slope differs from that of the first by one
+amount in all segments.
 """
 
 from __future__ import annotations
@@ -16,21 +20,21 @@ from astropy.table import Table
 from numpy.typing import NDArray
 from scipy.stats import t as student_t
 
+from bayesdist.errors import InputError
 from bayesdist.infer.series.breaks import BreakMoves
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.fit import fit_series
 from bayesdist.infer.series.heldout import HeldOut, block_folds, exposure_folds, held_out
-from bayesdist.infer.series.posterior import SeriesPosterior
+from bayesdist.infer.series.posterior import Change, SeriesPosterior
 from bayesdist.infer.series.problem import WIDE, Problem, normal_equations
 from bayesdist.infer.series.series import Series
 from bayesdist.infer.series.small import cholesky, precision_of
 from bayesdist.infer.series.trend import KINDS, TrendModel
 
-__all__ = ["Comparison", "compare", "serial_correlation"]
+__all__ = ["Comparison", "FilterDependence", "compare", "filter_dependence", "serial_correlation"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
-
 MIN_DIFFERENCE = 4.0
 CONFIDENCE = 0.95
 # lag-1 correlation, in its standard errors, from which exposures count as correlated
@@ -252,3 +256,95 @@ def serial_correlation(posterior: SeriesPosterior) -> float:
     residual = residual - residual.mean(axis=0)
     lagged = (residual[1:] * residual[:-1]).sum(axis=0)
     return float((lagged / (residual**2).sum(axis=0)).mean())
+
+
+@dataclass(frozen=True, eq=False)
+class FilterDependence:
+    """Comparison of common slopes with a slope for each filter.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Filters; the first has most exposures, and the others are compared with it.
+    offset : dict of str to Change
+        Offset of each further filter's coefficients, with common slopes.
+    slope : dict of str to Change
+        Difference of its slopes, per year, where it has its own.
+    all_slopes : Change
+        All of these in one vector, filter by filter, with their covariance.
+    common, separate : SeriesPosterior
+    comparison : Comparison
+        Held-out scores of the two, in this order.
+    """
+
+    names: tuple[str, ...]
+    offset: dict[str, Change]
+    slope: dict[str, Change]
+    all_slopes: Change
+    common: SeriesPosterior
+    separate: SeriesPosterior
+    comparison: Comparison
+
+    @property
+    def gain(self) -> tuple[float, float]:
+        """Gain of own slopes in predicting held-out exposures, with standard error."""
+        return self.comparison.difference(*self._places)
+
+    @property
+    def depends(self) -> bool:
+        """True if own slopes predict significantly better."""
+        return self.comparison.beats(*self._places)
+
+    @property
+    def _places(self) -> tuple[int, int]:
+        posteriors = self.comparison.posteriors
+        return posteriors.index(self.separate), posteriors.index(self.common)
+
+
+def filter_dependence(series: Series, trend: TrendModel, *, seed: int = 1) -> FilterDependence:
+    """Compare common slopes with a slope for each filter.
+
+    Parameters
+    ----------
+    series : Series
+        With filters as its groups.
+    trend : TrendModel
+        With slopes.
+    seed : int
+
+    Returns
+    -------
+    FilterDependence
+
+    Raises
+    ------
+    InputError
+        For a series of one filter, and a trend without slopes.
+    DegenerateError
+        For a filter with fewer than three exposures, or of one date only.
+    """
+    names = series.group_names
+    if len(names) < 2:
+        raise InputError(
+            "there are no two filters to compare",
+            where=series.source,
+            do="give the filter of each exposure as its group",
+        )
+    if not trend.has_slope:
+        raise InputError(
+            f"trend {trend.name!r} has no slopes", where=series.source, do="ask for lines"
+        )
+    both = (replace(trend, groups="offsets"), replace(trend, groups="slopes"))
+    comparison = compare(series, both, seed=seed)
+    places = [comparison.trends.index(c) for c in both]
+    common, separate = (comparison.posteriors[i] for i in places)
+    slopes = separate.group_slope
+    return FilterDependence(
+        names=names,
+        offset={f: Change.of(common.group_offset[:, i]) for i, f in enumerate(names[1:])},
+        slope={f: Change.of(slopes[:, i]) for i, f in enumerate(names[1:])},
+        all_slopes=Change.of(np.ascontiguousarray(slopes.reshape(len(slopes), -1))),
+        common=common,
+        separate=separate,
+        comparison=comparison,
+    )

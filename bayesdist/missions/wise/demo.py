@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -90,14 +91,19 @@ unit = "pix"
 probability = 0.95
 
 [products]
-sip = {{inverse_order = 5, linear = "sip"}}
+sip = {{inverse_order = 5, {sip}}}
 """
 
+MIDDLE = 508.5  # pixel from which u, v of the demo count, as offsets in a focal plane do
 
-def write_simulation(folder: Path, matches: Matches, truth: Truth, band: str) -> None:
+
+def write_simulation(
+    folder: Path, matches: Matches, truth: Truth, band: str, *, sip: str = 'linear = "sip"'
+) -> None:
     """Write stars.ecsv, truth.ecsv and config.toml of a simulated band.
 
-    InputError when the folder cannot be made or written.
+    `sip`: how its SIP header states u, v; by default as WISE has it. InputError when the folder
+    cannot be made or written.
     """
     made_folder(folder)
     stars = QTable()
@@ -116,7 +122,7 @@ def write_simulation(folder: Path, matches: Matches, truth: Truth, band: str) ->
         with atomic_path(folder / name) as temporary:
             table.write(temporary, format="ascii.ecsv")
     with atomic_path(folder / "config.toml") as temporary:
-        temporary.write_text(_CONFIG.format(band=band), encoding="utf-8")
+        temporary.write_text(_CONFIG.format(band=band, sip=sip), encoding="utf-8")
 
 
 def demo(
@@ -136,8 +142,8 @@ def demo(
         raise InputError(
             "the folder holds another demo", where=str(folder), do="replace it by --force"
         )
-    matches, truth = simulate_wise(N_STARS, rng=np.random.default_rng(SEED))
-    write_simulation(folder / "input", matches, truth, "W2")
+    matches, truth = _from_middle(*simulate_wise(N_STARS, rng=np.random.default_rng(SEED)))
+    write_simulation(folder / "input", matches, truth, "W2", sip='axes = "linear"')
     run(folder / "input" / "config.toml", folder / "run", force=force, command=command)
     finished = RunDirectory.open(folder / "run")
     results = results_of(finished)
@@ -156,6 +162,14 @@ def demo(
     return (
         f"{text}\n\n{written}\n  its scale, names and position in the focal plane are placeholders"
     )
+
+
+def _from_middle(matches: Matches, truth: Truth) -> tuple[Matches, Truth]:
+    """Matches and truth whose u, v are offsets from the middle of the detector."""
+    theta = truth.theta.copy()
+    theta[[truth.model.names.index(name) for name in ("u_0_0", "v_0_0")]] -= MIDDLE
+    moved = replace(matches, u=matches.u - MIDDLE, v=matches.v - MIDDLE)
+    return moved, replace(truth, theta=theta)
 
 
 def _against_truth(posterior: Posterior, fit: LinearFit, truth: Truth) -> str:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.diagnose.correlated.cells import cell_sums
 from bayesdist.diagnose.correlated.functions import StructureFunctions
-from bayesdist.diagnose.correlated.information import Information
+from bayesdist.diagnose.correlated.information import Information, cell_sums
 from bayesdist.diagnose.correlated.structure import chip_structure
 from bayesdist.infer import GaussianPriors
 from bayesdist.infer.solution import likelihood_of

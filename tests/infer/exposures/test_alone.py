@@ -105,33 +105,30 @@ def test_each_is_the_fit_of_its_own_stars(some):
 # -- what cannot be fitted ------------------------------------------------------------------------
 
 
-def test_a_chip_missing_in_an_exposure_is_named_or_skipped(some):
+def test_an_exposure_without_stars_on_a_chip_is_left_out(some):
     model, matches, _, _ = some
     first = matches.select(matches.exposure < 3)
     part = first.select(~((first.exposure == 1) & (first.chip == 0)))
-    with pytest.raises(
-        DegenerateError, match="exposure j002, chip WFC1: no star lies on this chip"
-    ):
-        fit_exposures(part, model)
-    found = fit_exposures(part, model, skip=True)
+    found = fit_exposures(part, model)
     assert found.names == ("j001", "j003") and set(found.skipped) == {"j002"}
     assert "no star" in found.skipped["j002"]
-    with pytest.raises(DegenerateError, match="none of 1 exposures"):
-        fit_exposures(part.select(part.exposure == 1), model, skip=True)
+    with pytest.raises(DegenerateError, match=r"none of 1 exposures .* no star lies on this chip"):
+        fit_exposures(part.select(part.exposure == 1), model)
 
 
 def test_an_exposure_with_fewer_stars_than_terms_is_named():
     model, matches, _ = campaign(3, 60, 36, order=5, time=False)  # 18 stars, 21 terms
-    with pytest.raises(DegenerateError, match=r"exposure j\d+, chip WFC\d: 1\d stars lie on this"):
+    message = r"none of 60 exposures .* 1\d stars lie on this chip"
+    with pytest.raises(DegenerateError, match=message):
         fit_exposures(matches, model)
 
 
-def test_stars_in_a_corner_are_named_with_exposure_and_chip(some):
+def test_an_exposure_with_stars_in_a_corner_is_left_out(some):
     model, matches, _, _ = some
     first = matches.select(matches.exposure < 2)
     keep = (first.exposure == 0) | (first.chip == 0) | ((first.x < 1500) & (first.y < 900))
-    with pytest.raises(DegenerateError, match="exposure j002, chip WFC2: the stars lie within"):
-        fit_exposures(first.select(keep), replace(model, order=1))
+    found = fit_exposures(first.select(keep), replace(model, order=1))
+    assert found.names == ("j001",) and "the stars lie within" in found.skipped["j002"]
 
 
 def test_epochs_are_needed(some):

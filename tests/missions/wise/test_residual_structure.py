@@ -7,7 +7,7 @@ import pytest
 from numpy.polynomial import legendre
 from scipy.stats import chi2, kstest
 
-from bayesdist.assess import BinnedResiduals
+from bayesdist.diagnose.residuals.binned import BinnedResiduals
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.missions.wise.assess.residual_correlation import residual_correlation
 from bayesdist.missions.wise.assess.residual_structure import residual_partition

@@ -31,7 +31,7 @@ from bayesdist.calibration.inverse import fitted_inverse
 from bayesdist.errors import InputError
 from bayesdist.reading.tables import read_table
 
-__all__ = ["METHODS", "apply_to_table"]
+__all__ = ["apply_to_table"]
 
 Float = NDArray[np.float64]
 

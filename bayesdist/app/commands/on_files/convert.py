@@ -19,7 +19,7 @@ from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky.tangent import sky_of_plane
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 from bayesdist.files import atomic_path
 from bayesdist.products.formats.common.document import (
     PARAMETERS,
@@ -288,9 +288,9 @@ def _pairs(source: Calibration, back: Sequence[Calibration]) -> list[tuple[int, 
 
 
 def _on_sky(one: Calibration, at: Float) -> Float:
-    assert one.plane.point is not None
+    point = required(one.plane.point, "does not lie on the sky")
     xi, eta = (at * ARCSEC[one.unit]).T
-    return np.stack(sky_of_plane(xi, eta, one.plane.point), axis=-1)
+    return np.stack(sky_of_plane(xi, eta, point), axis=-1)
 
 
 def _after_similarity(a: Float, b: Float) -> Float:

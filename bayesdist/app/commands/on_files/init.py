@@ -6,15 +6,15 @@ import logging
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from bayesdist.app.commands.on_files.init_columns import column_lines, guessed_sigma, quoted
+from bayesdist.app.commands.on_files.init_columns import column_lines, guessed_sigma
+from bayesdist.app.commands.on_files.init_detector import detector_lines, quoted
+from bayesdist.app.commands.on_files.init_draft import draft_of
 from bayesdist.app.config import parse_config
 from bayesdist.app.config.data import data_sections
-from bayesdist.app.kinds.matches.reading import load_matches
-from bayesdist.app.kinds.matches.sources import mission_template
+from bayesdist.app.kinds.matches.sources import load_matches, mission_template
 from bayesdist.app.store.output import refuse_existing
 from bayesdist.data import FORMATS, Matches
 from bayesdist.data.formats.files import mission_formats
@@ -108,24 +108,6 @@ _CENTRE = """\
 # reference_pixel = [{cx}, {cy}]  # zero point of the polynomial; the centre by default
 """
 
-_DETECTOR = """\
-[detector]
-name = "{name}"
-size = [{nx}, {ny}]             # columns, rows; {how}
-# mission = ""                  # beside the name in the title of the report: mission,
-# instrument = ""               # instrument
-# filter = ""                   # and filter
-# scale_mas = 50.0              # size of a pixel, to state errors in mas beside pixels
-"""
-
-_CHIP = """\
-[[chip]]
-number = {number}
-name = {name}
-size = [{nx}, {ny}]             # columns, rows; {how}
-reference_pixel = [{cx}, {cy}]  # zero point of the polynomial
-"""
-
 
 def init(
     path: str | Path,
@@ -134,23 +116,29 @@ def init(
     columns: Mapping[str, str] | None = None,
     size: tuple[int, int] | None = None,
     force: bool = False,
-) -> int:
-    """Number of matches that a new configuration reads, which is written with comments.
+) -> str:
+    """Write a new configuration with comments; returned is what it is for, and what comes next.
 
     `path` is the TOML file, `matches` its ``data.matches``, `columns` its ``data.columns``; `size`
-    are columns and rows of each chip, by default as large as the positions ask for.
+    are columns and rows of each chip, by default as large as the positions ask for.  Of a table in
+    which columns are lacking it is a draft, as of `draft_of`.
     """
     path = Path(path)
     refuse_existing(path, force)
     relative = quoted(os.path.relpath(Path(matches), path.resolve().parent))
     own = mission_template(matches) if columns is None else None
-    n, values = _of_matches(matches, columns, size) if own is None else own
-    order = 4 if n >= 300 else 3 if n >= 100 else 2
-    text = _TEMPLATE.format(matches=relative, order=order, **{"not_finite": ""} | values)
-    parse_config(text, str(path))
+    draft = draft_of(path, matches, relative, columns, size) if own is None else None
+    if draft is not None:
+        text, outcome = draft
+    else:
+        n, values = _of_matches(matches, columns, size) if own is None else own
+        order = 4 if n >= 300 else 3 if n >= 100 else 2
+        text = _TEMPLATE.format(matches=relative, order=order, **{"not_finite": ""} | values)
+        parse_config(text, str(path))
+        outcome = f"for {n} matches; read it, then 'bayesdist check' it"
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
-    return n
+    return f"{path}: {outcome}"
 
 
 def _of_matches(
@@ -168,12 +156,10 @@ def _of_matches(
     for reason, count in table.rejected.items():
         log.warning("%s: left out %d rows: %s", matches, count, reason)
     layout = table_layout(matches, columns, read_sigma=read_sigma)
-    chips = {n: _size(*reach, size) for n, reach in _reach(table).items()}
-    several = len(chips) > 1
-    first = next(iter(chips.values()))
-    name = Path(matches).stem.replace('"', "")
     names = dict(zip(table.chip_numbers, _chip_names(table), strict=True))
-    blocks = [_CHIP.format(number=n, name=quoted(names[n]), **one) for n, one in chips.items()]
+    detector = detector_lines(_reach(table), names, size, Path(matches).stem)
+    cx, cy = detector.middle
+    nx, ny = detector.size
     return len(table), {
         "format": _AUTO.format(
             formats=" | ".join((*FORMATS, *mission_formats(), *data_sections()))
@@ -182,10 +168,10 @@ def _of_matches(
         "unit_line": unit_line,
         "sigma": sigma,
         "not_finite": not_finite,
-        "detector": "\n".join(blocks) if several else _DETECTOR.format(name=name, **first),
-        "reference": "" if several else _CENTRE.format(**first),
+        "detector": detector.text,
+        "reference": "" if detector.several else _CENTRE.format(cx=cx, cy=cy),
         "frames": "shift_rotation_scale" if len(table.exposure_names) > 1 else "none",
-        "grid_y": max(3, round(32 * first["ny"] / first["nx"]) + 1),
+        "grid_y": max(3, round(32 * ny / nx) + 1),
         "unit": table.unit,
     }
 
@@ -258,28 +244,3 @@ def _reach(matches: Matches) -> dict[int, tuple[float, float]]:
                     max(y, float(table.y[rows].max())),
                 )
     return dict(sorted(out.items()))
-
-
-def _size(x: float, y: float, given: tuple[int, int] | None) -> dict[str, Any]:
-    """Size of a chip: as given, or as far as its stars say."""
-    if given is not None:
-        (nx, ny), how = given, "as given"
-    else:
-        nx, ny = _guess_size(x), _guess_size(y)
-        how = f"guessed from x up to {x:.1f}, y up to {y:.1f}"
-    return {"nx": nx, "ny": ny, "how": how, "cx": (nx + 1) / 2, "cy": (ny + 1) / 2}
-
-
-def _guess_size(largest: float) -> int:
-    """Detector size: the next multiple of 2 above the data, or a power of 2 that is near."""
-    largest -= 0.5
-    if largest < 1:
-        raise InputError(
-            "no star of a chip lies beyond the first pixel, on x or on y",
-            where="x, y",
-            do="name the columns of its pixels by --columns, or give --size",
-        )
-    for power in (256, 512, 1024, 2048, 4096, 8192):
-        if 0.97 * power <= largest <= power:
-            return power
-    return int(np.ceil(largest / 2) * 2)

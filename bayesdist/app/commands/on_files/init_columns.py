@@ -8,11 +8,12 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
+from bayesdist.app.commands.on_files.init_detector import quoted
 from bayesdist.data import Matches
 from bayesdist.data.formats.layout import TableLayout
 from bayesdist.model.basis import polynomial_terms
 
-__all__ = ["column_lines", "guessed_sigma", "quoted"]
+__all__ = ["column_lines", "guessed_sigma"]
 
 # names under which SExtractor writes what the image's own WCS makes of the pixels
 _BY_THE_IMAGE = ("alpha_j2000", "alphawin_j2000", "alphapsf_j2000", "sky_centroid.ra")
@@ -21,11 +22,6 @@ _TOLD = 3  # columns that may be chips
 _NONE = """\
 # columns = {x = "x", y = "y", u = "u", v = "v"}  # they are found by their names
 """
-
-
-def quoted(text: str) -> str:
-    """Text as TOML has it."""
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
 def column_lines(layout: TableLayout | None, columns: Mapping[str, str] | None) -> str:

@@ -15,12 +15,7 @@ from bayesdist.assess.requirements.margins import judge
 from bayesdist.assess.requirements.validity import ValidityPeriod
 from bayesdist.infer.solution import Solution
 
-__all__ = [
-    "errors_of",
-    "margins_of",
-    "probability_met",
-    "validity_periods_of",
-]
+__all__ = ["errors_of", "margins_of", "probability_met", "validity_periods_of"]
 
 
 def errors_of(results: Results) -> DrawnErrors:

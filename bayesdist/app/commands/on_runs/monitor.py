@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.commands.on_runs.comparison_files import joined
+from bayesdist.app.commands.on_runs.compare import joined
 from bayesdist.app.commands.on_runs.new_exposures import fit_exposures_of, read_new_exposures
 from bayesdist.app.config import Config, load_config
 from bayesdist.app.kinds.fitted import load_errors
@@ -18,7 +18,7 @@ from bayesdist.app.results import results_of
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_late
-from bayesdist.assess.comparison.tables import comparison_table, difference_table
+from bayesdist.assess.comparison.compare import comparison_table, difference_table
 from bayesdist.assess.units import convert, pixel_scale_of
 from bayesdist.data import Matches, input_files
 from bayesdist.diagnose.diagnostics import misfits_of, residual_sums

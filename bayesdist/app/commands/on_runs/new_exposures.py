@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted, load_errors, required
-from bayesdist.app.store.inputs import input_name
+from bayesdist.app.store.made_from import input_name
 from bayesdist.app.store.rundir import PAIRS, RunDirectory, part_files
 from bayesdist.data import Matches, read_matches
 from bayesdist.errors import InputError
@@ -20,7 +20,7 @@ from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.compare.monitoring import NewFit, fit_new, with_star_errors_of
 from bayesdist.infer.linear import Rejection
 
-__all__ = ["NewExposures", "fit_exposures_of", "read_new_exposures"]
+__all__ = ["fit_exposures_of", "read_new_exposures"]
 
 Float = NDArray[np.float64]
 

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from bayesdist.app.assessment.error_terms import published_tables
-from bayesdist.app.commands.on_runs.filter_figures import draw_filters
 from bayesdist.app.commands.on_runs.filters import (
     FilterComparison,
     compare_filters,
     comparison_table,
+    draw_filters,
 )
 from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.kinds.fitted import Fitted, required
-from bayesdist.app.products.release_files import write_files
+from bayesdist.app.products.made_files import write_files
 from bayesdist.app.results import Results, results_of
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.output import record_folder, write_table

@@ -12,8 +12,13 @@ from astropy.table import Table
 from bayesdist.app.commands.patterns.config import PlanConfig, load_plan
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.output import record_folder, write_table
-from bayesdist.assess.planning.dithers import KINDS, PlannedPattern, compare_patterns
-from bayesdist.assess.planning.words import lacking, nearly_free
+from bayesdist.assess.planning.dithers import (
+    KINDS,
+    PlannedPattern,
+    compare_patterns,
+    lacking,
+    nearly_free,
+)
 
 __all__ = ["plan_patterns"]
 

@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from bayesdist.app.config.assess import require_own_names
-from bayesdist.app.config.detector import (
+from bayesdist.app.config.model import Polynomials
+from bayesdist.app.config.reading import load_text, validated
+from bayesdist.app.config.section import (
     ChipBlock,
     Detector,
+    Section,
     chips_of,
     one_chip,
     reference_first,
     require_detector,
 )
-from bayesdist.app.config.model import Polynomials
-from bayesdist.app.config.reading import load_text, validated
-from bayesdist.app.config.section import Section
 from bayesdist.app.config.selfcal import Frames, MinDetections, require_scales
 from bayesdist.assess.planning.dithers import Camera, PlannedStars, PriorInformation
 from bayesdist.model import Chip

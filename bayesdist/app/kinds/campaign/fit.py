@@ -7,10 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesdist.app.kinds.campaign.gap import gap_priors, with_gap
 from bayesdist.app.kinds.campaign.input_validation import frames_not_set
 from bayesdist.app.kinds.campaign.inputs import Inputs
-from bayesdist.app.kinds.campaign.linear_terms import FIXED, line_sections
+from bayesdist.app.kinds.campaign.linear_terms import FIXED, gap_priors, line_sections, with_gap
 from bayesdist.app.kinds.campaign.matched import CampaignMatched
 from bayesdist.app.kinds.campaign.reference import rate_priors
 from bayesdist.app.kinds.campaign.tables import fit_tables, scatter_by_magnitude, tables_section
@@ -63,7 +62,7 @@ def _fitted(matched: CampaignMatched) -> Fitted:
     rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs)
     joint = _joint(stars, affine, inputs, rejection)
     number = config.chips()[0].number
-    alone = fit_exposures(stars, affine, chip=number, skip=True, rejection=rejection)
+    alone = fit_exposures(stars, affine, chip=number, rejection=rejection)
     facts = {
         **line_sections(joint, number),
         "tables": tables_section(config, tables),

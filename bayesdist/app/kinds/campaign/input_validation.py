@@ -24,9 +24,7 @@ __all__ = [
     "input_warnings",
     "refuse_campaign",
     "refuse_few",
-    "refuse_unsound",
     "segment_counts",
-    "segment_text",
     "shear_warnings",
 ]
 

@@ -1,11 +1,54 @@
-"""Gauge and linear terms of a campaign, as Tables 1 to 3 of ACS ISR 2015-06."""
+"""Linear terms of a campaign, and the step between its chips, as in ACS ISR 2015-06."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from bayesdist.infer import GaussianPriors
 from bayesdist.infer.solution import ReferenceGauge, Solution, TransformedSolution
 from bayesdist.infer.transforms import LinearTerms, lines, reference_gauge, without_frames
+from bayesdist.model import DistortionModel, TimeDependence
 
-__all__ = ["FIXED", "line_sections"]
+__all__ = ["FIXED", "gap_priors", "line_sections", "with_gap"]
+
+
+CONSTANTS = (("u", 0, 0), ("v", 0, 0))
+SIGMA_HELD = 1e-6  # pixels, and pixels per year
+
+
+def with_gap(model: DistortionModel) -> DistortionModel:
+    """The model with steps of the constant terms, where it has several chips and breaks."""
+    time = model.time
+    if time is None or not time.breaks or len(model.chips) == 1:
+        return model
+    terms = (*time.terms, *(t for t in CONSTANTS if t not in time.terms))
+    return replace(model, time=replace(time, terms=terms))
+
+
+def gap_priors(
+    model: DistortionModel, asked: TimeDependence | None, pixel: float
+) -> GaussianPriors:
+    """Priors that leave of the constant terms' drift the steps of all chips but the first.
+
+    Parameters
+    ----------
+    model : DistortionModel
+        The reference chip comes first: its constant terms are where the exposures point.
+    asked : TimeDependence or None
+        The configured drift: constant terms that it names have rates as well.
+    pixel : float
+        Size of a pixel in the unit of u, v.
+    """
+    reference, named = model.chips[0].number, () if asked is None else asked.terms
+    held = {
+        p.name: (0.0, SIGMA_HELD * pixel)
+        for p in model.parameters
+        if p.kind == "tdd"
+        and (p.axis, p.i, p.j) in CONSTANTS
+        and (p.chip == reference or (".rate" in p.name and (p.axis, p.i, p.j) not in named))
+    }
+    return GaussianPriors.of(model, held)
+
 
 FIXED = ("A_1", "B_1", "A_3")  # by the gauge, on the reference chip
 

@@ -13,8 +13,7 @@ from bayesdist.app.kinds.campaign.aberration import aberration_term
 from bayesdist.app.kinds.campaign.catalogue import errors_by_star
 from bayesdist.app.kinds.campaign.inputs import Inputs
 from bayesdist.app.kinds.errors import ExposureScatter
-from bayesdist.app.kinds.matched import Matched
-from bayesdist.app.kinds.split import set_aside
+from bayesdist.app.kinds.matched import Matched, set_aside
 from bayesdist.app.kinds.star_lists import known_calibration
 from bayesdist.app.store.rundir import PAIRS, part_files
 from bayesdist.assess.terms.parameters import ScaleError
@@ -22,7 +21,7 @@ from bayesdist.data import read_matches, write_partitioned
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.overlap import OverlapTest, overlap_test
 from bayesdist.infer import Posterior
-from bayesdist.infer.catalogue.star_influence import StarErrors
+from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel, LookupTable
 

@@ -53,7 +53,6 @@ def match_lists(inputs: Inputs) -> CampaignMatched:
         cuts=lists.cuts,
         radius=block.radius,
         mirrored=parities,
-        skip=True,
     )
     _refuse_bare(found.table, config.chips(), inputs.catalog.source)
     if found.left_out:

@@ -7,7 +7,7 @@ from pathlib import Path
 from bayesdist.app.config import Config
 from bayesdist.app.config.model import TablesBlock
 from bayesdist.app.config.other_runs import TABLES, rates_file, tables_file
-from bayesdist.app.kinds.campaign.gap import with_gap
+from bayesdist.app.kinds.campaign.linear_terms import with_gap
 from bayesdist.app.kinds.fitted import read_tables
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Posterior, load_posterior
@@ -15,11 +15,7 @@ from bayesdist.infer.exposures.shared_drift import drift_priors
 from bayesdist.model import Chip, DistortionModel, LookupTable
 from bayesdist.products import read_d2im
 
-__all__ = [
-    "held_tables",
-    "rate_priors",
-    "rehearse_references",
-]
+__all__ = ["held_tables", "rate_priors", "rehearse_references"]
 
 
 def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tuple[LookupTable, ...]:

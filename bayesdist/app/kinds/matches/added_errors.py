@@ -12,12 +12,7 @@ from bayesdist.errors import DegenerateError
 from bayesdist.infer import GaussianPriors, LinearFit
 from bayesdist.infer.catalogue.added_errors import ONE, GroupedErrors, grouped_errors
 
-__all__ = [
-    "added_errors_rows",
-    "compared_errors",
-    "grouping_sentence",
-    "knows_circle",
-]
+__all__ = ["added_errors_rows", "compared_errors", "grouping_sentence", "knows_circle"]
 
 log = logging.getLogger("bayesdist")
 

@@ -1,4 +1,4 @@
-"""Matched stars: read, fitted and sampled."""
+"""Matched stars: read, fitted, also with an earlier calibration as prior, and sampled."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.app.config import Config, MatchesConfig
+from bayesdist.app.config.other_runs import POSTERIOR, calibration_file
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
-from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.app.kinds.matched import Matched
+from bayesdist.app.kinds.fit_data import FitData, StarReader
+from bayesdist.app.kinds.fitted import FIT, Fitted
+from bayesdist.app.kinds.matched import Matched, set_aside
 from bayesdist.app.kinds.matches.added_errors import compared_errors, knows_circle
-from bayesdist.app.kinds.matches.earlier import earlier_calibration
 from bayesdist.app.kinds.matches.plausibility import doubts_on_stars, refuse_empty_segments
-from bayesdist.app.kinds.matches.reading import check_chips
-from bayesdist.app.kinds.matches.sources import read_configured
-from bayesdist.app.kinds.reader import StarReader
-from bayesdist.app.kinds.split import set_aside
-from bayesdist.assess import SAMPLE
-from bayesdist.calibration.prior import CalibrationPrior
+from bayesdist.app.kinds.matches.sources import check_chips, read_configured
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.tables.diagnostics_files import load_diagnostics
+from bayesdist.assess.error_model import with_diagnosed_errors
+from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.calibration.prior import CalibrationPrior, prior_of_calibration
 from bayesdist.data import Matches
 from bayesdist.diagnose.residuals.quoted import error_scale
-from bayesdist.errors import ConfigError, DegenerateError, NotSettledError
+from bayesdist.diagnose.residuals.sample import SAMPLE
+from bayesdist.errors import ConfigError, DegenerateError, InputError, NotSettledError
 from bayesdist.infer import (
     GaussianPriors,
     LinearFit,
@@ -35,21 +36,25 @@ from bayesdist.infer import (
     build_model,
     fit_by_magnitude,
     fit_linear,
+    load_fit,
+    load_posterior,
     sample,
 )
 from bayesdist.infer.exposures.frame_choice import frames_that_help
 from bayesdist.infer.linear import Rejection
 from bayesdist.model import DistortionModel
+from bayesdist.products.registry import read_calibration
 
 __all__ = [
+    "earlier_calibration",
     "fit_stars",
     "match_stars",
     "model_of",
-    "priors_of",
     "read_stars",
     "sample_stars",
     "shards_of",
 ]
+
 
 log = logging.getLogger("bayesdist")
 
@@ -253,3 +258,52 @@ def sample_stars(
     return data.fitted.scatter.averaged(
         posterior, np.random.default_rng([config.sampler.seed, SAMPLING])
     )
+
+
+def earlier_calibration(
+    model: DistortionModel, config: Config, base: Path
+) -> CalibrationPrior | None:
+    """Prior of a model by the calibration that a configuration names; None where it names none.
+
+    Raises
+    ------
+    InputError
+        For a file that is no calibration, a run that has not converged, and as
+        `prior_of_calibration`.
+    """
+    block = config.prior_calibration
+    if block is None:
+        return None
+    path = calibration_file(base / block.source)
+    return prior_of_calibration(
+        _calibration(path, block.filter),
+        model,
+        frame=block.frame,
+        epoch=block.epoch,
+        change_pix=block.change_pix,
+    )
+
+
+def _calibration(path: Path, filter: str | None) -> Calibration:
+    """Calibration of a file, or of a run with the errors that were found in it."""
+    if path.suffix != ".nc":
+        return read_calibration(path, filter=filter)
+    if path.name == FIT:
+        return calibration_of(load_fit(path), str(path))
+    posterior: Posterior = load_posterior(path)
+    if not posterior.convergence.converged:
+        raise InputError(
+            f"the run has not converged ({'; '.join(posterior.convergence.reasons)})",
+            where=str(path.parent),
+            do="resume it with more steps before it is a prior",
+        )
+    folder = path.parent
+    if path.name == POSTERIOR and (folder / "run.json").exists():
+        run = RunDirectory(folder)
+        # errors that are lost, or were never found, would narrow the prior
+        run.require("prior_calibration", ("fit", "sample", "diagnose"))
+        fit = load_fit(folder / FIT)
+        found = load_diagnostics(run, fit, posterior)
+        hierarchy = fit if run.config.campaign is not None else None
+        posterior = with_diagnosed_errors(posterior, found, hierarchy)
+    return calibration_of(posterior, str(folder))

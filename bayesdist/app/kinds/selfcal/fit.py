@@ -1,23 +1,109 @@
-"""The solution of a self-calibration at its mode, and its posterior."""
+"""The solution of a self-calibration: its mode, its posterior, and as later stages read it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.fitted import Fitted, required
-from bayesdist.app.kinds.selfcal.gauge import gauge_summary
-from bayesdist.app.kinds.selfcal.matched import SelfcalMatched
-from bayesdist.app.kinds.selfcal.matches import magnitude_errors_of
-from bayesdist.app.kinds.selfcal.solved import arrays_of, solved_of
+from bayesdist.app.kinds.fitted import (
+    FIT_AGAIN,
+    SOLUTION,
+    Fitted,
+    SelfCalibrated,
+    load_fitted,
+    required,
+)
+from bayesdist.app.kinds.selfcal.gauge import fixed_by, gauge_summary, gauge_table, gauge_words
+from bayesdist.app.kinds.selfcal.matched import SelfcalMatched, magnitude_errors_of, matches_of
 from bayesdist.infer import GaussianPriors, Posterior
-from bayesdist.infer.selfcal import sample_selfcal
-from bayesdist.infer.selfcal.mode import solve_in_gauge
+from bayesdist.infer.sampler.checkpoints import read_arrays
+from bayesdist.infer.selfcal import SelfCalibrationMode, sample_selfcal
+from bayesdist.infer.selfcal.elimination import Mixture, expand
+from bayesdist.infer.selfcal.gauge import Decision
+from bayesdist.infer.selfcal.mode import gauge_of, solve_in_gauge
+from bayesdist.model import DistortionModel
 
-__all__ = ["fit_selfcal", "sample_detections"]
+__all__ = ["fit_selfcal", "load_selfcal", "sample_detections"]
+
+
+Float = NDArray[np.float64]
+
+ARRAYS = ("theta", "stars", "mixture", "held", "n_free", "reference")
+RELINEARISED = 3  # times a problem is linearised anew about a solution that is read
+
+
+def arrays_of(solution: SelfCalibrationMode, reference: Float) -> dict[str, NDArray[Any]]:
+    """A solution as arrays; `reference` is where what is known beside it was linearised."""
+    mixture, decision = solution.mixture, solution.decision
+    counts = (0, 0) if decision is None else (decision.n_null, decision.n_open)
+    held = np.setdiff1d(np.arange(len(solution.theta)), solution.free)
+    return {
+        "theta": solution.theta,
+        "stars": solution.stars,
+        "mixture": np.array([mixture.jitter, mixture.fraction]),
+        "held": held if decision is None else decision.held,
+        "n_free": np.array(counts),
+        "reference": reference,
+    }
+
+
+def load_selfcal(folder: Path, matched: Callable[[], SelfcalMatched]) -> Fitted:
+    """The fit of an earlier stage, with its solution.
+
+    Raises
+    ------
+    InputError
+        For missing or damaged files.
+    """
+    fitted = load_fitted(folder)
+    arrays = read_arrays(folder / SOLUTION, "", ARRAYS, do=FIT_AGAIN)
+    return replace(fitted, solved=solved_of(matched(), fitted.linear.model, arrays))
+
+
+def solved_of(
+    matched: SelfcalMatched, model: DistortionModel, arrays: Mapping[str, NDArray[Any]]
+) -> SelfCalibrated:
+    """The solution that `arrays_of` made arrays of: what the fit has is what later stages read."""
+    inputs, held = matched.inputs, arrays["held"].astype(np.int64)
+    theta, stars = arrays["theta"], arrays["stars"]
+    jitter, fraction = (float(v) for v in arrays["mixture"])
+    n_null, n_open = (int(n) for n in arrays["n_free"])
+    mixture, known = Mixture(jitter, fraction), inputs.known_for(model)
+    problem = inputs.problem(model, matched.detections, theta, matched.theta)
+    for _ in range(RELINEARISED):
+        problem = problem.at(theta, stars)
+    found = expand(problem, theta, mixture, stars)
+    solution = SelfCalibrationMode(
+        problem,
+        theta,
+        problem.found_again(theta, found.stars),
+        mixture,
+        np.setdiff1d(np.arange(model.n_params), held),
+        found,
+        known(arrays["reference"]),
+        Decision(n_null, n_open, held),
+    )
+    gauge = gauge_of(problem, theta, known(theta), solution)
+    fixed, places = fixed_by(gauge, solution, known), solution.stars
+    return SelfCalibrated(
+        solution,
+        gauge,
+        fixed,
+        gauge_words(gauge, fixed, model),
+        gauge_table(gauge, fixed, model),
+        matches_of(problem, places, matched.detections, inputs, matched.unused),
+        arrays,
+        tuple(known.contradictions(theta)),
+        inputs.catalog,
+    )
 
 
 def fit_selfcal(matched: SelfcalMatched) -> Fitted:

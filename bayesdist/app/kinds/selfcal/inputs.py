@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.config import SelfcalConfig
-from bayesdist.app.kinds.selfcal.commanded import Commanded, read_commanded
-from bayesdist.app.kinds.selfcal.known import GaugeConstraints
+from bayesdist.app.kinds.selfcal.known import Commanded, GaugeConstraints, read_commanded
 from bayesdist.app.kinds.selfcal.start import started
 from bayesdist.app.kinds.star_lists import lists_of, refuse_other_chips
 from bayesdist.calibration.plane import ARCSEC

@@ -1,26 +1,157 @@
-"""Constraints beside the detections of a self-calibration, which fix its gauge."""
+"""What is known beside the detections: commanded offsets and rolls, and what fixes the gauge."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from bayesdist.app.config import SelfcalConfig
-from bayesdist.app.kinds.selfcal.commanded import Commanded
+from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.names import find_columns
+from bayesdist.data.tables.units import conversion
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.priors import GaussianPriors, Prior
 from bayesdist.infer.selfcal.prior import frame_prior, pointing_prior, tie
 from bayesdist.infer.selfcal.sky_moves import functionals
 from bayesdist.limits import GAUGE_CONTRADICTION
 from bayesdist.model import DistortionModel
+from bayesdist.reading.tables import read_table
 
-__all__ = ["GaugeConstraints"]
+__all__ = ["Commanded", "GaugeConstraints", "read_commanded"]
+
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+_COLUMNS = {
+    "exposure": ("exposure", "name", "rootname"),
+    "du": ("du", "postarg1", "dx"),
+    "dv": ("dv", "postarg2", "dy"),
+    "sigma": ("sigma",),
+    "roll": ("roll",),
+    "group": ("group", "guide_stars"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Commanded:
+    """Where exposures were to point.
+
+    Parameters
+    ----------
+    offsets : ndarray, shape (E, 2)
+        Along u and v, NaN where there is none; None in a file of rolls alone.
+    sigma : ndarray, shape (E,)
+        Of each, on one axis.
+    roll : ndarray, shape (E,), or None
+        Radians, from u to v.
+    group : ndarray of int, shape (E,)
+        Exposures with the same guide stars.
+    """
+
+    offsets: Float | None
+    sigma: Float
+    roll: Float | None
+    group: Int
+
+
+def read_commanded(
+    path: Path, names: Sequence[str], unit: str, scale_mas: float | None, sigma: float | None
+) -> Commanded:
+    """Commanded offsets and rolls of exposures from a table.
+
+    Parameters
+    ----------
+    path : Path
+        Columns exposure, du and dv along u and v, sigma, roll in degrees from u to v, group.
+    names : sequence of str
+        Exposures, in their order.
+    unit : str
+        Of u and v, for columns without one.
+    scale_mas : float, optional
+        Size of a pixel, where units have to be converted.
+    sigma : float, optional
+        Of the offsets, where the table has no such column.
+
+    Raises
+    ------
+    InputError
+        For files that cannot be read, missing columns or values, and units that do not go together.
+    """
+    table = read_table(path)
+    found = find_columns(table.colnames, None, _COLUMNS, source=str(path))
+    if "exposure" not in found or ("du" in found) != ("dv" in found):
+        raise InputError(
+            f"no columns exposure, du and dv among {', '.join(table.colnames) or 'none'}",
+            where=str(path),
+            do="name the exposures and their offsets along u and v",
+        )
+
+    def column(key: str) -> SourceColumn:
+        return SourceColumn(table[found[key]], str(path), found[key])
+
+    def length(key: str) -> Float:
+        own = column(key).unit
+        return column(key).numbers() * (1.0 if own is None else _factor(own, unit, scale_mas, path))
+
+    codes, labels = column("exposure").labels()
+    row_of = {labels[code]: k for k, code in enumerate(codes)}
+    if len(row_of) < len(codes):
+        twice = labels[int(np.argmax(np.bincount(codes)))]
+        raise InputError(
+            f"exposure {twice} stands there twice", where=str(path), do="keep one row of each"
+        )
+    rows = np.array([row_of.get(name, -1) for name in names])
+    if (rows < 0).all():
+        raise InputError(
+            f"has none of the exposures {', '.join(names[:3])}, ...",
+            where=str(path),
+            do="name them as the lists do",
+        )
+
+    def of_each(values: Float, missing: float = np.nan) -> Float:
+        return np.where(rows >= 0, values[rows], missing)
+
+    offsets, error = None, np.full(len(names), np.nan if sigma is None else sigma)
+    if "du" in found:
+        offsets = np.stack([of_each(length("du")), of_each(length("dv"))], axis=1)
+        if "sigma" in found and sigma is None:
+            error = of_each(length("sigma"), 1.0)
+        if not (error > 0).all():
+            raise InputError(
+                "the offsets have no errors",
+                where=str(path),
+                do="give a column sigma above zero, or gauge.offset_sigma",
+            )
+    group = np.zeros(len(names), np.int64)
+    if "group" in found:
+        group = np.where(rows >= 0, column("group").labels()[0][rows], -1)
+    roll = np.radians(of_each(column("roll").numbers())) if "roll" in found else None
+    return Commanded(offsets, error, roll, group)
+
+
+def _factor(own: str, unit: str, scale_mas: float | None, path: Path) -> float:
+    """Factor from a unit `own` to `unit`, pixels among them."""
+    if own == unit:
+        return 1.0
+    if "pix" not in (own, unit):
+        return conversion(own, unit, where=str(path))
+    if scale_mas is None:
+        raise InputError(
+            f"offsets are in {own}, and u and v in {unit}",
+            where=str(path),
+            do="give detector.scale_mas, by which one is the other",
+        )
+    if own == "pix":
+        return conversion("mas", unit, where=str(path)) * scale_mas
+    return conversion(own, "mas", where=str(path)) / scale_mas
+
+
 Piece = Callable[[Float], Prior]
 
 

@@ -3,32 +3,29 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
+from bayesdist.app.kinds.selfcal.gauge import CONVENTION, fixed_by
 from bayesdist.app.kinds.selfcal.inputs import Inputs
 from bayesdist.app.kinds.selfcal.matched import SelfcalMatched, selfcal_matched
+from bayesdist.app.screen import number
 from bayesdist.data.detections import NO_STAR, Detections
 from bayesdist.data.matching.pairs import hull_of, inside_hull
 from bayesdist.errors import DegenerateError, InputError, NotSettledError
 from bayesdist.infer.selfcal import SelfCalibration
 from bayesdist.infer.selfcal.calibrate import self_calibrate
 from bayesdist.infer.selfcal.elimination import memberships
+from bayesdist.infer.selfcal.gauge import NamedDirection
 from bayesdist.infer.selfcal.tangent import places_of
 from bayesdist.model import DistortionModel
 
-__all__ = [
-    "calibrated",
-    "exposure_table",
-    "match_dithers",
-    "matching_facts",
-    "refuse_unconnected",
-    "rolled_180",
-]
+__all__ = ["match_dithers", "refuse_unconnected", "selfcal_lines"]
+
 
 log = logging.getLogger("bayesdist")
 
@@ -269,3 +266,48 @@ def _corners(
     x, y = (0.5 + n * np.array(c) for n, c in zip(size, ([0, 1, 1, 0], [0, 0, 1, 1]), strict=True))
     when = None if model.time is None else np.full(4, model.time.epoch0[0])
     return model.predict(theta, x, y, exposure=np.full(4, exposure), chip=chip, epoch=when)
+
+
+def selfcal_lines(inputs: Inputs) -> Iterator[str]:
+    """Stars and free directions of a self-calibration, as lines of text: nothing is sampled."""
+    found = calibrated(inputs, lambda text: None)
+    s, gauge, model = found.mode, found.gauge, found.mode.problem.model
+    refuse_unconnected(exposure_table(found, inputs))
+    summary = matching_facts(found, inputs)
+    fixed = fixed_by(gauge, s, inputs.known_for(model))
+    d = summary["detections"]
+    cut = "".join(f", {count} {reason}" for reason, count in d["cut"].items())
+    yield f"exposures    {summary['n_exposures']}"
+    yield f"detections   {d['read']} read{cut}"
+    for reason, count in d["unused"].items():
+        yield f"             {count} {reason}"
+    yield (
+        f"stars        {summary['n_stars']} of {d['used']} detections, "
+        f"{number(summary['per_star']['median'])} at the median; "
+        f"{summary['n_ambiguous']} ambiguous groups"
+    )
+    if inputs.tangent_plane is None:
+        yield "sky          taken as flat: detector.scale_mas, the size of a pixel, is not given"
+    else:
+        moved = summary["tangent_planes_pix"]
+        yield f"sky          tangent planes taken to one: detections move by up to {moved:.2g} pix"
+    error = float(np.sqrt(np.median(s.problem.var) + s.mixture.jitter**2))
+    yield f"errors       {number(error)} pix at the median, {number(s.mixture.fraction)} false"
+    yield f"model        order {model.order}, frames '{model.frames}', {model.n_params} parameters"
+    n, held = gauge.null.shape[1], gauge.open.shape[1]
+    yield f"null space   {n} directions are free, {held} of them held by convention"
+    for one in gauge.directions:
+        if one.free or one.weak:
+            yield f"             {_state_words(one, fixed[one.name])}"
+    for sigma, k in gauge.weakest:
+        yield f"nearly free  {number(sigma)} pix at the edge, led by {model.names[int(k)]}"
+    for text in (*gauge.sentences, *summary["warnings"]):
+        yield f"WARNING      {text[0].upper() + text[1:]}"
+
+
+def _state_words(one: NamedDirection, by: str) -> str:
+    """Error of a direction by the detections, what fixes it, and its error then."""
+    known = "" if one.free else f", {number(one.sigma)} {one.unit} from detections".rstrip()
+    how = "held by convention" if by == CONVENTION else f"fixed by {by}"
+    size = "" if by == CONVENTION else f", sigma {number(one.sigma_fixed)} {one.unit}".rstrip()
+    return f"{one.name}{known}: {how}{size}"

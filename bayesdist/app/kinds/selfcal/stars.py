@@ -12,14 +12,14 @@ from astropy.table import Column, Table
 from astropy.units import Unit
 from numpy.typing import NDArray
 
-from bayesdist.app.kinds.solved import SelfCalibrated
+from bayesdist.app.kinds.fitted import SelfCalibrated
 from bayesdist.app.store.output import write_table
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.storage.write import write_columns
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.infer.selfcal import SelfCalibrationMode, StarCatalogue, star_catalogue
 
-__all__ = ["FLAGS", "star_table", "write_stars"]
+__all__ = ["star_table", "write_stars"]
 
 NAMES = ("u", "v", "pm_u", "pm_v", "parallax")
 FEW, DOUBTFUL, REFERENCE = 1, 2, 4

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.config import SelfcalConfig
-from bayesdist.app.config.detector import one_chip
-from bayesdist.app.kinds.selfcal.commanded import Commanded
+from bayesdist.app.config.section import one_chip
+from bayesdist.app.kinds.selfcal.known import Commanded
 from bayesdist.app.kinds.star_lists import positions_by_chip, start_of
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.detections import Detections

@@ -20,7 +20,7 @@ from bayesdist.missions.acs.handbook.published import acs_detector, handbook_row
 from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 
 if TYPE_CHECKING:
-    from bayesdist.assess import BinnedResiduals
+    from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
 __all__ = ["handbook"]
 

@@ -22,7 +22,7 @@ from bayesdist.report.panels import OneArray
 from bayesdist.report.style import PALETTE, nice_below
 
 if TYPE_CHECKING:
-    from bayesdist.assess import BinnedResiduals
+    from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
 __all__ = [
     "area_figure",

@@ -8,8 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from bayesdist.app.kinds.matches.reading import is_large
-from bayesdist.app.kinds.matches.sources import MatchSource
+from bayesdist.app.kinds.matches.sources import MatchSource, is_large
 from bayesdist.app.store.rundir import PAIRS, RunDirectory, part_files
 from bayesdist.data import Matches, open_matches, write_partitioned
 from bayesdist.errors import InputError

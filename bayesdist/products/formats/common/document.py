@@ -26,6 +26,7 @@ __all__ = [
     "LEVELS",
     "PARAMETERS",
     "BuildOptions",
+    "Builder",
     "Built",
     "Choice",
     "Document",
@@ -141,6 +142,9 @@ class Built:
     warnings: tuple[str, ...] = ()  # on what programs will make of it, for the terminal
 
 
+Builder = Callable[[Calibration, Any, BuildOptions], tuple[Built, ...]]
+
+
 @dataclass(frozen=True)
 class Format:
     """Format of files, as its functions.
@@ -183,7 +187,7 @@ class Format:
     lint: Callable[[Any], Sequence[Finding]] | None = None
     calibration: Callable[[Any, str, Choice], Calibration] | None = None
     settings: type[FormatSettings] | None = None
-    build: Callable[[Calibration, Any, BuildOptions], tuple[Built, ...]] | None = None
+    build: Builder | None = None
     read_back: Callable[[Sequence[Built], Calibration, BuildOptions], Sequence[ReadBack]] | None = (
         None
     )

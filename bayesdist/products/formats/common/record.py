@@ -136,7 +136,7 @@ def at_date(
         further=scaled(calibration.further, factor),
     )
     model = replace(made.model, chips=(known,))
-    solution = replace(made.solution, model=model)  # type: ignore[type-var]
+    solution = GaussianSolution(model, made.solution.mean, made.solution.cov)
     return replace(made, solution=solution)
 
 

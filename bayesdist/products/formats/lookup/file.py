@@ -113,9 +113,9 @@ class LookupFile:
         FormatError when one is missing or repeated, or when the two have no common grid.
         """
         x, y = (self._one(chip, axis) for axis in AXES)
-        if x.nodes.shape != y.nodes.shape or x.first != y.first or x.step != y.step:
+        if x.grid != y.grid:
             raise FormatError(
-                "DX and DY differ in shape or registration",
+                f"DX and DY differ in shape or registration: DX has {x.grid}, DY {y.grid}",
                 where=f"{self.name}, chip {chip}",
                 do="give both on the same grid",
             )

@@ -7,6 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
+from bayesdist.errors import FormatError
 from bayesdist.products.formats.common.document import Finding, missing_identity
 from bayesdist.products.formats.lookup.file import AXES, LookupFile
 from bayesdist.products.formats.lookup.plane import Plane
@@ -118,6 +119,11 @@ def _chips(file: LookupFile) -> Iterator[Finding]:
                     f"{names.count(axis)} extensions {axis}: stwcs takes the values of the last "
                     "and the registration of the first",
                 )
+        if sorted(names) == sorted(AXES):
+            try:
+                file.pair(chip)
+            except FormatError as error:
+                yield Finding("error", f"chip {chip}", error.cause)
 
 
 def _absent(file: LookupFile, chip: int, axes: str) -> Finding:

@@ -80,3 +80,9 @@ class Plane:
     def step(self) -> tuple[float, float]:
         """Pixels between nodes along x and y."""
         return float(self.number("CDELT1", 1.0)), float(self.number("CDELT2", 1.0))
+
+    @property
+    def grid(self) -> str:
+        """Grid of the nodes, in words."""
+        (ny, nx), (x, y), (dx, dy) = self.nodes.shape, self.first, self.step
+        return f"{nx} x {ny} nodes from pixel ({x:.10g}, {y:.10g}), {dx:.10g} x {dy:.10g} apart"

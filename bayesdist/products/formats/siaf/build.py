@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap, Monomials
 from bayesdist.calibration.inverse import fit_inverse
+from bayesdist.errors import required
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.formats.common.coefficients import require_regular
 from bayesdist.products.formats.common.content import Content
@@ -82,8 +83,8 @@ def siaf_files(
         *(f"{k} = {v!r}" for k, v in zip(KEYWORDS, (*size, *reference), strict=True)),
     ]
     lines = _lines(aperture, rows_order, columns)
-    closure = table_of(Content("new table", _joined(head, lines))).closure()
-    assert closure is not None
+    made = table_of(Content("new table", _joined(head, lines)))
+    closure = required(made.closure(), "a new table states no size")
     head.append(f"Idl2Sci of Sci2Idl misses a pixel by {closure:.2g} pixels at worst.")
     raw = _joined(head, lines)
     record = record_of(one, calibration, epoch=date, closure=closure)

@@ -23,7 +23,7 @@ from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import fitted_map
 from bayesdist.calibration.inverse import ExplicitInverse, detector_grid
 from bayesdist.calibration.plane import Plane
-from bayesdist.errors import FormatError, InputError
+from bayesdist.errors import FormatError, InputError, required
 from bayesdist.products.formats.common.coefficients import Coefficients, evaluate
 from bayesdist.products.formats.common.content import Content, read_content
 from bayesdist.products.formats.common.document import Choice, MissingSizeError
@@ -272,8 +272,7 @@ def departure(table: SiafTable, calibration: Calibration) -> float:
 
 def siaf_read_back(table: SiafTable) -> ReadBack:
     """Ideal coordinates by a table that states its size, and where Sci2Idl and Idl2Sci lead."""
-    size = table.size
-    assert size is not None
+    size = required(table.size, "a new table states no size")
     x0, y0 = table.reference_pixel(size)
 
     def forward(x: Float, y: Float, _: int, __: float | None) -> Float:

@@ -24,7 +24,7 @@ from bayesdist.report.style import OUTLINE, PALETTE, WIDTH, new_figure, nice_bel
 from bayesdist.report.texttable import TextTable, listing
 
 if TYPE_CHECKING:
-    from bayesdist.assess import BinnedResiduals
+    from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
 __all__ = [
     "binned_of",

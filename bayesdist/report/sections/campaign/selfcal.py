@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
-from bayesdist.assess.circular import per_axis
+from bayesdist.assess.maps import per_axis
 from bayesdist.numbers import MISSING, count, display_scale, number, percent, with_mas
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, SelfcalResults, needed

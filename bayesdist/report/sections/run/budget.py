@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.patches import Patch
 
-from bayesdist.assess.circular import circular_error, per_axis
+from bayesdist.assess.maps import circular_error, per_axis
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.numbers import (
     MISSING,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess import residual_statistics
+from bayesdist.diagnose.residuals.binned import residual_statistics
 from bayesdist.diagnose.score.result import POWER
 from bayesdist.infer.skew import skew_of
 from bayesdist.limits import SCORE_TESTS

@@ -28,7 +28,7 @@ from bayesdist.report.registry import Plot
 from bayesdist.report.style import PALETTE, WIDTH, legend_above, new_figure, nice_below
 
 if TYPE_CHECKING:
-    from bayesdist.assess import BinnedResiduals
+    from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
 __all__ = [
     "MixtureCurve",

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.assess.circular import per_axis
+from bayesdist.assess.maps import per_axis
 from bayesdist.checks import LEVELS, Check, warnings_of, worst
 from bayesdist.numbers import counted, rounded, with_mas
 from bayesdist.report.contents import REPORT

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.inverse import detector_grid, fitted_inverse
 from bayesdist.calibration.plane import Plane
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 from bayesdist.products.formats.common.asdf.distortion import closure_of
 from bayesdist.products.formats.common.asdf.settings import PlacedSettings
 from bayesdist.products.formats.common.asdf.transforms import (
@@ -55,9 +55,8 @@ def chip_transforms(
     `fitted_inverse`.
     """
     plane = _placed(calibration.plane, settings, where)
-    matrix, v2v3 = plane.to_v2v3, plane.v2v3
-    assert matrix is not None
-    assert v2v3 is not None
+    matrix = required(plane.to_v2v3, "the plane of an aperture has no axes along V2 and V3")
+    v2v3 = required(plane.v2v3, "the plane of an aperture has no position in V2 and V3")
     for known in calibration.model.chips:
         number = known.number
         one = at_date(calibration, number, options.epoch, options.scale_arcsec, where=where)

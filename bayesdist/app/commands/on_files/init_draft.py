@@ -1,0 +1,151 @@
+"""`bayesdist init` of a table in which columns are lacking: a draft with the candidates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from bayesdist.app.commands.on_files.init_detector import detector_lines, quoted
+from bayesdist.app.config import parse_config
+from bayesdist.data import read_star_lists
+from bayesdist.data.formats.files import input_files, kind_of
+from bayesdist.data.formats.hst1pass import read_hst1pass
+from bayesdist.data.formats.layout import TableLayout, table_layout
+
+__all__ = ["draft_of"]
+
+MAX_CANDIDATES = 40  # columns that are listed
+
+_HEAD = """\
+# A DRAFT: no columns of {file} are known as {lacking}.
+"""
+
+_CANDIDATES = """\
+# If they are there under other names, name them, and write this file anew:
+#     bayesdist init {path} --matches {matches} --columns {wanted} --force
+# Columns of numbers that are not taken: {candidates}
+"""
+
+_WITHOUT_PIXELS = """
+[data]
+matches = {relative}
+# columns = {{{wanted}}}
+
+[detector]
+# size = [2048, 2048]           # columns, rows
+
+[model]
+order = 4                       # 1 to 12
+"""
+
+_STAR_LIST = """
+# A star list without reference positions belongs to a [selfcal] or a [campaign].
+# 1. Dithered exposures of one field calibrate themselves; see 'bayesdist docs self_calibration':
+[selfcal]
+lists = {relative}
+# lists = "lists/*"             # a pattern, or a list of names: all exposures of the field
+{columns}match_radius = 0.5              # pixels between detections of one star in the end
+# start_radius = 2.0            # and at the beginning, before the distortion is known
+# initial_distortion = ""       # a finished run, or an IDCTAB: for a distortion of some ten pixels
+
+# [gauge]                       # fixes scale, orientation and skew
+# offsets = ""                  # a table of commanded offsets: exposure, du, dv, sigma
+
+{detector}
+[model]
+order = 3                       # 1 to 12
+
+# 2. Matched with a catalogue; see 'bayesdist docs campaign'.  In place of [selfcal], and with
+#    [[chip]] blocks in place of [detector]:
+# [campaign]
+# lists = {relative}
+# catalog = ""                  # FILL IN: a table with ra, dec (Gaia's, say) or u, v
+# exposures = ""                # FILL IN: a table with exposure, epoch, filter, vafactor
+# initial_distortion = ""       # FILL IN: an IDCTAB near enough to find the stars by
+
+# 3. Matched by another program, as TOPCAT or astropy's match_to_catalog_sky, the table has ra, dec
+#    of the catalogue beside each detection: 'bayesdist init' makes a configuration of it.
+"""
+
+_PAIRS = {"xy": "pixels (x, y)", "uv": "reference positions (ra, dec or u, v)"}
+_LIST_KEYS = ("x", "y", "mag", "exposure")
+
+
+def draft_of(
+    path: Path,
+    matches: str | Path,
+    relative: str,
+    columns: Mapping[str, str] | None,
+    size: tuple[int, int] | None,
+) -> tuple[str, str] | None:
+    """Text of a draft and what it is, for a table in which columns are lacking; None for others.
+
+    With pixels alone it is a self-calibration, and all else is commented; without pixels nothing
+    can be run.  `path` is to be written, `relative` is what it calls the table.
+    """
+    layout = table_layout(matches, columns)
+    lacking = _lacking(matches, columns) if layout is None else layout.lacking
+    if not lacking:
+        return None
+    words = " and ".join(what for pair, what in _PAIRS.items() if set(pair) & set(lacking))
+    head = _HEAD.format(file=Path(matches).name, lacking=words)
+    if layout is not None:
+        head += _candidates(path, matches, layout)
+    if set("xy") & set(lacking):
+        wanted = ", ".join(f'{key} = ""' for key in lacking)
+        text = head + _WITHOUT_PIXELS.format(relative=relative, wanted=wanted)
+        return text, f"an incomplete draft with the candidates: no columns are known as {words}"
+    text = head + _of_star_list(matches, relative, _named(layout, columns), size)
+    parse_config(text, str(path))
+    return text, (
+        "an incomplete draft: no columns are known as reference positions; as it stands it is a "
+        "[selfcal] of star lists, with a [campaign] and the candidates as comments"
+    )
+
+
+def _lacking(matches: str | Path, columns: Mapping[str, str] | None) -> list[str]:
+    """Reference positions that a list of hst1pass lacks; nothing of other formats."""
+    file = input_files(matches)[0]
+    if kind_of(file, columns) != "hst1pass":
+        return []
+    return [key for key in ("u", "v") if key not in read_hst1pass(file).columns]
+
+
+def _candidates(path: Path, matches: str | Path, layout: TableLayout) -> str:
+    """Lines on the columns that may be those which are lacking."""
+    spans = list(layout.spans.items())
+    listed = [f"{name} ({low:g} to {high:g})" for name, (low, high) in spans[:MAX_CANDIDATES]]
+    if len(spans) > MAX_CANDIDATES:
+        listed.append(f"and {len(spans) - MAX_CANDIDATES} more")
+    keys = ["ra", "dec"] if layout.lacking == ["u", "v"] else layout.lacking
+    return _CANDIDATES.format(
+        path=path,
+        matches=matches,
+        wanted=",".join(f"{key}=NAME" for key in keys),
+        candidates=", ".join(listed) or "none",
+    )
+
+
+def _named(layout: TableLayout | None, columns: Mapping[str, str] | None) -> dict[str, str]:
+    """Columns of a star list: those of the layout, and those that the user names."""
+    taken = {} if layout is None else layout.taken
+    return {key: taken[key] for key in _LIST_KEYS if key in taken} | dict(columns or {})
+
+
+def _of_star_list(
+    matches: str | Path, relative: str, columns: dict[str, str], size: tuple[int, int] | None
+) -> str:
+    """Text of a self-calibration, with the size of the chips by the detections."""
+    reach: dict[int, tuple[float, float]] = {}
+    for one in read_star_lists(matches, columns or None):
+        for number in one.chips:
+            x, y = reach.get(number, (0.0, 0.0))
+            rows = one.chip == number
+            reach[number] = (max(x, float(one.x[rows].max())), max(y, float(one.y[rows].max())))
+    detector = detector_lines(dict(sorted(reach.items())), {}, size, Path(matches).stem)
+    inline = ", ".join(f"{key} = {quoted(name)}" for key, name in columns.items())
+    return _STAR_LIST.format(
+        relative=relative,
+        columns=f"columns = {{{inline}}}\n" if columns else "",
+        detector=detector.text,
+    )
