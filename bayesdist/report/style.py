@@ -152,8 +152,8 @@ def new_figure(
     layout: Literal["constrained", "compressed", "none"] = "constrained",
 ) -> Figure:
     """Empty figure (inches) that belongs to no window and to no pyplot state."""
-    engine = None if layout == "none" else _Layout(compress=layout == "compressed")
-    fig = Figure(figsize=(width, height), layout=engine or "none")
+    fig = Figure(figsize=(width, height))
+    fig.set_layout_engine("none" if layout == "none" else _Layout(compress=layout == "compressed"))
     FigureCanvasAgg(fig)
     return fig
 
