@@ -431,6 +431,10 @@ def test_without_asdf_there_is_a_sentence(plain, monkeypatch):
     [
         ({"detector": "NRCA1"}, "the detector is 'NRCA1', none of NIRISS; choose one of NIS"),
         ({"instrument": "MIRI", "detector": "MIRIFULONG"}, "none of MIRI"),
+        (
+            {"instrument": "MIRI", "detector": "MIRIMAGE"},
+            "the chip has 2048 x 2048 pixels, and MIRIMAGE 1032 x 1024; name the detector",
+        ),
     ],
 )
 def test_detectors_are_those_of_the_instrument(plain, change, message):

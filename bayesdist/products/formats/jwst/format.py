@@ -68,9 +68,12 @@ def _lint_meta(meta: Mapping[str, Any]) -> Sequence[Finding]:
 
 
 def _tree(one: ChipTransform, detector: str, settings: Settings, _: str) -> dict[str, Any]:
+    from bayesdist.products.formats.common.asdf.build import refuse_larger
+    from bayesdist.products.formats.jwst.instruments import detector_of
     from bayesdist.products.formats.jwst.meta import meta_of
 
     meta = meta_of(detector, settings.model_dump(), "products.jwst")
+    refuse_larger(one, detector, detector_of(settings.instrument, detector), "products.jwst")
     return {"meta": meta, "model": one.model, "bayesdist": one.record}
 
 

@@ -64,9 +64,11 @@ def _lint_meta(meta: Mapping[str, Any]) -> Sequence[Finding]:
 
 
 def _tree(one: ChipTransform, detector: str, settings: Settings, file: str) -> dict[str, Any]:
-    from bayesdist.products.formats.roman.meta import TAG, meta_of
+    from bayesdist.products.formats.common.asdf.build import refuse_larger
+    from bayesdist.products.formats.roman.meta import TAG, detector_of, meta_of
 
     meta = meta_of(detector, settings.model_dump(), "products.roman")
+    refuse_larger(one, detector, detector_of(detector), "products.roman")
     return {"roman": tagged({"meta": meta, KEY: one.model, "bayesdist": one.record}, TAG, file)}
 
 
