@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.files import atomic_path
-from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure
+from bayesdist.report.figures.style import PALETTE, WIDTH, figure_style, new_figure
 from tests.benchmarks.scamp import summarised
 
 __all__ = ["HISTORY", "ratios_of", "read_history", "regressions", "with_run", "write_history"]
