@@ -20,6 +20,7 @@ from tests.adversarial import KINDS
 from tests.adversarial.campaign_measure import actual_error, assessed, stated_sigma
 from tests.adversarial.campaign_truth import CampaignTruth
 from tests.app.support import summary_of
+from tests.reduced import only_in_full
 
 pytestmark = pytest.mark.slow
 
@@ -83,6 +84,7 @@ def test_draws_are_spread_by_what_the_pattern_does_to_the_fit(patterned):
     assert np.isfinite(table["sd"]).all()
 
 
+@only_in_full("a pattern is measured, and covered")
 def test_where_nothing_is_left_out_errors_are_hardly_wider(plain):
     budget = rows(plain)
     beside = [budget[name]["radial"] for name in (STRUCTURE, STRUCTURE_IN_FIT, DEVIATIONS)]
@@ -91,6 +93,7 @@ def test_where_nothing_is_left_out_errors_are_hardly_wider(plain):
     assert budget["total"]["radial"] < 1.2 * without
 
 
+@only_in_full("a pattern is measured, and covered")
 def test_at_the_mode_the_priors_pull_as_hard_as_the_stars(plain):
     """Or the structure would be that of deviations which their priors have shrunk."""
     results = plain.results

@@ -13,6 +13,7 @@ from bayesdist.diagnose.selfcal.misfit import dithered_misfit
 from bayesdist.diagnose.selfcal.score import selfcal_score_tests
 from bayesdist.infer.selfcal import self_calibrate
 from tests.infer.selfcal.fields import field
+from tests.reduced import only_in_full
 
 pytestmark = pytest.mark.slow
 
@@ -36,6 +37,7 @@ def found(full) -> list[np.ndarray]:
     return groups if full else [np.concatenate(groups)]
 
 
+@only_in_full("test_selfcal_cover has p-values of noise")
 def test_noise_is_no_structure(found):
     """Three tests share the p-value: Bonferroni is a little too careful."""
     for p in (group[:, 0] for group in found):
@@ -44,6 +46,7 @@ def test_noise_is_no_structure(found):
         assert (p < 0.5).sum() >= max(binom.ppf(0.001, len(p), 0.3), 1)
 
 
+@only_in_full("test_selfcal_cover has p-values of noise")
 def test_noise_does_not_go_with_where_exposures_point(found):
     """On a sky that is flat."""
     for p in (group[:, 1] for group in found):

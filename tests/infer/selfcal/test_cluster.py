@@ -24,6 +24,7 @@ from bayesdist.infer.selfcal.problem import StarPriors
 from bayesdist.infer.stars.shards import Pieces
 from tests.infer.selfcal import fields
 from tests.infer.workers import local_workers
+from tests.reduced import only_in_full
 
 PIECE = 200  # detections: some ten pieces on three workers
 
@@ -139,6 +140,8 @@ def test_density_and_slope_are_those_of_the_whole(solution, compute):
     assert np.abs(modes.moved(solution.problem, theta[0]) - again.stars).max() < 0.01
 
 
+@pytest.mark.slow
+@only_in_full("tests/app/selfcal/test_on_a_cluster compares")
 def test_posterior_is_that_of_one_process(solution, compute):
     expected = sample_selfcal(solution, seed=5, target_ess=100)
     assert_same_draws(sample_selfcal(solution, seed=5, target_ess=100, compute=compute), expected)
@@ -164,6 +167,8 @@ class Interrupted(Pieces):
         self.pieces.close()
 
 
+@pytest.mark.slow
+@only_in_full("tests/infer/stars kills one of them")
 def test_one_of_three_workers_is_killed_while_sampling(solution, compute, monkeypatch):
     struck = []
 
@@ -185,6 +190,8 @@ def test_one_of_three_workers_is_killed_while_sampling(solution, compute, monkey
     assert struck[0].passes > 12 and struck[0].victims
 
 
+@pytest.mark.slow
+@only_in_full("tests/infer/stars kills one")
 def test_worker_dies_of_a_task_and_its_pieces_are_made_again(solution, compute, tmp_path):
     with in_pieces(solution, compute) as there:
         before = there.sum(content)

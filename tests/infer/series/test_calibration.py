@@ -8,6 +8,7 @@ from scipy.stats import binom, chi2
 
 from bayesdist.infer.series import fit_series
 from tests.infer.calibration import over_seeds
+from tests.reduced import only_in_full
 
 from .campaign import ALPHA, BETA, FORMAL, LINES, SCATTER, SIGMA_ALPHA, SIGMA_BETA, campaign
 from .straight import straight_lines
@@ -44,11 +45,12 @@ def one(seed: int) -> dict[str, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def runs(full) -> list[dict[str, np.ndarray]]:
-    return over_seeds(one, 120 if full else 12)
+def runs() -> list[dict[str, np.ndarray]]:
+    return over_seeds(one, 120)
 
 
-def test_pulls_and_coverage(runs, full, capsys):
+@only_in_full("tests/campaign has pulls of lines by two steps")
+def test_pulls_and_coverage(runs, capsys):
     assert np.mean([r["converged"] for r in runs]) >= 0.95
     n = len(runs)
     with capsys.disabled():
@@ -65,8 +67,7 @@ def test_pulls_and_coverage(runs, full, capsys):
         # as below, campaigns x segments are independent
         low, high = np.sqrt(chi2.ppf([0.001, 0.999], 2 * n) / (2 * n))
         assert low < np.sqrt((pulls**2).mean()) < high
-        if full:
-            assert 0.8 < np.sqrt((pulls**2).mean()) < 1.2
+        assert 0.8 < np.sqrt((pulls**2).mean()) < 1.2
         for level in (0.683, 0.954):
             covered = np.array([r[f"covered {name} {level}"] for r in runs])
             # the three coefficients of a campaign share their exposures: count campaigns x segments
@@ -76,6 +77,7 @@ def test_pulls_and_coverage(runs, full, capsys):
     assert ratio == pytest.approx(1, abs=0.06)
 
 
+@only_in_full("test_real_series holds out exposures")
 def test_new_exposures_fall_where_they_are_expected(runs):
     n = len(runs) * 100  # some hundred good exposures each; the coefficients are correlated
     for key, level in (("new 1", 0.683), ("new 2", 0.954)):
@@ -85,6 +87,7 @@ def test_new_exposures_fall_where_they_are_expected(runs):
         assert abs(mean - level) < 4 * error
 
 
+@only_in_full("test_real_series shows it")
 def test_formal_errors_alone_are_far_too_small(runs):
     """Why the scatter is a parameter."""
     formal = np.array([r["formal pull"] for r in runs])
@@ -93,6 +96,7 @@ def test_formal_errors_alone_are_far_too_small(runs):
     assert np.sqrt((ours**2).mean()) < 1.2
 
 
+@only_in_full("test_closed_forms has least squares")
 def test_two_steps_and_one_agree_where_nothing_lies_off(runs):
     """Least squares that is told which exposures lie off: the same lines, the same errors."""
     ratio = np.array([r["clean ratio"] for r in runs])

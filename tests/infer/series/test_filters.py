@@ -7,12 +7,15 @@ import pytest
 
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.series import TrendModel, filter_dependence, fit_series
+from tests.reduced import only_in_full
 
 from .campaign import LINES, campaign
 
 FILTERS = {"F606W": 70, "F814W": 25, "F435W": 20}
 
 
+@pytest.mark.slow
+@only_in_full("tests/app/test_filters has one")
 def test_a_common_drift():
     truth = campaign(11, filters=FILTERS)
     answer = filter_dependence(truth.series, LINES)
