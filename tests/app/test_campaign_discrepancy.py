@@ -22,7 +22,7 @@ from tests.adversarial.campaign_truth import CampaignTruth
 from tests.app.support import summary_of
 from tests.reduced import only_in_full
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, only_in_full("tests/diagnose/correlated has patterns")]
 
 SIZE = 0.01  # px: of the pattern, either way along x
 
@@ -84,7 +84,6 @@ def test_draws_are_spread_by_what_the_pattern_does_to_the_fit(patterned):
     assert np.isfinite(table["sd"]).all()
 
 
-@only_in_full("a pattern is measured, and covered")
 def test_where_nothing_is_left_out_errors_are_hardly_wider(plain):
     budget = rows(plain)
     beside = [budget[name]["radial"] for name in (STRUCTURE, STRUCTURE_IN_FIT, DEVIATIONS)]
@@ -93,7 +92,6 @@ def test_where_nothing_is_left_out_errors_are_hardly_wider(plain):
     assert budget["total"]["radial"] < 1.2 * without
 
 
-@only_in_full("a pattern is measured, and covered")
 def test_at_the_mode_the_priors_pull_as_hard_as_the_stars(plain):
     """Or the structure would be that of deviations which their priors have shrunk."""
     results = plain.results

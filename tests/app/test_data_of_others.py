@@ -80,11 +80,10 @@ CASES = {
     ),
 }  # fmt: skip
 RUN = (
-    "chips_by_name.fits",
     "errors_too_small.ecsv",
     *(
-        case_in_full(name, instead="two tables are run, and all are begun")
-        for name in ("nan.fits", "no_errors.ecsv")
+        case_in_full(name, instead="one table is run, and all are begun")
+        for name in ("chips_by_name.fits", "nan.fits", "no_errors.ecsv")
     ),
 )
 

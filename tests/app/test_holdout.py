@@ -122,6 +122,8 @@ def test_too_small_errors_leave_requirements_undecided(tmp_path):
     assert "times as large as predicted" in html[: html.index("Held-out truth")]
 
 
+@pytest.mark.slow
+@only_in_full("test_campaign_holdout holds out whole exposures")
 def test_whole_exposures_are_drawn_and_predicted(tmp_path):
     names = tuple(f"e{k}" for k in range(8))
     model = model_of(frames="shift_rotation", exposures=names)

@@ -15,7 +15,7 @@ from bayesdist.infer.selfcal import self_calibrate
 from tests.infer.selfcal.fields import field
 from tests.reduced import only_in_full
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, only_in_full("test_selfcal_cover has p-values of noise")]
 
 FIELDS = {"rolls": {}, "one roll": {"rolls": (0, 0, 0)}, "two chips": {"n_chips": 2}}
 
@@ -37,7 +37,6 @@ def found(full) -> list[np.ndarray]:
     return groups if full else [np.concatenate(groups)]
 
 
-@only_in_full("test_selfcal_cover has p-values of noise")
 def test_noise_is_no_structure(found):
     """Three tests share the p-value: Bonferroni is a little too careful."""
     for p in (group[:, 0] for group in found):
@@ -46,7 +45,6 @@ def test_noise_is_no_structure(found):
         assert (p < 0.5).sum() >= max(binom.ppf(0.001, len(p), 0.3), 1)
 
 
-@only_in_full("test_selfcal_cover has p-values of noise")
 def test_noise_does_not_go_with_where_exposures_point(found):
     """On a sky that is flat."""
     for p in (group[:, 1] for group in found):

@@ -140,8 +140,6 @@ def test_density_and_slope_are_those_of_the_whole(solution, compute):
     assert np.abs(modes.moved(solution.problem, theta[0]) - again.stars).max() < 0.01
 
 
-@pytest.mark.slow
-@only_in_full("tests/app/selfcal/test_on_a_cluster compares")
 def test_posterior_is_that_of_one_process(solution, compute):
     expected = sample_selfcal(solution, seed=5, target_ess=100)
     assert_same_draws(sample_selfcal(solution, seed=5, target_ess=100, compute=compute), expected)

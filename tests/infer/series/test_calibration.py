@@ -13,7 +13,7 @@ from tests.reduced import only_in_full
 from .campaign import ALPHA, BETA, FORMAL, LINES, SCATTER, SIGMA_ALPHA, SIGMA_BETA, campaign
 from .straight import straight_lines
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, only_in_full("tests/campaign has lines by two steps")]
 
 
 def one(seed: int) -> dict[str, np.ndarray]:
@@ -49,7 +49,6 @@ def runs() -> list[dict[str, np.ndarray]]:
     return over_seeds(one, 120)
 
 
-@only_in_full("tests/campaign has pulls of lines by two steps")
 def test_pulls_and_coverage(runs, capsys):
     assert np.mean([r["converged"] for r in runs]) >= 0.95
     n = len(runs)
@@ -77,7 +76,6 @@ def test_pulls_and_coverage(runs, capsys):
     assert ratio == pytest.approx(1, abs=0.06)
 
 
-@only_in_full("test_real_series holds out exposures")
 def test_new_exposures_fall_where_they_are_expected(runs):
     n = len(runs) * 100  # some hundred good exposures each; the coefficients are correlated
     for key, level in (("new 1", 0.683), ("new 2", 0.954)):
@@ -87,7 +85,6 @@ def test_new_exposures_fall_where_they_are_expected(runs):
         assert abs(mean - level) < 4 * error
 
 
-@only_in_full("test_real_series shows it")
 def test_formal_errors_alone_are_far_too_small(runs):
     """Why the scatter is a parameter."""
     formal = np.array([r["formal pull"] for r in runs])
@@ -96,7 +93,6 @@ def test_formal_errors_alone_are_far_too_small(runs):
     assert np.sqrt((ours**2).mean()) < 1.2
 
 
-@only_in_full("test_closed_forms has least squares")
 def test_two_steps_and_one_agree_where_nothing_lies_off(runs):
     """Least squares that is told which exposures lie off: the same lines, the same errors."""
     ratio = np.array([r["clean ratio"] for r in runs])
