@@ -35,8 +35,8 @@ SITE = ("sphinx", "myst_parser", "numpydoc", "pydata_sphinx_theme", "sphinx-math
 
 @pytest.fixture(scope="module", autouse=True)
 def quick_reports(full):
-    """Figures of the reports of tutorials are not drawn, unless run in full."""
-    with nullcontext() if full else sketched():
+    """Figures of the reports of tutorials are neither made nor drawn, unless run in full."""
+    with nullcontext() if full else sketched(made=False):
         yield
 
 

@@ -16,6 +16,7 @@ from astropy.wcs import WCS
 
 from bayesdist.app.cli import main
 from bayesdist.simulate.camera import camera
+from tests.reduced import only_in_full
 
 from .docs_blocks import run_page
 
@@ -36,6 +37,8 @@ def printed(name: str, cwd: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
+@only_in_full("tests/missions/wise/test_bringup does")
 def test_the_bring_up_ends_at_the_truth_from_every_start(tmp_path):
     """A sigma of a corner is 0.023 px: that of 5700 pairs of 0.14 px and 15 terms of an axis.
 

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tests.reduced import only_in_full
+
 from . import KINDS
 from .campaign_kinds import OPENING
 from .campaign_measure import assessed, coefficient_errors, table_errors
@@ -71,9 +73,9 @@ def test_tables_under_a_sharp_pattern_say_how_far_off_they_are(full, capsys):
     assert inside[0][0] > 0.55
 
 
-def gaps(full: bool) -> list[dict[str, Any]]:
+def gaps() -> list[dict[str, Any]]:
     """Score tests of campaigns whose chips move apart, by name."""
-    return [outcome("campaign_gap_step", seed)["tests"] for seed in range(SEEDS if full else 1)]
+    return [outcome("campaign_gap_step", seed)["tests"] for seed in range(SEEDS)]
 
 
 def sizes_are_those_of_the_opening(runs: list[dict[str, Any]]) -> bool:
@@ -82,20 +84,20 @@ def sizes_are_those_of_the_opening(runs: list[dict[str, Any]]) -> bool:
     return all(OPENING / np.sqrt(2) * 0.8 < one < OPENING * 1.2 for one in size)
 
 
-def test_a_gap_that_opens_is_noticed(full):
-    runs = gaps(full)
+@only_in_full("tests/diagnose/test_time finds one")
+def test_a_gap_that_opens_is_noticed():
+    runs = gaps()
     assert sum(one["gap"].significant for one in runs) >= 0.9 * len(runs)
-    assert full or sizes_are_those_of_the_opening(runs)
     assert not any(one["motions"].significant for one in runs)
 
 
 @pytest.mark.xfail(strict=True, reason="three sizes of 20 are 0.0025 and 0.0032 px a year")
-def test_the_size_of_every_gap_is_that_of_its_opening(full):
-    if not full:
-        pytest.skip("one of them is made: set BAYESDIST_FULL=1")
-    assert sizes_are_those_of_the_opening(gaps(full))
+@only_in_full("tests/diagnose/test_time finds one")
+def test_the_size_of_every_gap_is_that_of_its_opening():
+    assert sizes_are_those_of_the_opening(gaps())
 
 
+@only_in_full("test_claims has such truths")
 @pytest.mark.parametrize(
     "kind",
     [
@@ -107,10 +109,8 @@ def test_the_size_of_every_gap_is_that_of_its_opening(full):
         "stars_that_move",
     ],
 )
-def test_verdicts_are_withheld_for_the_right_reason(kind, full):
-    if not full and kind != "stars_that_move":
-        pytest.skip("one of them is made: set BAYESDIST_FULL=1")
-    runs = results_of((kind, seed) for seed in range(SEEDS if full else 1))
+def test_verdicts_are_withheld_for_the_right_reason(kind):
+    runs = results_of((kind, seed) for seed in range(SEEDS))
     assert np.mean([one["right_reason"] for one in runs]) >= 0.9
     verdicts = [m["verdict"] for one in runs if one["right_reason"] for m in one["margins"]]
     assert "met" not in verdicts

@@ -10,7 +10,7 @@ import pytest
 from bayesdist.app.config import parse_config
 from bayesdist.assess import Requirement
 from bayesdist.assess.requirements.verdict import verdict_of
-from tests.reduced import case_in_full
+from tests.reduced import case_in_full, only_in_full
 
 from . import KINDS
 from .fields import SIDE, distortion, even_pixels, of_rms, smooth, tree_rings
@@ -20,7 +20,14 @@ from .truth import Truth
 from .written import toml_text
 
 
-@pytest.fixture(scope="module", params=[k for k in KINDS if not k.startswith("campaign")])
+@pytest.fixture(
+    scope="module",
+    params=[
+        case_in_full(k, instead="other fields are drawn") if k.startswith("selfcal") else k
+        for k in KINDS
+        if not k.startswith("campaign")
+    ],
+)
 def truth(request) -> Truth:
     return KINDS[request.param].truth(3, 200)
 
@@ -58,7 +65,9 @@ def test_distortions_are_of_a_detector(rng):
     assert 15 < np.median(sizes) < 60
 
 
-@pytest.mark.parametrize("scale", [100, case_in_full(270, instead="a shorter scale is run")])
+@pytest.mark.slow
+@only_in_full("the rms of a field is compared below")
+@pytest.mark.parametrize("scale", [100, 270])
 def test_random_fields_have_their_scale_and_size(scale):
     along = np.linspace(100, 1900, 60)
     products, squares = [], []

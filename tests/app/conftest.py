@@ -42,6 +42,18 @@ def sketched(full) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="package", autouse=True)
+def few_likelihoods(full) -> Iterator[None]:
+    """Posteriors leave out what those of large runs do: the likelihood of each star at each draw.
+
+    Unless run in full; it takes a fifth of a small run, and tests/infer/test_files looks at it.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        if not full:
+            patch.setattr("bayesdist.infer.files.LARGEST", 0)
+        yield
+
+
 @pytest.fixture(scope="module")
 def figures_made(sketched, full) -> Iterator[None]:
     """Figures of reports are made and have their words; they are drawn if run in full."""
@@ -50,7 +62,7 @@ def figures_made(sketched, full) -> Iterator[None]:
 
 
 @pytest.fixture(scope="package")
-def finished(sketched, tmp_path_factory) -> Finished:
+def finished(sketched, few_likelihoods, tmp_path_factory) -> Finished:
     folder = tmp_path_factory.mktemp("finished")
     matches, truth = simulated(mag=np.linspace(12.0, 18.0, 400))
     config = write_job(

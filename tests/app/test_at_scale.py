@@ -28,6 +28,7 @@ from tests.app.support import (
     truth_of,
     write_config,
 )
+from tests.reduced import only_in_full
 
 N = 6000
 
@@ -127,6 +128,8 @@ def test_no_stage_takes_all_rows_into_memory(job, tmp_path, on_disk, monkeypatch
     assert "of 6000 stars flagged" in good("inspect", run).out
 
 
+@pytest.mark.slow
+@only_in_full("the run on disk is that in memory")
 def test_the_data_are_read_once_for_all_passes(job, tmp_path, on_disk):
     """The scan, the median position, the passes, what is said of each star, and the sample."""
     read = []
@@ -159,6 +162,8 @@ def test_sums_over_pieces_are_those_of_the_whole(job, tmp_path, on_disk, monkeyp
         np.testing.assert_allclose(found.residuals().sem_v, expected.sem_v, rtol=1e-9)
 
 
+@pytest.mark.slow
+@only_in_full("test_kinds_of_data has such errors in memory")
 def test_errors_by_magnitude_on_disk(tmp_path, on_disk):
     """From the residuals of a sample, given to all: a bright star is good to 0.01 px."""
 
@@ -180,6 +185,8 @@ def test_errors_by_magnitude_on_disk(tmp_path, on_disk):
     assert not summary_of(run)["warnings"]
 
 
+@pytest.mark.slow
+@only_in_full("the run on disk is that in memory")
 def test_the_epoch_of_the_assessment_is_the_latest_of_the_data(tmp_path, on_disk):
     names = ("a", "b", "c")
     model = model_of(time=TimeDependence((("u", 1, 0),), (2004.5,)), exposures=names)

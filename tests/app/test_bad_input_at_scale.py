@@ -26,6 +26,7 @@ from tests.app.support import (
     truth_of,
     write_config,
 )
+from tests.reduced import only_in_full
 
 N, PART, GROUP = 20_000, 10_000, 1_000
 
@@ -163,6 +164,8 @@ def test_a_damaged_part(job, case):
             words=words)  # fmt: skip
 
 
+@pytest.mark.slow
+@only_in_full("test_bad_input has a shell")
 def test_the_same_from_a_shell(tmp_path, stars):
     """In a process of its own, where more than a million rows stay on disk."""
     (tmp_path / "stars").mkdir()

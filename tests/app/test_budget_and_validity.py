@@ -8,6 +8,7 @@ import pytest
 from astropy.table import Table
 
 from tests.app.support import cli, good, one_sentence, refused
+from tests.reduced import only_in_full
 
 pytestmark = pytest.mark.usefixtures("figures_made")
 
@@ -202,6 +203,8 @@ def test_errors_larger_than_the_residuals_are_refused_before_anything_is_sampled
     refused(tmp_path, "check", config, words=words)
 
 
+@pytest.mark.slow
+@only_in_full("the fit refuses them")
 def test_errors_larger_than_the_residuals_are_told_by_assess(run, tmp_path, monkeypatch):
     """As where the posterior takes more stars for false matches than the linear fit rejects."""
     folder = too_large(run, tmp_path / "run").parent

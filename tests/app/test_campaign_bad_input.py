@@ -22,7 +22,7 @@ from bayesdist.model import Chip, DistortionModel
 from bayesdist.reading.tables import read_table
 from tests.app.damaged import CONFIG, ONE, Campaign, masked, scattered, setting
 from tests.app.support import cli, good, one_sentence, refused, summary_of
-from tests.reduced import case_in_full
+from tests.reduced import case_in_full, only_in_full
 
 
 @pytest.fixture(scope="module")
@@ -336,6 +336,8 @@ def test_a_known_distortion_without_distortion(campaign):
     assert found["completeness"]["median"] > 0.9 and found["n_exposures"] == 8
 
 
+@pytest.mark.slow
+@only_in_full("tests/data/test_columns moves the origin")
 def test_pixels_that_count_from_elsewhere_give_the_same_positions(campaign, undamaged, tmp_path):
     """Half a pixel is a shift of the polynomials, and of nothing else."""
 
@@ -585,6 +587,7 @@ def test_resuming_after_a_list_was_removed(resumable):
 
 
 @pytest.mark.slow
+@only_in_full("each damage is matched alone, and test_campaign runs to its end")
 def test_a_damaged_campaign_is_calibrated_and_says_so(campaign, monkeypatch):
     monkeypatch.setattr("bayesdist.app.run.report", lambda results, pdf: [])
     # how linear terms went with time takes longer than all the rest, and is not asked here

@@ -19,8 +19,9 @@ from tests.adversarial import KINDS
 from tests.adversarial.campaign_measure import actual_error, assessed, stated_sigma
 from tests.adversarial.campaign_truth import CampaignTruth
 from tests.app.support import summary_of
+from tests.reduced import only_in_full
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, only_in_full("tests/diagnose/correlated has patterns")]
 
 SIZE = 0.01  # px: of the pattern, either way along x
 

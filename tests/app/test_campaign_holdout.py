@@ -24,6 +24,7 @@ from bayesdist.data import read_matches
 from bayesdist.infer import load_fit
 from bayesdist.reading.tables import read_table
 from tests.app.support import cli, good, one_sentence, refused, summary_of
+from tests.reduced import only_in_full
 
 N, LATER = 14, 3  # exposures, and how many of them the release does not see
 HOLDOUT = "[holdout]\nfraction = 0.2\nexposures = 2\n"
@@ -32,7 +33,7 @@ HOLDOUT = "[holdout]\nfraction = 0.2\nexposures = 2\n"
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("campaign") / "acs"
-    options = ("--exposures", N, "--stars", 5000, "--seed", 11, "--no-tables", "-q")
+    options = ("--exposures", N, "--stars", 2500, "--seed", 11, "--no-tables", "-q")
     good("simulate", "acs", "-o", folder, *options)
     return folder
 
@@ -110,6 +111,8 @@ def test_what_is_held_out_is_no_part_of_the_fit(run) -> None:
     assert len(set(held.star[~whole])) == pytest.approx(0.2 * len(set(pairs.star)), rel=0.25)
 
 
+@pytest.mark.slow
+@only_in_full("test_pipeline has a script that does")
 def test_functions_find_what_the_run_has_found(run) -> None:
     """Lists are matched and fitted without a run's folder, and are prepared as those of the run."""
     config, _ = load_config(run / "config.toml")
@@ -130,6 +133,8 @@ def test_functions_find_what_the_run_has_found(run) -> None:
     np.testing.assert_array_equal(fitted.scatter.tau, results.fitted.scatter.tau)
 
 
+@pytest.mark.slow
+@only_in_full("test_run has stages by themselves")
 def test_stages_can_be_run_again(later, tmp_path) -> None:
     again = shutil.copytree(later, tmp_path / "again")
     found = []
@@ -151,6 +156,8 @@ def test_what_is_held_out_agrees_with_the_prediction(run) -> None:
     }
 
 
+@pytest.mark.slow
+@only_in_full("tests/diagnose/test_holdout_campaign names such")
 def test_an_exposure_that_went_wrong_is_named(run, folder, tmp_path, monkeypatch) -> None:
     """One of the two exposures, bent by 0.3 pixels of the second order before it is matched."""
     name = summary_of(run)["holdout"]["exposures"][0]
@@ -184,6 +191,8 @@ def test_later_exposures_confirm_the_release(run, later, tmp_path) -> None:
     assert (tmp_path / "out" / "figures" / "change.png").exists()
 
 
+@pytest.mark.slow
+@only_in_full("tests/infer/compare finds such a change")
 def test_a_detector_that_changed_is_told_with_its_size_and_date(run, later, tmp_path) -> None:
     """Pairs as a run keeps them, from the second later date on bent by 0.1 pixels at the edges."""
     pairs = read_table(next((later / "pairs").glob("*.parquet")))
@@ -198,6 +207,8 @@ def test_a_detector_that_changed_is_told_with_its_size_and_date(run, later, tmp_
     assert float(largest) == pytest.approx(0.1, abs=4 * float(sigma))
 
 
+@pytest.mark.slow
+@only_in_full("later exposures confirm the release")
 def test_exposures_that_the_release_has_seen_are_left_out(run) -> None:
     seen = summary_of(run)["data"]["n_exposures"]
     # those that were held out whole are new to it

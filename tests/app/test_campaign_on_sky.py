@@ -23,6 +23,7 @@ from bayesdist.data import read_matches
 from bayesdist.infer import load_fit
 from bayesdist.infer.transforms import without_frames
 from tests.app.support import cli, good, one_sentence, refused, summary_of, write_config
+from tests.reduced import case_in_full
 
 SIDE, PIXEL = 1024, 0.05  # pixels, arcsec
 MIDDLE = (SIDE + 1) / 2
@@ -258,7 +259,13 @@ def pulls_of_pairs(run: Path, parity: int) -> np.ndarray:
     return np.concatenate(out, axis=1)
 
 
-BOTH = pytest.mark.parametrize("parity", [-1, 1], ids=["as the sky is seen", "mirrored"])
+BOTH = pytest.mark.parametrize(
+    "parity",
+    [
+        case_in_full(-1, instead="the mirrored one is run", id="as the sky is seen"),
+        pytest.param(1, id="mirrored"),
+    ],
+)
 
 
 @BOTH
@@ -366,7 +373,7 @@ def on_a_plane(unit):
     return change
 
 
-@pytest.mark.parametrize("unit", ["arcsec", "mas"])
+@pytest.mark.parametrize("unit", [case_in_full("arcsec", instead="mas are run"), "mas"])
 def test_a_catalogue_without_units_gets_its_unit_from_the_configuration(tmp_path, unit):
     """The message names the key, and so does the one that says that axes are mirrored."""
     config = write(tmp_path / "bare", -1, change=on_a_plane(unit))

@@ -41,6 +41,7 @@ from tests.products.acs_offline import Pointing, to_sky
 from tests.products.acs_offline import corrected as corrected_by_stwcs
 from tests.products.stwcs_offline import separation_mas
 from tests.products.support import laid_on, turned_by
+from tests.reduced import only_in_full
 
 FILTERS = {"F606W": ("F606W", "CLEAR2L"), "F814W": ("CLEAR1L", "F814W")}
 # coarse nodes and few draws: quick
@@ -166,6 +167,8 @@ def test_drift_of_few_exposures_is_that_of_the_reference(by_filter):
     assert np.abs(pulls).max() < 3.5
 
 
+@pytest.mark.slow
+@only_in_full("few exposures take the drift of others")
 def test_a_filter_without_exposures_before_a_break(folder, runs, tmp_path):
     """All of them after SM4: before it the drift is the reference's, with its error."""
     log = Table.read(folder / "exposures.ecsv")
@@ -318,6 +321,8 @@ def exposures_of(campaign, filter: str, sigma: float = 2e-6) -> Series:
     )
 
 
+@pytest.mark.slow
+@only_in_full("tests/infer/series/test_filters finds it")
 @pytest.mark.parametrize("own", [0.0, 6e-6])
 def test_a_drift_of_one_filter_only_is_found(own, monkeypatch):
     """B_2 of F814W drifts by a fifth more than the report's 3.5e-5 a year, or does not."""

@@ -105,6 +105,8 @@ def test_while_checkpointing(job, undisturbed, disk, no_report):
     _assert_same_draws(undisturbed, path)
 
 
+@pytest.mark.slow
+@only_in_full("the disk fills between two checkpoints")
 def test_while_the_posterior_is_written(job, undisturbed, disk, no_report):
     path = disk.path / "run"
     disk.resize(200_000_000)

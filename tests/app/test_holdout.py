@@ -22,6 +22,7 @@ from tests.app.support import (
     truth_of,
     write_job,
 )
+from tests.reduced import only_in_full
 
 LOOSE = [{"name": "loose", "statistic": "p95", "limit": 1.0}]
 
@@ -74,6 +75,8 @@ def test_verdict_and_tests_are_written_and_shown(run):
     assert summary_of(run[1])["margins"][0]["verdict"] == "met"
 
 
+@pytest.mark.slow
+@only_in_full("a resumed run sets them aside")
 def test_stages_by_themselves_set_the_same_stars_aside(run, tmp_path):
     config, whole = run
     folder = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess")
@@ -88,6 +91,8 @@ def test_a_resumed_run_sets_the_same_stars_aside(run, tmp_path):
     assert (folder / "holdout.ecsv").read_bytes() == (whole / "holdout.ecsv").read_bytes()
 
 
+@pytest.mark.slow
+@only_in_full("test_at_scale has a run on disk")
 def test_data_on_disk_give_the_same_answer(run, tmp_path, monkeypatch):
     config, whole = run
     folder = tmp_path / "input"
@@ -117,6 +122,8 @@ def test_too_small_errors_leave_requirements_undecided(tmp_path):
     assert "times as large as predicted" in html[: html.index("Held-out truth")]
 
 
+@pytest.mark.slow
+@only_in_full("test_campaign_holdout holds out whole exposures")
 def test_whole_exposures_are_drawn_and_predicted(tmp_path):
     names = tuple(f"e{k}" for k in range(8))
     model = model_of(frames="shift_rotation", exposures=names)

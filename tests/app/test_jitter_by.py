@@ -15,6 +15,7 @@ from tests.app.support import (
     write_config,
     write_job,
 )
+from tests.reduced import only_in_full
 
 QUOTED, SIZES = 0.02, (0.043, 0.060)
 N = 6000
@@ -95,6 +96,8 @@ def test_it_is_told_wherever_the_run_is_read(split):
     assert "j is the least of those beyond the quoted" in html
 
 
+@pytest.mark.slow
+@only_in_full("test_run has stages by themselves")
 def test_stages_by_themselves_and_a_fit_made_anew_see_the_same_errors(split, tmp_path):
     config, whole, _ = split
     folder = begin_stagewise(tmp_path / "run", config, "fit", "fit", "sample", "assess")
@@ -102,6 +105,8 @@ def test_stages_by_themselves_and_a_fit_made_anew_see_the_same_errors(split, tmp
     assert (folder / "holdout.ecsv").read_bytes() == (whole / "holdout.ecsv").read_bytes()
 
 
+@pytest.mark.slow
+@only_in_full("tests/diagnose/test_holdout names such an axis")
 def test_one_jitter_for_unequal_axes_is_flagged(tmp_path):
     config = job(tmp_path / "input", outliers={"jitter_by": "one"})
     folder = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess")
@@ -128,6 +133,8 @@ def test_equal_axes_keep_one_jitter(tmp_path):
     assert {row["excess"] for row in groups["groups"]} == {0.0}
 
 
+@pytest.mark.slow
+@only_in_full("axes have them, and chips in tests/infer")
 def test_chips_have_jitters_of_their_own_on_request(tmp_path):
     sizes = [(0.04, 0.06), (0.07, 0.05)]
     config = job(

@@ -26,6 +26,7 @@ from tests.app.support import (
     write_config,
     write_job,
 )
+from tests.reduced import only_in_full
 
 SCALE = 0.05  # arcsec in a pixel
 COLUMNS = {"x": "XRAW", "y": "YRAW", "u": "XI", "v": "ETA", "sigma_u": "E_XI", "sigma_v": "E_ETA"}
@@ -180,6 +181,8 @@ def test_exposures_with_frames(tmp_path):
     assert any(r["name"] != "coefficients" for r in summary_of(run)["budget"][:-1])
 
 
+@pytest.mark.slow
+@only_in_full("test_budget_and_validity has a drift")
 def test_drift_with_time(tmp_path):
     """Terms that drift: the rate is recovered, and the error grows away from the data."""
     names, epochs = ("a", "b", "c", "d"), (2004.0, 2006.0, 2008.0, 2010.0)
@@ -230,6 +233,8 @@ def test_drift_with_time(tmp_path):
 # -- outliers -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
+@only_in_full("test_match_circle has one")
 def test_uniform_outliers_on_the_match_circle(tmp_path):
     matches, truth = simulated(outliers="uniform", outlier_scale=1.0, fraction=0.1, seed=8)
     config = write_job(
@@ -247,6 +252,8 @@ def test_uniform_outliers_on_the_match_circle(tmp_path):
     assert np.abs(pull).max() < 4.5
 
 
+@pytest.mark.slow
+@only_in_full("tests/infer/test_closed_form samples it")
 def test_without_outliers_and_jitter_it_is_least_squares(tmp_path):
     """The closed form is the oracle: errors known, nothing false."""
     matches, _ = simulated(fraction=0.0, jitter=0.0, seed=9)

@@ -18,6 +18,7 @@ from bayesdist.app.commands.options import LazyGroup
 from bayesdist.mission import GROUP, Mission, load_object
 from tests.app.several import encoded, results_of
 from tests.app.support import REPOSITORY, one_sentence
+from tests.reduced import only_in_full
 
 MEGACAM = """
 import click
@@ -80,6 +81,8 @@ def test_a_package_adds_its_mission(tmp_path):
     assert "[default: 4]" in shown and "--quiet" in shown
 
 
+@pytest.mark.slow
+@only_in_full("tests/test_new_instrument.py has such a package")
 def test_a_package_adds_a_format_of_matches(tmp_path):
     """Of others' names, of a text that would else be a table: what it reads is a table's."""
     installed(tmp_path, PAIRS)

@@ -32,7 +32,7 @@ from tests.app.support import (
     write_config,
     write_job,
 )
-from tests.reduced import case_in_full
+from tests.reduced import case_in_full, only_in_full
 
 pytestmark = pytest.mark.usefixtures("figures_made")
 
@@ -254,6 +254,8 @@ def test_a_pattern_that_no_polynomial_follows_is_found(tmp_path):
     assert min(row["p_value"] for key, row in by.items() if key[1] == "X") > 1e-3 / 3
 
 
+@pytest.mark.slow
+@only_in_full("test_at_scale has a run on disk")
 def test_pairs_on_disk_give_the_same(quiet, tmp_path, monkeypatch):
     run, matches, _ = quiet
     monkeypatch.setattr(app_matches, "IN_MEMORY", 1000)

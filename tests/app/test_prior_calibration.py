@@ -19,6 +19,7 @@ from bayesdist.calibration.prior import prior_of_calibration
 from bayesdist.errors import InputError
 from bayesdist.infer import save_fit
 from bayesdist.infer.linear import NO_REJECTION
+from tests.reduced import case_in_full
 
 from .support import as_table, good, refused
 
@@ -137,7 +138,7 @@ def test_intervals_cover_as_they_say():
             assert abs(covered - level) < 4 * error
 
 
-@pytest.mark.parametrize("n_stars", [10, 200])
+@pytest.mark.parametrize("n_stars", [case_in_full(10, instead="as many as before are run"), 200])
 def test_a_prior_of_few_draws_covers_at_least_as_it_says(n_stars):
     """Mean and covariance of four draws a parameter, the fewest that are taken: 68 and 95 %.
 

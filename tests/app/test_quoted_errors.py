@@ -9,6 +9,7 @@ import pytest
 from astropy.table import Table
 
 from tests.app.support import SIZE, good, write_job
+from tests.reduced import only_in_full
 
 FACTOR = 300.0
 
@@ -52,6 +53,8 @@ def test_check_says_it_in_one_sentence(tmp_path):
     assert "quoted errors say" not in good("check", job(tmp_path / "right", 1.0)).out
 
 
+@pytest.mark.slow
+@only_in_full("test_data_of_others has such a run")
 def test_the_run_goes_on_with_errors_scaled(both):
     """Nothing but the size of all errors was lost: what comes out is that of the right errors."""
     right, small = both

@@ -6,6 +6,7 @@ import pytest
 from astropy.table import Table
 
 from bayesdist.app.cli import main
+from tests.reduced import only_in_full
 
 SCOPED = """
 [[requirement]]
@@ -78,6 +79,8 @@ def test_scopes_are_judged_and_kept(run, capsys):
     ]
 
 
+@pytest.mark.slow
+@only_in_full("scopes are judged and kept")
 def test_the_report_judges_them_again_as_they_were_asked(run):
     before = validated(run, SCOPED, 4)
     assert main(["stage", "report", str(run), "-q"]) == 0

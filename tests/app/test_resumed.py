@@ -25,19 +25,29 @@ from bayesdist.app.store.made_from import (
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer import load_posterior
 from tests.app.support import cli, good, refused, snapshot, summary_of, toml
+from tests.reduced import case_in_full
 
 pytestmark = pytest.mark.usefixtures("no_report")
 
 NEW = {"name": "new", "statistic": "u_rms", "limit": 0.5, "probability": 0.9}
+WRITTEN = ("posterior.nc", "budget.ecsv", "sip.hdr", "summary.json")
 ROWS = ("budget.ecsv", "margins.ecsv", "coefficients.ecsv")
 
 
-@pytest.fixture
-def run(finished, tmp_path) -> Path:
-    """A copy of a finished run, whose report has been made as these tests make it: not at all."""
-    path = shutil.copytree(finished.path, tmp_path / "run")
-    good("stage", "report", path)
+@pytest.fixture(scope="module")
+def unreported(finished, tmp_path_factory) -> Path:
+    """A finished run, whose report has been made as these tests make it: not at all."""
+    path = shutil.copytree(finished.path, tmp_path_factory.mktemp("unreported") / "run")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("bayesdist.app.run.report", lambda results, pdf: [])
+        good("stage", "report", path)
     return path
+
+
+@pytest.fixture
+def run(unreported, tmp_path) -> Path:
+    """A copy of it, to be changed."""
+    return shutil.copytree(unreported, tmp_path / "run")
 
 
 def edited(finished, *replacements: tuple[str, str], more: str = "") -> Path:
@@ -125,8 +135,18 @@ def test_higher_limits_let_the_chains_go_on(finished, run):
     assert min(convergence.ess_bulk_min, convergence.ess_tail_min) >= 150
 
 
-@pytest.mark.parametrize("name", ["posterior.nc", "budget.ecsv", "sip.hdr", "summary.json"])
-@pytest.mark.parametrize("how", ["removed", "altered"])
+@pytest.mark.parametrize(
+    ("name", "how"),
+    [
+        *((name, "altered") for name in WRITTEN),
+        ("sip.hdr", "removed"),
+        *(
+            case_in_full(name, "removed", instead="each is altered, and one is removed")
+            for name in WRITTEN
+            if name != "sip.hdr"
+        ),
+    ],
+)
 def test_a_file_that_is_not_as_it_was_written_is_written_again(finished, run, name, how):
     numbers, content = rows(run), (run / name).read_bytes()
     if how == "removed":

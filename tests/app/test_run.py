@@ -44,6 +44,7 @@ from tests.app.support import (
     write_config,
     write_job,
 )
+from tests.reduced import only_in_full
 
 FILES = (
     "config.toml run.json bayesdist.log fit.nc posterior.nc coefficients.ecsv maps.fits "
@@ -439,6 +440,8 @@ def test_each_stage_by_itself_gives_the_same_numbers(copy, posterior):
     np.testing.assert_array_equal(load_posterior(copy).theta, posterior.theta)
 
 
+@pytest.mark.slow
+@only_in_full("tests/infer/sampler loses checkpoints")
 def test_without_its_checkpoints_it_samples_the_same_again(copy, posterior):
     for path in copy.glob("chain-*.h5"):
         path.unlink()
@@ -455,6 +458,8 @@ def test_two_runs_of_one_seed_are_identical(finished, posterior, tmp_path):
     np.testing.assert_array_equal(load_posterior(other).theta, posterior.theta)
 
 
+@pytest.mark.slow
+@only_in_full("runs of one seed are compared")
 def test_another_seed_agrees_within_its_monte_carlo_error(finished, posterior, tmp_path):
     text = finished.config.read_text().replace("[sampler]", "[sampler]\nseed = 2")
     config = finished.config.with_name("seed2.toml")
@@ -654,29 +659,42 @@ def test_a_report_of_earlier_margins_is_told_and_renewed(copy, finished, tmp_pat
     assert "renew it" not in cli("requirements", copy, "--requirements", path).out
 
 
-def test_dates_that_change_nothing_are_told(tmp_path, finished):
-    """In the log of assess, by check, and by validate; where something drifts nothing is said."""
-    dated = {"name": "dated", "statistic": "rms", "limit": 1.0, "epoch": 2006.5}
+DATED = {"name": "dated", "statistic": "rms", "limit": 1.0, "epoch": 2006.5}
+NOTHING = "nothing in the model depends on time, so that the dates given change nothing"
+
+
+@pytest.fixture
+def dated(tmp_path, finished):
+    """A configuration that asks for dates, of stars that have them."""
     table = Table.read(finished.config.parent / "stars.ecsv")
     table["epoch"] = np.linspace(2004.0, 2010.0, len(table))
     assess = {"epoch": 2005.0, "grid": (9, 7), "draws": 400}
-    config = write_job(tmp_path / "job", table, assess=assess, requirement=[dated])
-    told = "nothing in the model depends on time, so that the dates given change nothing"
-    both = f"WARNING      {told} (assess.epoch, of requirement 'dated')"
-    assert both in good("check", config).out.splitlines()
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess")
-    assert (run / "bayesdist.log").read_text().count(told) == 1
-    req = _requirements(tmp_path / "req.toml", dated)
+    return write_job(tmp_path / "job", table, assess=assess, requirement=[DATED])
+
+
+def test_dates_that_change_nothing_are_told(dated):
+    """By check; where something drifts nothing is said."""
+    both = f"WARNING      {NOTHING} (assess.epoch, of requirement 'dated')"
+    assert both in good("check", dated).out.splitlines()
+    drift = {"epoch0": 2004.0, "terms": [["u", 1, 0]]}
+    drifting = {"assess": {"epoch": 2005.0}, "requirement": [DATED], "model.tdd": drift}
+    assert NOTHING not in good("check", write_config(dated, **drifting)).out
+
+
+@pytest.mark.slow
+@only_in_full("check tells it, and test_budget_and_validity judges at dates")
+def test_dates_that_change_nothing_are_told_by_a_run(dated, tmp_path):
+    """In the log of assess, and by validate."""
+    run = begin_stagewise(tmp_path / "run", dated, "fit", "sample", "assess")
+    assert (run / "bayesdist.log").read_text().count(NOTHING) == 1
+    req = _requirements(tmp_path / "req.toml", DATED)
     out = good("requirements", run, "--requirements", req).out
-    assert f"WARNING: {req}: {told} (of requirement 'dated')" in out.splitlines()
-    undated = {key: value for key, value in dated.items() if key != "epoch"}
+    assert f"WARNING: {req}: {NOTHING} (of requirement 'dated')" in out.splitlines()
+    undated = {key: value for key, value in DATED.items() if key != "epoch"}
     out = good(
         "requirements", run, "--requirements", _requirements(tmp_path / "b.toml", undated)
     ).out
-    assert told not in out
-    drift = {"epoch0": 2004.0, "terms": [["u", 1, 0]]}
-    config = write_config(config, assess=assess, requirement=[dated], **{"model.tdd": drift})
-    assert told not in good("check", config).out
+    assert NOTHING not in out
 
 
 def test_validate_of_an_unconverged_run_is_not_met(unconverged, tmp_path):

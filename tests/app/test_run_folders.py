@@ -14,6 +14,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.errors import InputError
 from bayesdist.files import path_within
 from tests.app.support import cli, good, refused, write_config
+from tests.reduced import case_in_full
 
 pytestmark = pytest.mark.usefixtures("no_report")
 
@@ -57,7 +58,13 @@ READ = {
 }
 
 
-@pytest.mark.parametrize("name", sorted(READ))
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("diagnostics.h5", "evaluation.h5"),
+        *(case_in_full(name, instead="others are damaged") for name in ("fit.nc", "posterior.nc")),
+    ],
+)
 def test_no_command_goes_by_a_damaged_file(project, tmp_path, name):
     stage, *readers = READ[name]
     run = project / "run"

@@ -18,6 +18,7 @@ from bayesdist.missions.wise.pairs.read import read_rvb
 from bayesdist.missions.wise.rvb.transform import RvbTransform
 from tests.app.rvb_jobs import DETECTORS, rvb_job, rvb_pairs, write_rvb_table
 from tests.app.support import cli, good, refused, snapshot, summary_of
+from tests.reduced import only_in_full
 
 RVB = {"colour": (-0.4, 0.9), "accept_centre": 1.0, "accept_corner": 2.5}
 STAGES = ("fit", "sample", "assess", "export")
@@ -88,6 +89,8 @@ def test_on_disk_the_pairs_are_selected_once(tmp_path, monkeypatch):
     assert len(open_matches(run / "pairs")) == len(kept)
 
 
+@pytest.mark.slow
+@only_in_full("test_killed kills runs")
 @pytest.mark.usefixtures("no_report", "on_disk")
 def test_half_a_set_that_a_killed_run_left_is_not_trusted(tmp_path):
     table = rvb_pairs()

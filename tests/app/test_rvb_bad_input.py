@@ -12,7 +12,7 @@ from astropy.table import Table, vstack
 
 from tests.app.rvb_jobs import DETECTORS, rvb_job, rvb_pairs
 from tests.app.support import EXACT, cli, good, refused, summary_of
-from tests.reduced import case_in_full
+from tests.reduced import case_in_full, only_in_full
 
 W1 = {"detector": DETECTORS["W1"]}
 
@@ -225,6 +225,8 @@ def test_a_table_of_mostly_false_pairs_is_not_believed(tmp_path, outliers):
         assert margin["probability_met"] > 0.95  # it would have been called met
 
 
+@pytest.mark.slow
+@only_in_full("false pairs of its shape are run")
 @pytest.mark.usefixtures("no_report")
 def test_false_pairs_of_another_shape_than_the_mixture_are_not_taken_for_true(tmp_path):
     """Gaussian outliers cannot hold a circle of false pairs: all become true with a wide error."""

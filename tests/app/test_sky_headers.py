@@ -23,7 +23,7 @@ from bayesdist.products import read_calibration
 from bayesdist.products.formats.common.content import read_content
 from bayesdist.products.formats.tpv.head import tpv_of
 from tests.app.support import EXACT, begin_stagewise, good, summary_of, write_config, write_job
-from tests.reduced import case_in_full
+from tests.reduced import case_in_full, only_in_full
 
 SIZE = (2000, 1500)
 PIXEL = 0.4  # arcsec
@@ -86,7 +86,7 @@ def made(folder: Path, truth: WCS, rng, **sections) -> Path:
     [
         case_in_full((83.8, -5.4), -1, instead="harder places are run"),
         case_in_full((83.8, -5.4), 1, instead="harder places are run"),
-        ((359.999, 41.2), -1),
+        case_in_full((359.999, 41.2), -1, instead="a harder place is run"),
         ((211.0, 89.8), 1),
     ],
 )
@@ -139,6 +139,8 @@ def test_headers_of_other_kinds_are_on_the_sky_of_the_truth(tmp_path, rng) -> No
     assert back.errors == "covariance" and back.plane.kind == "sky"
 
 
+@pytest.mark.slow
+@only_in_full("test_sky_positions applies such headers")
 def test_a_given_crval_keeps_the_sky_right(tmp_path, rng) -> None:
     """That of the tangent point, as once had to be given: the constants are folded in."""
     truth = camera((83.8, -5.4), -1)
@@ -149,6 +151,8 @@ def test_a_given_crval_keeps_the_sky_right(tmp_path, rng) -> None:
     assert summary_of(run)["products"][0]["sky"]["solution_arcsec"] < 1e-5 * PIXEL
 
 
+@pytest.mark.slow
+@only_in_full("one exposure, and two chips are run")
 def test_of_several_exposures_it_is_the_first_one(tmp_path, rng) -> None:
     """Dithered and rotated exposures: the header says whose sky it is, and has it."""
     first, second = camera((83.8, -5.4), -1), camera((83.83, -5.38), -1, angle=0.8)

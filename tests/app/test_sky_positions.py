@@ -73,25 +73,24 @@ def test_the_covariance_is_that_of_draws(calibration, stars):
     x, y, chip = (np.asarray(stars[c]) for c in ("x", "y", "chip"))
     sigma = np.stack([stars["sx"], stars["sy"]])
     at = sky_positions(calibration, x, y, chip, centroids=tuple(sigma), joint=True)
-    true = SkyCoord(at.ra, at.dec, unit="deg")
-    n, out = 3000, []
-    thetas = calibration.solution.draws(n, rng)
-    for theta in thetas:
-        px, py = np.stack([x, y]) + sigma * rng.normal(size=(2, 6))
-        u, v = np.empty(6), np.empty(6)
-        for number in (1, 2):
-            mine = chip == number
-            phi = calibration.model.basis(number).evaluate(px[mine], py[mine])
-            u[mine], v[mine] = (
-                phi @ theta[calibration.model.coefficient_slice(number, a)] for a in (0, 1)
-            )
-        u += 0.004 * rng.normal() + 0.002 * rng.normal(size=6)
-        v += 0.003 * rng.normal() + np.hypot(0.001, 0.002) * rng.normal(size=6)
-        wcs = _gnomonic()
-        sky = SkyCoord(*wcs.wcs_pix2world(u / 3600, v / 3600, 0), unit="deg")
-        east, north = true.spherical_offsets_to(sky)
-        out.append(np.stack([east.mas, north.mas], axis=-1).ravel())
-    drawn = np.cov(np.array(out).T)
+    n = 3000
+    true = SkyCoord(np.tile(at.ra, n), np.tile(at.dec, n), unit="deg")
+    theta = calibration.solution.draws(n, rng)
+    p = np.stack([x, y])[:, None] + sigma[:, None] * rng.normal(size=(2, n, 6))
+    uv = np.empty((2, n, 6))
+    for number in (1, 2):
+        mine = chip == number
+        phi = calibration.model.basis(number).evaluate(*p[:, :, mine].reshape(2, -1))
+        phi = phi.reshape(n, mine.sum(), -1)
+        for axis in (0, 1):
+            of_axis = theta[:, calibration.model.coefficient_slice(number, axis)]
+            uv[axis, :, mine] = np.einsum("nsk,nk->sn", phi, of_axis)
+    uv[0] += 0.004 * rng.normal(size=(n, 1)) + 0.002 * rng.normal(size=(n, 6))
+    uv[1] += 0.003 * rng.normal(size=(n, 1)) + np.hypot(0.001, 0.002) * rng.normal(size=(n, 6))
+    u, v = uv.reshape(2, -1)
+    drawn_sky = SkyCoord(*_gnomonic().wcs_pix2world(u / 3600, v / 3600, 0), unit="deg")
+    east, north = true.spherical_offsets_to(drawn_sky)
+    drawn = np.cov(np.stack([east.mas, north.mas], axis=-1).reshape(n, -1).T)
     scale = np.sqrt(np.diag(at.joint))
     # of a correlation r the standard error is (1 - r^2) / sqrt(n); the largest of 78
     assert np.abs((drawn - at.joint) / np.outer(scale, scale)).max() < 4.5 * np.sqrt(2 / n)

@@ -20,6 +20,7 @@ from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import idctab_from_solution, write_idctab
 from bayesdist.simulate import simulate_matches
 from tests.app.support import good
+from tests.reduced import only_in_full
 
 CHIPS = tuple(Chip(k, f"WFC{k}", (512.0, 256.0), (256.0, 128.0)) for k in (2, 1))
 NAMES = ("shift_x", "shift_y", "scale", "rotation")
@@ -65,6 +66,8 @@ def pair(fit, name="fit"):
     return pair_of_chips(calibration_of(fit, name), 2, 1)
 
 
+@pytest.mark.slow
+@only_in_full("test_comparison has differences of errors alone")
 def test_errors_alone_make_a_chi_square_of_four():
     """Frames turned, shifted and mirrored as wholes, of other orders: they are no gap."""
     a, b = DistortionModel(3, CHIPS, "arcsec"), DistortionModel(4, CHIPS, "arcsec")

@@ -29,6 +29,7 @@ from bayesdist.simulate.patterns import (
 )
 from tests.dithered_fields import simulate_dithers, smooth_distortion
 from tests.infer.selfcal.fields import aligned
+from tests.reduced import case_in_full
 
 SIZE = (1024.0, 1024.0)
 CHIP = Chip(1, "C", SIZE, (512.0, 512.0))
@@ -65,7 +66,13 @@ def _deviation(model, truth, free, rng):
     return solved[: len(free)]
 
 
-@pytest.mark.parametrize("rolls", [(0, 60, 130), (0,)], ids=["three rolls", "one roll"])
+@pytest.mark.parametrize(
+    "rolls",
+    [
+        pytest.param((0, 60, 130), id="three rolls"),
+        case_in_full((0,), instead="three rolls are run", id="one roll"),
+    ],
+)
 def test_expected_covariance_is_the_scatter_of_solutions(rolls, capsys):
     """40 campaigns, each of its own stars and noise, solved by other means."""
     pattern = _pattern(rolls=rolls)

@@ -14,6 +14,7 @@ from bayesdist.infer.exposures.hierarchy import fit_hierarchical
 from tests.budgets import detector_budget
 from tests.infer.small_campaign import campaign, campaign_truth, shared_stars, with_star_errors
 from tests.infer.support import UNCLIPPED
+from tests.reduced import only_in_full
 
 from .drawn_fields import fields_at
 
@@ -82,15 +83,16 @@ def test_the_budget_is_the_scatter_over_catalogues():
 
 
 @pytest.mark.slow
+@only_in_full("test_field_terms has its closed form")
 @threadpool_limits.wrap(limits=1, user_api="blas")
-def test_positions_in_exposures_that_no_fit_has_seen(full):
+def test_positions_in_exposures_that_no_fit_has_seen():
     """|error| <= q sigma as often as a normal number, after shift and rotation were fitted.
 
     Coefficients and scatter from 20 exposures; new ones drawn with the true scatter.  What its
     positions have in common is one fit and one tau, so that truths are counted, not positions.
     """
     rng = np.random.default_rng(8)
-    n_truths, n_new = (60 if full else 8), 12
+    n_truths, n_new = 60, 12
     inside = {0.68: [], 0.95: []}
     squares, without = [], []
     for seed in range(n_truths):

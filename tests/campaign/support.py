@@ -94,7 +94,7 @@ PUBLISHED_SIZE = Setting("matern", WIDE, 110, 53_900)
 # a chip that is as restless by itself as both are together: its gap to the other is no ruler
 LOOSE = Setting("none", WIDE, own=1.0)
 # what a reduced suite makes of it: as many lines and nodes, from fewer exposures and stars
-SHORT = {MATERN: replace(MATERN, exposures=24, stars=12_000)}
+SHORT = {MATERN: replace(MATERN, exposures=20, stars=7000)}
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ from bayesdist.data.preparing import neutralise_aberration
 from bayesdist.data.starlists import StarCuts, read_star_lists
 from bayesdist.errors import InputError
 from tests.data.sky import ZERO_POINT, campaign, positions, start
+from tests.reduced import case_in_full, only_in_full
 
 
 def truth_of(table, truth):
@@ -23,7 +24,9 @@ def truth_of(table, truth):
     return np.array([truth[e][r] for e, r in zip(table.exposure, table.row, strict=True)])
 
 
-@pytest.mark.parametrize("left", [0.0, 1.0, 5.0])
+@pytest.mark.parametrize(
+    "left", [*(case_in_full(left, instead="five pixels are left") for left in (0.0, 1.0)), 5.0]
+)
 def test_every_star_finds_itself(rng, left):
     catalog, lists, log, truth, rolls = campaign(rng, 6, left=left)
     found = match_campaign(lists, log, catalog, start)
@@ -162,7 +165,14 @@ def test_a_wrong_field_is_named_with_the_best_count(rng):
         match_campaign(lists, log, other, start)
 
 
-@pytest.mark.parametrize(("factor", "mirror"), [(0.05, 1), (1000.0, 1), (1.0, -1)])
+@pytest.mark.parametrize(
+    ("factor", "mirror"),
+    [
+        (0.05, 1),
+        case_in_full(1000.0, 1, instead="another unit is named"),
+        (1.0, -1),
+    ],
+)
 def test_what_would_match_is_named(rng, factor, mirror):
     """The catalogue in arcsec or thousandths, or seen from behind."""
     catalog, lists, log, _, _ = campaign(rng, 1, stars=4000)
@@ -178,6 +188,8 @@ def test_what_would_match_is_named(rng, factor, mirror):
         assert scale == pytest.approx(factor, rel=0.01)
 
 
+@pytest.mark.slow
+@only_in_full("a wrong field is named without one")
 def test_no_reason_is_made_up(rng):
     """Where a list matches as it is, or where nothing matches, there is nothing to be named."""
     catalog, lists, _, _, _ = campaign(rng, 1, stars=2500)
@@ -273,6 +285,8 @@ def test_a_summary_has_a_row_for_each_exposure(rng):
     assert np.all(summary["chip 1"] + summary["chip 2"] == summary["matched"])
 
 
+@pytest.mark.slow
+@only_in_full("test_matching has a million")
 def test_many_detections_match_in_seconds(rng):
     catalog, lists, log, _, _ = campaign(rng, 12, stars=40_000, side=8000.0)
     n = sum(len(one) for one in lists)

@@ -43,6 +43,7 @@ from bayesdist.missions.wise.assess.tables import (
 )
 from bayesdist.missions.wise.published import SAMPLE_SIZES
 from bayesdist.missions.wise.simulate import simulate_wise
+from tests.reduced import only_in_full
 
 SIZE = (60.0, 60.0)
 
@@ -186,6 +187,8 @@ def test_the_noise_free_sigma_and_its_error_cover_the_truth(observed, rows):
     assert low < np.mean(pulls**2) < high
 
 
+@pytest.mark.slow
+@only_in_full("errors of single maps are compared")
 @pytest.mark.parametrize("name", ["sigma", "max", "p99"])
 def test_errors_over_all_pairs_are_the_scatter_over_repetitions(observed, pairs, name):
     values = [pair_statistics(m.ravel())[name] for m in observed[2]]

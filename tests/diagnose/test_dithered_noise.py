@@ -13,8 +13,9 @@ from bayesdist.diagnose.selfcal.misfit import dithered_misfit
 from bayesdist.diagnose.selfcal.score import selfcal_score_tests
 from bayesdist.infer.selfcal import self_calibrate
 from tests.infer.selfcal.fields import field
+from tests.reduced import only_in_full
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, only_in_full("test_selfcal_cover has p-values of noise")]
 
 FIELDS = {"rolls": {}, "one roll": {"rolls": (0, 0, 0)}, "two chips": {"n_chips": 2}}
 

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from bayesdist.data import Matches, find_similarity, pattern_index
 from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
 from bayesdist.infer import build_model, fit_linear
+from tests.reduced import case_in_full, only_in_full
 
 SIGMA, PM = 0.02, 0.012  # arcsec, and arcsec per year
 
@@ -38,7 +39,7 @@ def found(table):
     return epoch_shift(table, fit_linear(table, model))
 
 
-@pytest.mark.parametrize("exposures", [1, 3])
+@pytest.mark.parametrize("exposures", [case_in_full(1, instead="three are run"), 3])
 def test_the_shift_is_found_with_its_error(exposures):
     """Pulls over many fields of stars; the errors of a field's stars differ between exposures."""
     results = [found(stars(-9.9, seed, exposures=exposures)) for seed in range(40)]
@@ -54,6 +55,8 @@ def test_the_shift_is_found_with_its_error(exposures):
     assert "before the epoch that the reference positions have" in one.sentence
 
 
+@pytest.mark.slow
+@only_in_full("the shift is found with its error")
 def test_errors_of_motions_do_not_draw_the_shift_to_zero():
     """A fifth of their scatter; and two stars of five have no motions, which catalogues call 0."""
     pulls = []

@@ -31,7 +31,7 @@ from bayesdist.infer.density.target import Target
 from bayesdist.limits import HELD_OUT_DOUBTFUL
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
-from tests.reduced import case_in_full
+from tests.reduced import case_in_full, only_in_full
 
 SIZE = (1000.0, 800.0)
 RUNS = 200 if os.environ.get("BAYESDIST_FULL") else 40
@@ -128,6 +128,8 @@ def test_right_models_have_uniform_probabilities():
     assert_calibrated([judged(seed, 3000) for seed in range(RUNS)])
 
 
+@pytest.mark.slow
+@only_in_full("Gaussian ones are judged")
 def test_uniform_false_matches_have_uniform_probabilities():
     mixture = OutlierMixture("uniform", match_radius=FAR, jitter=0.0)
     some = [judged(1000 + seed, 3000, mixture=mixture, outliers="uniform") for seed in range(RUNS)]
@@ -148,6 +150,8 @@ def test_whole_exposures_have_uniform_probabilities(frames):
     assert_calibrated([judged(2000 + seed, 1600, model, aside=aside) for seed in range(RUNS)])
 
 
+@pytest.mark.slow
+@only_in_full("whole exposures are judged")
 def test_an_exposure_is_found_whatever_its_roll():
     """A frame of a hundred pixels and nearly half a turn is no misfit."""
     model = model_of(frames="shift_rotation_scale", exposures=("a", "b", "c"), origin=(10.0, -5.0))

@@ -21,6 +21,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_errors import star_covariance, star_influence
 from bayesdist.report.sections.run.holdout import holdout_coverage, holdout_table
 from tests.diagnose.held_campaign import field, judged, solved
+from tests.reduced import only_in_full
 
 RUNS = 60 if os.environ.get("BAYESDIST_FULL") else 6
 WHOLE = ("j004", "j007")
@@ -57,6 +58,7 @@ def test_right_predictions_have_uniform_probabilities() -> None:
 
 
 @pytest.mark.slow
+@only_in_full("exposures that point elsewhere are judged")
 def test_one_pointing_has_uniform_probabilities() -> None:
     """All exposures see the same stars in the same places: what these do to the fit is shared."""
     runs = range(200, 200 + RUNS // 2)
@@ -64,6 +66,7 @@ def test_one_pointing_has_uniform_probabilities() -> None:
 
 
 @pytest.mark.slow
+@only_in_full("test_holdout has false matches")
 def test_false_matches_raise_no_alarm() -> None:
     runs = range(400, 400 + RUNS // 2)
     assert_calibrated(

@@ -11,6 +11,7 @@ from scipy import stats
 from bayesdist.diagnose.score.gap import visit_codes
 from bayesdist.limits import SCORE_TESTS
 from bayesdist.model import TimeDependence
+from tests.reduced import case_in_full
 
 from .. import seeds
 from .dated import DRIFT, Dated
@@ -140,7 +141,7 @@ def is_found(name: str, seed: int) -> bool:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["gap", "motions"])
+@pytest.mark.parametrize("name", ["gap", case_in_full("motions", instead="the gap is run")])
 def test_smallest_is_found_nine_times_in_ten(name, full):
     runs = 400 if full else 12
     jobs = [(name, seed) for seed in range(runs)]

@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import binom, binomtest, chisquare
 
 from tests.infer.calibration import LEVELS, coverage_of, over_seeds, ranks_of
+from tests.reduced import only_in_full
 
 pytestmark = pytest.mark.slow
 
@@ -57,14 +58,15 @@ def test_clipped_least_squares_is_overconfident(runs):
     assert clipped.mean() < posterior.mean()
 
 
-def test_ranks_are_uniform(full, capsys):
+@only_in_full("tests/coverage has ranks of the same parameters")
+def test_ranks_are_uniform(capsys):
     """Simulation-based calibration (Talts et al. 2018): truths from the prior rank uniformly."""
-    n = 200 if full else 20
+    n = 200
     ranks = over_seeds(ranks_of, n)
     assert sum(r["converged"] for r in ranks) >= 0.99 * n
     for key in ("f", "j", "s_out"):
         values = np.array([r[key] for r in ranks])
-        counts, _ = np.histogram(values, bins=10 if full else 4, range=(-0.5, 199.5))
+        counts, _ = np.histogram(values, bins=10, range=(-0.5, 199.5))
         p = chisquare(counts).pvalue
         with capsys.disabled():
             print(f"\nranks of {key}: {counts.tolist()}, chi-square p = {p:.3f}")

@@ -11,6 +11,7 @@ from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Rejection, build_model, fit_linear, residuals
 from bayesdist.model import FRAME_KINDS, DistortionModel, TimeDependence
+from tests.reduced import only_in_full
 
 from .support import (
     CHIP,
@@ -131,15 +132,15 @@ def test_with_frames_it_is_scipys_nonlinear_least_squares(frames):
     assert fit.chi2 == pytest.approx(2 * best.cost, rel=1e-9)
 
 
-def test_formal_covariance_describes_repeated_experiments():
-    """300 experiments: squared Mahalanobis distance to the truth is chi-square distributed."""
+def test_formal_covariance_describes_repeated_experiments(full):
+    """Squared Mahalanobis distances to the truth, of 100 or 300 of them, are chi-square ones."""
     rng = np.random.default_rng(11)
     model = DistortionModel(
         2, (CHIP,), frames="shift_rotation", exposures=exposures(2), origin=(500.0, 400.0)
     )
     theta = truth_of(model, rng)
     distance, chi2 = [], []
-    for k in range(300):
+    for k in range(300 if full else 100):
         _, matches, _ = simulated(
             1000 + k, 120, order=2, frames="shift_rotation", n_exposures=2, theta=theta
         )
@@ -282,6 +283,8 @@ def test_who_is_used_is_decided_by_the_first_pass():
     np.testing.assert_array_equal(fit.uses(matches.select(some)), used[some])
 
 
+@pytest.mark.slow
+@only_in_full("the formal covariance is compared")
 def test_corner_weights_in_repeated_experiments():
     """The sandwich predicts the scatter of 400 experiments; the naive inverse would not."""
     model, matches, truth = simulated(9, 80, order=1)

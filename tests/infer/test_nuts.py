@@ -11,6 +11,7 @@ from bayesdist.infer import OutlierMixture, build_model, fit_by_magnitude, fit_l
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
 from tests.infer.by_nuts import nuts_draws, spread_draws, stein_pulls
+from tests.reduced import case_in_full
 
 pytestmark = pytest.mark.slow
 numpyro = pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
@@ -108,7 +109,13 @@ def test_draws_of_another_density_are_seen(rng):
     assert right < 4 < min(off, wide)
 
 
-CASES = ["simulated", "errors exact (j = 0)", "real hst1pass exposure"]
+CASES = [
+    "simulated",
+    *(
+        case_in_full(case, instead="simulated stars are run")
+        for case in ("errors exact (j = 0)", "real hst1pass exposure")
+    ),
+]
 
 
 def _case(name: str, n: int, request):

@@ -22,7 +22,7 @@ from bayesdist.products import (
     sip_header,
     worst_closure,
 )
-from tests.reduced import case_in_full
+from tests.reduced import only_in_full
 
 from .support import StandIn, random_pixels, some_solution, wfc_solution
 
@@ -107,7 +107,9 @@ def test_epoch_and_chip_are_those_asked_for() -> None:
         sip_from_solution(solution, chip=3, epoch=2011.25)
 
 
-@pytest.mark.parametrize("linear", ["cd", case_in_full("sip", instead="cd is run")])
+@pytest.mark.slow
+@only_in_full("on the sky they are")
+@pytest.mark.parametrize("linear", ["cd", "sip"])
 def test_sigmas_are_those_of_draws(linear: str) -> None:
     solution = some_solution(3, unit="arcsec", pixel=0.1, angle=0.1)
     names = {"scale_arcsec": 0.1} if linear == "sip" else {}

@@ -104,13 +104,13 @@ def test_a_pole_as_crval_is_turned_as_it_should() -> None:
         assert worst(solution, sip, (ra, 89.99)) < 2e-5 * PIXEL
 
 
-def test_sigmas_are_those_of_draws_on_the_sky() -> None:
+def test_sigmas_are_those_of_draws_on_the_sky(full: bool) -> None:
     solution = some_solution(3, unit="mas", pixel=100.0, angle=0.1, offset=(3e6, 2e6))
     point = {"tangent_point": (150.0, 30.0)}
     sip = sip_from_solution(solution, **point)
     drawn = [
         sip_from_solution(StandIn(solution.model, theta, solution.cov), inverse_order=2, **point)
-        for theta in solution.draws(200, np.random.default_rng(11))
+        for theta in solution.draws(200 if full else 60, np.random.default_rng(11))
     ]
     assert set(sip.sigma_a) == set(sip.a)
     for own, sigma in (("a", sip.sigma_a), ("b", sip.sigma_b)):

@@ -21,7 +21,7 @@ from bayesdist.products.formats.sip.header import worst_closure
 from bayesdist.products.formats.sip.implied import implied_values
 from bayesdist.products.formats.wise.lint import lint_wise_band
 from bayesdist.products.formats.wise.meta import read_wise_meta
-from tests.reduced import case_in_full
+from tests.reduced import case_in_full, only_in_full
 
 # band: (A_DMAX, B_DMAX), then rows of p_q, A, B, AP, BP
 # fmt: off
@@ -344,6 +344,8 @@ def exact(sip):
     return replace(sip, ap=ap, bp=bp, dmax=(None, None))
 
 
+@pytest.mark.slow
+@only_in_full("sound coefficients are inside")
 def test_intervals_hold_the_truth_as_often_as_they_say(bands) -> None:
     """Over inverses with white errors: posterior tail probabilities are uniform."""
     sip, rng = exact(bands[2].sip), np.random.default_rng(3)

@@ -16,6 +16,7 @@ from scipy import stats
 
 import bayesdist as bd
 from bayesdist.errors import InputError
+from tests.reduced import only_in_full
 
 from ..app.support import good
 from .megacam import RADIUS, SIGMA, SIZE, Fitted, Pairs, fitted, twin
@@ -111,6 +112,8 @@ def test_false_pairs_fill_the_circle_about_the_header_s_position(megacam, real) 
 # -- the twin, whose truth is known ---------------------------------------------------------------
 
 
+@pytest.mark.slow
+@only_in_full("its false pairs are as many")
 def test_the_twin_is_as_dense_as_the_real_set(megacam, known) -> None:
     """As dense as at the circle's edge, where stars keep fewest detections away."""
     true, _ = known
@@ -193,6 +196,8 @@ grid = [5, 9]
 """
 
 
+@pytest.mark.slow
+@only_in_full("test_new_instrument runs two of them")
 def test_a_run_of_one_ccd_agrees_with_its_geometry(megacam, real, tmp_path) -> None:
     one = megacam.ccd == 1
     Table(megacam.select(one).table()).write(tmp_path / "pairs.ecsv")

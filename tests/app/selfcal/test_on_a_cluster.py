@@ -11,9 +11,12 @@ from bayesdist.app.pipeline import fit, match, read, sample
 from bayesdist.infer.selfcal import pieces
 from bayesdist.infer.stars import cluster
 from tests.app.selfcal.support import list_table, small, write_selfcal
+from tests.reduced import only_in_full
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
+@only_in_full("tests/infer/selfcal/test_cluster samples on one")
 def test_draws_are_those_of_one_process(tmp_path, monkeypatch):
     passes = []
 

@@ -11,8 +11,9 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import read_hst1pass
 from bayesdist.infer.selfcal import gauge_free
 from tests.app.support import good, summary_of, write_config
+from tests.reduced import only_in_full
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, only_in_full("simulated fields are calibrated")]
 
 SIDE, CELLS = 1024, 12
 WITHIN_95 = 5.991  # chi-square of two numbers

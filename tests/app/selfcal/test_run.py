@@ -24,6 +24,7 @@ from bayesdist.infer.compare.planning import with_information
 from bayesdist.infer.selfcal import gauge_free
 from tests.app.selfcal.support import affine_left
 from tests.app.support import cli, good, one_sentence, snapshot, summary_of, write_config
+from tests.reduced import only_in_full
 
 
 def _grid(n: int = 12) -> tuple[np.ndarray, np.ndarray]:
@@ -199,6 +200,8 @@ class Killed(BaseException):
     """What no stage catches."""
 
 
+@pytest.mark.slow
+@only_in_full("test_killed kills one")
 def test_a_run_that_was_killed_goes_on(three_rolls, tmp_path, monkeypatch, no_report):
     """Killed before each of its stages in turn, it ends bit for bit as if nothing had happened."""
     shutil.copytree(three_rolls.config.parent, tmp_path / "input")

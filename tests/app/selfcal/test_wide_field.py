@@ -10,6 +10,7 @@ from bayesdist.diagnose.selfcal.score import selfcal_score_tests
 from tests.app.selfcal.support import fitted, write_selfcal
 from tests.app.support import good
 from tests.infer.selfcal.wide import ARCSEC, MIDDLE, N, observed, on, tangent_plane
+from tests.reduced import case_in_full
 
 SEED = 5
 
@@ -29,7 +30,10 @@ def _config(folder, scale_mas, **more):
     )
 
 
-@pytest.mark.parametrize("scale_mas", [1000 * ARCSEC, None])
+@pytest.mark.parametrize(
+    "scale_mas",
+    [1000 * ARCSEC, case_in_full(None, instead="pixels of known size are run")],
+)
 def test_tangent_planes_are_taken_to_one_by_the_size_of_a_pixel(tmp_path, scale_mas):
     config = _config(tmp_path, scale_mas)
     told = good("check", config).out

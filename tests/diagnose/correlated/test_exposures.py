@@ -10,6 +10,7 @@ import pytest
 from bayesdist.diagnose.correlated import estimate_discrepancy
 from bayesdist.infer import Rejection, build_model, fit_linear
 from tests.diagnose.correlated.skies import SIZE, matched
+from tests.reduced import case_in_full
 
 EXPOSURES, SCATTER = 8, 3e-5
 
@@ -34,7 +35,9 @@ def breathing(frames: str, scatter: float = SCATTER, seed: int = 2):
     return estimate_discrepancy(table, fit, rng=rng, stars=table)
 
 
-@pytest.mark.parametrize("frames", ["none", "shift_rotation"])
+@pytest.mark.parametrize(
+    "frames", [case_in_full("none", instead="frames are fitted"), "shift_rotation"]
+)
 def test_the_scatter_of_the_scales_is_found(frames):
     found = breathing(frames).linear
     assert found is not None and found.n_exposures == EXPOSURES
@@ -46,7 +49,7 @@ def test_the_scatter_of_the_scales_is_found(frames):
     ("frames", "kinds"),
     [
         ("none", ("shift", "rotation", "scale", "shear")),
-        ("shift", ("rotation", "scale", "shear")),
+        case_in_full("shift", ("rotation", "scale", "shear"), instead="none and all are run"),
         ("shift_rotation_scale", ("shear",)),
     ],
 )

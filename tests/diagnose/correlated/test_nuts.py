@@ -29,11 +29,10 @@ def polynomials(X: np.ndarray, Y: np.ndarray) -> np.ndarray:
     return np.stack([every[:, i * (ORDER + 1) + j] for i, j in POWERS], axis=1)
 
 
-def nuts(density: Callable[[], None], start: dict[str, object], seed: int, full: bool):
+def nuts(density: Callable[[], None], start: dict[str, object], seed: int):
     """Draws (4, n, ...) of what the density samples and names."""
-    warmup, draws = (1000, 10_000) if full else (500, 1500)
-    settings = {"warmup": warmup, "target_accept": 0.9, "by_chain": True}
-    return nuts_draws(density, start, draws, seed, **settings)
+    settings = {"warmup": 1000, "target_accept": 0.9, "by_chain": True}
+    return nuts_draws(density, start, 10_000, seed, **settings)
 
 
 def _effective(chains: np.ndarray) -> np.ndarray:
@@ -69,7 +68,7 @@ def agree(ours: np.ndarray, got: dict[str, np.ndarray], name: str, what: str, ca
     "test_against_dense has what is conditional, test_coverage and tests/coverage the rest"
 )
 @pytest.mark.parametrize("found", [True, False], ids=["a field", "nothing"])
-def test_structure(found, full, capsys):
+def test_structure(found, capsys):
     """Polynomial, higher orders and sines of both axes; three amplitudes; length and likeness."""
     import jax
     import jax.numpy as jnp
@@ -155,7 +154,7 @@ def test_structure(found, full, capsys):
         "of_field_v": np.log(5e-3),
         "pick": 0.5,
     }
-    got = nuts(density, start, 5, full)
+    got = nuts(density, start, 5)
     agree(ours, got, "at", "structure" + (" of a field" if found else " of nothing"), capsys)
 
 
@@ -184,6 +183,7 @@ def deviations():
     return found.theta, A / NOISE, data / NOISE, index
 
 
+@only_in_full("test_against_dense has what is conditional")
 def test_deviations_of_exposures_are_those_of_the_integral(deviations):
     """Dense, over a fine mesh of the three amplitudes: given these all else is normal."""
     theta, matrix, seen, index = deviations
@@ -214,8 +214,8 @@ def test_deviations_of_exposures_are_those_of_the_integral(deviations):
     np.testing.assert_allclose(theta.std(axis=0) / sd, 1, atol=0.03)
 
 
-@only_in_full("the integral above is dense, and takes a second")
-def test_deviations_of_exposures(deviations, full, capsys):
+@only_in_full("test_against_dense has what is conditional")
+def test_deviations_of_exposures(deviations, capsys):
     """The same density without any conjugacy."""
     import jax
     import jax.numpy as jnp
@@ -241,5 +241,5 @@ def test_deviations_of_exposures(deviations, full, capsys):
         numpyro.deterministic("each", each)
 
     start = {"own": np.zeros(q)} | {name: np.log(m) for name, m in MEDIANS.items()}
-    got = nuts(density, start, 4, full)
+    got = nuts(density, start, 4)
     agree(theta, got, "each", "deviations", capsys)

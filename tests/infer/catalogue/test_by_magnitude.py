@@ -10,6 +10,7 @@ from bayesdist.data import Matches, read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Rejection, build_model, fit_by_magnitude, fit_linear, residuals
 from bayesdist.infer.catalogue import by_magnitude
+from tests.reduced import case_in_full
 
 from ..support import simulated
 
@@ -81,7 +82,9 @@ def test_one_error_for_all_is_that_of_the_residuals_and_their_freedom():
     assert np.ptp(ratio) < 0.2
 
 
-@pytest.mark.parametrize("name", ["AstroTomii", "Harry695"])
+@pytest.mark.parametrize(
+    "name", [case_in_full("AstroTomii", instead="another field is run"), "Harry695"]
+)
 def test_real_pairs_of_every_order_have_errors(name, data_dir, monkeypatch):
     """Fields on which fit and errors in turn swung for ever; the climb ends long before its end."""
     monkeypatch.setattr(by_magnitude, "TURNS", 60)

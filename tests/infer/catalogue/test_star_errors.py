@@ -18,6 +18,7 @@ from bayesdist.infer.exposures.hierarchy import fit_hierarchical
 from bayesdist.infer.solution import Solution
 from bayesdist.infer.transforms import linear_terms, reference_gauge
 from bayesdist.model import DistortionModel
+from tests.reduced import only_in_full
 
 from ..small_campaign import campaign, shared_stars, with_star_errors
 from ..support import CHIP, SIZE, UNCLIPPED, columns_of, legendre_design, simulated
@@ -172,6 +173,8 @@ def test_more_exposures_of_the_same_pixels_do_not_help_against_the_catalogue():
         )
 
 
+@pytest.mark.slow
+@only_in_full("tests/assess/test_shared_stars repeats catalogues")
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def test_repeated_catalogues():
     """Simulated from the beginning: catalogue, proper motions, centroids, the fit, 200 times."""

@@ -15,7 +15,7 @@ from bayesdist.infer.compare.monitoring import change_of, fit_new
 from bayesdist.model import TimeDependence
 from bayesdist.simulate import simulate_matches
 from tests.infer.support import CHIP, TWO_CHIPS, UNCLIPPED, simulated
-from tests.reduced import case_in_full
+from tests.reduced import case_in_full, only_in_full
 
 DRIFT = TimeDependence((("u", 1, 0), ("v", 0, 1)), (2010.0,))
 DATES = np.linspace(2005.0, 2015.0, 6)
@@ -73,9 +73,11 @@ def test_without_a_change_p_is_uniform(frames, time, dof, full) -> None:
     assert np.sum(np.array(since) < 0.05) <= binom.ppf(0.999, n, 0.05)
 
 
-def test_errors_that_are_too_small_are_no_change(full) -> None:
+@pytest.mark.slow
+@only_in_full("without a change p is uniform")
+def test_errors_that_are_too_small_are_no_change() -> None:
     """Quoted 0.05 px, true 0.07: the jitter takes it up; false matches do not matter either."""
-    n = 60 if full else 12
+    n = 60
     values = []
     for seed in range(n):
         release, matches = pair(seed, fraction=0.03, jitter=0.05, outlier_scale=1.0)

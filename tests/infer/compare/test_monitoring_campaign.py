@@ -17,6 +17,7 @@ from bayesdist.simulate import simulate_matches
 from tests.diagnose.held_campaign import field
 from tests.infer.small_campaign import campaign, campaign_truth, with_star_errors
 from tests.infer.support import UNCLIPPED
+from tests.reduced import only_in_full
 
 EXACT = OutlierMixture("none", jitter=0.0)
 TAU, OWN = (7e-6, 5e-6, 3e-6), (8e-3, 8e-3, 2e-6, 2e-6, 1.5e-6, 1e-6)
@@ -53,8 +54,10 @@ def monitored(seed, **options):
     return new, change, scan_dates(period_scores(new, change, matches), change)
 
 
-def test_exposures_that_scatter_are_no_change(full) -> None:
-    n = 100 if full else 4
+@pytest.mark.slow
+@only_in_full("tests/app/test_campaign_holdout confirms a release")
+def test_exposures_that_scatter_are_no_change() -> None:
+    n = 100
     values, scatters, since = [], [], []
     for seed in range(n):
         _, change, date = monitored(seed)

@@ -19,7 +19,7 @@ from bayesdist.infer.transforms import lines, reference_gauge
 from bayesdist.model import FRAME_KINDS
 from bayesdist.model.frames import CHIP_DEVIATIONS
 from bayesdist.records import record_from_arrays, record_to_arrays
-from tests.reduced import case_in_full
+from tests.reduced import case_in_full, only_in_full
 
 from ..small_campaign import LINEAR, campaign, campaign_model, seen_by, true_lines
 from ..support import UNCLIPPED, columns_of, residual_of
@@ -281,16 +281,17 @@ def named_by_chance(n, campaigns=20_000):
 
 
 @pytest.mark.slow
+@only_in_full("tests/campaign/test_lines has such pulls")
 @pytest.mark.parametrize(
     "own",
     [
-        case_in_full(None, instead="chips that deviate by themselves are run", id="together"),
+        pytest.param(None, id="together"),
         pytest.param(OWN, id="apart"),
     ],
 )
-def test_scatter_and_lines_over_many_truths(full, own):
+def test_scatter_and_lines_over_many_truths(own):
     """Pulls of alpha and beta, and where the true tau lies in its posterior."""
-    n, exposures = (100, 40) if full else (3, 24)
+    n, exposures = 100, 40
     truth = TAU if own is None else np.concatenate([TAU, own])
     pulls, ranks, outlying = [], [], 0
     for seed in range(n):
@@ -310,6 +311,8 @@ def test_scatter_and_lines_over_many_truths(full, own):
     assert stats.kstest(np.ravel(ranks), "uniform").pvalue > 1e-3
 
 
+@pytest.mark.slow
+@only_in_full("tests/campaign/test_lines compares with the scatter")
 def test_a_chip_that_scatters_by_itself_makes_no_rate_well_known():
     """Scale and shear of the frame act on the distance of the chips too, a lever of 2000 pixels.
 
@@ -329,13 +332,14 @@ def test_a_chip_that_scatters_by_itself_makes_no_rate_well_known():
 
 
 @pytest.mark.slow
-def test_a_gap_that_goes_with_the_shear_is_no_second_measurement_of_it(full):
+@only_in_full("tests/campaign/test_lines compares with the scatter")
+def test_a_gap_that_goes_with_the_shear_is_no_second_measurement_of_it():
     """Scale and shear act on the whole focal plane, as in a telescope that breathes.
 
     In the gauge of WFC2 its B_2 deviates by twice the shear, and no error of its rate can be below
     what that scatter leaves of a line through the exposures.
     """
-    n, exposures = (60, 40) if full else (2, 24)
+    n, exposures = 60, 40
     pulls, ratio = [], []
     for seed in range(n):
         whole, matches, theta = campaign(2000 + seed, exposures, 150, tau=(5e-6, 5e-6, 5e-6))
@@ -351,7 +355,7 @@ def test_a_gap_that_goes_with_the_shear_is_no_second_measurement_of_it(full):
     assert np.sqrt(np.mean(np.square(pulls))) < 1 + 3 / np.sqrt(2 * 2 * n)  # two are independent
 
 
-def test_exposures_that_went_wrong_are_named_and_do_no_harm(full):
+def test_exposures_that_went_wrong_are_named_and_do_no_harm():
     wrong = {"j004.scale": 3e-4, "j011.shear_plus": -2e-4, "j011.WFC1.rotation": 1e-4}
     model, matches, theta = campaign(16, 30, 200, own=OWN, wrong=wrong)
     found = fit_hierarchical(matches, model)
@@ -364,9 +368,14 @@ def test_exposures_that_went_wrong_are_named_and_do_no_harm(full):
     assert stats.chi2(len(FREE)).sf(d @ np.linalg.solve(a.cov, d)) > 1e-3
     k = model.names.index("j004.scale")
     assert found.mean[k] == pytest.approx(theta[k], abs=5 * found.sigma[k])
-    # not only gross ones, and two of few: everything of ten times the usual size
+
+
+@pytest.mark.slow
+@only_in_full("gross errors of two of thirty are named")
+def test_two_of_few_exposures_that_went_wrong_are_named():
+    """Not only gross ones: everything of ten times the usual size."""
     rng = np.random.default_rng(3)
-    for seed in (18, 19, 20) if full else (18,):
+    for seed in (18, 19, 20):
         wrong = {
             f"{e}.{kind}": 10 * t * rng.standard_normal()
             for e in ("j003", "j009")
@@ -376,7 +385,11 @@ def test_exposures_that_went_wrong_are_named_and_do_no_harm(full):
         }
         few = fit_hierarchical(*campaign(seed, 16, 400, own=OWN, wrong=wrong)[1::-1])
         assert few.outlying == ("j003", "j009")
-    # with three quarters of them wrong, there is no telling who went wrong
+
+
+@pytest.mark.slow
+@only_in_full("gross errors of two of thirty are named")
+def test_of_three_quarters_there_is_no_telling_who_went_wrong():
     wrong = {f"j{k:03d}.scale": 3e-4 * (-1) ** k for k in range(2, 25)}
     spread = fit_hierarchical(*campaign(16, 30, 200, own=OWN, wrong=wrong)[1::-1])
     assert not spread.outlying and spread.tau["scale"] > 1e-4
@@ -402,7 +415,13 @@ def test_it_is_an_average_over_tau(some):
     assert (ratio > 0.999).all() and (ratio < 1.02).all()
 
 
-@pytest.mark.parametrize("own", [None, OWN], ids=["together", "apart"])
+@pytest.mark.parametrize(
+    "own",
+    [
+        pytest.param(None, id="together"),
+        case_in_full(OWN, instead="chips that deviate together are run", id="apart"),
+    ],
+)
 def test_draws_have_the_mean_and_the_covariance(some, own):
     found = some[3] if own is None else fit_hierarchical(*campaign(5, 30, 200, own=own)[1::-1])
     n = 4000

@@ -20,6 +20,7 @@ from bayesdist.infer.density.target import Target
 from bayesdist.infer.kernel import circle
 from bayesdist.infer.posterior.memberships import memberships, star_log_likelihood
 from bayesdist.infer.stars.likelihood import MixtureAt
+from tests.reduced import case_in_full, only_in_full
 from tests.seeds import over
 
 from ..selected import SIGMA, selected
@@ -314,7 +315,9 @@ def test_without_nominal_positions_or_radius_nothing_changes():
     assert values[0][0] != target.log_density(psi[None])[0]
 
 
-@pytest.mark.parametrize("compute", ["scratch file", "dask"])
+@pytest.mark.parametrize(
+    "compute", ["scratch file", case_in_full("dask", instead="tests/infer/stars has a cluster")]
+)
 def test_the_same_from_elsewhere(compute):
     target, _, matches, psi = target_at("gaussian")
     if compute == "dask":
@@ -383,6 +386,8 @@ def test_several_chips_and_frames(rng):
     assert chi2.sf(surprise(fit), n) < 1e-12
 
 
+@pytest.mark.slow
+@only_in_full("exact sampling knows of it")
 def test_certified_sampling_knows_of_the_circle():
     model, _, matches, radius = selected(2, 3.0, 600, order=1)
     mixture = OutlierMixture("uniform", match_radius=radius)

@@ -8,6 +8,7 @@ from numpy.polynomial.legendre import leggauss, legvander2d
 
 from bayesdist.infer import OutlierMixture, fit_linear, sample
 from tests.infer.by_nuts import nuts_draws, spread_draws, stein_pulls
+from tests.reduced import only_in_full
 
 from ..selected import SIDE, selected
 
@@ -82,6 +83,7 @@ def _sampled(n: int, target_ess: int):
     return matches, radius, fit, posterior
 
 
+@only_in_full("test_truncation integrates the density, and covers")
 def test_draws_are_of_the_density():
     matches, radius, fit, posterior = _sampled(300, 4000)
     some, h = spread_draws(posterior, 3000)

@@ -27,6 +27,7 @@ from tests.infer.nodes.support import (
     places,
 )
 from tests.infer.support import legendre_design
+from tests.reduced import only_in_full
 
 NOISE = 0.03
 
@@ -203,14 +204,15 @@ def test_the_field_beats_the_bins(rng):
 
 
 @pytest.mark.slow
-def test_it_is_calibrated_over_truths(full, capsys):
+@only_in_full("tests/campaign has pulls of the nodes")
+def test_it_is_calibrated_over_truths(capsys):
     """Pulls of nodes N(0, 1) within 10 %, and 68 % of the positions within one sigma.
 
     Truth and field are drawn anew each time, hyperparameters fitted each time.
     """
     rng = np.random.default_rng(606)
     squares, inside, count = [], 0, 0
-    truths = 60 if full else 12
+    truths = 60
     for _ in range(truths):
         prior = Matern(rng.uniform(0.03, 0.2), rng.uniform(40, 140), 1.5)
         x, y = places(rng, 6000, gradient=True)

@@ -31,6 +31,7 @@ from tests.infer.nodes.support import (
     projector,
 )
 from tests.infer.nodes.test_pixels import turned_by
+from tests.reduced import case_in_full, only_in_full
 
 NOISE = 0.03
 SECOND = Chip(2, "B", SIZE, (320.0, 256.0))
@@ -251,7 +252,7 @@ def test_two_chips_and_turned_exposures(rng):
     assert sigma_uv.max() < 0.05 * NOISE
 
 
-@pytest.mark.parametrize("method", ["field", "binned"])
+@pytest.mark.parametrize("method", ["field", case_in_full("binned", instead="fields are run")])
 def test_false_matches_are_found_and_do_not_pull(rng, method):
     model = DistortionModel(ORDER, (CHIP,))
     x, y = places(rng, 30_000)
@@ -269,6 +270,8 @@ def test_false_matches_are_found_and_do_not_pull(rng, method):
     assert rms[1] < 1.15 * rms[0]  # a tenth of the stars is gone: 5 % by itself
 
 
+@pytest.mark.slow
+@only_in_full("tests/app/test_filters has two filters")
 def test_filters_have_their_own_polynomial_and_table(rng):
     """Positions in a second filter, with few stars: error and stated sigma agree."""
     model = DistortionModel(ORDER, (CHIP,), frames="shift", exposures=("a", "b", "c"))

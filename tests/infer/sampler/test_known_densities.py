@@ -23,6 +23,7 @@ from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.sampler import ensembles as sampler
 from bayesdist.infer.sampler.chains import Settings, run_chains
 from bayesdist.infer.sampler.move_schedule import mixing_steps
+from tests.reduced import case_in_full, only_in_full
 
 from ..fakes import FakeTarget, advanced, ensembles_of, gaussian_proposal
 from ..oracle import JitterOracle
@@ -187,7 +188,13 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("move", MOVES)
+@pytest.mark.parametrize(
+    "move",
+    [
+        "independence",
+        *(case_in_full(move, instead="one wrong move is run") for move in ("pCN", "DE")),
+    ],
+)
 def test_wrong_moves_are_found(move, monkeypatch):
     known = correlated_gaussian()
     monkeypatch.setattr(*WRONG[move])
@@ -196,6 +203,7 @@ def test_wrong_moves_are_found(move, monkeypatch):
     assert worst > 2 * limit(2 * len(known.mean))
 
 
+@only_in_full("each move is run at its density, and high orders sample many parameters")
 def test_many_parameters_are_sampled_from_a_proposal_that_is_worth_little():
     """120 dimensions, the proposal a sixth too wide in each: of a thousand draws ten count."""
     n = 120

@@ -17,6 +17,7 @@ from bayesdist.infer import (
     sample,
 )
 from bayesdist.model import TimeDependence
+from tests.reduced import case_in_full
 
 from ..oracle import JitterOracle
 from ..support import UNCLIPPED, simulated, table
@@ -272,7 +273,13 @@ def test_a_finished_run_is_read_back(small, whole, folder):
 
 @pytest.mark.parametrize(
     "lost",
-    ["first", "middle", "last", "proposal", "pilot", "pilot and first", "one ensemble", "half"],
+    [
+        *("first", "proposal", "half"),
+        *(
+            case_in_full(lost, instead="other blocks are lost")
+            for lost in ("middle", "last", "pilot", "pilot and first", "one ensemble")
+        ),
+    ],
 )
 def test_lost_blocks_are_run_again_bit_for_bit(small, whole, folder, lost):
     blocks = sorted(folder.glob("chain-[1-9]-*.h5"))
@@ -307,7 +314,9 @@ def test_the_total_of_steps_counts_over_resumed_runs(small, whole, tmp_path):
     assert_same(resumed(small, tmp_path, max_steps=100), first)
 
 
-@pytest.mark.parametrize(("first", "then"), [(60, 200), (200, 60)])
+@pytest.mark.parametrize(
+    ("first", "then"), [(60, 200), case_in_full(200, 60, instead="it is made longer")]
+)
 def test_the_spacing_of_checkpoints_does_not_matter(small, tmp_path, first, then):
     """It may be changed between two runs: the chain is the same, or the resume is refused."""
     one = resumed(small, tmp_path, checkpoint_every=first, max_steps=300)
@@ -371,7 +380,10 @@ def test_checkpoints_of_other_priors_are_refused(small, folder):
 
 
 @pytest.mark.parametrize("name", ["chain-2-000030.h5", "chain-0-proposal.h5", "chain-0-pilot.h5"])
-@pytest.mark.parametrize("damage", ["empty", "cut", "text"])
+@pytest.mark.parametrize(
+    "damage",
+    ["cut", *(case_in_full(damage, instead="files are cut") for damage in ("empty", "text"))],
+)
 def test_damaged_checkpoints_are_named(small, whole, folder, name, damage):
     path = folder / name
     data = path.read_bytes()

@@ -14,6 +14,7 @@ from bayesdist.infer import OutlierMixture
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.sampler import surrogate as surrogate_module
 from bayesdist.infer.sampler.surrogate import LEAST_HELD_OUT, Surrogate, certify, draw_surrogate
+from tests.reduced import case_in_full
 
 from ..support import simulated, target_of
 
@@ -215,8 +216,8 @@ FAR = {
 
 
 @pytest.mark.parametrize("log_ratio", FAR.values(), ids=FAR)
-def test_a_proposal_that_is_far_off_is_refused(log_ratio):
-    for seed in range(20):
+def test_a_proposal_that_is_far_off_is_refused(log_ratio, full):
+    for seed in range(20 if full else 5):
         _, certificate = certified(log_ratio, 12, 2, seed)
         assert not certificate.granted
         assert certificate.reasons and "refused" in certificate.statement
@@ -237,7 +238,7 @@ def test_a_bad_tail_is_a_reason(monkeypatch):
     assert replace(bad, pareto_k=good.pareto_k, reasons=()) == good
 
 
-@pytest.mark.parametrize("D", [5, 45, 420])
+@pytest.mark.parametrize("D", [5, 45, case_in_full(420, instead="fewer dimensions are run")])
 def test_noise_is_not_learnt(D):
     """Nothing can be predicted: what is held out keeps the noise, and not much more."""
     found = []

@@ -24,6 +24,7 @@ from bayesdist.infer.selfcal.problem import StarPriors
 from bayesdist.infer.stars.shards import Pieces
 from tests.infer.selfcal import fields
 from tests.infer.workers import local_workers
+from tests.reduced import only_in_full
 
 PIECE = 200  # detections: some ten pieces on three workers
 
@@ -164,6 +165,8 @@ class Interrupted(Pieces):
         self.pieces.close()
 
 
+@pytest.mark.slow
+@only_in_full("tests/infer/stars kills one of them")
 def test_one_of_three_workers_is_killed_while_sampling(solution, compute, monkeypatch):
     struck = []
 
@@ -185,6 +188,8 @@ def test_one_of_three_workers_is_killed_while_sampling(solution, compute, monkey
     assert struck[0].passes > 12 and struck[0].victims
 
 
+@pytest.mark.slow
+@only_in_full("tests/infer/stars kills one")
 def test_worker_dies_of_a_task_and_its_pieces_are_made_again(solution, compute, tmp_path):
     with in_pieces(solution, compute) as there:
         before = there.sum(content)

@@ -14,6 +14,7 @@ from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import TimeDependence
 from bayesdist.simulate.dithers import pixels_of
 from tests.infer.selfcal.fields import field, problem_of
+from tests.reduced import case_in_full
 
 NO_FALSE = Mixture(0.0, 1e-300)
 
@@ -162,7 +163,7 @@ def test_star_integral():
     assert np.abs(exact).max() < 0.01
 
 
-@pytest.mark.parametrize("n", [3, 8])
+@pytest.mark.parametrize("n", [3, case_in_full(8, instead="stars of three are run")])
 def test_a_detection_that_goes_away_from_its_star(n):
     """From 5 to 11 errors off: modes come and go, and the integral over the place follows.
 

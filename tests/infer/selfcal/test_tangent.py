@@ -24,6 +24,7 @@ from tests.infer.selfcal.wide import (
     on,
     tangent_plane,
 )
+from tests.reduced import only_in_full
 
 
 @pytest.mark.parametrize("point", [None, (300.0, -200.0)])
@@ -90,10 +91,12 @@ def _pointing_test(found):
     return next(t for t in selfcal_score_tests(found.mode) if t.name == "pointing")
 
 
-def test_a_wide_field(full):
+@pytest.mark.slow
+@only_in_full("tests/app/selfcal/test_wide_field has one")
+def test_a_wide_field():
     """A field of 19 minutes of arc, steps of 8: half a hundredth of a pixel if it were flat."""
     total, dof, p_values = 0.0, 0, []
-    n_fields = 4 if full else 2
+    n_fields = 4
     for seed in range(n_fields):
         detections, pointings, rolls, bends = observed(seed)
         model, theta = _start(detections, pointings, rolls)

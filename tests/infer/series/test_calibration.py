@@ -8,11 +8,12 @@ from scipy.stats import binom, chi2
 
 from bayesdist.infer.series import fit_series
 from tests.infer.calibration import over_seeds
+from tests.reduced import only_in_full
 
 from .campaign import ALPHA, BETA, FORMAL, LINES, SCATTER, SIGMA_ALPHA, SIGMA_BETA, campaign
 from .straight import straight_lines
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, only_in_full("tests/campaign has lines by two steps")]
 
 
 def one(seed: int) -> dict[str, np.ndarray]:
@@ -44,11 +45,11 @@ def one(seed: int) -> dict[str, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def runs(full) -> list[dict[str, np.ndarray]]:
-    return over_seeds(one, 120 if full else 12)
+def runs() -> list[dict[str, np.ndarray]]:
+    return over_seeds(one, 120)
 
 
-def test_pulls_and_coverage(runs, full, capsys):
+def test_pulls_and_coverage(runs, capsys):
     assert np.mean([r["converged"] for r in runs]) >= 0.95
     n = len(runs)
     with capsys.disabled():
@@ -65,8 +66,7 @@ def test_pulls_and_coverage(runs, full, capsys):
         # as below, campaigns x segments are independent
         low, high = np.sqrt(chi2.ppf([0.001, 0.999], 2 * n) / (2 * n))
         assert low < np.sqrt((pulls**2).mean()) < high
-        if full:
-            assert 0.8 < np.sqrt((pulls**2).mean()) < 1.2
+        assert 0.8 < np.sqrt((pulls**2).mean()) < 1.2
         for level in (0.683, 0.954):
             covered = np.array([r[f"covered {name} {level}"] for r in runs])
             # the three coefficients of a campaign share their exposures: count campaigns x segments

@@ -21,7 +21,7 @@ from bayesdist.infer.series import (
 )
 from bayesdist.infer.series.heldout import held_out
 from tests.infer.calibration import over_seeds
-from tests.reduced import case_in_full
+from tests.reduced import case_in_full, only_in_full
 
 from .campaign import BREAK, campaign, drifting
 
@@ -69,6 +69,8 @@ def test_no_line_without_one():
     assert "not enough" in verdict.text
 
 
+@pytest.mark.slow
+@only_in_full("a line, and no line are told")
 def test_a_trend_with_slopes_is_measured_against_the_one_without():
     comparison = compare(white(3), (TrendModel("lines", (2008.0,)),))
     assert [c.kind for c in comparison.trends] == ["constant", "step", "lines"]
@@ -87,6 +89,8 @@ def test_a_break_is_found_where_it_is(rng):
     assert abs(level.value[0] - 3.0) < 4 * level.sigma[0] and abs(level.significance[1]) < 4
 
 
+@pytest.mark.slow
+@only_in_full("one break is found where it is")
 def test_several_breaks_are_found(rng):
     epoch = np.sort(rng.uniform(2002, 2014, 90))
     true = (2005.0, 2008.5, 2011.2)
@@ -137,9 +141,9 @@ def false_line(seed: int) -> bool:
 
 
 @pytest.mark.slow
-def test_scatter_alone_is_not_taken_for_a_line(full):
-    n = 100 if full else 3
-    assert np.mean(over_seeds(false_line, n)) <= 0.03
+@only_in_full("test_no_line_without_one is one such series")
+def test_scatter_alone_is_not_taken_for_a_line():
+    assert np.mean(over_seeds(false_line, 100)) <= 0.03
 
 
 def test_folds():
@@ -162,7 +166,9 @@ def test_default_candidates_have_what_is_asked():
     assert all(c.find == 1 for c in default_candidates() if c.n_breaks)
 
 
-def test_a_break_in_a_random_walk_is_not_believed(full):
+@pytest.mark.slow
+@only_in_full("drifts that hang together are no lines")
+def test_a_break_in_a_random_walk_is_not_believed():
     """41 dates of sums of random steps: a break found there only follows the drift."""
     broken = (
         TrendModel("line"),
@@ -170,7 +176,7 @@ def test_a_break_in_a_random_walk_is_not_believed(full):
         TrendModel("spline"),
         TrendModel("random_walk"),
     )
-    for seed in range(3 if full else 1):
+    for seed in range(3):
         rng = np.random.default_rng([50, seed])
         epoch = np.sort(rng.uniform(2013, 2019, 41))
         values = np.cumsum(0.5 * rng.standard_normal((41, 2)), axis=0)
@@ -194,6 +200,8 @@ def test_weighted_draws_predict_as_refits_do(kind, monkeypatch):
     assert abs(weighted.rank - refitted.rank).max() < 0.1
 
 
+@pytest.mark.slow
+@only_in_full("a break with gain is found, and none is claimed")
 def test_breaks_without_gain_are_not_fitted():
     def tried(step: float) -> set[str]:
         rng = np.random.default_rng(51)

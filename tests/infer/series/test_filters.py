@@ -7,6 +7,7 @@ import pytest
 
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.series import Change, TrendModel, filter_dependence, fit_series
+from tests.reduced import only_in_full
 
 from .campaign import LINES, campaign
 
@@ -18,6 +19,8 @@ def by_filter(answer, draws) -> dict[str, Change]:
     return {name: Change.of(draws[:, k]) for k, name in enumerate(answer.names[1:])}
 
 
+@pytest.mark.slow
+@only_in_full("tests/app/test_filters has one")
 def test_a_common_drift():
     truth = campaign(11, filters=FILTERS)
     answer = filter_dependence(truth.series, LINES)

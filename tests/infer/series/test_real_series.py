@@ -17,6 +17,7 @@ from bayesdist.infer.series import (
     held_out,
     serial_correlation,
 )
+from tests.reduced import only_in_full
 
 from .straight import straight_lines
 
@@ -124,10 +125,12 @@ def test_held_out_sectors_of_tess_are_covered(tess_answers, capsys):
         print(check_coverage("TESS", tess_answers), end="")
 
 
-def test_decam_exposures_hang_together_and_no_line_is_claimed(decam, full):
+@pytest.mark.slow
+@only_in_full("test_compare has such series")
+def test_decam_exposures_hang_together_and_no_line_is_claimed(decam):
     """Slopes of more than three sigma if exposures were independent, and yet no line."""
     ratios = []
-    for one in some(decam, full, 24):
+    for one in decam.values():
         verdict = describe(one, (TrendModel("line"),))
         assert verdict.comparison.scheme == "blocks"
         assert not verdict.is_line, verdict.text
@@ -137,14 +140,17 @@ def test_decam_exposures_hang_together_and_no_line_is_claimed(decam, full):
     assert (np.array(ratios) > 3).mean() > 0.05
 
 
-def test_tess_has_no_line(tess, full):
-    chosen = list(tess) if full else [(3, 2)]
-    for key in chosen:
-        measured = tess[key].take(np.array(tess[key].names, int) <= LAST_MEASURED)
+@pytest.mark.slow
+@only_in_full("its sectors are held out")
+def test_tess_has_no_line(tess):
+    for one in tess.values():
+        measured = one.take(np.array(one.names, int) <= LAST_MEASURED)
         verdict = describe(measured, (TrendModel("line"),))
         assert not verdict.is_line, verdict.text
 
 
+@pytest.mark.slow
+@only_in_full("a break of DECam is found")
 def test_the_end_of_the_measured_sectors_is_found(tess):
     """Where the table goes from measured to predicted coefficients, with nobody telling."""
     whole = tess[3, 2]
@@ -169,9 +175,11 @@ def test_decam_breaks_are_found(decam):
     assert level.significance[0] < -8
 
 
-def test_a_step_put_into_real_scatter_is_found(decam, full):
+@pytest.mark.slow
+@only_in_full("a break of DECam is found")
+def test_a_step_put_into_real_scatter_is_found(decam):
     """Of six times the CCD's own scatter, at a date that differs from CCD to CCD."""
-    for i, name in enumerate(("N4", "N14", "S2", "S21") if full else ("N4", "N14")):
+    for i, name in enumerate(("N4", "N14", "S2", "S21")):
         one = decam[name].only("e1")
         posterior = fit_series(one, TrendModel("constant"))
         size = 6 * posterior.scatter_sigma.mean()

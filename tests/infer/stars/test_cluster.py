@@ -278,6 +278,8 @@ def test_one_of_three_workers_is_killed_while_sampling(there, by_threads, cluste
     assert before[0] not in after and len(after) == len(before)
 
 
+@pytest.mark.slow
+@only_in_full("one of three is killed while sampling")
 def test_worker_dies_of_a_task_that_then_succeeds(there, problem, tmp_path):
     """It was at work on the shard when it died, and held another."""
     here = load(*problem)
@@ -303,6 +305,8 @@ def test_task_that_kills_every_worker_ends_with_an_error(there, cluster):
     assert isinstance(there.sum(first_u), float)
 
 
+@pytest.mark.slow
+@only_in_full("three workers are run, and one is lost")
 def test_worker_of_two_threads_and_then_none(problem, by_threads, monkeypatch):
     """Its two threads do not get into each other's way; without workers there is an end of it."""
     monkeypatch.setattr(cluster_module, "PATIENCE", 1.5)
@@ -464,9 +468,9 @@ def test_own_cluster_ends_with_the_shards(problem, by_threads):
     """
     before = worker_pids()
     model, matches = problem
-    shards = load(model, matches, Compute(engine="dask", workers=2))
+    shards = load(model, matches, Compute(engine="dask", workers=1))
     try:
-        assert len(worker_pids() - before) == 2
+        assert len(worker_pids() - before) == 1
         assert_same_fit(fit_linear(shards, model), by_threads[0])
         processes = [psutil.Process(), *map(psutil.Process, worker_pids())]
         listening = {
@@ -504,6 +508,8 @@ def secured(tmp_path) -> dict[str, str]:
     return {"distributed.comm.require-encryption": True, f"{tls}.ca-file": str(certificate)} | own
 
 
+@pytest.mark.slow
+@only_in_full("a cluster without them is run")
 def test_cluster_that_asks_for_certificates(problem, by_threads, secured, tmp_path):
     """The settings of docs/scaling.md: with them the pass goes on, without them nobody connects."""
     model, matches = problem

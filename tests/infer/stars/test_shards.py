@@ -18,6 +18,7 @@ from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.shards import total
 from bayesdist.infer.stars.stars import in_table_order, prepare
 from bayesdist.model import DistortionModel, TimeDependence
+from tests.reduced import case_in_full
 
 from ..support import CHIP, TWO_CHIPS, residual_of, simulated
 
@@ -84,7 +85,7 @@ def assert_same(found, expected, rel=1e-12):
     np.testing.assert_allclose(density, expected[1], rtol=rel)
 
 
-@pytest.mark.parametrize("size", [1, 37, 500, 1200])
+@pytest.mark.parametrize("size", [case_in_full(1, instead="larger pieces are run"), 37, 500, 1200])
 def test_pieces_of_a_table(campaign, monkeypatch, size):
     model, matches, theta = campaign
     whole = load(model, matches)

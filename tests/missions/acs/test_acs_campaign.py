@@ -17,6 +17,7 @@ from bayesdist.missions.acs.simulate.detections import cte_shift
 from bayesdist.missions.acs.simulate.stars import centroid_error
 from bayesdist.model.lookup import corrected
 from tests.missions.acs.test_acs_distortion import A_2, B_2, B_3
+from tests.reduced import only_in_full
 
 
 @pytest.fixture(scope="module")
@@ -368,6 +369,8 @@ def test_pairs_scatter_as_their_errors_say(campaign):
     assert inside.std() == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.slow
+@only_in_full("tests/campaign compares with it")
 def test_scatter_of_the_exposures_gives_the_published_sigma():
     """sigma(alpha) of A_2 and B_2 before SM4 is 8.7e-7 to 9.2e-7 in Tables 1 and 3; 6 seeds."""
     sigma, corr = {"A_2": [], "B_2": []}, []

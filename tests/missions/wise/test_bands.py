@@ -35,6 +35,7 @@ from tests.app.support import (
     truth_of,
     write_job,
 )
+from tests.reduced import only_in_full
 from tests.sketches import sketched
 
 PAIRS = 20_000
@@ -284,6 +285,8 @@ def test_an_optical_model_of_another_field_is_refused(compared, tmp_path):
     )
 
 
+@pytest.mark.slow
+@only_in_full("tests/app/test_run has one")
 def test_a_run_that_has_not_converged_is_said_on_top(compared, tmp_path):
     text = (compared.run("W4") / "config.toml").read_text(encoding="utf-8")
     text = text.replace("target_ess = 100", "target_ess = 100000\nmax_steps = 20")
@@ -339,26 +342,22 @@ def test_a_folder_in_use_is_refused(compared):
     )
 
 
-def test_stars_that_are_not_those_of_the_run_are_refused(tmp_path):
-    config = write_job(tmp_path / "in", detector={"name": "D", "size": SIZE, "scale_mas": 50.0})
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "diagnose")
-    stars = config.parent / "stars.ecsv"
-    stars.write_text(stars.read_text(encoding="utf-8") + "\n", encoding="utf-8")
-    words = ["stars.ecsv", "changed since the run began"]
-    refused(tmp_path, "wise", "bands", run, "-o", tmp_path / "out", words=words)
-
-
 def test_bands_of_another_instrument_have_no_word_of_wise(tmp_path):
+    """And where its stars are no longer those of the run, it is refused."""
     detector = {"name": "blue", "size": SIZE, "scale_mas": 50.0}
     config = write_job(tmp_path / "in", detector=detector)
-    begin_stagewise(tmp_path / "run", config, "fit", "sample", "diagnose")
-    good("wise", "bands", tmp_path / "run", "-o", tmp_path / "out", "--bins", 6)
+    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "diagnose")
+    good("wise", "bands", run, "-o", tmp_path / "out", "--bins", 6)
     page = (tmp_path / "out" / "bands.html").read_text(encoding="utf-8")
     text = re.sub(r'src="data:[^"]*"', "", page)
     for word in ("printed", "WISE", "W1", "frameset", "5-1"):
         assert word not in text
     assert not (tmp_path / "out" / "wise_meta.tbl").exists()
     assert not (tmp_path / "out" / "table_5_2.ecsv").exists()  # one band has no other
+    stars = config.parent / "stars.ecsv"
+    stars.write_text(stars.read_text(encoding="utf-8") + "\n", encoding="utf-8")
+    words = ["stars.ecsv", "changed since the run began"]
+    refused(tmp_path, "wise", "bands", run, "-o", tmp_path / "other", words=words)
 
 
 def test_a_missing_scale_is_refused(tmp_path):

@@ -21,6 +21,7 @@ from bayesdist.missions.wise.simulate.bringup import simulate_unpaired
 from bayesdist.missions.wise.simulate.optical import optical_model, write_optical_model
 from bayesdist.model import Chip, DistortionModel
 from tests.app.support import good, refused
+from tests.reduced import case_in_full
 
 STARTS = {
     "nothing": None,
@@ -217,7 +218,7 @@ def write_lists(scene, folder):
     return folder / "detections.ecsv", folder / "reference.ecsv"
 
 
-@pytest.mark.parametrize("optical", [False, True])
+@pytest.mark.parametrize("optical", [case_in_full(False, instead="a start is read as well"), True])
 def test_the_command_gives_the_pairs_of_the_function(scene, ups, tmp_path, optical):
     lists, out = write_lists(scene, tmp_path), tmp_path / "out"
     start = ("--optical", tmp_path / "optical.hdr") if optical else ()
