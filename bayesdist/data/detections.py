@@ -143,15 +143,18 @@ def detections_of(
     epoch: Float | None = None,
     sigma: float | None = None,
 ) -> Detections:
-    """Detections of lists of one exposure each, with epochs (E,) in years and one error (pixels).
+    """Detections of lists of one exposure each, with epochs (E,) in years.
 
-    Refused where only some of the lists have magnitudes.
+    `sigma` is one error for all, pixels; without it errors are those of the lists, where all have
+    some.  Refused where only some of the lists have magnitudes.
     """
     with_mag = [one.mag is not None for one in lists]
     if any(with_mag) and not all(with_mag):
         bare = lists[with_mag.index(False)]
         raise InputError("has no magnitudes, and others have", where=bare.source)
     n = [len(one) for one in lists]
+    own = [one.sigma for one in lists if one.sigma is not None]
+    errors = np.concatenate(own) if len(own) == len(lists) else None
     return Detections(
         np.concatenate([one.x for one in lists]),
         np.concatenate([one.y for one in lists]),
@@ -159,7 +162,7 @@ def detections_of(
         tuple(one.name for one in lists),
         np.concatenate([one.chip for one in lists]),
         epoch,
-        None if sigma is None else np.full(sum(n), sigma),
+        errors if sigma is None else np.full(sum(n), sigma),
         np.concatenate([one.mag for one in lists if one.mag is not None])
         if all(with_mag)
         else None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 from collections.abc import Mapping, Sequence
@@ -30,8 +31,12 @@ _LIST_ALIASES = {key: BASIC[key] for key in ("exposure", "chip", "epoch")} | {
     "x": ALIASES["x"],
     "y": ALIASES["y"],
     "mag": (*ALIASES["mag"], "m"),
+    "flux": ALIASES["flux"],
     "q": ("q", "qfit", "quality"),
+    "sigma_x": ("sigma_x", "x_err", "x_error", "errx2win_image", "errx2psf_image", "errx2_image"),
+    "sigma_y": ("sigma_y", "y_err", "y_error", "erry2win_image", "erry2psf_image", "erry2_image"),
 }
+_VARIANCE = ("errx2", "erry2")  # beginnings of columns of SExtractor
 
 
 @dataclass(frozen=True)
@@ -102,6 +107,8 @@ class StarCuts:
 def read_star_lists(
     path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     columns: Mapping[str, str] | None = None,
+    *,
+    errors: bool = False,
 ) -> tuple[Detections, ...]:
     """Raw detections of exposures, read from files.
 
@@ -112,9 +119,12 @@ def read_star_lists(
         of hst1pass.  A table with a column of exposures may hold several of them; any other file is
         one exposure, named for the file.
     columns : mapping of str to str, optional
-        Column of each quantity: x y exposure chip mag q epoch; without a column of chips all are 1.
-        Lists of hst1pass know theirs.  Pixels that the table's names or header show to count from 0
-        are converted.
+        Column of each quantity: x y exposure chip mag flux q epoch sigma_x sigma_y; without a
+        column of chips all are 1.  Lists of hst1pass know theirs.  Pixels that the table's names or
+        header show to count from 0 are converted; fluxes are magnitudes of zero point 0 where there
+        are no others, and all are positive.
+    errors : bool, optional
+        Whether errors of the pixels are read, of which the rms of x and y is taken.
 
     Returns
     -------
@@ -132,10 +142,16 @@ def read_star_lists(
     for file, name in zip(files, exposure_names(files), strict=True):
         named = file.name.lower().removesuffix(".gz").endswith(tuple(TABLE_SUFFIXES))
         kind = "table" if named else kind_of(file, columns)
-        if kind == "hst1pass":
+        if kind == "hst1pass" and not errors:
             out.append(read_hst1pass(file).detections(name=name))
+        elif kind == "hst1pass":
+            raise InputError(
+                "a list of hst1pass has no errors of its pixels",
+                where=str(file),
+                do="have them measured, by magnitude",
+            )
         elif kind == "table":
-            out += _of_table(read_table(file), columns, str(file), name)
+            out += _of_table(read_table(file), columns, str(file), name, errors)
         else:
             raise FormatError(
                 f"has matches or a catalogue ({kind}), and star lists are asked for",
@@ -154,11 +170,16 @@ def read_star_lists(
 
 
 def _of_table(
-    table: Table, columns: Mapping[str, str] | None, source: str, name: str
+    table: Table, columns: Mapping[str, str] | None, source: str, name: str, errors: bool
 ) -> list[Detections]:
     """Detections of each exposure of a table."""
     found = find_columns(
-        table.colnames, columns, _LIST_ALIASES, source=source, pairs=[("x", "y")], needed="xy"
+        table.colnames,
+        columns,
+        _LIST_ALIASES,
+        source=source,
+        pairs=[("x", "y"), ("sigma_x", "sigma_y")],
+        needed=("x", "y", "sigma_x", "sigma_y") if errors else ("x", "y"),
     )
     if not len(table):
         raise InputError("holds no detections", where=source, do="give a list with stars")
@@ -166,7 +187,15 @@ def _of_table(
     def column(key: str) -> SourceColumn:
         return SourceColumn(table[found[key]], source, found[key])
 
-    values = {key: column(key).numbers() for key in ("x", "y", "mag", "q") if key in found}
+    keys = [key for key in ("x", "y", "mag", "q") if key in found]
+    values: dict[str, NDArray[np.float64]] = {key: column(key).numbers() for key in keys}
+    if "mag" not in values and "flux" in found:
+        with contextlib.suppress(InputError):  # magnitudes help, and are not needed
+            flux = column("flux").numbers()
+            if (flux > 0).all():
+                values["mag"] = -2.5 * np.log10(flux)
+    if errors:
+        values["sigma"] = np.sqrt((_variance(column("sigma_x")) + _variance(column("sigma_y"))) / 2)
     if "exposure" in found:
         codes, names = column("exposure").labels()
     else:
@@ -180,6 +209,7 @@ def _of_table(
         chip=column("chip").integers() if "chip" in found else COMPLETED,
         mag=values.get("mag"),
         q=values.get("q"),
+        sigma=values.get("sigma"),
         source=source,
     )
     years = column("epoch").years() if "epoch" in found else None
@@ -193,3 +223,12 @@ def _of_table(
         )
         for one, rows in zip(names, np.split(order, edges[1:-1]), strict=True)
     ]
+
+
+def _variance(column: SourceColumn) -> NDArray[np.float64]:
+    """Variance of pixels (N,), which SExtractor writes itself."""
+    values = column.numbers()
+    bad = values <= 0
+    if bad.any():
+        raise column.fail(int(np.argmax(bad)), "the error of the pixel is not positive")
+    return values if column.name.lower().startswith(_VARIANCE) else values**2

@@ -153,15 +153,31 @@ def test_one_chip_of_several(tmp_path, data_dir):
     assert (tmp_path / "ast" / "ast.txt").is_file() and said(two) < 1e-6
 
 
+def test_meta_data_of_wise_go_into_themselves(tmp_path):
+    """The band is known from the file."""
+    solution = some_solution(4, size=(1016.0, 1016.0), reference_pixel=(508.5, 508.5))
+    path = write(tmp_path, "wise_meta", calibration_of(solution, "made up", detector="W3"))
+    out = good("convert", path, "--to", "wise_meta", "-o", tmp_path / "again").out
+    assert said(out) < 1e-9 and (tmp_path / "again" / "w3.meta").is_file()
+
+
 def test_bad_requests_get_a_sentence(tmp_path):
     path = write(tmp_path, "tpv", on_sky(3))
     high = write(tmp_path, "ast", on_sky(8))
+    pixels = write(tmp_path, "stdgdc", calibration_of(some_solution(3), "made up"))
+    (notes := tmp_path / "notes.txt").write_text("nothing\n")
     new = ("-o", tmp_path / "x")
     for arguments, message in (
         ((path, "--to", "fit", *new), "there is no format 'fit' that can be built"),
         ((path, "--to", "tpv", "--option", "colour=red", *new), "the keys of tpv are crval"),
         ((path, "--to", "tpv", "--option", "crval", *new), "is not KEY=VALUE"),
         ((path, "--to", "jwst", *new), "needs useafter, pedigree, author, instrument"),
+        ((notes, "--to", "jwst", *new), "notes.txt: is of no kind that is understood"),
+        (
+            (pixels, "--to", "siaf", "--option", "aperture=A", *new),
+            "give the pixel scale (of convert: --scale)",
+        ),
+        ((path, "--to", "wise_meta", *new), "give a run whose detector.name is the band"),
         ((path, "--to", "tpv", "--order", 11, *new), "choose one from 1 to 7 for TPV headers"),
         ((high, "--to", "tpv", *new), "up to order 7"),
         ((path, "--to", "tpv", "-o", tmp_path / "one.head"), "2 files are made"),

@@ -787,6 +787,9 @@ def test_demo(tmp_path, full):
     assert summary["sampler"]["rhat_max"] < 1.01
     stages = json.loads((run / "run.json").read_text())["stages"]
     assert sum(s["wall_s"] for s in stages.values()) < 60
+    # band and size of a pixel are those of the run
+    out = good("convert", run, "--to", "wise_meta", "-o", tmp_path / "wise").out
+    assert "w2.meta" in out and " mas)" in out
     again = cli("demo", "-o", tmp_path / "demo")
     assert again.code == 1 and "--force" in again.err
 

@@ -90,8 +90,35 @@ def test_lists_of_raw_positions(tmp_path, head):
     assert one.name == "jw01501_nis_cal"
     assert (one.x.tolist(), one.y.tolist()) == ([100.25, 2040.125], [12.5, 2000.75])
     assert (one.mag.tolist(), one.q.tolist()) == ([-12.7, -9.2], [0.031, 0.12])
-    with pytest.raises(FormatError, match=r"no columns u, v \(it has x y m q\)"):
+    with pytest.raises(FormatError, match=r"no columns u, v \(it has x y m q( K)?\)"):
         read_matches(path)
+
+
+FRAME = """\
+# BDRY_xy_K1:         1.0000000     2.0000000
+# BDRY_xy_K2:      4095.0000000  4095.0000000
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "rows", "chip", "y"),
+    [
+        ("j8c0.xympqks", "", "1 90.5 -9 7 .1 1 3\n1 3000.5 -9 7 .1 2 3\n", [2, 1], [90.5, 952.5]),
+        ("j8c0.xymK", "", "1 90.5 -9 K1\n1 300.5 -9 K2\n", [2, 1], [90.5, 300.5]),
+        ("j8c0.xymk", FRAME, "1 90.5 -9 1\n1 80.5 -9 1\n", [2, 2], [90.5, 80.5]),
+        ("u2.xymk", "", "1 90.5 -9 3\n1 80.5 -9 1\n", [3, 1], [90.5, 80.5]),
+        ("jw.xymk", "", "1 90.5 -9 1\n1 80.5 -9 1\n", [1, 1], [90.5, 80.5]),
+    ],
+)
+def test_chips_are_those_of_hst(tmp_path, name, head, rows, chip, y):
+    """k = 1 is the lower half of the frame of ACS/WFC and UVIS, which is CCDCHIP 2."""
+    (tmp_path / name).write_text(head + rows)
+    [one] = read_star_lists(tmp_path / name)
+    assert (one.chip.tolist(), one.y.tolist()) == (chip, y)
+    path = tmp_path / name.replace("xym", "uvxym")
+    path.write_text(head + "".join(f"5 6 {row}\n" for row in rows.splitlines()))
+    m = read_matches(path, sigma=0.01)
+    assert np.array(m.chip_numbers)[m.chip].tolist() == chip and m.y.tolist() == y
 
 
 def test_positions_corrected_for_charge_transfer_come_first(tmp_path):

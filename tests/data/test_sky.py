@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from astropy.coordinates import get_body_barycentric
-from astropy.table import MaskedColumn, Table
+from astropy import units as u
+from astropy.coordinates import SkyCoord, get_body_barycentric
+from astropy.table import MaskedColumn, QTable, Table
 from astropy.time import Time
 
 from bayesdist.data import ReadOptions, matches_from_table, read_catalog, tangent_plane
@@ -110,6 +111,23 @@ def test_units_by_name_need_the_company_of_the_catalogue():
     t["pmra"].unit = "arcsec / yr"  # what the file says wins
     moved = read(t, epoch=2016.001, columns={"parallax": ""})
     assert np.abs(moved.pm_u).max() > 100
+
+
+def test_motions_and_time_of_a_skycoord_are_used():
+    """As of the same columns; a SkyCoord without them has positions alone."""
+    t = catalogue()
+    t.remove_columns(["parallax", *GAIA])
+    sky = SkyCoord(
+        t["ra"] * u.deg, t["dec"] * u.deg, pm_ra_cosdec=t["pmra"] * u.mas / u.yr,
+        pm_dec=t["pmdec"] * u.mas / u.yr, obstime=Time(2016.0, format="jyear"),
+    )  # fmt: skip
+    given = QTable({"x": t["x"], "y": t["y"], "skycoord": sky})
+    moved = read(given, epoch=2004.0)
+    t["ref_epoch"] = 2016.0
+    t["pmra"].unit = t["pmdec"].unit = "mas / yr"
+    np.testing.assert_allclose(moved.u, read(t, epoch=2004.0).u, atol=1e-9)
+    bare = QTable({"x": t["x"], "y": t["y"], "skycoord": SkyCoord(sky.ra, sky.dec)})
+    assert np.abs(moved.u - read(bare).u).max() > 1
 
 
 def test_without_an_epoch_nothing_moves_and_it_is_said():

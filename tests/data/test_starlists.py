@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.data.detections import Detections
+from bayesdist.data.detections import Detections, detections_of
 from bayesdist.data.starlists import StarCuts, read_star_lists
 from bayesdist.errors import InputError
 
@@ -81,6 +83,35 @@ def test_pixels_that_count_from_zero_are_converted(tmp_path, caplog, names):
         [one] = read_star_lists(tmp_path / "j1.ecsv")
     assert (one.x.tolist(), one.y.tolist()) == ([11.0, 21.0], [11.0, 21.0])
     assert "j1.ecsv: 1 is added to its pixels" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("names", "factor"),
+    [(("XWIN_IMAGE", "YWIN_IMAGE", "ERRX2WIN_IMAGE", "ERRY2WIN_IMAGE"), 1.0),
+     (("x_fit", "y_fit", "x_err", "y_err"), 0.5)],
+)  # fmt: skip
+def test_errors_are_those_of_the_program(tmp_path, names, factor):
+    """SExtractor writes variances, photutils standard deviations; fluxes are magnitudes."""
+    sigma = np.array([[0.01, 0.02], [0.03, 0.02]])  # of x, of y
+    columns = [np.array([10.0, 20.0])] * 2 + list(sigma ** (2 * factor))
+    table = Table(dict(zip(names, columns, strict=True)) | {"flux": [100.0, 1.0]})
+    table.write(tmp_path / "j1.ecsv")
+    [one] = read_star_lists(tmp_path / "j1.ecsv", errors=True)
+    np.testing.assert_allclose(one.sigma, np.sqrt((sigma**2).mean(axis=0)))
+    np.testing.assert_allclose(one.mag, [-5.0, 0.0])
+    [bare] = read_star_lists(tmp_path / "j1.ecsv")
+    assert bare.sigma is None
+    np.testing.assert_array_equal(detections_of([one, replace(one)]).sigma, np.tile(one.sigma, 2))
+    table[names[2]][1] = 0.0
+    table.write(tmp_path / "j2.ecsv")
+    with pytest.raises(InputError, match=r"row 2.*the error of the pixel is not positive"):
+        read_star_lists(tmp_path / "j2.ecsv", errors=True)
+    table[names[:2]].write(tmp_path / "j3.ecsv")
+    with pytest.raises(InputError, match="no column for 'sigma_x'"):
+        read_star_lists(tmp_path / "j3.ecsv", errors=True)
+    (tmp_path / "j4.xym").write_text("1 2 -9\n")
+    with pytest.raises(InputError, match="has no errors of its pixels; have them measured"):
+        read_star_lists(tmp_path / "j4.xym", errors=True)
 
 
 def test_text_of_other_programs_is_a_star_list(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -187,6 +188,21 @@ def test_planted_faults_are_found(tmp_path, fault):
     assert len(found) == 1 and registry.describe(path)
 
 
+def test_a_mirror_image_is_noted(tmp_path):
+    """The sign of one output: where the plane is on the sky, east is on the left of north."""
+    right = write(tmp_path, on_sky(3))
+    assert not registry.lint(right)
+    text = right.read_text()
+    half = text.count(" CF") // 2
+    turned = re.sub(
+        r" CF(\d+) = (\S+)",
+        lambda f: f" CF{f[1]} = {float(f[2]) * (-1 if int(f[1]) > half else 1)!r}", text,
+    )  # fmt: skip
+    right.write_text(turned)
+    found = [f for f in registry.lint(right) if f.where == "CF"]
+    assert "parity of a mirror image" in found[0].message
+
+
 def test_bad_dumps_get_a_sentence(tmp_path, ast):
     path = write(tmp_path, on_sky(3))
     right = path.read_text()
@@ -293,6 +309,9 @@ GBDES_FAULTS = {
         lambda t: t["parameter"].__setitem__([7, 8], [t["parameter"][8], t["parameter"][7]]),
         "not perpendicular"),
     "arcsec": (lambda t: t.replace_column("parameter", 3600 * t["parameter"]), "is the degree"),
+    "parity": (
+        lambda t: t["parameter"].__setitem__(slice(6, 12), -t["parameter"][6:12]),
+        "of different parity"),
 }  # fmt: skip
 
 

@@ -232,6 +232,11 @@ FAULTS = {
     "a node off": (lambda h: _shifted(h, 25.0), "WCSDVARR,1", "a node off"),
     "no registration": (_no_registration, "WCSDVARR,1", "version 6.1"),
     "degrees": (_in_degrees, "WCSDVARR", "unit is the pixel"),
+    "parity": (
+        lambda h: h["SCI"].header.__setitem__("CDELT1", -0.0225), "CD", "parity of a mirror"),
+    "parity of the sky": (
+        lambda h: h["SCI"].header.update(CTYPE1="RA---TAN", CTYPE2="DEC--TAN"),
+        "CD", "parity of a mirror"),
     "not finite": (
         lambda h: h["WCSDVARR", 2].data.__setitem__((0, 0), np.nan), "WCSDVARR,2", "not finite"),
     "one axis": (

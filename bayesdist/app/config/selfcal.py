@@ -42,7 +42,7 @@ class SelfcalBlock(StarListsBlock):
     """Star lists of dithered exposures, and how their detections become stars."""
 
     exposures: str | None = None
-    sigma: Literal["measured"] | PositiveFloat = "measured"
+    sigma: Literal["measured", "columns"] | PositiveFloat = "measured"
     initial_distortion: str | None = None
     unit: Literal["pix", "arcsec", "mas"] = "pix"
     frames: Frames = "shift_rotation"

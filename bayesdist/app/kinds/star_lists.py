@@ -84,13 +84,15 @@ class StarLists:
         return ", ".join(f"{count} {reason}" for reason, count in self.cut.items())
 
 
-def lists_of(block: StarListsBlock, base: Path) -> StarLists:
-    """All star lists that a configuration names; paths are relative to `base`.
+def lists_of(block: StarListsBlock, base: Path, *, errors: bool = False) -> StarLists:
+    """All star lists that a configuration names, with `errors` of their own; relative to `base`.
 
     Each place is read alone: a list whose name stands in two is an exposure given twice, not two.
     """
     names = block.list_names
-    lists = (one for name in names for one in read_star_lists(base / name, block.columns))
+    lists = (
+        one for name in names for one in read_star_lists(base / name, block.columns, errors=errors)
+    )
     return StarLists(tuple(lists), StarCuts(block.mag, block.saturation, block.q_max))
 
 

@@ -28,7 +28,9 @@ Float = NDArray[np.float64]
 _COLUMN = re.compile(r"#\s*\((\d+)\)\s+(\S+)\s+--\s")
 _KEYWORD = re.compile(r"#\s*(\w+)\s*:\s*(.*?)\s*$")
 _SUFFIX = re.compile(r"\w*(xym|XYM|XYm)\w*")
-_LABELS = "IJKN"  # row, column, chip and number of a star for grepping: I0042, K1, N00007
+_LABELS = "IJN"  # row, column and number of a star for grepping: I0042, J0817, N00007
+_CHIP = "kK"  # chip: as a number, or a label such as K1
+_ROWS = 2048  # of the lower chip, in the frame that holds both
 _DAMAGED = "fetch or write the file again"
 
 
@@ -52,6 +54,8 @@ class Hst1passList:
         Decimal years, from rDAT.
     exptime : float or None
         Seconds, from EXPTI.
+    two_chips : bool
+        True of a detector with two chips in one frame of 4096 x 4096 pixels, as the header says.
     """
 
     name: str
@@ -60,6 +64,7 @@ class Hst1passList:
     filter: str
     epoch: float | None
     exptime: float | None
+    two_chips: bool = False
 
     def matches(self, *, name: str | None = None) -> Matches:
         """Matches of raw pixels with the observatory's corrected positions.
@@ -85,11 +90,15 @@ class Hst1passList:
         """
         x, y = self._pair(("X", "Y"), ("x", "y"))
         u, v = self._pair(("u", "v"))
+        chip, y = self._on_chips(y)
+        numbers, codes = np.unique(chip, return_inverse=True)
         return Matches(
             x=x,
             y=y,
             u=u,
             v=v,
+            chip=codes,
+            chip_numbers=tuple(numbers.tolist()),
             mag=self._mag,
             epoch=None if self.epoch is None else np.full(len(x), self.epoch),
             exposure_names=(self.name if name is None else name,),
@@ -117,14 +126,32 @@ class Hst1passList:
             When the list lacks pixels.
         """
         x, y = self._pair(("X", "Y"), ("x", "y"))
+        chip, y = self._on_chips(y)
         return Detections(
             x=x,
             y=y,
+            chip=chip,
             exposure_names=(self.name if name is None else name,),
             mag=self._mag,
             q=self.columns.get("q"),
             source=self.source,
         )
+
+    def _on_chips(self, y: Float) -> tuple[NDArray[np.int64], Float]:
+        """Chip of each star, (N,), and its row on that chip.
+
+        hst1pass lays the two chips of ACS/WFC and WFC3/UVIS into one frame, k = 1 below k = 2; of
+        these it is CCDCHIP, 2 below 1, as in HST's other files.  Rows count on the chip, unless the
+        list has them so.  Where a list has no k, it has one chip, 1.
+        """
+        k = next((self.columns[name] for name in _CHIP if name in self.columns), None)
+        if k is None:
+            return np.ones(len(y), np.int64), y
+        chip = k.astype(np.int64)
+        if not (self.two_chips or set(chip.tolist()) == {1, 2}):
+            return chip, y
+        in_frame = bool((y[chip == 2] > _ROWS).all())
+        return 3 - chip, y - _ROWS * (chip - 1) if in_frame else y
 
     @property
     def _mag(self) -> Float | None:
@@ -217,6 +244,7 @@ def read_hst1pass(path: str | Path) -> Hst1passList:
         filter=keywords.get("FILT", "").strip("' "),
         epoch=_float(keywords.get("rDAT")),
         exptime=_float(keywords.get("EXPTI")),
+        two_chips="BDRY_xy_K2" in keywords and "BDRY_xy_K3" not in keywords,
     )
 
 
@@ -241,7 +269,7 @@ def _numbers(path: Path, lines: list[str], n_columns: int, kept: Sequence[int]) 
         try:
             if len(fields) < n_columns:
                 raise ValueError(f"has {len(fields)} of {n_columns} columns")
-            out[k] = [fields[m] for m in kept]
+            out[k] = [fields[m].removeprefix("K") for m in kept]
         except ValueError as error:
             raise FormatError(str(error), where=f"{path}, row {k + 1}", do=_DAMAGED) from None
     return out

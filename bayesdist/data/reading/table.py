@@ -25,6 +25,7 @@ __all__ = ["matches_from_table", "own_epoch", "sky_positions", "with_sky_columns
 
 Float = NDArray[np.float64]
 
+_MOTION = "mas / yr"
 _SPARED = frozenset((*SPARED, "colour", "flux"))  # optional: a star may lack them
 
 
@@ -60,7 +61,8 @@ def sky_positions(
 def with_sky_columns(table: Table) -> Table:
     """Table whose SkyCoord columns are columns of ra and dec, in degrees.
 
-    `skycoord` becomes `skycoord.ra`, `skycoord.dec` (ICRS); without such it is the table itself.
+    `skycoord` becomes `skycoord.ra`, `skycoord.dec` (ICRS), and its motions and the time of its
+    positions `pmra`, `pmdec` and `ref_epoch`; without such it is the table itself.
     """
     coordinates = [name for name in table.colnames if isinstance(table[name], SkyCoord)]
     if not coordinates:
@@ -69,6 +71,11 @@ def with_sky_columns(table: Table) -> Table:
     for name in coordinates:
         sky = table[name].icrs
         out[f"{name}.ra"], out[f"{name}.dec"] = sky.ra.deg, sky.dec.deg
+        if "s" in sky.data.differentials and "pmra" not in out.colnames:
+            out["pmra"] = sky.pm_ra_cosdec.to(_MOTION)
+            out["pmdec"] = sky.pm_dec.to(_MOTION)
+        if sky.obstime is not None and "ref_epoch" not in out.colnames:
+            out["ref_epoch"] = np.broadcast_to(sky.obstime.jyear, len(out))
         out.remove_column(name)
     return out
 

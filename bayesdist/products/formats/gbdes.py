@@ -115,6 +115,7 @@ def _lint(found: GbdesParameters) -> tuple[Finding, ...]:
 
 def _findings(found: GbdesParameters) -> Iterator[Finding]:
     table = found.table
+    handed: set[float] = set()  # signs of the determinants
     for name, rows in found.maps.items():
         axes = [str(v) for v in np.asarray(table["coordinate"])[rows]]
         half = len(rows) // 2
@@ -128,6 +129,7 @@ def _findings(found: GbdesParameters) -> Iterator[Finding]:
         slope = np.asarray(table["parameter"], float)[rows]
         if half >= 3 and _DEVICE.match(name):
             linear = np.array([slope[1:3], slope[half + 1 : half + 3]])
+            handed.add(float(np.sign(np.linalg.det(linear))))
             across, up = np.hypot(*linear)
             unequal = min(across, up) < 0.5 * max(across, up)
             if unequal or abs(np.linalg.det(linear)) < 0.5 * across * up:
@@ -136,6 +138,8 @@ def _findings(found: GbdesParameters) -> Iterator[Finding]:
                 )
             if max(across, up) > 90:
                 yield Finding("error", name, "is wider than the sky: its unit is the degree")
+    if len(handed) > 1:
+        yield Finding("warning", "parameter", "detectors are of different parity: check their maps")
     cov = found.covariance
     if cov is None:
         yield Finding("warning", "MAP_x_n_cov", "columns of the covariance are missing")

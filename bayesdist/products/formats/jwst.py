@@ -66,7 +66,10 @@ def _parse(content: Content) -> DistortionFile | None:
 
 
 def _tree(one: ChipTransform, detector: str, settings: Settings, _: str) -> dict[str, Any]:
+    from bayesdist.products.formats.common.asdf.build import refuse_larger
+
     meta = meta_of(detector, settings.model_dump(), "products.jwst")
+    refuse_larger(one, detector, detector_of(settings.instrument, detector), "products.jwst")
     return {"meta": meta, "model": one.model, "bayesdist": one.record}
 
 

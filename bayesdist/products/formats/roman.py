@@ -67,7 +67,10 @@ def _parse(content: Content) -> DistortionFile | None:
 
 
 def _tree(one: ChipTransform, detector: str, settings: Settings, file: str) -> dict[str, Any]:
+    from bayesdist.products.formats.common.asdf.build import refuse_larger
+
     meta = meta_of(detector, settings.model_dump(), "products.roman")
+    refuse_larger(one, detector, detector_of(detector), "products.roman")
     return {"roman": tagged({"meta": meta, KEY: one.model, "bayesdist": one.record}, TAG, file)}
 
 

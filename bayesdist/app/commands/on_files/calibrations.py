@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import TypeAdapter
 
+from bayesdist.app.config.section import Detector
 from bayesdist.app.products.made_files import further_errors
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
@@ -22,7 +23,7 @@ from bayesdist.products.formats.common.content import read_hdus
 from bayesdist.products.registry import read_calibration
 from bayesdist.reading.documents import read_json_as
 
-__all__ = ["calibration_at", "images_of", "notes_of", "on_the_sky"]
+__all__ = ["calibration_at", "images_of", "notes_of", "on_the_sky", "pixel_of_run"]
 
 _SUMMARY = TypeAdapter(Summary)
 
@@ -64,7 +65,12 @@ def calibration_at(
     if solution is None:
         found = read_calibration(path, filter=filter, size=size)
     else:
-        found = calibration_of(solution, str(path), scale=_scale_of_run(path, solution))
+        found = calibration_of(
+            solution,
+            str(path),
+            detector=_detector_of_run(path).name,
+            scale=_scale_of_run(path, solution),
+        )
         summary = _summary_of(path)
         budget = [] if summary is None else summary.budget or []
         found = replace(found, further=further_errors([row.model_dump() for row in budget]))
@@ -134,14 +140,24 @@ def _summary_of(path: Path) -> Summary | None:
     return read_json_as(_SUMMARY, summary, do="resume the run, which writes it again")
 
 
+def _detector_of_run(path: Path) -> Detector:
+    """The section [detector] of the run that a file or folder is of; empty where it is of none."""
+    home = path if path.is_dir() else path.parent
+    return RunDirectory(home).config.detector if (home / "run.json").exists() else Detector()
+
+
+def pixel_of_run(path: Path) -> float | None:
+    """Arcseconds in a pixel as a run was configured; None where nothing says it."""
+    mas = _detector_of_run(path).scale_mas
+    return None if mas is None else 1e-3 * mas
+
+
 def _scale_of_run(path: Path, solution: Solution) -> tuple[float, str] | None:
     """Size of a corrected pixel as a run was configured; None where nothing says it."""
-    unit = solution.model.unit
-    home = path if path.is_dir() else path.parent
-    if unit == "pix" or not (home / "run.json").exists():
+    unit, pixel = solution.model.unit, pixel_of_run(path)
+    if unit == "pix" or pixel is None:
         return None
-    mas = RunDirectory(home).config.detector.scale_mas
-    return None if mas is None else (1e-3 * mas / ARCSEC[unit], "detector.scale_mas")
+    return pixel / ARCSEC[unit], "detector.scale_mas"
 
 
 def notes_of(found: Calibration, epoch: float | None) -> tuple[str, ...]:

@@ -12,7 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from bayesdist.app.commands.on_files.calibrations import calibration_at, on_the_sky
+from bayesdist.app.commands.on_files.calibrations import (
+    calibration_at,
+    on_the_sky,
+    pixel_of_run,
+)
 from bayesdist.app.screen import number as digits
 from bayesdist.app.store.output import refuse_existing
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
@@ -60,18 +64,21 @@ def convert(
     configuration, values as in TOML.  `output` is a folder, or the name of the file where the
     format makes one; by default the present folder.  `order` is of the polynomial where another one
     than that of the calibration is wanted; look-up tables go into it where the format has none.
-    `scale` is arcseconds in a pixel.  `filter`, `epoch` and `size` are as of `calibration_at`.
+    `scale` is arcseconds in a pixel, by default as the run says.  `filter`, `epoch` and `size` are
+    as of `calibration_at`.
     What is to be printed is returned.  InputError for what the format cannot hold, or files that
     are there without `force`.
     """
     target = format_of(to)
-    settings = _settings(to, product_settings()[to], options)
     found = on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
+    settings = _settings(to, product_settings()[to], options)
     source = found if chip is None else found.only(chip, epoch)
     at = None
     if source.model.time is not None:
         at = source.reference_date if epoch is None else epoch
     made, notes = _representable(source, target, order, at)
+    if scale is None:
+        scale = pixel_of_run(Path(path))
     if scale is not None and not (np.isfinite(scale) and scale > 0):
         raise InputError(f"the scale is {scale}", where="--scale", do="give a positive number")
     built = build(to, made, settings, BuildOptions(at, scale))

@@ -45,6 +45,7 @@ _STAR_LIST = """
 lists = {relative}
 # lists = "lists/*"             # a pattern, or a list of names: all exposures of the field
 {columns}match_radius = 0.5              # pixels between detections of one star in the end
+# sigma = "measured"            # errors of the pixels, by magnitude; or "columns", or one number
 # start_radius = 2.0            # and at the beginning, before the distortion is known
 # initial_distortion = ""       # a finished run, or an IDCTAB: for a distortion of some ten pixels
 
@@ -68,7 +69,7 @@ order = 3                       # 1 to 12
 """
 
 _PAIRS = {"xy": "pixels (x, y)", "uv": "reference positions (ra, dec or u, v)"}
-_LIST_KEYS = ("x", "y", "mag", "exposure")
+_LIST_KEYS = ("x", "y", "mag", "flux", "exposure")
 
 
 def draft_of(
@@ -142,7 +143,7 @@ def _of_star_list(
             x, y = reach.get(number, (0.0, 0.0))
             rows = one.chip == number
             reach[number] = (max(x, float(one.x[rows].max())), max(y, float(one.y[rows].max())))
-    detector = detector_lines(dict(sorted(reach.items())), {}, size, Path(matches).stem)
+    detector = detector_lines(dict(sorted(reach.items())), {}, size, input_files(matches)[0].stem)
     inline = ", ".join(f"{key} = {quoted(name)}" for key, name in columns.items())
     return _STAR_LIST.format(
         relative=relative,

@@ -182,7 +182,7 @@ def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
         and as `read_commanded`.
     """
     block, gauge = config.selfcal, config.gauge
-    found = lists_of(block, base)
+    found = lists_of(block, base, errors=block.sigma == "columns")
     names = found.names
     for name, one, good in zip(names, found.lists, found.passed, strict=True):
         if not good.any():
@@ -205,7 +205,7 @@ def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
     epoch, dilation = _of_log(config, base, names)
     if epoch is None and all(one.epoch is not None for one in used):
         epoch = np.concatenate([one.epoch for one in used if one.epoch is not None])
-    sigma = None if block.sigma == "measured" else float(block.sigma)
+    sigma = None if isinstance(block.sigma, str) else float(block.sigma)
     commanded, catalog = None, _read_references(config, base)
     if gauge.offsets is not None:
         commanded = read_commanded(

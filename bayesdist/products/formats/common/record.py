@@ -112,7 +112,7 @@ def at_date(
         raise InputError(
             "u and v are in pixels, and the file is in arcseconds",
             where="detector.scale_mas",
-            do="give the pixel scale",
+            do="give the pixel scale (of convert: --scale)",
         )
     date = epoch if calibration.model.time is not None else None
     factor = float(scale_arcsec or 1.0) if unit == "pix" else ARCSEC[unit]

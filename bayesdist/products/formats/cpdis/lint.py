@@ -21,6 +21,8 @@ __all__ = ["lint_cpdis"]
 
 _TINY = 1e-3  # pixels: tables all of which are below are in another unit
 _ASKEW = 0.75  # of a step by which the nodes lie nearer to one edge than to the other
+# sign of det(CD) by CTYPE1: with north up RA grows to the left, longitude on the Sun to the right
+_HANDED = {"RA--": -1, "HPLN": 1}
 _WIDE = 180.0  # degrees: what a CD in arcseconds makes of a detector
 
 
@@ -139,7 +141,7 @@ def _linear(image: CpdisImage) -> Iterator[Finding]:
         yield Finding("error", "CD", "is singular")
     elif image.size is not None and np.sqrt(abs(det)) * max(image.size) > _WIDE:
         yield Finding("error", "CD", "makes the image wider than the sky: check its unit")
-    elif det > 0 and str(image.header.get("CTYPE1", "")).startswith("RA"):
+    elif det * _HANDED.get(str(image.header.get("CTYPE1", ""))[:4], 0) < 0:
         yield Finding("note", "CD", "has the parity of a mirror image")
 
 

@@ -258,7 +258,7 @@ def _arcsec(unit: str, scale_arcsec: float | None) -> float:
         raise InputError(
             "u and v are in pixels, and an IDCTAB is in arcseconds",
             where="detector.scale_mas",
-            do="give the pixel scale",
+            do="give the pixel scale (of convert: --scale)",
         )
     return scale_arcsec
 

@@ -123,7 +123,7 @@ def _build(calibration: Calibration, _: Settings, options: BuildOptions) -> tupl
         raise InputError(
             f"the detector is {calibration.detector!r}, no band of WISE",
             where="products.wise_meta",
-            do="name the band as detector.name, or leave wise_meta out",
+            do="give a run whose detector.name is the band (W1, W2, W3, W4), or a file of WISE",
         )
     sip = sip_from_solution(
         replace(calibration, plane=Plane("free")),  # the entries cannot state a sky position

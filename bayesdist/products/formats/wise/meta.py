@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from astropy.io import fits
 
@@ -182,4 +182,5 @@ def wise_calibration(bands: Sequence[WiseBand], name: str, band: str | None = No
         )
     one = known[chosen] if band is not None else next(iter(known.values()))
     notes = ("without the SKEW of its CD matrix",) if one.skew else ()
-    return sip_calibration(one.sip, f"{name}, W{one.band}", pixels=True, notes=notes)
+    found = sip_calibration(one.sip, f"{name}, W{one.band}", pixels=True, notes=notes)
+    return replace(found, detector=f"W{one.band}")

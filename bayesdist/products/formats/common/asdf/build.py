@@ -20,12 +20,12 @@ from bayesdist.products.formats.common.asdf.transforms import (
     inverse_transform,
     tables_of,
 )
-from bayesdist.products.formats.common.asdf.tree import PlacedSettings
+from bayesdist.products.formats.common.asdf.tree import Detector, PlacedSettings
 from bayesdist.products.formats.common.coefficients import require_regular
 from bayesdist.products.formats.common.document import BuildOptions
 from bayesdist.products.formats.common.record import at_date, record_of
 
-__all__ = ["ChipTransform", "chip_transforms"]
+__all__ = ["ChipTransform", "chip_transforms", "refuse_larger"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +79,18 @@ def chip_transforms(
         date = options.epoch if calibration.model.time is not None else None
         record = record_of(one, calibration, epoch=date, closure=closure)
         yield ChipTransform(one, number, known.name, model, record, closure)
+
+
+def refuse_larger(one: ChipTransform, name: str, known: Detector | None, where: str) -> None:
+    """Refuse a chip with more pixels than the detector that it is said to be."""
+    [chip] = one.calibration.model.chips
+    if known is not None and any(a > b for a, b in zip(chip.size, known.size, strict=True)):
+        (nx, ny), (most_x, most_y) = chip.size, known.size
+        raise InputError(
+            f"the chip has {nx:g} x {ny:g} pixels, and {name} {most_x:g} x {most_y:g}",
+            where=where,
+            do="name the detector that it is",
+        )
 
 
 def _placed(plane: Plane, settings: PlacedSettings, where: str) -> Plane:
