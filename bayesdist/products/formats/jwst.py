@@ -66,7 +66,6 @@ def _parse(content: Content) -> DistortionFile | None:
 
 
 def _tree(one: ChipTransform, detector: str, settings: Settings, _: str) -> dict[str, Any]:
-    # no file that is read needs it
     from bayesdist.products.formats.common.asdf.build import refuse_larger
 
     meta = meta_of(detector, settings.model_dump(), "products.jwst")
