@@ -23,6 +23,7 @@ _CLIP = 4.0  # sigmas beyond which a star has no part in the scatter
 MAD_TO_SIGMA = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
 _SMALL_SAMPLE = 0.31  # relative bias of the median of |z| over n stars is +0.31 / n
 _LOG_VARIANCE = 1.36  # variance of ln(scatter) times n: the median of |z| is 37 % efficient
+_LEAST_LEFT = 0.25  # of errors from which others are taken off
 _TURN = 9.0  # gain in chi-square that a rise towards the bright end must bring to be believed
 
 
@@ -69,6 +70,17 @@ class MagnitudeErrors:
             for sigma in (self.sigma_u, self.sigma_v)
         )
         return u, v
+
+    def less(self, sigma_u: ArrayLike, sigma_v: ArrayLike) -> MagnitudeErrors:
+        """Errors less others that are in them, one for all magnitudes or those of each bin (B,).
+
+        A quarter stays at least: the other errors are not that well known.
+        """
+        left_u, left_v = (
+            np.sqrt(np.maximum(sigma**2 - np.square(known), (_LEAST_LEFT * sigma) ** 2))
+            for sigma, known in ((self.sigma_u, sigma_u), (self.sigma_v, sigma_v))
+        )
+        return replace(self, sigma_u=left_u, sigma_v=left_v)
 
 
 def no_magnitudes(where: str) -> InputError:

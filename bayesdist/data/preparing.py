@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,8 +29,6 @@ _MAX_BINS = 40
 # above the median, in the logarithm: 0.6 % of a log-normal distribution
 _MAX_SCATTERS_ABOVE = 2.5
 _MIN_SCATTER = 0.05  # of ln(sigma): among errors all alike a slightly larger one stays
-# of the total scatter that is the centroid's, whatever the catalogue quotes
-MIN_CENTROID_FRACTION = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,8 +137,7 @@ def centroid_errors(table: Matches, total: MagnitudeErrors) -> MagnitudeErrors:
     Returns
     -------
     MagnitudeErrors
-        Total less catalogue (median of each bin's stars) in quadrature, at least a quarter of the
-        total: the catalogue's quoted errors are not that well known.
+        Total less catalogue (median of each bin's stars).
 
     Raises
     ------
@@ -154,16 +151,12 @@ def centroid_errors(table: Matches, total: MagnitudeErrors) -> MagnitudeErrors:
             do="give lists with magnitudes and a catalogue with errors",
         )
     which = np.searchsorted((total.mag[1:] + total.mag[:-1]) / 2, table.mag)
-    left = []
-    for sigma, of_catalog in ((total.sigma_u, table.sigma_u), (total.sigma_v, table.sigma_v)):
-        known = np.array(
-            [
-                np.median(of_catalog[which == k]) if (which == k).any() else 0.0
-                for k in range(len(total.mag))
-            ]
-        )
-        left.append(np.sqrt(np.maximum(sigma**2 - known**2, (MIN_CENTROID_FRACTION * sigma) ** 2)))
-    return replace(total, sigma_u=left[0], sigma_v=left[1])
+    of_bins = [np.flatnonzero(which == k) for k in range(len(total.mag))]
+    known_u, known_v = (
+        np.array([np.median(sigma[rows]) if rows.size else 0.0 for rows in of_bins])
+        for sigma in (table.sigma_u, table.sigma_v)
+    )
+    return total.less(known_u, known_v)
 
 
 def neutralise_aberration(table: Matches, log: ExposureLog) -> Matches:

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from bayesdist.files import atomic_path, made_folder
-from bayesdist.report.figure_numbers import numbers_of
+from bayesdist.report.figures.figure_numbers import numbers_of
+from bayesdist.report.figures.style import figure_style, plain_ticks
 from bayesdist.report.registry import Item, Plot, Registry
-from bayesdist.report.style import figure_style, plain_ticks
 
 __all__ = [
     "DPI",

@@ -8,16 +8,14 @@ other counts the catalogue twice: what is known to be in the residuals is taken 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from bayesdist.data.magnitude_errors import MagnitudeErrors
-from bayesdist.data.preparing import MIN_CENTROID_FRACTION
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError
 
-__all__ = ["centroid_errors", "centroids_of", "without"]
+__all__ = ["centroid_errors", "centroids_of"]
 
 
 def centroid_errors(
@@ -25,8 +23,7 @@ def centroid_errors(
 ) -> MagnitudeErrors:
     """Scatter of residuals by magnitude, less other errors that are in it.
 
-    `contained`: errors that the residuals hold beside those of the centroids, in their unit. The
-    result is at least a quarter of the scatter: the other errors are not that well known.
+    `contained`: errors that the residuals hold beside those of the centroids, in their unit.
     InputError where an error that is said to be in the residuals is larger than these.
     """
     squares = np.sum([(u**2, v**2) for _, u, v in contained] or [(0.0, 0.0)], axis=0)
@@ -42,22 +39,7 @@ def centroid_errors(
                 where=f"budget term {contained[0][0]!r}",
                 do="correct them, or set included_in_scatter = false",
             )
-    return without(scatter, float(left[0]), float(left[1]))
-
-
-def without(errors: MagnitudeErrors, sigma_u: float, sigma_v: float) -> MagnitudeErrors:
-    """Errors by magnitude, less an error that all of them hold.
-
-    `sigma_u`, `sigma_v`: in their unit. The result is at least a quarter of what they were.
-    """
-    left = {
-        name: np.sqrt(np.maximum(sigma**2 - known**2, (MIN_CENTROID_FRACTION * sigma) ** 2))
-        for name, sigma, known in (
-            ("sigma_u", errors.sigma_u, sigma_u),
-            ("sigma_v", errors.sigma_v, sigma_v),
-        )
-    }
-    return replace(errors, **left)
+    return scatter.less(*left)
 
 
 def centroids_of(
@@ -76,4 +58,4 @@ def centroids_of(
     errors = centroid_errors(diagnostics.centroid, contained) if contained else diagnostics.centroid
     correlated = diagnostics.correlated
     median = None if correlated is None else correlated.structure_median
-    return errors if median is None else without(errors, *median)
+    return errors if median is None else errors.less(*median)

@@ -21,6 +21,7 @@ from bayesdist.data.matching.linear_map import (
 )
 from bayesdist.data.matching.pairs import (
     beats_chance,
+    chance_radius,
     chance_rate,
     hull_of,
     inside_hull,
@@ -32,6 +33,7 @@ from bayesdist.data.matching.search_radius import SearchRadius, search_radius
 from bayesdist.data.matching.similarity import (
     PatternIndex,
     Similarity,
+    brightest,
     find_similarity,
     grown_map,
 )
@@ -47,7 +49,7 @@ _ASTRAY_FRACTION = 0.2  # of the matched fraction of the best chip: a chip below
 _MIN_DETECTIONS_ON_CHIP = 20  # detections of a chip for that comparison
 _CHANCE_RATE = 0.1  # chance matches of a detection within the largest radius that is looked at
 _DISPLACEMENT = 10.0  # radii by which detections are displaced to count chance matches
-_BRIGHT_STARS = 2000  # stars of the first linear map, and of the last check
+_MAX_CHECKED = 2000  # detections of the last check
 _MARGIN = 0.1  # of the field, around it
 _MAX_ROUNDS = 12  # of a cubic for each chip, and then the radius that follows
 _MIN_UNPAIRED = 100  # unpaired detections that sample where such detections lie
@@ -95,9 +97,7 @@ def match_exposure(
     reference = np.column_stack([catalog.u, catalog.v])[nearby]
     tree = cKDTree(reference)
     n_over, area = overlap(first(points), reference)
-    largest = float(np.sqrt(-np.log1p(-_CHANCE_RATE) * area / (np.pi * n_over)))
-    if radius is not None:
-        largest = radius
+    largest = chance_radius(_CHANCE_RATE, n_over, area) if radius is None else radius
     linear = iterated_map(points, reference, tree, first, 2.0 * largest, largest)
     failure = InputError(
         f"does not match {catalog.source}: {coincidences} stars agree on a rotation and shift, but "
@@ -226,7 +226,7 @@ def _iterated_pairs(
         index, partner, distance = index[near], partner[near], distance[near]
         if not growing and (fixed or widest < largest):
             break
-    sample = moved[:: -(-len(moved) // _BRIGHT_STARS)]
+    sample = moved[:: -(-len(moved) // _MAX_CHECKED)]
     if len(index) < MIN_PAIRS or not beats_chance(sample, reference, tree, distance):
         return None
     return _Pairs(moved, allowed, index, partner, distance)
@@ -279,10 +279,8 @@ def _by_patterns(
             raise
         found = recognised(np.ones(len(stars), bool))
     # a similarity is good in the middle: the map grows outwards from there with the bright stars
-    rows = np.flatnonzero(good)
-    if stars.mag is not None:
-        rows = rows[np.argsort(stars.mag[rows], kind="stable")]
-    rough = grown_map(plane[rows[:_BRIGHT_STARS]], found, patterns, narrow=0.15)
+    mag = None if stars.mag is None else stars.mag[good]
+    rough = grown_map(brightest(plane[good], mag), found, patterns, narrow=0.15)
     return rough, found.coincidences
 
 

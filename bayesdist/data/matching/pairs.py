@@ -10,6 +10,7 @@ from bayesdist.data.matching.linear_map import MAX_SAMPLE
 
 __all__ = [
     "beats_chance",
+    "chance_radius",
     "chance_rate",
     "hull_of",
     "inside_hull",
@@ -97,6 +98,11 @@ def mutual_pairs(
     if np.ndim(radius):
         mutual = mutual[distance[mutual] <= np.asarray(radius)[mutual]]
     return mutual, forth[mutual].astype(np.int64), distance[mutual]
+
+
+def chance_radius(rate: float, n: int, area: float) -> float:
+    """Radius in which one of n stars, even over an area, is found by chance with a probability."""
+    return float(np.sqrt(-np.log1p(-rate) * area / (np.pi * n)))
 
 
 def chance_rate(points: Float, tree: cKDTree, radius: float | Float, step: float) -> float:

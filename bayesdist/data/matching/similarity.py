@@ -25,6 +25,7 @@ __all__ = [
     "MIRRORED",
     "PatternIndex",
     "Similarity",
+    "brightest",
     "find_similarity",
     "grown_map",
     "mismatch_reason",
@@ -40,6 +41,7 @@ _LEVEL_FACTOR = 3
 _TOLERANCES = (0.004, 0.012)  # of the logarithms of side ratios: remainder of a distortion
 _DEPTHS = (1.0, 0.5, 2.0)  # stars of the list, in units of the number by the mean density
 _WIDE = 0.3  # mean distances between reference stars: reach of the first pairs
+_BRIGHT_STARS = 2000  # stars of the first linear map
 _STARS_CHECKED = 1000  # stars that a candidate is checked with
 _CHANCE_SIGMAS = 8.0  # by which its coincidences must beat chance
 _MIN_AGREEING = 6  # stars that agree
@@ -224,6 +226,11 @@ def find_similarity(
         where=source,
         do="check the field, the scale, the parity and the distortion that is taken as known",
     )
+
+
+def brightest(points: Float, mag: Float | None) -> Float:
+    """Points (n, 2) enough for a linear map: the brightest, or the first of points without mag."""
+    return (points if mag is None else points[np.argsort(mag, kind="stable")])[:_BRIGHT_STARS]
 
 
 def grown_map(

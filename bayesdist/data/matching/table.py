@@ -10,8 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, iterated_map
-from bayesdist.data.matching.pairs import beats_chance, mutual_pairs, overlap
-from bayesdist.data.matching.similarity import find_similarity, grown_map, pattern_index
+from bayesdist.data.matching.pairs import beats_chance, chance_radius, mutual_pairs, overlap
+from bayesdist.data.matching.similarity import (
+    brightest,
+    find_similarity,
+    grown_map,
+    pattern_index,
+)
 from bayesdist.errors import InputError
 
 __all__ = ["Matching", "match_table", "match_to_catalog"]
@@ -19,7 +24,6 @@ __all__ = ["Matching", "match_table", "match_to_catalog"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-_BRIGHT_STARS = 2000  # stars of the first linear map
 _NARROW = 0.25  # mean distances between reference stars: reach of its last pairs
 _FALSE_RATE = 0.02  # chance matches of a detection that the default radius allows
 _CONVINCING_PAIRS = 15  # pairs that convince although most stars have none
@@ -127,11 +131,10 @@ def match_to_catalog(
             where=source,
             do="check the field, or allow a larger offset",
         )
-    bright = np.arange(len(points)) if magnitudes is None else np.argsort(magnitudes, kind="stable")
-    rough = grown_map(points[bright[:_BRIGHT_STARS]], found, patterns, narrow=_NARROW)
+    rough = grown_map(brightest(points, magnitudes), found, patterns, narrow=_NARROW)
     n_over, area = overlap(rough(points), reference)
     if radius is None:
-        radius = float(np.sqrt(-np.log1p(-_FALSE_RATE) * area / (np.pi * n_over)))
+        radius = chance_radius(_FALSE_RATE, n_over, area)
     reach = max(_NARROW * patterns.spacing, radius)
     transformation = iterated_map(points, reference, patterns.tree, rough, reach, radius)
     if transformation is None:

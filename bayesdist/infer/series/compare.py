@@ -266,20 +266,14 @@ class FilterDependence:
     ----------
     names : tuple of str
         Filters; the first has most exposures, and the others are compared with it.
-    offset : dict of str to Change
-        Offset of each further filter's coefficients, with common slopes.
-    slope : dict of str to Change
-        Difference of its slopes, per year, where it has its own.
     all_slopes : Change
-        All of these in one vector, filter by filter, with their covariance.
+        Differences of the slopes, per year, in one vector, filter by filter.
     common, separate : SeriesPosterior
     comparison : Comparison
         Held-out scores of the two, in this order.
     """
 
     names: tuple[str, ...]
-    offset: dict[str, Change]
-    slope: dict[str, Change]
     all_slopes: Change
     common: SeriesPosterior
     separate: SeriesPosterior
@@ -341,8 +335,6 @@ def filter_dependence(series: Series, trend: TrendModel, *, seed: int = 1) -> Fi
     slopes = separate.group_slope
     return FilterDependence(
         names=names,
-        offset={f: Change.of(common.group_offset[:, i]) for i, f in enumerate(names[1:])},
-        slope={f: Change.of(slopes[:, i]) for i, f in enumerate(names[1:])},
         all_slopes=Change.of(np.ascontiguousarray(slopes.reshape(len(slopes), -1))),
         common=common,
         separate=separate,

@@ -7,10 +7,10 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2 as chi_squared
 
 from bayesdist.errors import InputError
 from bayesdist.infer.convergence import Convergence
+from bayesdist.infer.equations.scaled import chi_square
 from bayesdist.infer.series.chains import Draws, Engine
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.problem import State
@@ -46,31 +46,19 @@ class Change:
         return np.sqrt(np.diag(self.cov))
 
     @property
-    def free(self) -> NDArray[np.bool_]:
-        """Boolean mask (k,) of those that can differ: the slope of a step cannot."""
-        return self.sigma > 0
-
-    @property
     def significance(self) -> Float:
-        """Value over sigma (k,) of each; 0 for those that cannot differ."""
-        return np.where(self.free, self.value / np.where(self.free, self.sigma, 1.0), 0.0)
-
-    @property
-    def chi2(self) -> float:
-        """Chi-square of all that can differ together, against no difference."""
-        some = np.flatnonzero(self.free)
-        unit = self.sigma[some]
-        scaled = self.cov[np.ix_(some, some)] / np.outer(unit, unit)
-        return float(self.significance[some] @ np.linalg.solve(scaled, self.significance[some]))
+        """Value over sigma (k,) of each; 0 for those that cannot differ, as slopes of a step."""
+        return np.divide(
+            self.value, self.sigma, out=np.zeros_like(self.value), where=self.sigma > 0
+        )
 
     @property
     def p_value(self) -> float:
-        """Probability of a larger chi-square where nothing differs.
+        """Probability of a larger chi-square of all that can differ, where nothing does.
 
         Of a Gaussian: with few exposures the posterior has heavier tails, and this is too small.
         """
-        n = int(self.free.sum())
-        return float(chi_squared.sf(self.chi2, n)) if n else 1.0
+        return chi_square(self.value, self.cov).p_value
 
 
 @dataclass(frozen=True, eq=False)
