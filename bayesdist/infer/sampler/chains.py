@@ -7,6 +7,7 @@ on it.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -40,6 +41,7 @@ from bayesdist.infer.sampler.move_schedule import (
     doubling_schedule,
     first_check,
     has_mixed,
+    is_hopeless,
     mixing_steps,
     next_check,
     pilot_steps,
@@ -48,6 +50,8 @@ from bayesdist.infer.sampler.move_schedule import (
 )
 from bayesdist.infer.sampler.proposal_batch import ProposalBatch, pilot_batch
 from bayesdist.limits import PARETO_K
+
+log = logging.getLogger("bayesdist")
 
 __all__ = ["Chains", "Settings", "ensemble_seeds", "run_chains"]
 
@@ -206,6 +210,8 @@ def run_chains(target: Density, proposal: Proposal, settings: Settings) -> Chain
         moved, mixes = _state_dependent(target, start(plan), s, quality, passes, steps)
         if mixes:
             return moved
+        if is_hopeless(len(target.names), s.n_stars, E):
+            return _given_up(moved)
         passes, steps = moved.passes, moved.steps
         plan = plan_moves(0.0, np.inf, len(target.names), s.n_stars, s.walkers)
     return _state_dependent(target, start(plan), s, quality, passes, steps)[0]
@@ -214,6 +220,20 @@ def run_chains(target: Density, proposal: Proposal, settings: Settings) -> Chain
 def _plan(target: Density, quality: Quality, s: Settings) -> Plan:
     q, n_proposals = quality, len(quality.log_weights) + quality.n_outside
     return plan_moves(q.efficiency, q.k, len(target.names), s.n_stars, s.walkers, n_proposals)
+
+
+def _given_up(chains: Chains) -> Chains:
+    """Chains whose verdict says that no move reaches the posterior in reasonable time."""
+    v = chains.verdict
+    draws = min(v.ess_bulk_min, v.ess_tail_min)
+    reason = (
+        f"sampling was given up after {chains.steps} steps with {draws:.0f} effective draws: the "
+        f"Laplace approximation is too far from the posterior of {len(v.names)} parameters "
+        f"(importance efficiency {v.importance_efficiency:.2g}, Pareto k {v.pareto_k:.2g}); lower "
+        "model.order, or give the coefficients priors"
+    )
+    log.warning("sample: %s", reason)
+    return replace(chains, verdict=replace(v, converged=False, reasons=(reason, *v.reasons)))
 
 
 def _drawn_ahead(

@@ -25,6 +25,7 @@ __all__ = [
     "expected_passes",
     "first_check",
     "has_mixed",
+    "is_hopeless",
     "mixing_steps",
     "next_check",
     "pilot_steps",
@@ -44,6 +45,9 @@ NO_MEAN = 1.0  # Pareto k beyond which weights have no mean: the proposal misses
 # parameters from which differential evolution, with two walkers for each, mixes later than
 # Crank-Nicolson moves do from next to any proposal
 MANY = 50
+# evaluations of one star, about a minute's: beyond them differential evolution of many parameters
+# is not begun
+MOST_WORK = 600 * WORTH
 PROBATION = 2048  # proposals below which k scatters too much (by about 0.2 at 512) to reject one
 
 
@@ -115,6 +119,17 @@ def has_mixed(ess: float, n_params: int, walkers: int) -> bool:
     `walkers` are those of all ensembles together.
     """
     return ess >= (1.0 if n_params > MANY else DRAWS_PER_WALKER.value) * walkers
+
+
+def is_hopeless(n_params: int, n_stars: int, ensembles: int) -> bool:
+    """True if differential evolution is too slow to help where Crank-Nicolson moves do not mix.
+
+    It forgets in three steps for each parameter, and every one of its walkers, two for each
+    parameter, makes five effective draws after as many steps of warm-up.
+    """
+    steps = 2 * DRAWS_PER_WALKER.value * 3 * n_params
+    work = ensembles * 2 * (n_params + 1) * steps * n_stars
+    return n_params > MANY and work > MOST_WORK
 
 
 # -- independence: sizes --------------------------------------------------------------------------

@@ -220,3 +220,22 @@ def test_many_parameters_are_sampled_from_a_proposal_that_is_worth_little():
     assert np.abs(z).max() < 5.0
     # of all parameters together, whose variances have errors of 2 / ess each
     assert chains.draws.var(axis=(0, 1)).mean() == pytest.approx(1.0, abs=4 * np.sqrt(2 / ess / 40))
+
+
+def test_a_funnel_of_many_parameters_is_given_up(caplog):
+    """Neal's funnel (2003) in 120 dimensions: no step from a Gaussian reaches its neck."""
+    n, stars = 120, 10_000
+
+    def log_density(x):
+        v, rest = x[:, 0], x[:, 1:]
+        return -(v**2) / 18 - 0.5 * (rest**2).sum(axis=1) * np.exp(-v) - 0.5 * (n - 1) * v
+
+    target = FakeTarget(log_density, n)
+    settings = Settings(seeds=SEEDS, n_stars=stars, limits=Limits(400, 1.01))
+    proposal = gaussian_proposal(np.zeros(n), np.diag(np.append(9.0, np.ones(n - 1))))
+    chains = run_chains(target, proposal, settings)
+    assert chains.steps <= mixing_steps(n) + settings.checkpoint_every
+    assert not chains.verdict.converged
+    reason, *_ = chains.verdict.reasons
+    assert "given up" in reason and "120 parameters" in reason and "lower model.order" in reason
+    assert reason in caplog.text

@@ -22,6 +22,7 @@ from bayesdist.infer.sampler.move_schedule import (
     doubling_schedule,
     expected_passes,
     has_mixed,
+    is_hopeless,
     mixing_steps,
     pilot_steps,
     plan_moves,
@@ -206,5 +207,8 @@ def test_plan_falls_back_as_the_proposal_gets_worse():
     assert mixing_steps(45) == 500 and mixing_steps(184) == 1840
     assert has_mixed(130, 184, 128) and not has_mixed(120, 184, 128)
     assert has_mixed(650, 45, 128) and not has_mixed(630, 45, 128)
+    # ... nor is it begun where a minute would not do
+    assert is_hopeless(184, 5000, 4) and is_hopeless(60, 10**6, 4)
+    assert not is_hopeless(60, 5000, 4) and not is_hopeless(45, 10**6, 4)
     for plan in (good, fair, poor, many):
         assert sum(plan.weights) == pytest.approx(1)
