@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import Table
 from astropy.wcs import WCS
 
 from bayesdist.app.cli import main
@@ -35,6 +36,21 @@ def printed(name: str, cwd: Path) -> str:
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def test_steps_of_a_mask_of_pinholes_fix_the_scale(tmp_path, monkeypatch, capsys):
+    """As well as a step over their lever arm; only where the mask is stays a convention."""
+    assert "mask.toml" in printed("pinhole_mask.py", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert main(["check", "mask/mask.toml"]) == 0
+    out = capsys.readouterr().out
+    assert "null space   4 directions are free, 2 of them held by convention" in out
+    assert "zero_point_u: held" in out and "zero_point_v: held" in out
+    stage = Table.read("mask/stage.ecsv")
+    arm = np.hypot(*(np.std(stage[key]) for key in ("du", "dv"))) * len(stage) ** 0.5
+    for what in ("scale", "rotation"):
+        sigma = float(re.search(rf"{what}: fixed by commanded offsets, sigma (\S+)", out)[1])
+        assert sigma == pytest.approx(0.002 / arm, rel=0.1)
 
 
 @pytest.mark.slow
