@@ -1,18 +1,20 @@
-# Five targets do everything on a bare machine with Python 3.11 or newer:
+# Six targets do everything on a bare machine with Python 3.11 or newer:
 #   make demo    the environment, then `bayesdist demo`
 #   make test    the environment with the test extra, checks of the code, then the tests: some
 #                20 minutes on two cores
 #   make test-full  the same, with the statistical suites in full: some hours on two cores
 #   make bench   the same environment, then the benchmarks: build/bench/bench.json, and
 #                docs/benchmarks.md with what other pages state of it (docs/measured.toml);
-#                some 20 minutes on two cores that have nothing else to do
+#                some 20 minutes on two cores that have nothing else to do; with RELEASE=NAME the
+#                ratios are kept in docs/benchmark_history.json, and drawn over time
+#   make bench-check  the benchmarks alone; fails where a ratio is a fifth worse than at the release
 #   make docs    the environment with the docs extra, then the site: build/docs/index.html; a
 #                warning is an error
 PYTHON ?= python3
 VENV   ?= .venv
 BIN     = $(VENV)/bin
 
-.PHONY: demo test types imports test-full docs bench lint clean
+.PHONY: demo test types imports test-full docs bench bench-check lint clean
 
 demo: $(VENV)/.installed
 	$(BIN)/bayesdist demo -o demo-run --force
@@ -38,7 +40,10 @@ docs: $(VENV)/.installed-docs
 	@echo build/docs/index.html
 
 bench: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks --output build/bench --docs docs
+	$(BIN)/python -m tests.benchmarks --output build/bench --docs docs $(if $(RELEASE),--release $(RELEASE))
+
+bench-check: $(VENV)/.installed-test
+	$(BIN)/python -m tests.benchmarks --output build/bench --against docs/benchmark_history.json
 
 lint: $(VENV)/.installed-test
 	$(BIN)/ruff check --fix .

@@ -26,7 +26,7 @@ _HOMES = {
     f"{_FORMATS}.wise.build": ("write_wise_meta",),
     f"{_FORMATS}.wise.lint": ("lint_wise_band",),
     f"{_FORMATS}.wise.meta": ("WiseBand", "read_wise_meta"),
-    "bayesdist.products.pam_file": ("write_pam",),
+    "bayesdist.products.maps_file": ("write_pam",),
     "bayesdist.products.registry": ("describe", "lint", "open_document", "read_calibration"),
     "bayesdist.products.release": ("Period", "Release", "write_release"),
 }

@@ -7,11 +7,12 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import BinaryIO
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.memory import memory_limit, size_text
 
-__all__ = ["head_of", "opened", "read_bytes", "read_lines", "read_text"]
+__all__ = ["head_of", "opened", "read_bytes", "read_lines", "read_text", "read_up_to"]
 
 PathLike = str | os.PathLike[str]
 
@@ -98,7 +99,7 @@ def read_bytes(path: PathLike, *, most: int | None = None) -> bytes:
     with opened(path) as stream:
         size = os.fstat(stream.fileno()).st_size
         try:
-            raw = b"" if size > most else _up_to(stream, most, expected=size)
+            raw = b"" if size > most else read_up_to(stream, most, expected=size)
         except OSError as error:
             raise InputError(
                 f"cannot be read ({error.strerror or error})",
@@ -114,7 +115,7 @@ def read_bytes(path: PathLike, *, most: int | None = None) -> bytes:
     return raw
 
 
-def _up_to(stream: io.BufferedReader, most: int, *, expected: int) -> bytes:
+def read_up_to(stream: BinaryIO | io.BufferedIOBase, most: int, *, expected: int = PIECE) -> bytes:
     """Bytes of a stream, at most one beyond `most`; read at once where it has as many as expected.
 
     Python allocates whatever is asked for before it reads.

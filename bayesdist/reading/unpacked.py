@@ -8,6 +8,7 @@ import zlib
 
 from bayesdist.errors import FormatError
 from bayesdist.memory import memory_limit, size_text
+from bayesdist.reading.regular import read_up_to
 
 __all__ = ["most_unpacked", "refuse_inflated", "unpacked"]
 
@@ -57,7 +58,7 @@ def unpacked(raw: bytes, where: str) -> bytes:
     most = most_unpacked(len(raw))
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(raw)) as stream:
-            content = stream.read(most + 1)
+            content = read_up_to(stream, most)
     except (EOFError, OSError, zlib.error) as error:
         raise FormatError(
             f"is a broken gzip file ({error})", where=where, do="fetch the file again"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bayesdist.checks import Check, warnings_of
 from bayesdist.numbers import MISSING, count, with_mas
-from bayesdist.report.mosaic import Mosaic
+from bayesdist.report.figures.mosaic import Mosaic
 
 if TYPE_CHECKING:
     from astropy.table import Table

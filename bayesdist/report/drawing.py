@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from bayesdist.files import atomic_path, made_folder
-from bayesdist.report.figure_numbers import numbers_of
+from bayesdist.report.figures.figure_numbers import numbers_of
+from bayesdist.report.figures.style import figure_style, plain_ticks
 from bayesdist.report.registry import Item, Plot, Registry
-from bayesdist.report.style import figure_style, plain_ticks
 
 __all__ = [
     "DPI",
@@ -174,6 +174,10 @@ def _png(pixels: Pixels) -> bytes:
     some = Image.fromarray(np.ascontiguousarray(pixels[::2, ::2]))
     colors = some.quantize(256, method=Image.Quantize.MEDIANCUT)
     few = image.quantize(palette=colors, dither=Image.Dither.NONE)
+    palette = few.getpalette() or []
+    page = 3 * int(few.getpixel((0, 0)))  # type: ignore[arg-type]  # one number of such an image
+    palette[page : page + 3] = pixels[0, 0].tolist()  # it would be a shade darker
+    few.putpalette(palette)
     buffer = io.BytesIO()
     few.save(buffer, format="png", dpi=(DPI, DPI))
     return buffer.getvalue()

@@ -14,7 +14,7 @@ import jinja2
 from markupsafe import Markup
 
 from bayesdist.numbers import MISSING
-from bayesdist.report.documentation import explanation_of, section_of
+from bayesdist.report.contents import explanation_of, section_of
 from bayesdist.report.drawing import DPI, Drawing
 from bayesdist.report.registry import Registry
 from bayesdist.report.texttable import Level, TextTable

@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeVar
 
 from matplotlib.figure import Figure
 
-from bayesdist.report.style import figure_style
+from bayesdist.report.figures.style import figure_style
 
 __all__ = ["Entry", "Item", "Plot", "Registry", "Section"]
 

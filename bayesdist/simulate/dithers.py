@@ -23,6 +23,7 @@ Int = NDArray[np.int64]
 
 MOST_STEPS = 30
 CLOSE = 1e-9  # pixels
+EDGE = 9  # points along each side of a chip that its outline on the sky is found from
 OUTSIDE = 0.1  # of the detector's size: no star is sought beyond
 
 
@@ -99,11 +100,28 @@ def stars_on_detector(
     columns = []
     for e in range(len(model.exposures)):
         for chip in model.chips:
-            x, y, seen = pixels_of(model, theta, sky, e, chip)
-            k = np.flatnonzero(seen)
-            columns.append((x[k], y[k], np.full(len(k), e), np.full(len(k), chip.number), k))
+            around = np.flatnonzero(_within(sky, *_outline(model, theta, e, chip)))
+            x, y, seen = pixels_of(model, theta, sky[around], e, chip)
+            k = around[seen]
+            columns.append((x[seen], y[seen], np.full(len(k), e), np.full(len(k), chip.number), k))
     x, y, exposure, number, star = (np.concatenate(part) for part in zip(*columns, strict=True))
     return x, y, exposure, number, star
+
+
+def _outline(
+    model: DistortionModel, theta: Float, exposure: int, chip: Chip
+) -> tuple[Float, Float]:
+    """Lowest and highest corner (2,) of a rectangle of the sky that holds a chip with room."""
+    x, y = (np.linspace(0.5, n + 0.5, EDGE) for n in chip.size)
+    x, y = (z.ravel() for z in np.meshgrid(x, y))
+    points = model.predict(theta, x, y, exposure=exposure, chip=chip.number)
+    room = OUTSIDE * np.ptp(points, axis=0)
+    return points.min(axis=0) - room, points.max(axis=0) + room
+
+
+def _within(points: Float, low: Float, high: Float) -> Bool:
+    """Boolean mask (N,) of the points (N, 2) in a rectangle."""
+    return np.all((points > low) & (points < high), axis=1)
 
 
 def pixels_of(

@@ -20,7 +20,8 @@ from astropy.wcs import WCS, FITSFixedWarning, Sip
 from astropy.wcs.utils import fit_wcs_from_points
 
 from bayesdist.products import read_calibration
-from bayesdist.products.formats.tpv.head import read_tpv
+from bayesdist.products.formats.common.content import read_content
+from bayesdist.products.formats.tpv.head import tpv_of
 from tests.app.support import EXACT, begin_stagewise, good, summary_of, write_config, write_job
 from tests.reduced import case_in_full
 
@@ -118,7 +119,7 @@ def test_headers_of_other_kinds_are_on_the_sky_of_the_truth(tmp_path, rng) -> No
     run = made(tmp_path, truth, rng, products={"tpv": {}, "ast": {}, "cpdis": {"step": 50.0}})
     x, y = rng.uniform(0.5, np.array(SIZE) + 0.5, (1000, 2)).T
     true = SkyCoord(*truth.all_pix2world(x, y, 1), unit="deg")
-    [head] = read_tpv(run / "tpv.head").heads
+    [head] = tpv_of(read_content(run / "tpv.head")).heads
     with fits.open(run / "cpdis.fits") as hdus, warnings.catch_warnings():
         warnings.simplefilter("ignore", FITSFixedWarning)
         by_file = {"tpv": WCS(head.header), "cpdis": WCS(hdus["SCI"].header, hdus)}

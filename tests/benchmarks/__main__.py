@@ -1,4 +1,8 @@
-"""`python -m tests.benchmarks [--quick] [--only NAME ...] [--output DIR] [--docs DIR]`"""
+"""`python -m tests.benchmarks [--quick] [--only NAME ...] [--output DIR] [--docs DIR]`
+
+With `--release NAME` the ratios of the run are kept as those of a release, and with `--against
+FILE` compared with those of the latest one: the exit code is 1 where one is a fifth worse.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +19,7 @@ from typing import Any
 from bayesdist.files import atomic_path
 from tests.benchmarks import budget, dithers, likelihood, linear, samplers, scaling, scamp, wise
 from tests.benchmarks.figure import draw_scaling
+from tests.benchmarks.history import HISTORY, read_history, regressions, with_run, write_history
 from tests.benchmarks.machine import describe
 from tests.benchmarks.markdown import to_markdown
 from tests.benchmarks.measured import with_measured
@@ -58,9 +63,14 @@ def _write(bench: dict[str, Any], folder: Path) -> None:
             path.write_text(text, encoding="utf-8")
 
 
-def _document(bench: dict[str, Any], folder: Path) -> None:
-    """Write the page of the documentation, and the figures of it that other pages state."""
-    page, measured = to_markdown(_finite(bench)), folder / "measured.toml"
+def _document(bench: dict[str, Any], folder: Path, release: str | None) -> None:
+    """Write the page of the documentation, the figures of it that other pages state, and ratios."""
+    kept = folder / HISTORY
+    history = read_history(kept) if kept.exists() else []
+    if release is not None:
+        history = with_run(history, bench, release)
+        write_history(history, folder)
+    page, measured = to_markdown(_finite(bench), history), folder / "measured.toml"
     revision = bench["machine"]["revision"] or "unknown"
     texts = {
         measured: with_measured(measured.read_text(encoding="utf-8"), page, revision),
@@ -82,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Zero.
+        Zero; 1 where a ratio is a fifth worse than at the release that it is compared with.
     """
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="tiny problems: does it work?")
@@ -100,11 +110,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="N",
         help="of the part scamp: that many, without false matches",
     )
+    parser.add_argument("--release", metavar="NAME", help="keep the ratios there as this one's")
+    parser.add_argument(
+        "--against", type=Path, metavar="FILE", help="history whose latest ratios are to be kept up"
+    )
     options = parser.parse_args(arguments)
     if options.fields is not None and (options.quick or options.only != ["scamp"]):
         parser.error("--fields goes with --only scamp, and without --quick")
     if options.docs is not None and (options.quick or len(options.only) < len(PARTS)):
         parser.error("--docs takes the whole benchmark: leave --quick and --only out")
+    if options.release is not None and options.docs is None:
+        parser.error("--release goes with --docs")
+    if options.against is not None and options.quick:
+        parser.error("--against takes problems of full size: leave --quick out")
     bench: dict[str, Any] = {
         "schema": 1,
         "quick": options.quick,
@@ -127,10 +145,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         bench["parts"][name] = part
         _write(bench, options.output)
     if options.docs is not None:
-        _document(bench, options.docs)
+        _document(bench, options.docs, options.release)
         shutil.copy(options.output / FIGURE, options.docs / FIGURE)
     say(f"written: {options.output / 'bench.json'}, {options.output / 'bench.md'}")
-    return 0
+    worse = [] if options.against is None else regressions(read_history(options.against), bench)
+    for sentence in worse:
+        say(sentence)
+    return 1 if worse else 0
 
 
 if __name__ == "__main__":

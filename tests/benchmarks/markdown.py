@@ -385,13 +385,32 @@ _PARTS = {
 }
 
 
-def to_markdown(bench: dict[str, Any]) -> str:
+def _history(history: Sequence[dict[str, Any]]) -> list[str]:
+    names = dict.fromkeys(name for one in history for name in one["ratios"])
+    return [
+        "## By release",
+        "",
+        "Ratios, the larger the better; `make bench RELEASE=NAME` adds a column, and the weekly "
+        "workflow fails where one is a fifth worse than in the last.",
+        "",
+        *_table(
+            ("ratio", *(f"{one['release']} ({one['revision']})" for one in history)),
+            [(name, *(_number(one["ratios"].get(name)) for one in history)) for name in names],
+        ),
+        "![Ratios by release, relative to the first](figures/benchmark_history.png)",
+        "",
+    ]
+
+
+def to_markdown(bench: dict[str, Any], history: Sequence[dict[str, Any]] = ()) -> str:
     """The report.
 
     Parameters
     ----------
     bench : dict
         What stands in bench.json.
+    history : sequence of dict
+        Ratios of releases.
 
     Returns
     -------
@@ -408,4 +427,6 @@ def to_markdown(bench: dict[str, Any]) -> str:
     for name, part in bench["parts"].items():
         out += _PARTS[name](part)
         out += [f"({part['wall_s']:.0f} s)", ""]
+    if history:
+        out += _history(history)
     return "\n".join(out).rstrip() + "\n"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.files import atomic_path
-from bayesdist.report.style import figure_style
+from bayesdist.report.figures.style import figure_style
 
 from .campaigns import KINDS
 from .figure import ranks_figure, reliability_figure

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from bayesdist.report.style import CYCLE, WIDTH, figure_style, new_figure
+from bayesdist.report.figures.style import CYCLE, WIDTH, figure_style, new_figure
 
 from .summary import WITHIN, reliability, simultaneous_band
 

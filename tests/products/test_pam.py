@@ -14,7 +14,7 @@ from bayesdist.calibration.subarray import Subarray, subarray_at_corner
 from bayesdist.errors import InputError
 from bayesdist.products import read_idctab
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
-from bayesdist.products.pam_file import write_pam
+from bayesdist.products.maps_file import write_pam
 
 from .acs_offline import Pointing, corrected
 from .support import F606W, some_solution

@@ -16,8 +16,8 @@ from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import LookupTable
 from bayesdist.products import registry
-from bayesdist.products.formats.stdgdc.file import EXTENSIONS, read_stdgdc
-from bayesdist.products.formats.stdgdc.frame import CorrectedFrame
+from bayesdist.products.formats.common.content import read_content
+from bayesdist.products.formats.stdgdc.file import EXTENSIONS, CorrectedFrame, stdgdc_of
 from tests.app.support import good
 
 from .support import some_solution, wfc_model
@@ -62,7 +62,7 @@ def test_bp3m_has_the_positions_of_the_calibration(tmp_path, precision):
     found = some_calibration()
     path = write(tmp_path, found, precision)
     gdc = io.load_stdgdc(path)
-    frame = CorrectedFrame.of_header(read_stdgdc(path).header)
+    frame = CorrectedFrame.of_header(stdgdc_of(read_content(path)).header)
     j, i = np.indices((99, 149), float)
     x, y = i.ravel() + 1, j.ravel() + 1
     ours = frame.corrected(found.forward(x, y, chip=1).T)
@@ -72,7 +72,7 @@ def test_bp3m_has_the_positions_of_the_calibration(tmp_path, precision):
     x, y = pixels_inside()
     ours = frame.corrected(found.forward(x, y, chip=1).T)
     theirs = np.stack(io.apply_gdc(x - 1, y - 1, gdc)[:2])
-    stated = float(read_stdgdc(path).header["BDWORST"])
+    stated = float(stdgdc_of(read_content(path)).header["BDWORST"])
     assert 1e-6 < np.hypot(*(ours - theirs)).max() < 1.2 * stated < 1e-3
 
 
@@ -113,7 +113,7 @@ def test_the_frame_lies_along_the_detector_and_keeps_the_skew(tmp_path):
 
 def test_sigmas_are_those_of_the_covariance(tmp_path):
     found = some_calibration()
-    file = read_stdgdc(write(tmp_path, found))
+    file = stdgdc_of(read_content(write(tmp_path, found)))
     frame = CorrectedFrame.of_header(file.header)
     turn = np.linalg.inv(frame.similarity)
     cov = (
@@ -126,7 +126,7 @@ def test_sigmas_are_those_of_the_covariance(tmp_path):
 
 def test_the_magnitude_is_that_of_the_area(tmp_path):
     """By differences of corrected positions."""
-    file = read_stdgdc(write(tmp_path, some_calibration(), "double"))
+    file = stdgdc_of(read_content(write(tmp_path, some_calibration(), "double")))
     xy, xx = np.gradient(file.table("XGC"))
     yy, yx = np.gradient(file.table("YGC"))
     area = (xx * yy - xy * yx)[20, 30]
@@ -139,7 +139,7 @@ def test_areas_are_those_of_the_tables(tmp_path):
     one = registry.read_calibration(path).in_frame()[1]
     inside = slice(1, -1)  # at the edge a table ends at the centre of the pixel
     area, _ = pixel_areas(one, np.arange(2.0, 150), np.arange(2.0, 100))
-    theirs = 10 ** (-0.4 * read_stdgdc(path).table("MGC")[inside, inside])
+    theirs = 10 ** (-0.4 * stdgdc_of(read_content(path)).table("MGC")[inside, inside])
     assert_allclose(area, theirs, rtol=2e-4)
     assert np.ptp(area) > 0.05
 
@@ -255,7 +255,7 @@ def test_commands_take_the_tables_of_others(tmp_path):
     (tmp_path / "stars.csv").write_text("x,y\n31,9\n")
     good("apply", path, tmp_path / "stars.csv", "-o", tmp_path / "out.csv")
     last = (tmp_path / "out.csv").read_text().splitlines()[-1].split(",")
-    file = read_stdgdc(path)
+    file = stdgdc_of(read_content(path))
     there = np.array([file.table("XGC")[8, 30], file.table("YGC")[8, 30]])
     assert_allclose([float(last[2]), float(last[3])], there, rtol=1e-9)
     (tmp_path / "back.csv").write_text(f"x_out,y_out\n{there[0]},{there[1]}\n")

@@ -16,8 +16,9 @@ from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.products import registry
+from bayesdist.products.formats.common.content import read_content
 from bayesdist.products.formats.common.document import BuildOptions
-from bayesdist.products.formats.tpv.head import read_tpv
+from bayesdist.products.formats.tpv.head import tpv_of
 from tests.app.support import good
 
 from .skies import PROGRAMS, apart_mas, sky_by, sky_of
@@ -91,7 +92,7 @@ def write(folder: Path, calibration: Calibration, options=BuildOptions(), **sett
 
 
 def header_of(path: Path) -> fits.Header:
-    [head] = read_tpv(path).heads
+    [head] = tpv_of(read_content(path)).heads
     return head.header
 
 
@@ -176,7 +177,7 @@ def test_scamp_heads_of_a_mosaic(tmp_path):
     assert found.numbers == (1, 2) and found.errors == "none" and found.model.order == 3
     assert found.plane.point == (215.135, 52.992)
     x, y = random_pixels(SCAMP_SIZE, 2000)
-    for head in read_tpv(path).heads:
+    for head in tpv_of(read_content(path)).heads:
         theirs = sky_by("astropy.wcs", head.header, x, y)
         assert apart_mas(sky_of(found, x, y, head.number), theirs) < 2.6e-4
     assert not [f for f in registry.lint(path) if f.level != "note"]
@@ -196,7 +197,7 @@ def test_powers_of_r_are_followed_and_a_note_says_how_well(tmp_path, program):
     [note] = found.notes
     said = float(note.split(" pix off")[0].split()[-1])
     x, y = random_pixels(SCAMP_SIZE, 4000)
-    theirs = sky_by(program, read_tpv(path).heads[0].header, x, y)
+    theirs = sky_by(program, tpv_of(read_content(path)).heads[0].header, x, y)
     off = apart_mas(sky_of(found, x, y), theirs) / (3.6e6 * 7.285e-5)
     assert 0 < said < 0.01 and off < 1.5 * said
     assert "powers of r" in str(registry.lint(path))
@@ -222,7 +223,7 @@ def test_a_real_header_is_read_as_astropy_reads_it():
     path = Path(astropy.wcs.__file__).parent / "tests" / "data" / "tpvonly.hdr"
     found = registry.read_calibration(path)
     assert found.model.order == 4 and found.model.chips[0].size == (2048.0, 4096.0)
-    [head] = read_tpv(path).heads
+    [head] = tpv_of(read_content(path)).heads
     x, y = random_pixels(found.model.chips[0].size, 2000)
     assert apart_mas(sky_of(found, x, y), sky_by("astropy.wcs", head.header, x, y)) < 1e-3
     assert not registry.lint(path)
@@ -272,7 +273,7 @@ def test_without_pv1_1_programs_differ_and_the_header_is_refused(tmp_path):
     path.write_text(_without(_SCAMP.format(crpix1=-1066.5), "PV1_1 "))
     with pytest.raises(FormatError, match="PV1_1, which some programs take for 0"):
         registry.read_calibration(path, size=SCAMP_SIZE)
-    header = read_tpv(path).heads[0].header
+    header = tpv_of(read_content(path)).heads[0].header
     x, y = random_pixels(SCAMP_SIZE, 10)
     a, b = (sky_by(p, header, x, y) for p in ("astropy.wcs", "starlink-pyast"))
     assert apart_mas(a, b) > 1e5  # minutes of arc, as large as the chip

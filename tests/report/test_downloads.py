@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from lxml import html as lxml_html
 
-from bayesdist.report.documentation import EXPLAINED, explanation_of, section_of
-from bayesdist.report.figure_numbers import numbers_of
+from bayesdist.report.contents import EXPLAINED, explanation_of, section_of
+from bayesdist.report.figures.figure_numbers import numbers_of
 from bayesdist.report.run_report import render_report
 from bayesdist.report.sections import REPORT
 from bayesdist.report.sections.run.status import GROUPS

@@ -14,10 +14,10 @@ from PIL import Image
 
 from bayesdist.report import drawing
 from bayesdist.report.drawing import DPI, MARGIN, png_of, render
+from bayesdist.report.figures.style import figure_style, new_figure, plain_ticks
 from bayesdist.report.page import picture_of
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections import REPORT
-from bayesdist.report.style import figure_style, new_figure, plain_ticks
 
 
 def pixels(png: bytes) -> np.ndarray:

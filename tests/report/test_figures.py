@@ -14,10 +14,11 @@ from matplotlib.quiver import Quiver
 
 from bayesdist.assess import VectorMap
 from bayesdist.errors import InputError
-from bayesdist.report.arrows import Arrows, cross_map, square_cells
 from bayesdist.report.drawing import save_figures
-from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.panels import ChipPanels
+from bayesdist.report.figures.arrows import Arrows, cross_map, square_cells
+from bayesdist.report.figures.mosaic import Mosaic
+from bayesdist.report.figures.panels import ChipPanels
+from bayesdist.report.figures.style import figure_style, nice_below
 from bayesdist.report.sections.run.data import _density
 from bayesdist.report.sections.run.posterior import (
     correlation_matrix,
@@ -25,7 +26,6 @@ from bayesdist.report.sections.run.posterior import (
     slowest_parameters,
 )
 from bayesdist.report.sections.run.residuals import MixtureCurve, _histograms
-from bayesdist.report.style import figure_style, nice_below
 from tests.reduced import case_in_full
 
 from .plots import figures_of

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from bayesdist.diagnose.residuals.binned import binned_residuals
-from bayesdist.report.arrows import CHANCE, significant_cells
+from bayesdist.report.figures.arrows import CHANCE, significant_cells
 from bayesdist.report.sections.run.residuals import MixtureCurve
 
 

@@ -15,10 +15,10 @@ from bayesdist.diagnose.periods import PeriodSettings, time_variation
 from bayesdist.infer import fit_linear
 from bayesdist.infer.compare.order import select_order
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.report.order import order_comparison
+from bayesdist.report.figures.order import order_comparison
+from bayesdist.report.figures.style import INK, PALE
 from bayesdist.report.run_report import render_report
 from bayesdist.report.sections.run.periods import period_tables
-from bayesdist.report.style import INK, PALE
 
 from .plots import plot_of
 from .runs import report_input

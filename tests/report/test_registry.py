@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from bayesdist.missions.wise.bands.command import BANDS
 from bayesdist.missions.wise.bands.context import BandsInput
-from bayesdist.missions.wise.bands.page import BANDS
 from bayesdist.report.campaign import CampaignResults
 from bayesdist.report.context import ReportInput
 from bayesdist.report.page import parts_of

@@ -209,6 +209,17 @@ class Record:
         del facts["schema"]
         return cls(facts, artefacts, **rest)
 
+    def copied(self) -> Record:
+        """The same content, of which entries can be put, replaced and removed."""
+        under_way = self.under_way and {**self.under_way, "files": [*self.under_way["files"]]}
+        return Record(
+            dict(self.facts),
+            dict(self.artefacts),
+            dict(self.stages),
+            under_way,
+            dict(self.checkpoints),
+        )
+
     @property
     def file_names(self) -> set[str]:
         """Files that stages have written, or may have."""

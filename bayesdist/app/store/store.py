@@ -94,6 +94,7 @@ class ArtefactStore:
     ) -> None:
         self.path, self.stages, self.head = path, stages, head
         self._planned: Record | None = None
+        self._read: tuple[tuple[int, ...], Record] | None = None  # while run.json stays as it is
         self._known: dict[str, tuple[tuple[int, ...], FileMark]] = {}  # by name, of files as read
         # of the stage that is being made here
         self._making = ""
@@ -107,10 +108,14 @@ class ArtefactStore:
         """Content of run.json, or of what it will be."""
         if self._planned is not None:
             return self._planned
-        record = Record.read(self.path / RECORD)
-        for name in record.file_names:
-            path_within(self.path, name, where=str(self.path / RECORD))
-        return record
+        path = self.path / RECORD
+        now = _times(path)
+        if self._read is None or not now or self._read[0] != now:
+            record = Record.read(path)
+            for name in record.file_names:
+                path_within(self.path, name, where=str(path))
+            self._read = now, record
+        return self._read[1].copied()
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -161,9 +166,8 @@ class ArtefactStore:
 
     def _mark(self, name: str) -> FileMark:
         """Mark of a file, which is read once while its times stay as they are."""
-        status = (self.path / name).stat()
-        now = status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
-        if self._known.get(name, ((), None))[0] != now:
+        now = _times(self.path / name)
+        if self._known.get(name, (None, None))[0] != now:
             self._known[name] = now, FileMark.of(self.path / name)
         return self._known[name][1]
 
@@ -362,6 +366,15 @@ class ArtefactStore:
                 remove_leftovers(folder)
                 if not any(not is_leftover(one.name) for one in folder.iterdir()):
                     folder.rmdir()
+
+
+def _times(path: Path) -> tuple[int, ...]:
+    """What is another number once a file is another; () where there is none."""
+    try:
+        status = path.stat()
+    except OSError:
+        return ()
+    return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 def _reason(known: Artefact | None, parts: Mapping[str, Any], harmed: str) -> str:

@@ -47,6 +47,7 @@ Int = NDArray[np.int64]
 KINDS = ("gauge-free", "shape", "absolute")
 LEAST_SHARED = 3  # stars that two exposures share at least, if they overlap at all
 MOST_STARS = 2_000_000  # of the sky that all patterns see together
+MOST_LOOKED_FOR = 5e8  # stars of that sky times exposures of all patterns
 SHORT = 0.25  # of the detector's side: the scales above it are not sampled
 SKEWS = ("skew_plus", "skew_cross")
 MOST = 4  # parameters that are named
@@ -203,6 +204,13 @@ def compare_patterns(
         for p in patterns
     ]
     sky = _sky([sky_seen(*truth) for truth in truths], stars, camera)
+    exposures = sum(len(pattern.offsets) for pattern in patterns)
+    if len(sky) * exposures > MOST_LOOKED_FOR:
+        raise InputError(
+            f"{len(sky)} stars are to be looked for in {exposures} exposures",
+            where="pattern",
+            do=f"give fewer exposures or stars ({MOST_LOOKED_FOR:.0g} pairs of them at most)",
+        )
     found = [
         _planned(pattern, camera, *truth, sky, stars, known)
         for pattern, truth in zip(patterns, truths, strict=True)

@@ -76,9 +76,10 @@ class CatalogueErrors:
         scale = np.sqrt(np.diag(self.covariance)[:D])
         scale = np.where(scale > 0, scale, 1.0)
         values, vectors = np.linalg.eigh(self.covariance[:D, :D] / np.outer(scale, scale))
-        root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+        # the symmetric root: signs and order of eigenvectors do not change the draws
+        root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
         theta = np.tile(mean, (n, 1))
-        theta[:, :D] += rng.standard_normal((n, D)) @ root.T
+        theta[:, :D] += scale * (rng.standard_normal((n, D)) @ root)
         return Polynomials(self.rows[0], self.model, mean, theta)
 
 

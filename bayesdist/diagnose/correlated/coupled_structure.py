@@ -78,13 +78,14 @@ class StructurePosterior:
                 continue
             amplitude = np.repeat(self.terms_amplitude, by_terms)
             precision = point.values + amplitude[:, None] ** -2
-            along = point.score / precision
-            along = along + rng.standard_normal(along.shape) / np.sqrt(precision)
-            drawn = along @ point.vectors.T
+            # noise through symmetric roots, which signs and order of eigenvectors do not change
+            noise = rng.standard_normal((m, len(point.values))) @ point.vectors
+            drawn = (point.score / precision + noise / np.sqrt(precision)) @ point.vectors.T
             terms.append(drawn * decline)
             field, precision = point.field, point.precision
             along = (field.score - drawn @ field.tied.T) / precision
-            along += rng.standard_normal(along.shape) / np.sqrt(precision)
+            noise = rng.standard_normal(along.shape) @ field.vectors
+            along += noise / np.sqrt(precision)
             sines.append(field.scale * (along @ field.vectors.T))
             fine = [np.sqrt(one.finer(field.length)) for one in self.blocks]
             wave = rng.standard_normal((m, len(self.blocks), 2 * FINE))

@@ -60,9 +60,9 @@ class _Axis:
     def draws(self, amplitude: Float, rng: np.random.Generator) -> tuple[Float, Float]:
         """Terms (m, T) and sines (m, n_sines), given amplitudes (m,) of the terms."""
         precision = self.values + amplitude[:, None] ** -2
-        along = self.score / precision
-        along = along + rng.standard_normal(along.shape) / np.sqrt(precision)
-        terms = along @ self.vectors.T
+        # noise through the symmetric root, which signs and order of eigenvectors do not change
+        noise = rng.standard_normal((len(precision), len(self.values))) @ self.vectors
+        terms = (self.score / precision + noise / np.sqrt(precision)) @ self.vectors.T
         right = self.right[:, None] - self.tied @ terms.T
         right += rng.standard_normal(right.shape)
         return terms, _solve(self.factor, right, trans=1).T

@@ -12,7 +12,7 @@ from bayesdist.app.store.output import refuse_existing
 from bayesdist.calibration.area import PixelAreaMap, pixel_area_map
 from bayesdist.calibration.subarray import FULL
 from bayesdist.errors import InputError
-from bayesdist.products.pam_file import write_pam
+from bayesdist.products.maps_file import write_pam
 
 __all__ = ["write_area_maps"]
 

@@ -16,7 +16,7 @@ from bayesdist.assess.terms.given import CENTROID
 from bayesdist.numbers import ladder
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
-from bayesdist.report.style import CYCLE, SEQUENTIAL
+from bayesdist.report.figures.style import CYCLE, SEQUENTIAL
 
 __all__ = ["budget_data", "map_data"]
 

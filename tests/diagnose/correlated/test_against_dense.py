@@ -109,3 +109,22 @@ def test_conditional_means_are_those_of_dense_algebra():
         assert np.abs(pull).max() < 5.0
         ratio = drawn[:, :T].var(axis=0) / np.diag(cov)[:T]
         np.testing.assert_allclose(ratio, 1.0, atol=0.05)
+
+
+def test_draws_do_not_follow_rounding():
+    """Eigenvectors of one eigenvalue turn at the last digit of a matrix; the draws stay."""
+    rng = np.random.default_rng(1)
+    functions = StructureFunctions(2, (512.0, 512.0), 6)
+    m, T, decline = functions.n_known, functions.n_terms, functions.decline()
+    S = np.diag(np.concatenate([1e6 / decline**2, np.full(m - T, 1e6)]))
+    score = rng.normal(0, 1e3, m)
+    drawn = []
+    for rounding in (0.0, 1e-13):
+        noise = np.random.default_rng(2).normal(0, rounding, (m, m))
+        root = np.sqrt(np.diag(S))
+        moved = S + np.outer(root, root) * (noise + noise.T)
+        found = chip_structure(
+            functions, [moved] * 2, [score] * 2, noise=0.02, higher_order=1e-3, structure=1e-3
+        )
+        drawn.append(found.draws(200, np.random.default_rng(3)))
+    np.testing.assert_allclose(drawn[1], drawn[0], rtol=0, atol=1e-9 * np.abs(drawn[0]).max())

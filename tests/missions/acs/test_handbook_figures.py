@@ -9,8 +9,7 @@ from numpy.testing import assert_allclose
 
 from bayesdist.diagnose.residuals.binned import binned_sums
 from bayesdist.missions.acs.handbook.figures import area_figure, non_linear_figure, residual_figure
-from bayesdist.missions.acs.handbook.numbers import detector_numbers
-from bayesdist.missions.acs.handbook.published import handbook_rows
+from bayesdist.missions.acs.handbook.numbers import detector_numbers, handbook_rows
 from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 from bayesdist.products import read_idctab
 from bayesdist.products.formats.idctab.calibration import idctab_calibration

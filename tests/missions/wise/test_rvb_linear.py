@@ -11,12 +11,12 @@ from scipy.optimize import least_squares
 
 from bayesdist.data import Matches
 from bayesdist.errors import DegenerateError, InputError
+from bayesdist.missions.wise.rvb.command import read_solutions
 from bayesdist.missions.wise.rvb.linear import (
     LinearMoments,
     fit_transform,
     linear_moments,
 )
-from bayesdist.missions.wise.rvb.solutions import read_solutions
 from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform, rereference, transformed
 
 CENTRE = (508.5, 508.5)

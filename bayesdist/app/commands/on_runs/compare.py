@@ -12,20 +12,25 @@ from astropy.table import Table, vstack
 from bayesdist.app.commands.on_files.calibrations import calibration_at
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.assess.comparison.compare import Comparison, compare
+from bayesdist.assess.comparison.compare import (
+    Comparison,
+    compare,
+    comparison_table,
+    difference_table,
+    gap_table,
+)
 from bayesdist.assess.comparison.gap import (
     GapDifference,
     gap_difference,
     pair_of_chips,
 )
 from bayesdist.assess.comparison.sentences import comparison_lines, gap_lines, gap_verdict, verdict
-from bayesdist.assess.comparison.tables import comparison_table, difference_table, gap_table
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
 from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.products.formats.common.document import MissingSizeError
-from bayesdist.report.comparison import difference_vectors
 from bayesdist.report.drawing import save_figures
+from bayesdist.report.figures.comparison import difference_vectors
 
 __all__ = ["compare_files", "joined"]
 

@@ -1,4 +1,7 @@
-"""Filters beside the reference: offsets of linear terms, whether all drift alike, and figures."""
+"""Filters beside the reference: offsets of linear terms, whether all drift alike, and figures.
+
+ACS ISR 2015-06, section 4.4.4 and Figures 25 and 26.
+"""
 
 from __future__ import annotations
 
@@ -251,7 +254,7 @@ def draw_filters(
     """
     # figures take seconds to import
     from bayesdist.report.drawing import save_figures
-    from bayesdist.report.filters import FilterTerm, filters_figure
+    from bayesdist.report.figures.filters import FilterTerm, filters_figure
 
     model = next(iter(fits.values())).linear.model
     time = model.time

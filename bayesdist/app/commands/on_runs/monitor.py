@@ -30,8 +30,8 @@ from bayesdist.infer.compare.change_date import PeriodScore, period_scores, scan
 from bayesdist.infer.compare.monitoring import NewFit, change_of, fit_new
 from bayesdist.infer.linear import Rejection
 from bayesdist.infer.posterior.memberships import count_outliers
-from bayesdist.report.comparison import change_over_time, difference_vectors
 from bayesdist.report.drawing import save_figures
+from bayesdist.report.figures.comparison import change_over_time, difference_vectors
 
 __all__ = ["monitor"]
 

@@ -113,7 +113,7 @@ def _sentences(one: PlannedPattern) -> list[str]:
 
 def _write(output: Path, found: Sequence[PlannedPattern], config: PlanConfig, command: str) -> None:
     from bayesdist.report.drawing import save_figures  # figures take seconds to import
-    from bayesdist.report.patterns import pattern_maps
+    from bayesdist.report.figures.patterns import pattern_maps
 
     with record_folder(output, "plan.json", command) as (folder, record):
         write_table(_table(found), folder / "patterns.ecsv")

@@ -1,4 +1,9 @@
-"""Linear terms of a campaign, and the step between its chips, as in ACS ISR 2015-06."""
+"""Linear terms of a campaign, and the step between its chips, as in ACS ISR 2015-06.
+
+ACS ISR 2015-06, Section 4.4.1, adopts a mean B_1 of WFC1 before SM4 and another one after it.  The
+drift of a model has a rate, and a step at each break, for every term and chip; what is not meant is
+held at zero by a prior that is narrow against all that can be measured.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""The detections of a self-calibration with their stars, also as pairs, and a first solution."""
+"""The detections of a self-calibration with their stars, also as pairs, and a first solution.
+
+So the usual statistics of residuals, maps of bins and diagrams serve self-calibrations too.  Stars
+follow their detections: residuals are smaller than the errors by what that takes.
+"""
 
 from __future__ import annotations
 

@@ -15,8 +15,7 @@ from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
-from bayesdist.missions.acs.handbook.numbers import detector_numbers
-from bayesdist.missions.acs.handbook.published import acs_detector, handbook_rows
+from bayesdist.missions.acs.handbook.numbers import acs_detector, detector_numbers, handbook_rows
 from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 
 if TYPE_CHECKING:

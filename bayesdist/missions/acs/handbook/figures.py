@@ -16,19 +16,15 @@ from numpy.typing import NDArray
 from bayesdist.missions.acs.handbook.numbers import detector_numbers
 from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 from bayesdist.numbers import size_of
-from bayesdist.report.arrows import Arrows, magnification_of, vector_map
-from bayesdist.report.fields import Grid, contour_levels, scalar_map
-from bayesdist.report.panels import OneArray
-from bayesdist.report.style import PALETTE, nice_below
+from bayesdist.report.figures.arrows import Arrows, magnification_of, vector_map
+from bayesdist.report.figures.fields import Grid, contour_levels, scalar_map
+from bayesdist.report.figures.panels import OneArray
+from bayesdist.report.figures.style import PALETTE, nice_below
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
-__all__ = [
-    "area_figure",
-    "non_linear_figure",
-    "residual_figure",
-]
+__all__ = ["area_figure", "non_linear_figure", "residual_figure"]
 
 Float = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import InputError
 from bayesdist.model.grid import mesh
 
-__all__ = ["ChipField", "WholeDetector"]
+__all__ = ["WholeDetector"]
 
 Float = NDArray[np.float64]
 

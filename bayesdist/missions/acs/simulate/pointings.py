@@ -21,7 +21,7 @@ from bayesdist.data.sky.earth import velocity_aberration
 from bayesdist.missions.acs.simulate.distortion import SM4
 from bayesdist.missions.acs.simulate.stars import CENTRE
 
-__all__ = ["PIXEL", "AcsFrames", "catalog_rotation", "exposures_of", "frames_of"]
+__all__ = ["AcsFrames", "exposures_of", "frames_of"]
 
 Float = NDArray[np.float64]
 

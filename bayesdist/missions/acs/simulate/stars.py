@@ -14,16 +14,7 @@ from scipy.spatial import cKDTree
 
 from bayesdist.data import ReferenceCatalog
 
-__all__ = [
-    "BRIGHT",
-    "CATALOG_EPOCH",
-    "CENTRE",
-    "FAINT",
-    "TrueStars",
-    "centroid_error",
-    "measured_catalogs",
-    "true_stars",
-]
+__all__ = ["CENTRE", "FAINT", "TrueStars", "centroid_error", "measured_catalogs", "true_stars"]
 
 Float = NDArray[np.float64]
 

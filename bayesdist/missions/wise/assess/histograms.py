@@ -17,7 +17,7 @@ from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.missions.wise.assess.distortion_field import DistortionField
 
-__all__ = ["CALIBRATED", "BandSums", "ResidualHistogram", "band_sums", "histogram"]
+__all__ = ["BandSums", "ResidualHistogram", "band_sums", "histogram"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -21,7 +21,7 @@ from bayesdist.limits import STRUCTURE
 from bayesdist.missions.wise.assess.residual_field import ResidualField, residual_field, scaled
 from bayesdist.model.basis import polynomial_terms
 
-__all__ = ["PARTITIONS", "ResidualPartition", "residual_partition"]
+__all__ = ["ResidualPartition", "residual_partition"]
 
 Float = NDArray[np.float64]
 Base = tuple[Float, Float]

@@ -10,17 +10,38 @@ from pathlib import Path
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.output import record_folder
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.bands.context import BandsInput
+from bayesdist.files import atomic_path
+
+# importing them registers what the page shows
+from bayesdist.missions.wise.bands import curves, figures, findings, tables  # noqa: F401
+from bayesdist.missions.wise.bands.context import BANDS, BandsInput
 from bayesdist.missions.wise.bands.findings import overview_table, verdict
 from bayesdist.missions.wise.bands.inputs import BandRun, open_bands
 from bayesdist.missions.wise.bands.measure import measure_bands
 from bayesdist.missions.wise.bands.optical import optical_models
-from bayesdist.missions.wise.bands.page import write_bands
 from bayesdist.missions.wise.bands.record import record_of, write_tables
 from bayesdist.missions.wise.published import WISE_BANDS
 from bayesdist.products import sip_from_solution, write_wise_meta
+from bayesdist.report.drawing import draw_all, save_drawings
+from bayesdist.report.page import parts_of, template
 
 __all__ = ["bands_of_runs"]
+
+
+def write_bands(folder: Path, inputs: BandsInput) -> list[str]:
+    """Names of bands.html and its figures, once they are written into a folder.
+
+    InputError when a file cannot be written.
+    """
+    drawings = draw_all(BANDS, inputs, pdf=True)
+    paths = save_drawings(drawings, folder / "figures")
+    overview, *parts = parts_of(BANDS, inputs, drawings)
+    page = template("bands.html.jinja", __package__)
+    text = page.render(run=inputs, overview=overview, parts=parts, verdict=findings.verdict(inputs))
+    with atomic_path(folder / "bands.html") as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return ["bands.html", *(f"figures/{path.name}" for path in paths)]
+
 
 log = logging.getLogger("bayesdist")
 

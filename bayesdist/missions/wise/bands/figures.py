@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput
 from bayesdist.numbers import size_of
-from bayesdist.report.arrows import Arrows, cross_map, magnification_of, spacing, vector_map
-from bayesdist.report.fields import Grid, scalar_map
-from bayesdist.report.panels import ArrayPanels
+from bayesdist.report.figures.arrows import Arrows, cross_map, magnification_of, spacing, vector_map
+from bayesdist.report.figures.fields import Grid, scalar_map
+from bayesdist.report.figures.panels import ArrayPanels
+from bayesdist.report.figures.style import nice_below
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import nice_below
 
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap

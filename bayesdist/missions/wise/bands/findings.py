@@ -13,16 +13,7 @@ from bayesdist.numbers import MISSING, count, number, percent, probability, size
 from bayesdist.report.sections.run.status import Verdict
 from bayesdist.report.texttable import TextTable, listing
 
-__all__ = [
-    "coverage_table",
-    "formal_table",
-    "histogram_table",
-    "overview_table",
-    "provenance_table",
-    "structure_table",
-    "vector_table",
-    "verdict",
-]
+__all__ = ["overview_table", "verdict"]
 
 SAME_VECTOR = 0.005  # of the printed maximum
 

@@ -13,7 +13,7 @@ from bayesdist.missions.wise.bands.context import BANDS, BandsInput
 from bayesdist.numbers import MISSING, number, rounded
 from bayesdist.report.texttable import TextTable
 
-__all__ = ["account_table", "as_printed", "contradiction_table", "statistics_table", "tables_of"]
+__all__ = ["as_printed"]
 
 TITLES = {
     "5-1": "Residuals of the fit in bins",

@@ -20,8 +20,7 @@ from bayesdist.missions.wise.bands.optical import optical_models
 from bayesdist.missions.wise.bring_up.iterate import BringUp, bring_up
 from bayesdist.missions.wise.pairs.files import RVB_ALIASES, band_name
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
-from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
-from bayesdist.missions.wise.pairs.write import write_rvb
+from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs, write_rvb
 from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.reading.tables import read_table

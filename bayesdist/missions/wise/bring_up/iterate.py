@@ -21,7 +21,7 @@ from bayesdist.missions.wise.bring_up.pairs import Field
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.model import Chip, DistortionModel
 
-__all__ = ["BringUp", "Round", "bring_up"]
+__all__ = ["BringUp", "bring_up"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -152,9 +152,9 @@ def bring_up(
     Raises
     ------
     InputError
-        For a model of several chips or with frames, a start of another length, stars without
-        errors, a detection outside the detector, or when nowhere on the detector more matches are
-        found than chance gives.
+        For a model of several chips or with frames, a start of another length or of positions that
+        are not finite, stars without errors, a detection outside the detector, or when nowhere on
+        the detector more matches are found than chance gives.
     DegenerateError
         As `fit_linear`, when in the end too little of the detector is covered.
     """
@@ -172,6 +172,12 @@ def bring_up(
         )
     field = Field(detections, reference, model, BINS)
     theta = None if start is None else np.asarray(start, float)
+    if not np.isfinite(field.positions(theta, field.grid)).all():
+        raise InputError(
+            "the positions that it begins with are not finite over the detector",
+            where="start",
+            do="check the coefficients",
+        )
     rounds: list[Round] = []
     rejection = DEFAULT_REJECTION  # with extra weight in the corners, as long as the radius has
     rule, order, settled = acceptance, min(FIRST_ORDER, model.order), False

@@ -15,7 +15,7 @@ from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.model import DistortionModel
 
-__all__ = ["Believed", "Field"]
+__all__ = ["Field"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

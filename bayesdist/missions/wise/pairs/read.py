@@ -20,10 +20,10 @@ from bayesdist.data.reading.columns import match_columns
 from bayesdist.data.reading.options import ReadOptions, check_sigma, refuse_missing_errors
 from bayesdist.data.tables.column import Columns, Place, Quantities, SourceColumn
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.pairs.array_check import ArrayCheck
 from bayesdist.missions.wise.pairs.files import (
     MAGNITUDES,
     RVB_ALIASES,
+    ArrayCheck,
     RvbFile,
     band_name,
     open_rvb_files,

@@ -14,12 +14,7 @@ from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform
 
-__all__ = [
-    "LinearMoments",
-    "TransformFit",
-    "fit_transform",
-    "linear_moments",
-]
+__all__ = ["LinearMoments", "fit_transform", "linear_moments"]
 
 Float = NDArray[np.float64]
 

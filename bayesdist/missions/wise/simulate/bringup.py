@@ -12,7 +12,7 @@ from bayesdist.errors import InputError
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import DistortionModel
 
-__all__ = ["UnpairedStars", "simulate_unpaired"]
+__all__ = ["simulate_unpaired"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

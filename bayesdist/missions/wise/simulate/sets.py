@@ -24,7 +24,7 @@ from bayesdist.missions.wise.simulate.stars import POPULATIONS
 from bayesdist.missions.wise.simulate.survey import FalseMatches, Survey, false_matches, survey
 from bayesdist.model import DistortionModel
 
-__all__ = ["CHUNK", "PairChunk", "WiseSet", "wise_set"]
+__all__ = ["PairChunk", "WiseSet", "wise_set"]
 
 Float = NDArray[np.float64]
 

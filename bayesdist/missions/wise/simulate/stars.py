@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from bayesdist.missions.wise.published import WISE_ARRAYS
 
-__all__ = ["POPULATIONS", "Population"]
+__all__ = ["POPULATIONS"]
 
 Float = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 
 from bayesdist.errors import InputError
 
-__all__ = ["FRAMES", "FalseMatches", "Survey", "false_matches", "match_radius", "survey"]
+__all__ = ["FalseMatches", "Survey", "false_matches", "match_radius", "survey"]
 
 Float = NDArray[np.float64]
 

@@ -17,8 +17,7 @@ from bayesdist.calibration.chip_map import fitted_map
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model.basis import MAX_ORDER
-from bayesdist.products.formats.ast.dump import parse_dump
-from bayesdist.products.formats.ast.mapping import Step, steps_of
+from bayesdist.products.formats.ast.mapping import Step, parse_dump, steps_of
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import MissingSizeError
 from bayesdist.products.formats.common.parameters import with_parameters

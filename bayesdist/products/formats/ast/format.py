@@ -26,7 +26,7 @@ from bayesdist.products.formats.common.document import (
     finding_lines,
 )
 from bayesdist.products.formats.common.parameters import parameters_content
-from bayesdist.products.formats.tpv.pv import substitution
+from bayesdist.products.formats.tpv.head import substitution
 
 __all__ = ["FORMAT", "Settings"]
 

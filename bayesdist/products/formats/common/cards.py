@@ -21,6 +21,7 @@ __all__ = [
     "wrapped_cards",
 ]
 
+_UNPRINTABLE = re.compile(r"[^ -~]")  # a header has printable ASCII alone
 # Without one of these nothing ties pixels to a world.
 _NEEDED = re.compile(r"(CTYPE|CRVAL)\d+[A-Z]?$|A_ORDER$|(T?CTYP|TCTY|TCRVL|TCRV)\d+[A-Z]?$")
 
@@ -36,7 +37,8 @@ def number_card(keyword: str, value: float | int, comment: str = "") -> str:
 
 
 def text_card(keyword: str, value: str, comment: str = "") -> str:
-    """Card of a string, or of a COMMENT or HISTORY."""
+    """Card of a string, or of a COMMENT or HISTORY, with ? for characters that no header has."""
+    value = _UNPRINTABLE.sub("?", value)
     if keyword in ("COMMENT", "HISTORY"):
         return f"{keyword:<8}{value}"[:80].ljust(80)
     return fits.Card(keyword, value, comment).image

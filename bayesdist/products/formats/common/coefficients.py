@@ -28,7 +28,6 @@ from bayesdist.errors import DegenerateError
 
 __all__ = [
     "Coefficients",
-    "coefficient_matrix",
     "evaluate",
     "idctab_column",
     "idctab_powers",

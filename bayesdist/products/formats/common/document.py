@@ -23,7 +23,6 @@ from bayesdist.products.formats.common.content import Content, readable
 from bayesdist.products.formats.common.read_back import ReadBack
 
 __all__ = [
-    "LEVELS",
     "PARAMETERS",
     "BuildOptions",
     "Builder",

@@ -30,9 +30,6 @@ from bayesdist.model import Chip, DistortionModel
 from bayesdist.products.formats.common.content import Content, Hdu, hdus_of
 
 __all__ = [
-    "EXTENSION",
-    "agreeing",
-    "largest_difference",
     "parameters_content",
     "parameters_hdu",
     "stored_calibration",

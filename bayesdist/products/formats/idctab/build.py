@@ -19,8 +19,15 @@ from bayesdist.products.formats.common.cards import (
     wrapped_cards,
 )
 from bayesdist.products.formats.common.content import hdus_of
-from bayesdist.products.formats.idctab.cards import closure_cards, provenance_cards, tdd_cards
-from bayesdist.products.formats.idctab.hdus import Piece, coefficient_hdu, covariance_hdu, sigma_hdu
+from bayesdist.products.formats.idctab.hdus import (
+    Piece,
+    closure_cards,
+    coefficient_hdu,
+    covariance_hdu,
+    provenance_cards,
+    sigma_hdu,
+    tdd_cards,
+)
 from bayesdist.products.formats.idctab.hst import combination_of, parity_of
 from bayesdist.products.formats.idctab.numbers import (
     ChipNumbers,

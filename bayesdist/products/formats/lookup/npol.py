@@ -36,7 +36,7 @@ from bayesdist.products.formats.lookup.file import (
     write_lookup_file,
 )
 
-__all__ = ["filter_name", "read_npol", "write_npol"]
+__all__ = ["read_npol", "write_npol"]
 
 Float = NDArray[np.float64]
 

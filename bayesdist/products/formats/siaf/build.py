@@ -30,7 +30,7 @@ from bayesdist.products.formats.siaf.table import (
     table_of,
 )
 
-__all__ = ["SiafFiles", "siaf_files"]
+__all__ = ["siaf_files"]
 
 Float = NDArray[np.float64]
 

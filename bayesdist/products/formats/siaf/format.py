@@ -1,14 +1,16 @@
-"""Format entry of SIAF tables of coefficients."""
+"""Format entry of SIAF tables of coefficients, and their description as text."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import Field
 
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.errors import InputError
+from bayesdist.calibration.inverse import detector_grid
+from bayesdist.errors import BayesdistError, InputError
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import (
     PARAMETERS,
@@ -17,20 +19,69 @@ from bayesdist.products.formats.common.document import (
     Choice,
     Format,
     FormatSettings,
+    finding_lines,
 )
 from bayesdist.products.formats.common.read_back import ReadBack, of_chips
+from bayesdist.products.formats.common.record import calibration_from
 from bayesdist.products.formats.siaf.lint import lint_siaf
 from bayesdist.products.formats.siaf.table import (
     HIGHEST,
+    NAMES,
     SiafTable,
     holds_table,
     siaf_calibration,
     siaf_read_back,
     table_of,
 )
-from bayesdist.products.formats.siaf.text import describe_siaf
 
-__all__ = ["FORMAT", "Settings"]
+__all__ = ["FORMAT", "Settings", "describe_siaf"]
+
+
+def describe_siaf(table: SiafTable) -> list[str]:
+    """Lines of text on a table or a side file, its findings at the end."""
+    if not table.rows:
+        lines = [f"{table.name}: covariance of the SIAF table of {table.aperture}"]
+        return [*lines, *_uncertainty(table), "", *finding_lines(lint_siaf(table))]
+    size = table.size
+    extent = "unknown" if size is None else f"{size[0]:g} x {size[1]:g} px"
+    lines = [
+        f"{table.name}: SIAF table of {table.aperture}, order {table.order}",
+        f"  detector  {extent}",
+    ]
+    if size is not None:
+        x, y = table.reference_pixel(size)
+        source = "" if "XSciRef" in table.stated else ", assumed: the middle"
+        lines.append(f"  zero      pixel ({x:g}, {y:g}){source}")
+    linear = np.array(
+        [[table.terms(name).get(k, 0.0) for k in ((1, 0), (0, 1))] for name in NAMES[:2]]
+    )
+    lines.append(f"  pixel     {np.sqrt(abs(np.linalg.det(linear))):.8f} arcsec")
+    closure = table.closure()
+    if closure is not None:
+        lines.append(f"  inverse   {closure:.2g} px at worst")
+    lines += [*_uncertainty(table), "", f"  nj {' '.join(name.rjust(15) for name in NAMES)}"]
+    for row in table.rows:
+        lines.append(f"  {row.index} {' '.join(f'{value:15.7g}' for value in row.values)}")
+    return [*lines, "", *finding_lines(lint_siaf(table))]
+
+
+def _uncertainty(table: SiafTable) -> list[str]:
+    if table.record is None:
+        return ["  errors    none stated"]
+    try:
+        found = calibration_from(table.record, table.name)
+    except BayesdistError:
+        return ["  errors    of a side file that cannot be read"]
+    [chip] = found.by_chip().values()
+    cov = chip.covariance_at(*detector_grid(chip.basis.size, 65))
+    if cov is None:
+        return ["  errors    none stated"]
+    sigma = 1e3 * np.sqrt((cov[:, 0, 0] + cov[:, 1, 1]) / 2)
+    return [
+        f"  errors    {found.errors}: {np.median(sigma):.3g} mas per axis at the median, "
+        f"{sigma.max():.3g} at worst"
+    ]
+
 
 WHERE = "products.siaf"
 

@@ -44,7 +44,6 @@ __all__ = [
     "SiafTable",
     "departure",
     "holds_table",
-    "record_beside",
     "siaf_calibration",
     "side_name",
     "table_of",

@@ -1,18 +1,30 @@
-"""Calibration of a SIP header."""
+"""Calibration of SIP headers, alone or with the parameters that stand beside them."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import fitted_map
-from bayesdist.calibration.plane import Plane
+from bayesdist.calibration.inverse import detector_grid
+from bayesdist.calibration.plane import ARCSEC, Plane
+from bayesdist.errors import FormatError
 from bayesdist.model import polynomial_terms
-from bayesdist.products.formats.common.document import MissingSizeError
+from bayesdist.products.formats.common.cards import header_of, text_card
+from bayesdist.products.formats.common.content import Content
+from bayesdist.products.formats.common.document import PARAMETERS, Built, MissingSizeError
+from bayesdist.products.formats.common.parameters import (
+    parameters_content,
+    stored_calibration,
+    stored_in,
+)
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
 
-__all__ = ["sip_calibration"]
+__all__ = ["side_file", "sip_calibration", "with_covariance", "with_side_file"]
+
 
 Float = NDArray[np.float64]
 
@@ -79,3 +91,67 @@ def _variances(sip: SipHeader, linear: Float) -> Float | None:
     sigma = [float(s.get(t, 0.0)) for s in (sip.sigma_a, sip.sigma_b) for t in terms]
     turn = np.kron(linear, np.eye(len(terms)))
     return (turn * np.array(sigma) ** 2) @ turn.T
+
+
+KEYWORD = "BDPARAM"  # name of the file that has the covariance
+AGREE = 1e-4  # pixels: a header is brought to the plane of its CRVAL to a tenth of that
+_GRID = 33
+
+
+def with_side_file(sip: SipHeader, name: str) -> SipHeader:
+    """Header that names the file with its covariance."""
+    return replace(sip, cards=(*sip.cards, text_card(KEYWORD, name, "file with the covariance")))
+
+
+def side_file(calibration: Calibration, chip: int, epoch: float | None, header: str) -> Built:
+    """File with the parameters of one chip at a date, to stand beside a header."""
+    date = epoch if calibration.model.time is not None else None
+    one = calibration.only(chip, date)
+    name = f"{header.removesuffix('.hdr')}_parameters.fits"
+    return Built(name, PARAMETERS, parameters_content(one), one, chip)
+
+
+def with_covariance(found: Calibration, sip: SipHeader, content: Content) -> Calibration:
+    """Calibration by the parameters that a header names, after a check that the two agree.
+
+    Without them, with a note.  FormatError where they are others.
+    """
+    name = str(header_of(sip.cards).get(KEYWORD, ""))
+    if not name:
+        return found
+    beside = content.beside(name)
+    hdu = None if beside is None else stored_in(beside)
+    if hdu is None:
+        note = f"its covariance is in {name}, which is not here"
+        return replace(found, notes=(*found.notes, note))
+    stored = stored_calibration(hdu, found.name)
+    far = _difference(found, stored)
+    if not far <= AGREE:
+        raise FormatError(
+            f"the parameters beside it are off by {far:.2g} pixels: one of the two was changed",
+            where=found.name,
+            do="keep together what was written together",
+        )
+    return replace(stored, notes=found.notes)
+
+
+def _difference(found: Calibration, stored: Calibration) -> float:
+    """Largest distance of positions, pixels: on the sky, or after the best similarity."""
+    [here], [there] = found.numbers, stored.numbers
+    if found.model.chips[0].size != stored.model.chips[0].size:
+        return float("inf")
+    x, y = detector_grid(found.model.chips[0].size, _GRID)
+    a = found.forward(x, y, chip=here)
+    b = stored.forward(x, y, chip=there)
+    pixel = np.sqrt(abs(np.linalg.det(stored.chip(there, origin="stated").linear)))
+    if found.plane.point is not None and stored.plane.point is not None:
+        from bayesdist.data.sky.tangent import sky_of_plane, tangent_plane  # slow to import
+
+        xi, eta = (ARCSEC[found.unit] * a).T
+        ra, dec = sky_of_plane(xi, eta, found.plane.point)
+        a = np.stack(tangent_plane(ra, dec, stored.plane.point), axis=-1) / ARCSEC[stored.unit]
+        return float(np.hypot(*(a - b).T).max() / pixel)
+    w, z = a @ [1, 1j], b @ [1, 1j]
+    design = np.stack([np.ones_like(w), w], axis=1)
+    left = design @ np.linalg.lstsq(design, z, rcond=None)[0] - z
+    return float(np.abs(left).max() / pixel)

@@ -20,18 +20,18 @@ from bayesdist.products.formats.common.document import (
     FormatSettings,
 )
 from bayesdist.products.formats.common.read_back import ReadBack
-from bayesdist.products.formats.sip.calibration import sip_calibration
-from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
-from bayesdist.products.formats.sip.lint import lint_sip
-from bayesdist.products.formats.sip.parameters import (
+from bayesdist.products.formats.sip.calibration import (
     side_file,
+    sip_calibration,
     with_covariance,
     with_side_file,
 )
+from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
+from bayesdist.products.formats.sip.lint import lint_sip
 from bayesdist.products.formats.sip.read import holds_sip, sip_of
 from bayesdist.products.formats.sip.write import sip_text
 
-__all__ = ["FORMAT", "Settings", "describe_wcs"]
+__all__ = ["FORMAT", "describe_wcs"]
 
 
 class Settings(FormatSettings):

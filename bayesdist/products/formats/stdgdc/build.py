@@ -21,8 +21,7 @@ from bayesdist.products.formats.common.cards import (
 )
 from bayesdist.products.formats.common.content import hdus_of
 from bayesdist.products.formats.common.parameters import parameters_hdu
-from bayesdist.products.formats.stdgdc.file import EXTENSIONS, SIGMAS
-from bayesdist.products.formats.stdgdc.frame import CorrectedFrame, frame_of
+from bayesdist.products.formats.stdgdc.file import EXTENSIONS, SIGMAS, CorrectedFrame, frame_of
 
 __all__ = ["stdgdc_content"]
 

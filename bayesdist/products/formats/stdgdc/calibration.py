@@ -14,10 +14,9 @@ from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError
 from bayesdist.model import LookupTable
 from bayesdist.products.formats.common.parameters import stored_calibration, stored_in
-from bayesdist.products.formats.stdgdc.file import StdGdc
-from bayesdist.products.formats.stdgdc.frame import CorrectedFrame
+from bayesdist.products.formats.stdgdc.file import CorrectedFrame, StdGdc
 
-__all__ = ["corrections", "stdgdc_calibration"]
+__all__ = ["stdgdc_calibration"]
 
 Float = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""STDGDC files: corrected positions of every pixel, as hst1pass and its relatives use them.
+"""STDGDC files, and the frame of the corrected positions in them.
 
 Extensions in this order, the primary header giving their dimensions:
 
@@ -8,11 +8,18 @@ Extensions in this order, the primary header giving their dimensions:
 
 A file of ours has in addition, where no consumer looks: SXGC, SYGC, standard errors of XGC and YGC,
 CXYGC, their correlation, and BDPARAM, the parameters behind it all with their covariance.
+
+The corrected frame is that of the detector, without distortion:
+
+    corrected = reference + S^-1 ((u, v) - zero)
+
+where S is the similarity (a scale, a rotation, perhaps a mirror) nearest to the map at its
+reference pixel, so that the corrected frame lies along the detector and has its scale; the skew of
+the map stays in it.
 """
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,12 +27,66 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import FormatError
-from bayesdist.products.formats.common.content import Content, Hdu, read_content
+from bayesdist.products.formats.common.content import Content, Hdu
 
-__all__ = ["EXTENSIONS", "SIGMAS", "StdGdc", "read_stdgdc", "stdgdc_of"]
+__all__ = ["EXTENSIONS", "SIGMAS", "CorrectedFrame", "StdGdc", "frame_of", "stdgdc_of"]
+
 
 Float = NDArray[np.float64]
+
+_S = ("BDS1_1", "BDS1_2", "BDS2_1", "BDS2_2")
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectedFrame:
+    """Relation between positions (u, v) and corrected pixels."""
+
+    reference: tuple[float, float]  # FITS 1-based pixel that is not moved
+    zero: Float  # (2,), (u, v) there
+    similarity: Float  # (2, 2), S
+
+    def corrected(self, at: Float) -> Float:
+        """Corrected pixels (2, N) of positions (2, N)."""
+        inside = np.linalg.solve(self.similarity, at - self.zero[:, None])
+        return inside + np.array(self.reference)[:, None]
+
+    def positions(self, corrected: Float) -> Float:
+        """Positions (2, N) of corrected pixels (2, N)."""
+        inside = corrected - np.array(self.reference)[:, None]
+        return self.similarity @ inside + self.zero[:, None]
+
+    def keywords(self) -> dict[str, tuple[float, str]]:
+        """Keywords of a header, with their comments."""
+        out = {
+            "BDREF1": (float(self.reference[0]), "[pix] pixel that is not moved"),
+            "BDREF2": (float(self.reference[1]), "[pix]"),
+            "BDZERO1": (float(self.zero[0]), "u there"),
+            "BDZERO2": (float(self.zero[1]), "v there"),
+        }
+        comment = "(u, v) by corrected pixels"
+        values = zip(_S, self.similarity.ravel(), strict=True)
+        return out | {keyword: (float(value), comment) for keyword, value in values}
+
+    @classmethod
+    def of_header(cls, header: fits.Header) -> CorrectedFrame | None:
+        """Frame that a header states; None for one that does not."""
+        names = ("BDREF1", "BDREF2", "BDZERO1", "BDZERO2", *_S)
+        if not all(isinstance(header.get(name), float | int) for name in names):
+            return None
+        a, b, c, d, *s = (float(header[name]) for name in names)
+        return cls((a, b), np.array([c, d]), np.array(s).reshape(2, 2))
+
+
+def frame_of(one: ChipMap, scale: float | None) -> CorrectedFrame:
+    """Frame for a map, of a stated scale or of that of the pixel at the reference pixel."""
+    x, y = one.basis.reference_pixel
+    linear = one.linear
+    left, singular, right = np.linalg.svd(linear)
+    size = float(np.sqrt(np.prod(singular))) if scale is None else scale
+    return CorrectedFrame((x, y), one.at([x], [y])[:, 0], size * left @ right)
+
 
 EXTENSIONS = ("XGC", "YGC", "MGC", "XCG", "YCG")
 SIGMAS = ("SXGC", "SYGC", "CXYGC")
@@ -81,14 +142,6 @@ class StdGdc:
         """Columns and rows of the detector."""
         ny, nx = self.table("XGC").shape
         return nx, ny
-
-
-def read_stdgdc(path: str | os.PathLike[str]) -> StdGdc:
-    """Read an STDGDC file; FormatError where it is none."""
-    found = stdgdc_of(read_content(path))
-    if found is None:
-        raise FormatError("is no STDGDC file", where=str(path), do="give one with XGC and YGC")
-    return found
 
 
 def stdgdc_of(content: Content) -> StdGdc | None:

@@ -20,8 +20,13 @@ from bayesdist.products.formats.common.cards import (
     wrapped_cards,
 )
 from bayesdist.products.formats.common.coefficients import require_regular
-from bayesdist.products.formats.tpv.head import SIDE_FILE, TpvHead
-from bayesdist.products.formats.tpv.pv import HIGHEST, pv_values_of, substitution
+from bayesdist.products.formats.tpv.head import (
+    HIGHEST,
+    SIDE_FILE,
+    TpvHead,
+    pv_values_of,
+    substitution,
+)
 
 __all__ = ["tpv_cards", "tpv_heads"]
 

@@ -17,9 +17,8 @@ from bayesdist.products.formats.common.document import (
 from bayesdist.products.formats.common.parameters import parameters_content
 from bayesdist.products.formats.sip.format import describe_wcs
 from bayesdist.products.formats.tpv.calibration import tpv_calibration
-from bayesdist.products.formats.tpv.head import TpvFile, tpv_of
+from bayesdist.products.formats.tpv.head import HIGHEST, TpvFile, tpv_of
 from bayesdist.products.formats.tpv.lint import lint_tpv
-from bayesdist.products.formats.tpv.pv import HIGHEST
 
 __all__ = ["FORMAT", "Settings"]
 

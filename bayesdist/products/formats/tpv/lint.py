@@ -8,8 +8,7 @@ import numpy as np
 
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.products.formats.common.document import Finding, repeated_values
-from bayesdist.products.formats.tpv.head import TpvFile, TpvHead
-from bayesdist.products.formats.tpv.pv import POWERS, pv_value
+from bayesdist.products.formats.tpv.head import POWERS, TpvFile, TpvHead, pv_value
 
 __all__ = ["lint_tpv"]
 

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 from bayesdist.model import LookupTable
 from bayesdist.numbers import count, display_scale, number, size_of
-from bayesdist.report.arrows import Arrows, magnification_of, spacing, vector_map
 from bayesdist.report.campaign import CampaignResults, ChipResiduals
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
-from bayesdist.report.fields import Grid, scalar_map
-from bayesdist.report.panels import ChipPanels
+from bayesdist.report.figures.arrows import Arrows, magnification_of, spacing, vector_map
+from bayesdist.report.figures.fields import Grid, scalar_map
+from bayesdist.report.figures.panels import ChipPanels
+from bayesdist.report.figures.style import OUTLINE, PALETTE, WIDTH, new_figure, nice_below
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.run.residuals import residual_panels
-from bayesdist.report.style import OUTLINE, PALETTE, WIDTH, new_figure, nice_below
 from bayesdist.report.texttable import TextTable, listing
 
 if TYPE_CHECKING:

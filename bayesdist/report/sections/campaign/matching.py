@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from bayesdist.numbers import count, number, percent, size_of
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
-from bayesdist.report.registry import Plot
-from bayesdist.report.style import (
+from bayesdist.report.figures.style import (
     GUIDE,
     INK,
     PALETTE,
@@ -23,6 +22,7 @@ from bayesdist.report.style import (
     guide_lines,
     new_figure,
 )
+from bayesdist.report.registry import Plot
 from bayesdist.report.texttable import TextTable, listing
 
 if TYPE_CHECKING:

@@ -6,12 +6,12 @@ import numpy as np
 
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.numbers import MISSING, count, number, size_of
-from bayesdist.report.arrows import Arrows, magnification_of, vector_map
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
-from bayesdist.report.panels import Panels
+from bayesdist.report.figures.arrows import Arrows, magnification_of, vector_map
+from bayesdist.report.figures.panels import Panels
+from bayesdist.report.figures.style import WIDTH, new_figure, nice_below
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import WIDTH, new_figure, nice_below
 from bayesdist.report.texttable import TextTable
 
 __all__ = [

@@ -13,8 +13,8 @@ from bayesdist.assess.maps import per_axis
 from bayesdist.numbers import MISSING, count, display_scale, number, percent, with_mas
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, SelfcalResults, needed
+from bayesdist.report.figures.style import CYCLE, INK, PALE, WIDTH, new_figure
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import CYCLE, INK, PALE, WIDTH, new_figure
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing
 
 if TYPE_CHECKING:

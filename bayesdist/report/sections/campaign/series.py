@@ -15,6 +15,7 @@ from bayesdist.numbers import count, display_scale, number, size_of
 from bayesdist.report.campaign import CampaignResults
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
+from bayesdist.report.figures.style import CYCLE, INK, WIDTH, guide_lines, legend_above, new_figure
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.campaign.terms import (
     TermCourse,
@@ -23,7 +24,6 @@ from bayesdist.report.sections.campaign.terms import (
     name_of_term,
     terms_of,
 )
-from bayesdist.report.style import CYCLE, INK, WIDTH, guide_lines, legend_above, new_figure
 
 if TYPE_CHECKING:
     from bayesdist.report.campaign import LinearSeries

@@ -24,11 +24,9 @@ from bayesdist.numbers import (
 )
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
-from bayesdist.report.fields import Grid, scalar_map
-from bayesdist.report.panels import ChipPanels
-from bayesdist.report.registry import Plot
-from bayesdist.report.sections.gauge import gauge_of_new_exposure
-from bayesdist.report.style import (
+from bayesdist.report.figures.fields import Grid, scalar_map
+from bayesdist.report.figures.panels import ChipPanels
+from bayesdist.report.figures.style import (
     CYCLE,
     INK,
     OUTLINE,
@@ -36,6 +34,8 @@ from bayesdist.report.style import (
     WIDTH,
     new_figure,
 )
+from bayesdist.report.registry import Plot
+from bayesdist.report.sections.gauge import gauge_of_new_exposure
 from bayesdist.report.texttable import TextTable
 
 __all__ = [

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from bayesdist.numbers import MISSING, count, display_scale, number
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
-from bayesdist.report.fields import Grid, scalar_map
-from bayesdist.report.panels import ChipPanels
+from bayesdist.report.figures.fields import Grid, scalar_map
+from bayesdist.report.figures.panels import ChipPanels
+from bayesdist.report.figures.style import INK, PALETTE, SEQUENTIAL, WIDTH, new_figure
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import INK, PALETTE, SEQUENTIAL, WIDTH, new_figure
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing, short_paths
 
 if TYPE_CHECKING:

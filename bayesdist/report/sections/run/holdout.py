@@ -15,9 +15,9 @@ from bayesdist.diagnose.holdout.validation import HoldoutValidation
 from bayesdist.numbers import count, number
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
-from bayesdist.report.panels import chip_axes
+from bayesdist.report.figures.panels import chip_axes
+from bayesdist.report.figures.style import CYCLE, INK, WIDTH, new_figure
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import CYCLE, INK, WIDTH, new_figure
 from bayesdist.report.texttable import TextTable
 
 if TYPE_CHECKING:

@@ -9,7 +9,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from bayesdist.numbers import display_scale, number, size_of, with_mas
-from bayesdist.report.arrows import (
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import ReportInput, needed
+from bayesdist.report.figures.arrows import (
     Arrows,
     cross_map,
     magnification_of,
@@ -17,13 +19,11 @@ from bayesdist.report.arrows import (
     square_cells,
     vector_map,
 )
-from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput, needed
-from bayesdist.report.fields import Grid, contour_levels, scalar_map
-from bayesdist.report.panels import ChipPanels
+from bayesdist.report.figures.fields import Grid, contour_levels, scalar_map
+from bayesdist.report.figures.panels import ChipPanels
+from bayesdist.report.figures.style import nice_below
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.gauge import gauge_mark, gauge_of_maps
-from bayesdist.report.style import nice_below
 from bayesdist.report.texttable import TextTable
 
 if TYPE_CHECKING:

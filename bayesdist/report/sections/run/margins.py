@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 from bayesdist.numbers import count, counted, display_scale, interval, number, percent, rounded
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
-from bayesdist.report.registry import Plot
-from bayesdist.report.sections.gauge import gauge_of_new_exposure
-from bayesdist.report.style import (
+from bayesdist.report.figures.style import (
     CYCLE,
     INK,
     LEVEL_COLORS,
@@ -22,6 +20,8 @@ from bayesdist.report.style import (
     WIDTH,
     new_figure,
 )
+from bayesdist.report.registry import Plot
+from bayesdist.report.sections.gauge import gauge_of_new_exposure
 from bayesdist.report.texttable import TextTable
 
 if TYPE_CHECKING:

@@ -16,12 +16,12 @@ from bayesdist.numbers import (
     size_of,
     with_mas,
 )
-from bayesdist.report.arrows import CHANCE, Arrows, magnification_of, spacing, vector_map
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
-from bayesdist.report.panels import ChipPanels
+from bayesdist.report.figures.arrows import CHANCE, Arrows, magnification_of, spacing, vector_map
+from bayesdist.report.figures.panels import ChipPanels
+from bayesdist.report.figures.style import nice_below
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import nice_below
 from bayesdist.report.texttable import TextTable, listing
 
 if TYPE_CHECKING:

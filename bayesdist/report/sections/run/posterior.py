@@ -22,9 +22,8 @@ from bayesdist.numbers import (
 )
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
-from bayesdist.report.corners import Column, corner_figure
-from bayesdist.report.registry import Plot
-from bayesdist.report.style import (
+from bayesdist.report.figures.corners import Column, corner_figure
+from bayesdist.report.figures.style import (
     COLORBAR,
     CYCLE,
     DIVERGING,
@@ -33,6 +32,7 @@ from bayesdist.report.style import (
     legend_above,
     new_figure,
 )
+from bayesdist.report.registry import Plot
 from bayesdist.report.texttable import TextTable
 
 if TYPE_CHECKING:

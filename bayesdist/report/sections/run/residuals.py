@@ -13,19 +13,19 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
 from bayesdist.numbers import display_scale
-from bayesdist.report.arrows import (
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import ReportInput
+from bayesdist.report.figures.arrows import (
     CHANCE,
     Arrows,
     magnification_of,
     significant_cells,
     vector_map,
 )
-from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput
-from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.panels import ChipPanels, Panels
+from bayesdist.report.figures.mosaic import Mosaic
+from bayesdist.report.figures.panels import ChipPanels, Panels
+from bayesdist.report.figures.style import PALETTE, WIDTH, legend_above, new_figure, nice_below
 from bayesdist.report.registry import Plot
-from bayesdist.report.style import PALETTE, WIDTH, legend_above, new_figure, nice_below
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals

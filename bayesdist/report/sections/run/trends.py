@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from bayesdist.numbers import count, display_scale, number
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
-from bayesdist.report.registry import Plot
-from bayesdist.report.style import (
+from bayesdist.report.figures.style import (
     CYCLE,
     INK,
     OUTLINE,
@@ -24,6 +23,7 @@ from bayesdist.report.style import (
     legend_above,
     new_figure,
 )
+from bayesdist.report.registry import Plot
 
 __all__ = [
     "Means",

@@ -15,12 +15,12 @@ from bayesdist.calibration.inverse import detector_grid, fitted_inverse
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError, required
 from bayesdist.products.formats.common.asdf.distortion import closure_of
-from bayesdist.products.formats.common.asdf.settings import PlacedSettings
 from bayesdist.products.formats.common.asdf.transforms import (
     forward_transform,
     inverse_transform,
     tables_of,
 )
+from bayesdist.products.formats.common.asdf.tree import PlacedSettings
 from bayesdist.products.formats.common.coefficients import require_regular
 from bayesdist.products.formats.common.document import BuildOptions
 from bayesdist.products.formats.common.record import at_date, record_of

@@ -17,13 +17,13 @@ from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model.basis import MAX_ORDER
 from bayesdist.products.formats.common.asdf.transforms import evaluated, order_of, tables_of
+from bayesdist.products.formats.common.asdf.tree import Detector
 from bayesdist.products.formats.common.document import Choice, MissingSizeError
 from bayesdist.products.formats.common.read_back import ReadBack, of_chips
 from bayesdist.products.formats.common.record import calibration_from
 
 __all__ = [
     "AGREEMENT",
-    "Detector",
     "DistortionFile",
     "closure_of",
     "departure",
@@ -38,14 +38,6 @@ Float = NDArray[np.float64]
 ARCSEC = {"arcsec": 1.0, "deg": 3600.0, "mas": 1e-3, "rad": 180 / np.pi * 3600, "arcmin": 60.0}
 AGREEMENT = 1e-6  # pixels: as far as record and transform of one file may differ
 GRID = 65  # nodes of each axis, over the pixel centres from corner to corner
-
-
-@dataclass(frozen=True)
-class Detector:
-    """Known properties of a detector."""
-
-    size: tuple[float, float]
-    scale: float  # arcsec, nominal
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.products.formats.common.asdf.settings import PlacedSettings
-from bayesdist.products.formats.common.asdf.tree import packed
+from bayesdist.products.formats.common.asdf.tree import PlacedSettings, packed
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import (
     BuildOptions,
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
     from bayesdist.products.formats.common.asdf.distortion import DistortionFile
 
 __all__ = ["Observatory"]
+
 
 Settings = TypeVar("Settings", bound=PlacedSettings)
 
@@ -53,7 +53,7 @@ class Observatory(Generic[Settings]):
     key: str
     name: str
     parse: Callable[[Content], DistortionFile | None]
-    lint_meta: Callable[[Mapping[str, Any]], Sequence[Finding]]
+    lint_meta: Callable[[Mapping[str, Any]], Iterable[Finding]]
     instrument: Callable[[Settings], str]
     tree: Callable[[ChipTransform, str, Settings, str], dict[str, Any]]
 
@@ -79,7 +79,7 @@ class Observatory(Generic[Settings]):
         return [*self.lint_meta(file.meta), *lint_distortion(file)]
 
     def _describe(self, file: DistortionFile) -> list[str]:
-        from bayesdist.products.formats.common.asdf.text import describe_distortion
+        from bayesdist.products.formats.common.asdf.lint import describe_distortion
 
         return describe_distortion(file, self._lint(file))
 

@@ -1,18 +1,53 @@
-"""Trees of ASDF files, read and written."""
+"""Trees of ASDF files, read and written, and settings that all observatories have."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from bayesdist.products.formats.common.content import Content
+from bayesdist.products.formats.common.document import FormatSettings
 from bayesdist.reading.asdf import asdf_tree, asdf_with_transforms
 
-__all__ = ["is_asdf", "packed", "plain", "tagged", "tree_of"]
+__all__ = ["Detector", "PlacedSettings", "is_asdf", "packed", "plain", "tagged", "tree_of"]
+
+
+DESCRIPTION = "Geometric distortion with its uncertainty, by bayesdist"
+
+
+class PlacedSettings(FormatSettings):
+    """Identity of the file, and position of the plane of (u, v) in V2, V3.
+
+    V2Ref, V3Ref [arcsec], V3IdlYAngle [deg] and VIdlParity are those of (u, v) = 0 and of the axes
+    of (u, v), which are those of the aperture's Ideal system; a calibration in an aperture has its
+    own.
+    """
+
+    detector: str | None = None  # by default the names of the chips, or of the calibration
+    useafter: str
+    pedigree: str
+    author: str
+    description: str = DESCRIPTION
+    v2ref: float | None = None
+    v3ref: float | None = None
+    v3idlyangle: float | None = None
+    parity: Literal[-1, 1] | None = None
+    inverse_order: Annotated[int, Field(ge=1, le=12)] | None = None
+
+
+@dataclass(frozen=True)
+class Detector:
+    """Known properties of a detector."""
+
+    size: tuple[float, float]
+    scale: float  # arcsec, nominal
+
 
 _START = b"#ASDF"
 

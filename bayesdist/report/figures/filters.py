@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bayesdist.report.style import (
+from bayesdist.report.figures.style import (
     CYCLE,
     INK,
     WIDTH,

@@ -14,8 +14,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RectBivariateSpline
 
-from bayesdist.report.panels import Panels
-from bayesdist.report.style import COLORBAR, INK, SEQUENTIAL, figure_style
+from bayesdist.report.figures.panels import Panels
+from bayesdist.report.figures.style import COLORBAR, INK, SEQUENTIAL, figure_style
 
 __all__ = ["Grid", "contour_levels", "scalar_map"]
 

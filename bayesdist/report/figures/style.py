@@ -7,17 +7,19 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.rcsetup import cycler
 from matplotlib.ticker import LogFormatterSciNotation, ScalarFormatter
+from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
 __all__ = [
@@ -108,9 +110,50 @@ def figure_style() -> Iterator[None]:
         yield
 
 
-def new_figure(width: float, height: float, *, layout: Any = "constrained") -> Figure:
+class _Layout(ConstrainedLayoutEngine):
+    """Constrained layout that measures the labels of each panel once.
+
+    Matplotlib measures all of them again after it has moved the panels, which takes as long as
+    drawing them; here they keep the room that they had.
+    """
+
+    def execute(self, fig: Figure) -> None:
+        panels = fig.axes
+        for ax in panels:
+            ax.get_tightbbox = _measured_once(ax)  # type: ignore[method-assign]
+        try:
+            super().execute(fig)
+        finally:
+            for ax in panels:
+                del ax.get_tightbbox
+
+
+def _measured_once(ax: Axes) -> Callable[..., Any]:
+    """The function `get_tightbbox` of a panel, whose labels keep their room when it is moved."""
+    measure, beyond = ax.get_tightbbox, list[Float]()
+
+    def box(renderer: Any, *options: Any, **more: Any) -> Any:
+        if beyond:
+            place = ax.get_axes_locator()
+            ax.apply_aspect(None if place is None else place(ax, renderer))
+            return Bbox(ax.bbox.get_points() + beyond[0])
+        found = measure(renderer, *options, **more)
+        if found is not None:
+            beyond.append(found.get_points() - ax.bbox.get_points())
+        return found
+
+    return box
+
+
+def new_figure(
+    width: float,
+    height: float,
+    *,
+    layout: Literal["constrained", "compressed", "none"] = "constrained",
+) -> Figure:
     """Empty figure (inches) that belongs to no window and to no pyplot state."""
-    fig = Figure(figsize=(width, height), layout=layout)
+    fig = Figure(figsize=(width, height))
+    fig.set_layout_engine("none" if layout == "none" else _Layout(compress=layout == "compressed"))
     FigureCanvasAgg(fig)
     return fig
 

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.style import OUTLINE, WIDTH, figure_style, new_figure
+from bayesdist.report.figures.mosaic import Mosaic
+from bayesdist.report.figures.style import OUTLINE, WIDTH, figure_style, new_figure
 
 __all__ = ["ArrayPanels", "ChipPanels", "OneArray", "Panels", "chip_axes"]
 

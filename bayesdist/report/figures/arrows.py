@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
 from bayesdist.numbers import size_of
-from bayesdist.report.panels import Panels
-from bayesdist.report.style import CYCLE, INK, PALE, PALETTE, figure_style, nice_below
+from bayesdist.report.figures.panels import Panels
+from bayesdist.report.figures.style import CYCLE, INK, PALE, PALETTE, figure_style, nice_below
 
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap

@@ -1,18 +1,75 @@
-"""Node meta of Roman's distortion reference files."""
+"""Distortion reference files of Roman's Wide Field Instrument: ASDF, as romancal reads them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from datetime import datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from astropy.time import Time
-
-from bayesdist.errors import InputError
-from bayesdist.products.formats.common.asdf.distortion import Detector
+from bayesdist.errors import FormatError, InputError
+from bayesdist.products.formats.common.asdf.format import Observatory
+from bayesdist.products.formats.common.asdf.tree import (
+    Detector,
+    PlacedSettings,
+    is_asdf,
+    plain,
+    tagged,
+    tree_of,
+)
+from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import Finding
 
-__all__ = ["TAG", "detector_of", "lint_meta", "meta_of", "units_of"]
+if TYPE_CHECKING:
+    from astropy.time import Time
+
+    from bayesdist.products.formats.common.asdf.build import ChipTransform
+    from bayesdist.products.formats.common.asdf.distortion import DistortionFile
+
+__all__ = ["FORMAT", "Settings"]
+
+
+KEY = "coordinate_distortion_transform"
+
+
+class Settings(PlacedSettings):
+    """Configuration of a Roman WFI distortion reference file."""
+
+    optical_element: str
+
+
+def _parse(content: Content) -> DistortionFile | None:
+    """ASDF files with the node roman: of another kind they are refused."""
+    if not is_asdf(content) or b"\nroman:" not in content.raw:
+        return None
+    # astropy.modeling takes longer to import than other files to read
+    from bayesdist.products.formats.common.asdf.distortion import DistortionFile, transform_in
+
+    tree = tree_of(content).get("roman")
+    if not isinstance(tree, Mapping) or KEY not in tree or "meta" not in tree:
+        held = ", ".join(sorted(tree)) if isinstance(tree, Mapping) else "nothing"
+        raise FormatError(
+            f"holds {held or 'nothing'} under roman, and not meta and {KEY}",
+            where=content.name,
+            do="give a distortion reference file of the WFI",
+        )
+    meta = plain(tree["meta"])
+    instrument = meta.setdefault("instrument", {})
+    record = tree.get("bayesdist")
+    return DistortionFile(
+        content.name,
+        "Roman",
+        transform_in(tree, KEY, content.name),
+        meta,
+        units_of(meta),
+        None if record is None else plain(record),
+        detector_of(instrument.get("detector")),
+    )
+
+
+def _tree(one: ChipTransform, detector: str, settings: Settings, file: str) -> dict[str, Any]:
+    meta = meta_of(detector, settings.model_dump(), "products.roman")
+    return {"roman": tagged({"meta": meta, KEY: one.model, "bayesdist": one.record}, TAG, file)}
+
 
 # The newest one that both romancal 1.1 and roman_datamodels 1.2 read.
 TAG = "asdf://stsci.edu/datamodels/roman/tags/reference_files/distortion-1.3.0"
@@ -65,6 +122,8 @@ def meta_of(detector: str, settings: Mapping[str, Any], where: str) -> dict[str,
 
 
 def _time(text: str, where: str) -> Time:
+    from astropy.time import Time  # slow to import
+
     try:
         return Time(datetime.fromisoformat(text).isoformat(), format="isot", scale="utc")
     except ValueError as error:
@@ -90,3 +149,8 @@ def lint_meta(meta: Mapping[str, Any]) -> Iterator[Finding]:
     reftype = str(meta.get("reftype", ""))
     if reftype and reftype != "DISTORTION":
         yield Finding("error", "meta.reftype", f"is {reftype!r}, and not 'DISTORTION'")
+
+
+FORMAT = Observatory[Settings](
+    "roman", "Roman", _parse, lint_meta, lambda settings: "WFI", _tree
+).format("a Roman distortion reference file", 6, Settings)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bayesdist.model.grid import mesh, outline_pixels
-from bayesdist.report.style import (
+from bayesdist.report.figures.style import (
     COLORBAR,
     INK,
     PALETTE,

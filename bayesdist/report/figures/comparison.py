@@ -13,10 +13,17 @@ from scipy.stats import chi2 as chi_square
 from scipy.stats import norm
 
 from bayesdist.numbers import size_of
-from bayesdist.report.arrows import Arrows, vector_map
-from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.panels import ChipPanels
-from bayesdist.report.style import COLORBAR, PALETTE, WIDTH, figure_style, new_figure, nice_below
+from bayesdist.report.figures.arrows import Arrows, vector_map
+from bayesdist.report.figures.mosaic import Mosaic
+from bayesdist.report.figures.panels import ChipPanels
+from bayesdist.report.figures.style import (
+    COLORBAR,
+    PALETTE,
+    WIDTH,
+    figure_style,
+    new_figure,
+    nice_below,
+)
 
 if TYPE_CHECKING:
     from bayesdist.assess.comparison.compare import Comparison

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from bayesdist.numbers import display_scale
-from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure
+from bayesdist.report.figures.style import PALETTE, WIDTH, figure_style, new_figure
 
 __all__ = [
     "Column",

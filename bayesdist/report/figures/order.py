@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from bayesdist.numbers import display_scale
-from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure
+from bayesdist.report.figures.style import PALETTE, WIDTH, figure_style, new_figure
 
 if TYPE_CHECKING:
     from bayesdist.infer.compare.order_result import OrderSelection

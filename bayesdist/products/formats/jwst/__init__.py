@@ -1,1 +1,0 @@
-"""Distortion reference files of JWST's imagers: ASDF, as stdatamodels' DistortionModel has them."""
