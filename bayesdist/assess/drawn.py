@@ -26,7 +26,6 @@ from bayesdist.assess.terms.forms import (
     ErrorTerm,
     Image,
     Noise,
-    Row,
 )
 from bayesdist.infer.solution import Solution
 
@@ -90,10 +89,6 @@ class DrawnErrors:
         if domain not in self._cache:
             self._cache[domain] = tuple(one.on(domain, self.image) for one in self.draws)
         return self._cache[domain]
-
-    def rows(self, domain: EvaluationDomain) -> tuple[Row, ...]:
-        """Rows of everything that an error is made of there."""
-        return tuple(row for one in self.at(domain) for row in one.rows)
 
     def treatments(self, grid: tuple[int, int] | None = None) -> tuple[DrawnErrors, ...]:
         """Draws with what may vary over the field varying: smoothly, and everywhere.

@@ -226,10 +226,6 @@ class AddedErrors:
     sigma: Float  # (G, 2), along u and v in their unit
     other: Float  # (2,), of stars with another label, as of an exposure that was held out
 
-    def times(self, factor: float) -> AddedErrors:
-        """These errors multiplied by a factor."""
-        return replace(self, sigma=factor * self.sigma, other=factor * self.other)
-
     def at(self, labels: Sequence[str], codes: Int) -> tuple[Float, Float]:
         """Errors (N,) on u and v of stars, by the labels of their groups and codes (N,) into them.
 

@@ -23,7 +23,7 @@ class DrawnFields:
 
     @property
     def parts(self):
-        return (*(row.name for row in self.drawn.rows(self.domain)), JOINT)
+        return (*(row.name for field in self.drawn.at(self.domain) for row in field.rows), JOINT)
 
     def field(self, name, draws=None):
         draws = draws or slice(0, self.drawn.n_draws)

@@ -34,7 +34,7 @@ def test_one_detection_of_an_exposure():
     places = np.array([[0.0, 0.0], [0.1, 0.0], [0.05, 0.05], [0.7, 0.0], [10.0, 0.0]])
     found = friends_of_friends(places, np.array([0, 1, 2, 2, 0]), 1.0)
     assert found.star.tolist() == [0, 0, 0, NO_STAR, 1]
-    assert (found.n_stars, found.n_alone, found.n_doubled, found.n_dropped) == (2, 1, 1, 1)
+    assert (found.n_stars, found.n_doubled, found.n_dropped) == (2, 1, 1)
 
 
 def test_chains_are_given_up():

@@ -167,7 +167,9 @@ def test_where_errors_come_from(rng, tmp_path, monkeypatch):
     bins = np.array([11.0, 14.0, 19.0])
     errors = MagnitudeErrors(bins, bins / 100, bins / 50, bins.astype(int), bins, bins)
     whole = read_matches(path, sigma="by_magnitude")
-    added = AddedErrors("", ("",), np.array([[0.0, 0.3]]), np.zeros(2))
+    added, doubled = (
+        AddedErrors("", ("",), np.array([[0.0, sigma]]), np.zeros(2)) for sigma in (0.3, 0.6)
+    )
     two = opened.with_errors((0.1, 0.2))
     for ours, theirs in (
         (opened.with_errors(errors), whole.with_errors(errors.at(whole.mag))),
@@ -186,7 +188,7 @@ def test_where_errors_come_from(rng, tmp_path, monkeypatch):
             opened.with_errors((0.1, 0.2))
             .with_errors(added, in_quadrature=True)
             .with_scaled_errors(2.0),
-            whole.with_errors((0.2, 0.4)).with_errors(added.times(2.0), in_quadrature=True),
+            whole.with_errors((0.2, 0.4)).with_errors(doubled, in_quadrature=True),
         ),
     ):
         assert ours.has_sigma and not opened.has_sigma

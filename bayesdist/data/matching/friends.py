@@ -27,7 +27,6 @@ class Friends:
 
     star: Int  # (N,) codes from 0; `NO_STAR` for detections that were dropped
     n_stars: int
-    n_alone: int  # stars on a single exposure
     n_doubled: int  # groups with several detections of one exposure: the nearest to the mean stays
     n_dropped: int  # detections that were dropped for that
     n_chains: int  # groups that were given up, as they span several stars
@@ -64,8 +63,7 @@ def friends_of_friends(places: Float, exposure: Int, length: float) -> Friends:
     rank[np.argsort(first)] = np.arange(len(codes))
     out = np.full(len(star), NO_STAR)
     out[good] = rank[code]
-    counts = np.bincount(out[good], minlength=len(codes))
-    return Friends(out, len(codes), int((counts == 1).sum()), n_doubled, n_dropped, n_chains)
+    return Friends(out, len(codes), n_doubled, n_dropped, n_chains)
 
 
 def _without_chains(places: Float, group: Int, most: float) -> tuple[Int, int, int]:

@@ -92,11 +92,6 @@ class GroupedErrors:
         return self.error / (2.0 * np.sqrt(np.maximum(self.variance, self.error)))
 
     @property
-    def gain(self) -> float:
-        """Largest gain of ln evidence over one error for both axes."""
-        return max(self.evidence.values())
-
-    @property
     def excess(self) -> Float:
         """Errors (G, 2) to add to the quoted ones; the smallest of them is left to the jitter."""
         return np.sqrt(self.variance - self.variance.min())

@@ -59,11 +59,6 @@ class ExposureSolutions:
     def __len__(self) -> int:
         return len(self.names)
 
-    @property
-    def sigma(self) -> Float:
-        """Formal standard deviations, shape (E, k)."""
-        return np.sqrt(np.maximum(np.einsum("ekk->ek", self.cov), 0.0))
-
     def series(self, *labels: str) -> tuple[Float, Float, Float]:
         """Selected linear terms against time.
 

@@ -40,11 +40,6 @@ class AxisField:
         return self.root @ self.root.T
 
     @property
-    def polynomial(self) -> Float:
-        """Polynomial (K,) that goes with the mean: change that the polynomial fit still needs."""
-        return self.sums.polynomial_of(self.mean)
-
-    @property
     def n_effective(self) -> float:
         """Number of parameters, nodes and polynomial, that the stars determine."""
         nodes = float((self.sums.informed(self.root) * self.root).sum())

@@ -50,8 +50,6 @@ class SelfCalibration:
         Of the last iteration; its `star` is of the detections given.
     detections : Detections
         With star codes and errors, on one tangent plane where that is requested.
-    magnitude_errors : tuple of ndarray, or None
-        Magnitudes and errors in pixels, where these were measured.
     iterations : int
     """
 
@@ -59,7 +57,6 @@ class SelfCalibration:
     gauge: Gauge
     friends: Friends
     detections: Detections
-    magnitude_errors: tuple[Float, Float] | None
     iterations: int
 
 
@@ -130,7 +127,6 @@ def self_calibrate(
         detections = replace(detections, sigma=np.full(len(detections), GUESS))
     radius = max(start_radius or match_radius, match_radius)
     pixel = model.pixel_size(theta)
-    errors: tuple[Float, Float] | None = None
     before: Friends | None = None
     mode: SelfCalibrationMode | None = None
     for turn in range(max_iterations):
@@ -160,7 +156,7 @@ def self_calibrate(
         )
         last = radius <= match_radius
         if measured:
-            sigma, errors = _errors_of(detections, mode)
+            sigma = _errors_of(detections, mode)
             detections = replace(detections, sigma=sigma)
         few = max(MAX_CHANGED * len(detections), MIN_CHANGED)
         if last and before is not None and _changed(before, friends) <= few:
@@ -176,7 +172,7 @@ def self_calibrate(
                 )
             gauge = gauge_of(mode.problem, mode.theta, prior_at(mode.theta), mode)
             found = replace(found, sigma=detections.sigma)
-            return SelfCalibration(mode, gauge, friends, found, errors, turn + 1)
+            return SelfCalibration(mode, gauge, friends, found, turn + 1)
         before = friends
         scatter = mode.error
         radius = max(match_radius, min(radius, max(SHRINK * radius, REACH * scatter)))
@@ -204,16 +200,14 @@ def _still(problem: Problem, mode: SelfCalibrationMode) -> Mixture | None:
     return mode.mixture if same and problem.n_star == 2 else None
 
 
-def _errors_of(
-    detections: Detections, mode: SelfCalibrationMode
-) -> tuple[Float, tuple[Float, Float]]:
-    """Errors (N,) by magnitude, or one for all; and the magnitudes and errors of the line."""
+def _errors_of(detections: Detections, mode: SelfCalibrationMode) -> Float:
+    """Errors (N,) in pixels: by magnitude, or one for all."""
     problem = mode.problem
     mag = np.zeros(len(detections)) if detections.mag is None else detections.mag
     middles, sigma = scatter_by_magnitude(
         problem, mode.theta, mode.mixture, mode.stars, mag[problem.rows]
     )
-    return np.exp(np.interp(mag, middles, np.log(sigma))), (middles, sigma)
+    return np.exp(np.interp(mag, middles, np.log(sigma)))
 
 
 def _changed(before: Friends, after: Friends) -> int:

@@ -280,19 +280,10 @@ class FilterDependence:
     comparison: Comparison
 
     @property
-    def gain(self) -> tuple[float, float]:
-        """Gain of own slopes in predicting held-out exposures, with standard error."""
-        return self.comparison.difference(*self._places)
-
-    @property
     def depends(self) -> bool:
         """True if own slopes predict significantly better."""
-        return self.comparison.beats(*self._places)
-
-    @property
-    def _places(self) -> tuple[int, int]:
         posteriors = self.comparison.posteriors
-        return posteriors.index(self.separate), posteriors.index(self.common)
+        return self.comparison.beats(posteriors.index(self.separate), posteriors.index(self.common))
 
 
 def filter_dependence(series: Series, trend: TrendModel, *, seed: int = 1) -> FilterDependence:

@@ -46,11 +46,6 @@ class Verdict:
     breaks: Float
     rivals: tuple[str, ...]
 
-    @property
-    def is_line(self) -> bool:
-        """True if a drift is claimed that goes on."""
-        return self.posterior.trend.has_slope and self.posterior.trend.kind != "spline"
-
 
 def default_candidates(breaks: tuple[float, ...] = ()) -> tuple[TrendModel, ...]:
     """Trends to compare: with the given breaks, or with one break that is to be found."""

@@ -82,7 +82,7 @@ def test_it_is_the_exact_joint_solution(small, rng):
     total = np.sqrt(formal + got.position_sigma(px, py, refitted=True) ** 2)
     where, sigma = joint.at(px, py)
     np.testing.assert_allclose(total, sigma, rtol=1e-5)
-    polynomial = phi @ np.stack([a.polynomial for a in got.axes], axis=1)
+    polynomial = phi @ np.stack([a.sums.polynomial_of(a.mean) for a in got.axes], axis=1)
     np.testing.assert_allclose(got.table.evaluate(px, py) + polynomial, where, atol=1e-6)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.infer.series import Series, TrendModel
+from bayesdist.infer.series import Series, TrendModel, Verdict
 
 COEFFICIENTS = ("A_2", "B_2", "B_3")
 REFERENCE = (2004.5, 2012.5)
@@ -84,3 +84,9 @@ def drifting(seed: int, n: int = 80, memory: float = 0.7, k: int = 2) -> Series:
     for i in range(1, n):
         values[i] = memory * values[i - 1] + np.sqrt(1 - memory**2) * noise[i]
     return Series.of(epoch, values, 0.03, coefficients=tuple("abcdef"[:k]))
+
+
+def is_line(verdict: Verdict) -> bool:
+    """True if a drift is claimed that goes on."""
+    trend = verdict.posterior.trend
+    return trend.has_slope and trend.kind != "spline"
