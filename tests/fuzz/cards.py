@@ -203,8 +203,8 @@ def data_are(content, hdu, column, row, value):
     return _set(content, hdu, column, row, value, whole=True)
 
 
-@changes("bomb", KNOWABLE, "fits")
+@changes("bomb", OPEN, "fits")
 def deep_extensions(content):
-    """Two thousand empty extensions behind the file's own."""
+    """Two thousand empty extensions behind the file's own, which `inspect` counts."""
     empty = fits.ImageHDU().header.tostring().encode()
     return content + empty * 2000

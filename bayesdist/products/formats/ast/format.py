@@ -141,7 +141,7 @@ def _build(
         text = _text(one, settings, options.scale_arcsec, side)
         out += [
             Built(side, PARAMETERS, parameters_content(one), one, number),
-            Built(f"ast{several}.txt", "AST", text.encode("ascii"), one, number),
+            Built(f"ast{several}.txt", "AST", text.encode("ascii", "replace"), one, number),
         ]
     return tuple(out)
 

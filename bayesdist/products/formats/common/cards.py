@@ -17,6 +17,7 @@ __all__ = [
     "holds_wcs",
     "keyword_of",
     "number_card",
+    "printable",
     "text_card",
     "wrapped_cards",
 ]
@@ -36,9 +37,14 @@ def number_card(keyword: str, value: float | int, comment: str = "") -> str:
     return f"{keyword:<8}= {number:>20}{' / ' + comment if comment else ''}"[:80].ljust(80)
 
 
+def printable(text: str) -> str:
+    """Text with ? for characters that no header has."""
+    return _UNPRINTABLE.sub("?", text)
+
+
 def text_card(keyword: str, value: str, comment: str = "") -> str:
     """Card of a string, or of a COMMENT or HISTORY, with ? for characters that no header has."""
-    value = _UNPRINTABLE.sub("?", value)
+    value = printable(value)
     if keyword in ("COMMENT", "HISTORY"):
         return f"{keyword:<8}{value}"[:80].ljust(80)
     return fits.Card(keyword, value, comment).image

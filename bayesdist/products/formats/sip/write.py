@@ -8,7 +8,13 @@ import numpy as np
 from astropy.io import fits
 
 from bayesdist.files import atomic_path
-from bayesdist.products.formats.common.cards import header_of, keyword_of, number_card, text_card
+from bayesdist.products.formats.common.cards import (
+    header_of,
+    keyword_of,
+    number_card,
+    printable,
+    text_card,
+)
 from bayesdist.products.formats.common.coefficients import sip_keyword, sip_powers
 from bayesdist.products.formats.sip.header import SipHeader
 from bayesdist.products.formats.sip.read import CD_KEYWORDS, LINEAR_KEYWORDS, cd_matrix, image_size
@@ -71,7 +77,7 @@ def write_sip(sip: SipHeader, path: str | os.PathLike[str]) -> None:
 
 def sip_text(sip: SipHeader) -> str:
     """Header as text, one card a line."""
-    return "\n".join(_cards(sip)) + "\n"
+    return "\n".join(map(printable, _cards(sip))) + "\n"
 
 
 def sip_header(sip: SipHeader) -> fits.Header:
@@ -79,7 +85,7 @@ def sip_header(sip: SipHeader) -> fits.Header:
 
     Returns the cards that were read, except where fields differ.
     """
-    return header_of(_cards(sip))
+    return header_of(list(map(printable, _cards(sip))))
 
 
 def _cards(sip: SipHeader) -> list[str]:
