@@ -102,13 +102,14 @@ def needed_columns(
     names = list(names)
     found = find_columns(names, columns, ALIASES, source=source, pairs=PAIRS)
     on_sky = is_on_sky(names, found, columns, source)
-    for key in ("x", "y") if on_sky else ("x", "y", "u", "v"):
-        if key not in found:
-            raise InputError(
-                f"no column for {key!r} among {', '.join(names) or 'none'}",
-                where=source,
-                do=f"name it in the option 'columns' (bayesdist init --columns {key}=NAME)",
-            )
+    missing = [key for key in (("x", "y") if on_sky else ("x", "y", "u", "v")) if key not in found]
+    if missing:
+        raise InputError(
+            f"no column for {', '.join(map(repr, missing))} among {', '.join(names) or 'none'}",
+            where=source,
+            do=f"name {'it' if len(missing) == 1 else 'them'} in the option 'columns' "
+            f"(bayesdist init --columns {','.join(f'{key}=NAME' for key in missing)})",
+        )
     unread = {"u", "v"} if on_sky else {"ra", "dec", *SKY_QUANTITIES}
     if not read_sigma:
         unread |= {"sigma_u", "sigma_v"}
