@@ -12,6 +12,7 @@ from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.circular import per_axis
+from bayesdist.numbers import rounded
 
 __all__ = [
     "judged_requirements",
@@ -131,7 +132,7 @@ def margins_text(rows: list[dict]) -> str:
             "value": r["value"],
             "limit": r["limit"],
             "unit": r["unit"],
-            "P(met)": f"{r['probability_met']:.3f} +- {r['mc_error']:.3f}",
+            "P(met)": f"{rounded(r['probability_met'], r['mc_error'])} +- {r['mc_error']:.1g}",
             "asked": r["probability"],
             "verdict": r["verdict"],
         }

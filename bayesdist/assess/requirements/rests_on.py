@@ -50,9 +50,9 @@ def rests_on(
     if tests:
         sizes = (t.smallest for t in passed if np.isfinite(t.smallest) and t.unit == model.unit)
         least = max(sizes, default=None)
-        text = f"{len(passed)} of {len(tests)} tests of the residuals that found nothing"
+        text = f"{len(passed)} of {len(tests)} tests of the residuals found nothing"
         if least is not None:
-            text += f", and would have seen {least:.2g} {model.unit} rms"
+            text += f"; each would have found {least:.2g} {model.unit} rms"
         out.append(text)
     held = diagnostics.holdout
     out.append("no held-out stars" if held is None else held.verdict)

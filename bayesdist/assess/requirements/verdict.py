@@ -9,6 +9,7 @@ from scipy.stats import beta
 from bayesdist.checks import LARGER, Check, doubts_of
 from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.limits import CONFIDENCE
+from bayesdist.numbers import count
 
 __all__ = ["counting_error", "verdict_of"]
 
@@ -32,7 +33,7 @@ def verdict_of(
     the draws alone point to.
     """
     low, high = clopper_pearson(fraction, n, CONFIDENCE.value)
-    interval = f"the probability is {low:.4g} to {high:.4g} (99 % Monte-Carlo interval)"
+    interval = f"the probability is {low:.4f} to {high:.4f} (99 % Monte-Carlo interval)"
     if low >= asked:
         verdict, reason = "met", f"{interval}, at or above the {asked:g} asked for"
     elif high < asked:
@@ -40,7 +41,7 @@ def verdict_of(
     else:
         verdict = "undecided"
         reason = f"{interval}, on both sides of the {asked:g} asked for: too few effective draws"
-        reason += f" ({n:.0f})"
+        reason += f" ({count(n)})"
     doubts = doubts_of(checks)
     if not doubts or (verdict == "missed" and all(one.doubt == LARGER for one in doubts)):
         return verdict, reason
