@@ -65,13 +65,14 @@ def test_each_figure_says_what_and_how(key):
         assert float(entry["percent"]) == pytest.approx(100 * float(entry["value"]), abs=1e-9)
 
 
-def test_the_readme_states_no_figure_that_is_not_measured():
+@pytest.mark.parametrize("name", ["README.md", "docs/other_tools.md", "docs/paper.md"])
+def test_pages_that_compare_state_no_figure_that_is_not_measured(name):
     """Outside code and pictures; 68.3 % is the nominal probability of the intervals."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    text = (ROOT / name).read_text(encoding="utf-8")
     text = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
     text = " ".join(re.sub(r"^(?:    |!\[).*$", "", text, flags=re.MULTILINE).split())
     for key, page, phrase in CLAIMS:
-        if page == "README.md":
+        if page == name:
             text = text.replace(sentence_of(phrase, MEASURED[key])[0], "")
     assert set(FIGURE.findall(text)) <= {"68.3 %"}
 

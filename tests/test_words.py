@@ -15,7 +15,8 @@ from bayesdist.app.cli import bayesdist as root
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = Path(bayesdist.__file__).parent
-PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md", ROOT / "examples" / "README.md"])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), ROOT / "examples" / "README.md"])
+TEMPLATES = sorted(path for folder in PACKAGE.rglob("templates") for path in folder.iterdir())
 
 # what is not said, and what is said instead
 INSTEAD = {
@@ -88,6 +89,14 @@ def spoken(path: Path) -> Iterator[str]:
             yield node.value
 
 
+def shown(template: Path) -> str:
+    """Text of a template that readers see: between its tags, or in its strings."""
+    text = template.read_text(encoding="utf-8")
+    if template.suffix == ".js":
+        return " ".join(re.findall(r'"[^"\n]*"|`[^`]*`', re.sub(r"\$\{[^}]*\}", "", text)))
+    return re.sub(r"\{#.*?#\}|\{%.*?%\}|\{\{.*?\}\}|<[^>]*>", " ", text, flags=re.DOTALL)
+
+
 def helps(command: click.Command, name: str = "bayesdist") -> Iterator[tuple[str, str]]:
     """Name and help of a command, of its options, and of all commands in it."""
     yield name, command.help or ""
@@ -117,11 +126,16 @@ def test_docstrings_of_the_public_names_use_the_words_of_the_field(name):
     assert hits(getattr(bayesdist, name).__doc__ or "") == []
 
 
-@pytest.mark.parametrize("room", sorted(p.name for p in PACKAGE.iterdir() if p.is_dir()), ids=str)
+@pytest.mark.parametrize("template", TEMPLATES, ids=lambda path: path.name)
+def test_templates_use_the_words_of_the_field(template):
+    assert hits(shown(template)) == []
+
+
+@pytest.mark.parametrize("room", ["*.py", *sorted(p.name for p in PACKAGE.iterdir() if p.is_dir())])
 def test_messages_and_captions_use_the_words_of_the_field(room):
     found = [
         f"{path.relative_to(PACKAGE)}: {hit}"
-        for path in sorted((PACKAGE / room).rglob("*.py"))
+        for path in sorted(PACKAGE.glob(room if room == "*.py" else f"{room}/**/*.py"))
         for text in spoken(path)
         for hit in hits(text)
     ]

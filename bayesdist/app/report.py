@@ -177,7 +177,7 @@ def _product_checks(product: dict[str, Any]) -> tuple[Check, ...]:
     for finding in product["findings"]:
         level, _, text = finding.partition(": ")
         # the sentence is what was found: the headline names the criterion
-        name = "as programs read it"
+        name = "reading by other programs"
         out.append(Check("Products", name, text, "", levels.get(level, "note")))
     return tuple(out)
 

@@ -1,4 +1,4 @@
-"""Sums over detections that err together: those of one star, of one exposure, or in one cell.
+"""Sums over detections with correlated errors: those of one star, of one exposure, or in one cell.
 
 A statistic that is a sum over detections varies by the squares of its sums over such clusters, not
 by those of single detections.

@@ -136,7 +136,7 @@ def sampling_checks(posterior: Posterior | None) -> tuple[Check, ...]:
                 SAMPLING,
                 f"Smallest {part} effective sample size",
                 count(np.floor(ess)),
-                f"at least {c.limits.ess:g}",
+                f"at least {count(c.limits.ess)}",
                 level_of(ess >= c.limits.ess),
             )
             for part, ess in (("bulk", c.ess_bulk_min), ("tail", c.ess_tail_min))

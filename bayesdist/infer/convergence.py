@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from bayesdist.limits import DRAWS_PER_WALKER
+from bayesdist.numbers import count
 
 __all__ = [
     "DIAGNOSTICS",
@@ -156,10 +157,14 @@ def diagnose(
         ("tail ESS", tail, tail < limits.ess, limits.ess),
     ):
         if bad.any():
-            k = int(np.argmax(values) if label == "R-hat" else np.argmin(values))
+            if label == "R-hat":
+                k, side = int(np.argmax(values)), "at most"
+                found, asked = f"{values[k]:.4f}", f"{limit:g}"
+            else:
+                k, side = int(np.argmin(values)), "at least"
+                found, asked = count(np.floor(values[k])), count(limit)
             reasons.append(
-                f"{label} of {names[k]} is {values[k]:.4g} and must be "
-                f"{'at most' if label == 'R-hat' else 'at least'} {limit:g}"
+                f"{label} of {names[k]} is {found} and must be {side} {asked}"
                 f" ({int(bad.sum())} of {D} parameters)"
             )
     # every walker counts at least as one draw, even if it never moved: many walkers must not

@@ -32,6 +32,7 @@ REPORT = Registry(
             "campaign-release",
             "Released files and the alignment of two exposures",
             parent="campaign",
+            printed=False,  # the products have their files
         ),
         Section("selfcal", "Gauge and stars"),
         Section("fit", _fit_title),

@@ -16,12 +16,14 @@ from markupsafe import Markup
 from bayesdist.numbers import MISSING
 from bayesdist.report.contents import explanation_of, section_of
 from bayesdist.report.drawing import DPI, Drawing
+from bayesdist.report.figures.style import HALF_WIDTH
 from bayesdist.report.registry import Registry
 from bayesdist.report.texttable import Level, TextTable
 
 __all__ = ["Part", "Picture", "parts_of", "picture_of", "template"]
 
 REPORT = "bayesdist.report"  # whose templates all pages share
+HALF, WIDE = HALF_WIDTH + 0.1, 5.3  # inches; margins are cut off, or added
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,11 @@ class Picture:
     width: float  # inches, at which its letters have the size they were set in
     words: Drawing  # title, text and text alternative
     printed: bool = True  # True where it is on paper
+
+    @property
+    def place(self) -> str:
+        """'half' where two stand side by side, 'wide' where a caption has no room next to it."""
+        return "half" if self.width <= HALF else "wide" if self.width > WIDE else ""
 
     @property
     def hundredths(self) -> int:

@@ -58,7 +58,7 @@ class Entry:
     needs: tuple[str, ...] = ()  # attributes of the results that must be neither None nor empty
     when: When | None = None  # condition that no attribute states
     each: Callable[[Any], Mapping[str, Any]] | None = None
-    printed: bool | When | Literal["first"] = False  # on paper, or 'first'
+    printed: bool | When = False  # on paper
 
     def applies(self, results: Any) -> bool:
         """True where it can be made of these results."""
@@ -96,7 +96,7 @@ class Registry:
         needs: tuple[str, ...] = (),
         when: When | None = None,
         each: Callable[[Any], Mapping[str, Any]] | None = None,
-        printed: bool | When | Literal["first"] = False,
+        printed: bool | When = False,
     ) -> Callable[[Make], Make]:
         """Decorator of a function that makes a `Plot`, in our style; parameters as of `Entry`."""
         options = {"needs": needs, "when": when, "each": each, "printed": printed}
@@ -137,13 +137,12 @@ class Registry:
         for entry in self.entries:
             if entry.kind != kind or not entry.applies(results):
                 continue
-            printed = entry.printed(results) if callable(entry.printed) else bool(entry.printed)
+            printed = entry.printed(results) if callable(entry.printed) else entry.printed
             if entry.each is None:
                 out.append(Item(entry.name, entry.section, entry.make, printed=printed))
                 continue
             for name, argument in entry.each(results).items():
                 out.append(Item(name, entry.section, entry.make, (argument,), printed))
-                printed = printed and entry.printed != "first"
         return tuple(out)
 
 

@@ -16,6 +16,7 @@ from bayesdist.report.drawing import Drawing, draw_all
 from bayesdist.report.page import Part, parts_of, template
 from bayesdist.report.sections import REPORT
 from bayesdist.report.sections.run.status import verdict
+from bayesdist.report.texttable import moment
 
 __all__ = ["draw_report", "render_markdown", "render_report", "write_report"]
 
@@ -29,15 +30,15 @@ _FOOTER = (
     " pixels (centre of the first pixel = 1)."
 )
 _BUDGET_WORDS = (
-    "The budget of the table, computed in this page at any position, between two positions of one"
-    " image, and at any epoch and magnitude. The parts of the model are correlated: the bar stacks"
-    " variances, and the hatched piece is what their correlation adds. Where it takes off, the"
-    " stack is longer than the total, which the dark line marks; in the table it then has a minus"
-    " before the root of its size."
+    "The budget of the table at any position, between two positions of one image, and at any epoch"
+    " and magnitude, computed in this page. The bar stacks the variances of the terms; the parts of"
+    " the model are correlated, and the hatched piece is what their correlation adds. Where the"
+    " correlation is negative, the stack is longer than the total, which the dark line marks, and"
+    " the table gives the root of its size with a minus sign."
 )
 _PRINT_WORDS = (
-    "In print: what decides. All tables and figures, and the budget at any position and epoch, are"
-    " in report.html; the figures also lie in figures/."
+    "This print has what decides. All tables and figures, and the budget at any position and epoch,"
+    " are in report.html; the figures are in figures/ as well."
 )
 
 
@@ -107,7 +108,7 @@ def _contents(r: ReportInput, drawings: Mapping[str, Drawing]) -> dict[str, Any]
 def _maker(r: ReportInput) -> str:
     """Version and time by which a copy on paper is traced to its run, as far as they are known."""
     versions = r.provenance.get("versions", {})
-    began = str(r.provenance.get("created", "")).replace("T", " ").replace("+00:00", " UTC")
+    began = moment(r.provenance.get("created", ""))
     return " ".join(
         part
         for part in (

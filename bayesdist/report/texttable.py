@@ -10,7 +10,16 @@ from pathlib import PurePath
 from bayesdist.checks import Check
 from bayesdist.numbers import MISSING, number
 
-__all__ = ["MAX_ROWS", "Level", "TextTable", "check_cells", "further", "listing", "short_paths"]
+__all__ = [
+    "MAX_ROWS",
+    "Level",
+    "TextTable",
+    "check_cells",
+    "further",
+    "listing",
+    "moment",
+    "short_paths",
+]
 
 _FEW_ROWS, _FEW_LETTERS = 16, 100  # of a table that leaves room next to it
 MAX_ROWS = 60  # of frames and exposures; hundreds of them belong in the files
@@ -81,6 +90,11 @@ def check_cells(check: Check) -> tuple[str, str, Level]:
 def further(n: int) -> str:
     """Words on how many of n rows only the files have; empty where the page shows all."""
     return "" if n <= MAX_ROWS else f"{n - MAX_ROWS} more rows are in the run's tables."
+
+
+def moment(time: object) -> str:
+    """Time in UTC for readers, of one as ISO 8601 has it."""
+    return str(time).replace("T", " ").replace("+00:00", " UTC")
 
 
 def short_paths(paths: Iterable[str]) -> list[str]:

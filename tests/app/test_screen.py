@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from bayesdist.app.screen import number, table_text
+from bayesdist.app.tables.margins import margins_text
 
 
 def test_table_text_aligns_text_left_and_numbers_right():
@@ -22,6 +23,14 @@ def test_table_text_aligns_text_left_and_numbers_right():
         "x         -   3",
     ]
     assert table_text([]) == "(none)"
+
+
+def test_probabilities_have_the_digits_of_their_error():
+    """A counted probability is never certain, and its error never none."""
+    row = {"name": "corner", "statistic": "max", "value": 0.01, "limit": 0.02, "unit": "pix"}
+    row |= {"probability": 0.95, "verdict": "met"}
+    for p, error, text in ((1.0, 0.000177, "1.00000 +- 0.0002"), (0.91, 0.0061, "0.9100 +- 0.006")):
+        assert text in margins_text([row | {"probability_met": p, "mc_error": error}])
 
 
 def test_numbers_that_are_none():

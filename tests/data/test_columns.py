@@ -47,7 +47,7 @@ def test_a_missing_column_is_answered_with_the_nearest():
         read(stars(x_cen=np.ones(6)), {"x": "xcen"})
     with pytest.raises(InputError, match=r"key 'sigmau'.*'sigma_u'"):
         read(stars(), {"sigmau": "x"})
-    with pytest.raises(InputError, match="no column for 'u'"):
+    with pytest.raises(InputError, match=r"no column for 'u', 'v' among x, y, w; .*u=NAME,v=NAME"):
         read({"x": [1.0], "y": [1.0], "w": [1.0]})
 
 

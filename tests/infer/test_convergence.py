@@ -119,6 +119,9 @@ def test_too_few_draws():
     assert not found.converged
     assert {r.split(" of ")[0] for r in found.reasons} >= {"bulk ESS", "tail ESS"}
     assert all("at least 400" in r for r in found.reasons if "ESS" in r)
+    # a number is the same in a sentence and in the table of the status: whole draws
+    (bulk,) = [r for r in found.reasons if r.startswith("bulk ESS")]
+    assert f" is {int(found.ess_bulk_min)} and" in bulk
     relaxed = judged(ar1((E, 60, 4, 3), 0.8, seed=9), limits=Limits(ess=20, rhat=1.3))
     assert relaxed.converged
 

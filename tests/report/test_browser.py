@@ -384,6 +384,25 @@ def test_heads_are_without_buttons_on_paper(opened):
     assert on_paper == 0
 
 
+def test_letters_on_paper_have_seven_points(wide):
+    """A page wider than the paper would be shrunk by the browser, with all its letters."""
+    text_width = (210 - 2 * 15) / 25.4 * 96
+    wide.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    edges(wide, int(text_width), "body")
+    widest, smallest, letters = wide.execute_script(
+        "const seen = [...document.querySelectorAll('body *')]"
+        ".filter(e => e.getClientRects().length && [...e.childNodes]"
+        ".some(n => n.nodeType === 3 && n.textContent.trim()));"
+        "return [document.documentElement.scrollWidth,"
+        " Math.min(...seen.map(e => parseFloat(getComputedStyle(e).fontSize))), seen.length];"
+    )
+    wide.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+    wide.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert letters > 200
+    assert widest <= text_width
+    assert smallest >= 7 / 72 * 96 - 0.01
+
+
 def test_every_printed_page_can_be_traced(opened):
     """The line at its foot is one that the browser knows: it takes it up as it was written."""
     rules = opened.execute_script(

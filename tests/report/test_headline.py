@@ -11,6 +11,7 @@ from bayesdist.assess.checks import catalogue_checks
 from bayesdist.assess.requirements.validity import ValidityPeriod
 from bayesdist.checks import Check
 from bayesdist.report.context import Product
+from bayesdist.report.sections.run.provenance import product_table
 from bayesdist.report.sections.run.status import status_checks, status_table, verdict
 
 YEARS = np.linspace(2010.3, 2020.3, 41)
@@ -43,6 +44,18 @@ def test_several_findings_of_a_file_are_counted_and_the_file_named_once(converge
     assert verdict(run).headline.startswith("2 criteria warn (a.hdr: as read);")
     rows = [row for row in status_table(run).rows if row[0] == "Products"]
     assert [row[2] for row in rows] == ["no parity", "no CRVAL"]
+
+
+def test_a_finding_of_several_files_is_one_row_of_the_products(converged):
+    both = Check("Products", "keywords", "PEDIGREE is missing", "", "note")
+    own = Check("Products", "closure", 1e-5, "", "note")
+    products = (Product("a.fits", "IDCTAB", (own, both)), Product("b.fits", "D2IMFILE", (both,)))
+    rows = product_table(replace(converged, products=products)).rows
+    assert [row[:3] for row in rows] == [
+        ("a.fits", "IDCTAB", "closure"),
+        ("b.fits", "D2IMFILE", "–"),
+        ("a.fits, b.fits", "–", "keywords"),
+    ]
 
 
 def test_the_headline_names_the_epoch_of_the_verdicts(converged):

@@ -95,13 +95,13 @@ def test_a_page_of_its_own_needs_no_change_elsewhere():
     def table(r):
         return TextTable("Numbers", ("n",), tuple((str(n),) for n in r.numbers))
 
-    @registry.figure("part", each=lambda r: {f"figure_{n}": n for n in r.numbers}, printed="first")
+    @registry.figure("part", each=lambda r: {f"figure_{n}": n for n in r.numbers}, printed=True)
     def figure(r, n):
         return Plot(None, f"Number {n}", "", "")
 
     results = SimpleNamespace(title="A part", numbers=(3, 5))
     items = registry.items(results, "figure")
-    assert [(one.name, one.printed) for one in items] == [("figure_3", True), ("figure_5", False)]
+    assert [(one.name, one.printed) for one in items] == [("figure_3", True), ("figure_5", True)]
     assert items[1].made(results).title == "Number 5"
     every, missing = parts_of(registry, results, {})
     assert [part.title for part in every.parts] == ["A part"]

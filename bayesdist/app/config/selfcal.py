@@ -1,4 +1,4 @@
-"""A run that begins with star lists alone: its configuration, and what fixes its gauge."""
+"""A run that begins with star lists alone: its configuration, and the constraints of its gauge."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ class SelfCalibrated:
     ----------
     mode : SelfCalibrationMode
     gauge : Gauge
-        What the detections leave free, and what fixes it.
+        Degeneracies of the detections, and the constraints that remove them.
     fixed : mapping of str to str
         What fixes each property of the solution.
     gauge_words : str

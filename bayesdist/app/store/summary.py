@@ -198,7 +198,7 @@ class ProductRow(Part):
     findings: list[str]
     forward_rms: Number = None
     inverse_rms: Number = None
-    total_rms: Number = Field(None, description="total error for whoever uses the file forward")
+    total_rms: Number = Field(None, description="total error for those who use the file forward")
 
 
 class Data(Part):

@@ -13,6 +13,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import MarginRow, WorstPosition
 from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.maps import per_axis
+from bayesdist.numbers import rounded
 
 __all__ = ["judged_requirements", "margin_rows", "margin_table", "margins_text", "results_text"]
 
@@ -111,7 +112,7 @@ def margins_text(rows: list[dict]) -> str:
             "value": r["value"],
             "limit": r["limit"],
             "unit": r["unit"],
-            "P(met)": f"{r['probability_met']:.3f} +- {r['mc_error']:.3f}",
+            "P(met)": f"{rounded(r['probability_met'], r['mc_error'])} +- {r['mc_error']:.1g}",
             "asked": r["probability"],
             "verdict": r["verdict"],
         }

@@ -18,7 +18,7 @@ STEPS = 9  # halvings of the interval in which the factor lies
 
 @dataclass(frozen=True)
 class RequiredReduction:
-    """Error term that would have to shrink."""
+    """Error term that must be reduced."""
 
     # where one term can do it alone, that which has to shrink least; else the largest one
     term: str

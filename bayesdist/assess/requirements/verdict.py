@@ -15,6 +15,7 @@ from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.limits import CONFIDENCE
 from bayesdist.model import DistortionModel
+from bayesdist.numbers import count
 
 __all__ = ["counting_error", "rests_on", "verdict_of"]
 
@@ -40,7 +41,7 @@ def verdict_of(
     the draws alone point to.
     """
     low, high = clopper_pearson(fraction, n, CONFIDENCE.value)
-    interval = f"the probability is {low:.4g} to {high:.4g} (99 % Monte-Carlo interval)"
+    interval = f"the probability is {low:.4f} to {high:.4f} (99 % Monte-Carlo interval)"
     if low >= asked:
         verdict, reason = "met", f"{interval}, at or above the {asked:g} asked for"
     elif high < asked:
@@ -48,7 +49,7 @@ def verdict_of(
     else:
         verdict = "undecided"
         reason = f"{interval}, on both sides of the {asked:g} asked for: too few effective draws"
-        reason += f" ({n:.0f})"
+        reason += f" ({count(n)})"
     doubts = doubts_of(checks)
     if not doubts or (verdict == "missed" and all(one.doubt == LARGER for one in doubts)):
         return verdict, reason
@@ -94,9 +95,9 @@ def rests_on(
     if tests:
         sizes = (t.smallest for t in passed if np.isfinite(t.smallest) and t.unit == model.unit)
         least = max(sizes, default=None)
-        text = f"{len(passed)} of {len(tests)} tests of the residuals that found nothing"
+        text = f"{len(passed)} of {len(tests)} tests of the residuals found nothing"
         if least is not None:
-            text += f", and would have seen {least:.2g} {model.unit} rms"
+            text += f"; each would have found {least:.2g} {model.unit} rms"
         out.append(text)
     held = diagnostics.holdout
     out.append("no held-out stars" if held is None else held.verdict)

@@ -134,12 +134,18 @@ def needed_columns(
     """Column of each quantity that is read, as of `present_columns`; refused where one lacks."""
     names = list(names)
     found = present_columns(names, columns, source=source, read_sigma=read_sigma)
-    for key in lacking_columns(found):
-        do = f"name it in the option 'columns' (bayesdist init --columns {key}=NAME)"
+    lacking = lacking_columns(found)
+    if lacking:
+        do = (
+            f"name {'it' if len(lacking) == 1 else 'them'} in the option 'columns' "
+            f"(bayesdist init --columns {','.join(f'{key}=NAME' for key in lacking)})"
+        )
         if "x" in found and "y" in found:
             do += ", or make the file one of the lists of a [campaign] or [selfcal]"
         raise InputError(
-            f"no column for {key!r} among {', '.join(names) or 'none'}", where=source, do=do
+            f"no column for {', '.join(map(repr, lacking))} among {', '.join(names) or 'none'}",
+            where=source,
+            do=do,
         )
     return found
 

@@ -147,7 +147,7 @@ class Gauge:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Sentences on each undetermined property, its reason and what fixes it."""
+        """Sentences on each undetermined property, its reason and its constraint."""
         out, free = list[str](), set(self.free_names)
         # the degeneracy with a skew of the sky is reported at once
         skew = {"skew_plus", "skew_cross"}
@@ -161,11 +161,11 @@ class Gauge:
             out.append("a linear skew of the distortion cannot be told from one of the sky")
         for one in self.directions:
             if one.free and one.name == "scale":
-                out.append(f"scale: the detections say nothing of it; {_fixed(one)}")
+                out.append(f"scale: not determined by the detections; {_fixed(one)}")
             elif one.free and one.name == "rotation":
                 out.append(f"rotation on the sky: free; {_fixed(one)}")
             elif one.free and one.name not in named:
-                out.append(f"{one.name}: the detections say nothing of it; {_fixed(one)}")
+                out.append(f"{one.name}: not determined by the detections; {_fixed(one)}")
             elif one.weak and not one.free:
                 out.append(
                     f"{one.name}: nearly free, {one.sigma:.2g} {one.unit} from the detections alone"
@@ -196,7 +196,7 @@ def _fixed(one: NamedDirection) -> str:
     if one.by_detections:
         return "nothing that is given fixes it better"
     if np.isfinite(one.sigma_fixed):
-        return f"fixed by what is given beside them, sigma {one.sigma_fixed:.2g} {one.unit}".strip()
+        return f"fixed by what is given besides, sigma {one.sigma_fixed:.2g} {one.unit}".strip()
     return "held by convention"
 
 

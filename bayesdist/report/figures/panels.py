@@ -10,7 +10,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from bayesdist.report.figures.mosaic import Mosaic
-from bayesdist.report.figures.style import OUTLINE, WIDTH, figure_style, new_figure
+from bayesdist.report.figures.style import (
+    HALF_WIDTH,
+    OUTLINE,
+    WIDTH,
+    figure_style,
+    new_figure,
+)
 
 __all__ = ["ArrayPanels", "ChipPanels", "OneArray", "Panels", "chip_axes"]
 
@@ -55,9 +61,9 @@ class ChipPanels(Panels):
         # maps of a chip are side by side; of a wide detector, or chip, one above the other
         side_by_side = columns == 1 if mosaic.several else aspect >= WIDE
         down, across = (rows, maps) if side_by_side else (maps * rows, columns)
-        # wide chips one above the other leave half a page empty unless they are narrow
+        # panels of one column share a line of the page with another figure
         narrow = aspect >= WIDE or down > 1
-        width = WIDTH if across > 1 or not narrow else 0.66 * WIDTH
+        width = WIDTH if across > 1 or not narrow else HALF_WIDTH
         margin = 0.75 + 0.55 * (across - 1) + (0.8 if colorbar else 0.0)
         height = down * (min((width - margin) / across * aspect, TALLEST_PANEL) + 0.8)
         figure = new_figure(width, height, layout="compressed")
@@ -96,7 +102,7 @@ class ArrayPanels(Panels):
         self.sizes = tuple(sizes.values())
         columns = min(2, len(sizes))
         rows = -(-len(sizes) // columns)
-        width = WIDTH if columns > 1 else 0.66 * WIDTH
+        width = WIDTH if columns > 1 else HALF_WIDTH
         panel = (width - 0.75 - 0.5 * (columns - 1) - (0.8 if colorbar else 0.0)) / columns
         aspect = max(ny / nx for nx, ny in self.sizes)
         figure = new_figure(width, rows * (panel * aspect + 0.72), layout="compressed")

@@ -27,6 +27,7 @@ __all__ = [
     "CYCLE",
     "DIVERGING",
     "GUIDE",
+    "HALF_WIDTH",
     "INK",
     "LEVEL_COLORS",
     "OUTLINE",
@@ -70,6 +71,7 @@ OUTLINE = "#9AA5B1"  # of chips, and lines at zero
 GUIDE = "#E3E8ED"  # lines of a grid behind data
 COLORBAR: dict[str, Any] = {"fraction": 0.05, "pad": 0.02}  # next to maps
 WIDTH = 7.2  # inches: the text width of an A4 or Letter page
+HALF_WIDTH = WIDTH / 2  # of figures that stand side by side
 
 _RC: Any = {
     "font.family": "DejaVu Sans",  # ships with matplotlib: the same page on every machine

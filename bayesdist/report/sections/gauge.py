@@ -53,6 +53,6 @@ def gauge_of_new_exposure(r: ReportInput) -> str:
     if r.campaign is None:
         return ""
     return (
-        "For a new exposure whose shift and rotation are fitted by whoever uses it: what a shift"
+        "For a new exposure whose shift and rotation are fitted by its user: what a shift"
         " and a rotation of all chips together take up is no error here."
     )

@@ -191,7 +191,7 @@ function budgetToAsk() {
   const spoken = make("p", { class: "spoken", "aria-live": "polite" });
   const bar = make("div", { class: "stack", role: "img" });
   const rows = make("tbody");
-  const heads = ["Term", "u", "v", "Per axis", "Share of variance"];
+  const heads = ["Term", "u", "v", "Per axis", "Fraction of variance"];
   const table = make("table", {}, make("thead", {}, make("tr", {}, ...heads.map((h, k) =>
     make("th", k > 0 ? { scope: "col", class: "n" } : { scope: "col" }, h)))), rows);
   panel.append(spoken, bar, make("div", { class: "tablebox" }, table));
@@ -241,7 +241,7 @@ function budgetToAsk() {
       class: t.kind === "shared" ? "shared" : "", title: `${t.name}: ${(100 * t.share).toFixed(1)} %`,
       style: `width:${100 * t.share / longest}%;${t.kind === "shared" ? "" : `background:${tint(t.k)}`}` }));
     bar.replaceChildren(...pieces, make("i", { style: `left:${100 / longest}%` }));
-    bar.setAttribute("aria-label", `Shares of the total variance: ${stacked.map(t => `${t.name} ${(100 * t.share).toFixed(0)} %`).join(", ")}`);
+    bar.setAttribute("aria-label", `Fractions of the total variance: ${stacked.map(t => `${t.name} ${(100 * t.share).toFixed(0)} %`).join(", ")}`);
     const when = data.years ? `, epoch ${state.epoch.toFixed(2)}` : "";
     const star = state.magnitude === null ? "" : `, magnitude ${number(state.magnitude, 4)}`;
     spoken.replaceChildren(`Total, ${where()}${when}${star}: `, make("b", { id: "budget-total" }, length(Math.sqrt(sum / 2), data)), " per axis, 1 \u03c3");

@@ -225,7 +225,8 @@ def _guessed_unit(table: Matches, layout: TableLayout | None) -> str:
     """Unit of u and v by their size beside pixels, and by their names."""
     some = table.sample(SAMPLE)
     ratio = float(np.ptp(some.u) / max(np.ptp(some.x), 1.0))
-    is_angle = layout is not None and layout.taken.get("u", "").lower() == "xi"
+    name = "" if layout is None else layout.taken.get("u", "").lower()
+    is_angle = name == "xi" or "arcsec" in name
     if LIKE_PIXELS[0] < ratio < LIKE_PIXELS[1]:
         return "arcsec" if is_angle else "pix"
     return "deg" if ratio < DEGREES else "mas" if ratio > MAS else "arcsec"

@@ -83,5 +83,5 @@ def _text(found: ErrorBudget, at: tuple[float, float], scale_mas: float | None) 
         "terms of the model are correlated and enter the total jointly",
     ]
     if any(t.kind == PRODUCT for t in found.every):
-        lines.append("rows of kind product come on top for whoever uses that file: in no total")
+        lines.append("rows of kind product come on top for the users of that file: in no total")
     return "\n".join(lines)

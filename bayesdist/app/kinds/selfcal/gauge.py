@@ -82,7 +82,7 @@ def gauge_table(gauge: Gauge, fixed: Mapping[str, str], model: DistortionModel) 
 
 
 def _row(d: NamedDirection, fixed: Mapping[str, str]) -> dict[str, object]:
-    """Name of a property, how well it is known, and what fixes it."""
+    """Name of a property, how well it is known, and its constraint."""
     return {
         "name": d.name,
         "state": "free" if d.free else "nearly free" if d.weak else "known",

@@ -306,7 +306,7 @@ def selfcal_lines(inputs: Inputs) -> Iterator[str]:
 
 
 def _state_words(one: NamedDirection, by: str) -> str:
-    """Error of a direction by the detections, what fixes it, and its error then."""
+    """Error of a direction by the detections, its constraint, and its error then."""
     known = "" if one.free else f", {number(one.sigma)} {one.unit} from detections".rstrip()
     how = "held by convention" if by == CONVENTION else f"fixed by {by}"
     size = "" if by == CONVENTION else f", sigma {number(one.sigma_fixed)} {one.unit}".rstrip()

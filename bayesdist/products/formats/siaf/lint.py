@@ -113,7 +113,9 @@ def _inverse(table: SiafTable) -> Iterator[Finding]:
             "coefficient of one or the other is wrong",
         )  # fmt: skip
     else:
-        yield Finding("warning", where, f"they leave up to {closure:.3g} px; raise the order")
+        yield Finding(
+            "warning", where, f"the inverse is wrong by up to {closure:.3g} px; raise the order"
+        )
 
 
 def _exchanged(table: SiafTable, columns: tuple[int, int]) -> Iterator[Row]:

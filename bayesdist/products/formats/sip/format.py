@@ -110,15 +110,17 @@ def _warnings(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
     """Warnings on what programs will make of a header that the solution does not say."""
     out = []
     if not sip.linear_axes and calibration.plane.point is None:
-        placed = "CRVAL is a placeholder" if sip.crval == (0.0, 0.0) else "CRVAL is as it was given"
+        placeholder = sip.crval == (0.0, 0.0)
         mirrored = (
             ", which makes the image a mirror of the sky" if np.linalg.det(sip.cd) > 0 else ""
         )
-        other = ", or axes = 'linear'" if calibration.unit == "pix" else ""
-        out.append(
-            f"{placed}, and u is taken for east and v for north{mirrored}: set "
-            f"products.sip.crval{other}"
+        other = ", or set axes = 'linear'" if calibration.unit == "pix" else ""
+        before, remedy = (
+            ("CRVAL is a placeholder, and ", "set products.sip.crval")
+            if placeholder
+            else ("", "check that they are")
         )
+        out.append(f"{before}u is taken for east and v for north{mirrored}: {remedy}{other}")
     low = {k: c for terms in (sip.a, sip.b) for k, c in terms.items() if sum(k) < 2 and c}
     if low:
         out.append(

@@ -193,7 +193,9 @@ def _inverse(sip: SipHeader, size: tuple[int, int]) -> Iterator[Finding]:
             advice = (
                 "raise AP_ORDER" if max(sip.inverse_order) < SIP_ORDERS[1] else "better iterate"
             )
-            yield Finding("warning", where, f"they leave up to {closure:.3g} px; {advice}")
+            yield Finding(
+                "warning", where, f"the inverse is wrong by up to {closure:.3g} px; {advice}"
+            )
     if sip.closure is not None and closure > sip.closure * (1 + _CLOSURE_RELATIVE) + 1e-9:
         yield Finding(
             "error", "BDCLOS", f"states {sip.closure:.3g} px, and AP, BP leave {closure:.3g} px"

@@ -84,6 +84,7 @@ def _gauge(c: CampaignResults) -> TextTable:
             "Shift by which it was fixed (u, v)": f"{shift} {scale.unit}",
             "Rotation": f"({rounded(rotation, sigma)} ± {number(sigma, 2)})\u202f×\u202f10⁻⁶ rad",
         },
+        detail=True,
     )
 
 

@@ -72,7 +72,7 @@ def _property(name: str) -> str:
 
 
 def _sigma(value: Any, unit: Any) -> str:
-    value = float(value)
+    value, unit = float(value), "" if np.ma.is_masked(unit) else unit  # of a ratio there is none
     return f"{number(value, 2)} {unit}".strip() if np.isfinite(value) else MISSING
 
 

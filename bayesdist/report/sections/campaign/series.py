@@ -48,7 +48,7 @@ def _figures(r: ReportInput) -> Mapping[str, tuple[str, int]]:
     }
 
 
-@REPORT.figure("campaign-time", needs=("campaign.series",), each=_figures, printed="first")
+@REPORT.figure("campaign-time", needs=("campaign.series",), each=_figures)
 def series(r: ReportInput, which: tuple[str, int]) -> Plot:
     """A term of some chips: as measured, after VAFACTOR with its lines, and without drift.
 

@@ -139,7 +139,7 @@ def _of_products(rows: Sequence[Mapping[str, Any]]) -> str:
         return ""
     return (
         " Rows of kind product say what a file differs by from the solution, the same in every"
-        " draw: they come on top, in quadrature, for whoever uses that file, and are in no total."
+        " draw: they come on top, in quadrature, for the users of that file, and are in no total."
     )
 
 

@@ -42,10 +42,12 @@ def data_tables(r: ReportInput) -> tuple[TextTable, ...]:
         f"Used by the {words.rejection}": count(fit.n_used),
         "Unit of u, v": m.unit,
         "Exposures": count(np.count_nonzero(r.exposures.n)),
-        "Filters": ", ".join(f for f in m.filter_names if f) or MISSING,
     }
+    if any(m.filter_names):
+        pairs["Filters"] = ", ".join(f for f in m.filter_names if f)
     if m.epoch is not None:
-        pairs[f"Epochs [yr]{partial}"] = f"{np.min(m.epoch):.2f} to {np.max(m.epoch):.2f}"
+        first, last = f"{np.min(m.epoch):.2f}", f"{np.max(m.epoch):.2f}"
+        pairs[f"Epochs [yr]{partial}"] = first if first == last else f"{first} to {last}"
     if m.mag is not None and np.isfinite(m.mag).any():
         pairs[f"Magnitudes{partial}"] = f"{np.nanmin(m.mag):.2f} to {np.nanmax(m.mag):.2f}"
     given = r.setting("data", "sigma", "as given")
@@ -154,7 +156,7 @@ def residuals_by_magnitude(r: ReportInput) -> Plot:
     )
 
 
-@REPORT.figure("data")
+@REPORT.figure("fit", printed=lambda r: r.campaign is None)
 def coverage(r: ReportInput) -> Plot:
     """Map of the number of stars in each cell of the detector."""
     grids = [Grid(c.binned.x, c.binned.y, np.asarray(c.binned.count, float)) for c in r.chips]
@@ -220,7 +222,8 @@ def _density(
         ax.axhline(0.0, color=INK, lw=0.5)
         ax.set_xlim(low - pad, high + pad)
         ax.set_ylim(-reach * scale.factor, reach * scale.factor)
-        ax.set_title(f"{axis}: {int((~inside).sum())} of {values.size} {shown} lie outside")
+        outside = f"{count((~inside).sum())} of {count(values.size)}"
+        ax.set_title(f"{axis}: {outside} {shown} lie outside")
         ax.set_xlabel("magnitude [mag]")
     axes[0].set_ylabel(f"residual [{scale.unit}]")
     fig.colorbar(hexagons, ax=axes, label=f"{shown} per hexagon", fraction=0.04, pad=0.01)

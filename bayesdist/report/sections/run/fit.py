@@ -31,7 +31,7 @@ def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
         "Chips": ", ".join(c.name or str(c.number) for c in model.chips),
         "Frame of each exposure": model.frames.replace("_", ", "),
         "Time-dependent terms": _drifting(r),
-        "Chi-square / degrees of freedom": f"{number(fit.chi2, 6)} / {count(fit.dof)} ="
+        "Chi-square / degrees of freedom": f"{count(fit.chi2)} / {count(fit.dof)} ="
         f" {number(fit.chi2 / fit.dof if fit.dof > 0 else None)}",
         "rms of u": with_mas(fit.rms_u, r.unit, mas),
         "rms of v": with_mas(fit.rms_v, r.unit, mas),
@@ -58,6 +58,7 @@ def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
             ("Chip, axis" if r.several else "Axis", *heads),
             tuple(rows),
             note=_residual_note(r),
+            detail=True,
         ),
     )
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from bayesdist.numbers import display_scale, number, size_of, with_mas
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput, needed
+from bayesdist.report.context import ReportInput
 from bayesdist.report.figures.arrows import (
     Arrows,
     cross_map,
@@ -121,7 +121,7 @@ def uncertainty_radius(r: ReportInput) -> Plot:
         low, high = (number(float(end(ratios))) for end in (np.min, np.max))
         text += (
             f" The posterior's is {low} to {high} times the formal one;"
-            " above 1, least squares with rejection is too sure of itself."
+            " above 1, the formal errors of least squares with rejection are too small."
         )
     return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")
 
@@ -171,11 +171,9 @@ def _flow(r: ReportInput, vectors: Sequence[VectorMap]) -> Figure:
     reach = max(one.reach(M, size) for one, size in zip(chips, sizes, strict=True))
     panels = ChipPanels(r.mosaic)
     panels.frame(reach + 0.02 * r.mosaic.longest_side)
-    titles = []
-    for k, (one, length) in enumerate(zip(chips, lengths, strict=True)):
-        x, y = needed(one.ring)
-        text = f"largest {size_of(length, digits=4)} at ({x:.0f}, {y:.0f})"
-        titles.append(panels.title(k, text))
+    titles = [
+        panels.title(k, f"largest {size_of(length, digits=4)}") for k, length in enumerate(lengths)
+    ]
     vector_map(panels, chips, titles, magnification=M, key=nice_below(max(lengths) / 1.5))
     return panels.figure
 
@@ -191,8 +189,7 @@ def _suppressed(r: ReportInput) -> str:
     if not r.several:
         return ""
     return (
-        " Each chip is compared with its own array: gap and rotation between the chips are not"
-        " shown. All panels have one scale."
+        " Each chip is compared with its own array: gap and rotation between chips are not shown."
     )
 
 
@@ -282,7 +279,7 @@ def pixel_area(r: ReportInput) -> Plot:
     )
 
 
-@REPORT.figure("maps")
+@REPORT.figure("maps", printed=True)
 def pixel_scale(r: ReportInput) -> Plot:
     """Map of the pixel scale, the square root of the area of each pixel."""
     areas = [c.area for c in r.chips]

@@ -105,7 +105,7 @@ def rests_on_table(r: ReportInput) -> TextTable | None:
     rows = tuple(
         (clause, "all" if len(of) == every else ", ".join(of)) for clause, of in clauses.items()
     )
-    return TextTable("Basis of the verdicts", ("", "Requirements"), rows, words=(0, 1))
+    return TextTable("Basis of the verdicts", ("Basis", "Requirements"), rows, words=(0, 1))
 
 
 @REPORT.figure("margins", needs=("margins",), printed=True)
@@ -223,7 +223,7 @@ def validity_period(r: ReportInput) -> Plot:
         "How long the requirements are met",
         "Probability of meeting each limit as the drift is extrapolated from the last data; the"
         " band is the 95 % interval of counting draws, red the date (with its interval) at which"
-        " the probability falls below what is asked. It holds while the drift goes on as the model"
-        " has it: a drift that bends is not in it.",
+        " the probability falls below what is asked. This assumes that the drift continues as"
+        " modelled; a change of its rate is not included.",
         " ".join(f"{one.sentence}." for one in periods),
     )

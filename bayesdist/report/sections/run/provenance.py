@@ -10,7 +10,7 @@ import numpy as np
 from bayesdist.numbers import MISSING, count, number, percent
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
-from bayesdist.report.texttable import Level, TextTable, check_cells, listing, short_paths
+from bayesdist.report.texttable import Level, TextTable, check_cells, listing, moment, short_paths
 
 __all__ = [
     "config_table",
@@ -24,15 +24,21 @@ _PRINTED = {"inputs": 4, "versions": 3}  # rows on paper
 
 @REPORT.table("products", needs=("products",))
 def product_table(r: ReportInput) -> TextTable:
-    """Table of files with the checks of each as written."""
+    """Table of files with the checks of each as written; an outcome of several files is one row."""
+    found: dict[tuple[str, ...], list[str]] = {}  # files in which each check has the same outcome
+    for product in r.products:
+        for check in product.checks:
+            found.setdefault((check.name, *check_cells(check)), []).append(product.path)
     rows: list[tuple[str, ...]] = []
     for product in r.products:
+        own = [cells for cells, files in found.items() if files == [product.path]]
         head = product.path, product.what
-        for check in product.checks:
-            rows.append((*head, check.name, *check_cells(check)))
+        for cells in own or [(MISSING, MISSING, MISSING, Level("note"))]:
+            rows.append((*head, *cells))
             head = "", ""
-        if not product.checks:
-            rows.append((*head, MISSING, MISSING, MISSING, Level("note")))
+    for cells, files in found.items():
+        if len(files) > 1:
+            rows.append((", ".join(files), MISSING, *cells))
     heads = ("File", "What it is", "Check", "Found", "Limit", "Status")
     return TextTable("Files written", heads, tuple(rows), words=tuple(range(6)), stacked=(3, 4))
 
@@ -48,21 +54,28 @@ def provenance_tables(r: ReportInput) -> tuple[TextTable, ...]:
             f" {count(s.passes)} passes over the data, acceptance {percent(s.acceptance, 2)},"
             f" {number(s.wall_s)} s, seed {s.seed}"
         )
+    if "created" in single:
+        single["created"] = moment(single["created"])
     named = {k[:1].upper() + k[1:]: v for k, v in single.items()}
     out = [listing("Run", named)] if named else []
     for key, value in r.provenance.items():
         if isinstance(value, Mapping):
             unit = " [s]" if key == "timings" else ""
+            shown = _stage if key == "stages" else _plain
             names = short_paths(value) if key == "inputs" else map(str, value)
             out.append(
                 listing(
                     f"{key.capitalize()}{unit}",
-                    dict(zip(names, map(_plain, value.values()), strict=True)),
+                    dict(zip(names, map(shown, value.values()), strict=True)),
                     detail=key in _DETAILS,
                     leading=_PRINTED.get(key, 0),
                 )
             )
     return tuple(out)
+
+
+def _stage(note: Mapping[str, Any]) -> str:
+    return f"{number(note['wall_s'])} s, ended {moment(note['ended'])}"
 
 
 def _plain(value: Any) -> str:
@@ -74,7 +87,7 @@ def _plain(value: Any) -> str:
         return ", ".join(_plain(v) for v in value) or MISSING
     if isinstance(value, Mapping):
         return ", ".join(f"{k} = {_plain(v)}" for k, v in value.items()) or MISSING
-    return str(value)
+    return str(value) or MISSING
 
 
 @REPORT.table("provenance")

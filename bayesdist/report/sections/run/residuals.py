@@ -265,7 +265,7 @@ def residual_panels(
     titles = [
         panels.title(
             k,
-            f"{c.n_clear} of {c.x.size} cells significant,\n{CHANCE * c.x.size:.0f} by chance",
+            f"{c.n_clear} of {c.x.size} significant, {CHANCE * c.x.size:.0f} by chance",
         )
         for k, c in enumerate(chips)
     ]
@@ -276,5 +276,6 @@ def residual_panels(
         magnification=magnification or magnification_of(1.1 * min(c.step for c in chips), typical),
         key=key or nice_below(typical),
         unit=unit,
+        pad=24.0,
     )
     return panels

@@ -195,7 +195,7 @@ def _accuracy_sentence(r: ReportInput) -> str:
     whom = (
         ""
         if r.campaign is None
-        else " for a new exposure whose shift and rotation are fitted by whoever uses it"
+        else " for a new exposure whose shift and rotation are fitted by its user"
     )
     return (
         f"{text}; with all terms of the budget the rms over the detector is {with_budget} per"

@@ -150,7 +150,7 @@ def _against_pixels(r: ReportInput, most: int, *, points: bool) -> tuple[Plot, f
     """Plot without words: u and v against x and y; and the largest mean in units of its error."""
     found, table = _residuals_of(r), r.stars.table
     pixels = table.x[found.shown], table.y[found.shown]
-    fig = new_figure(WIDTH, 3.6)
+    fig = new_figure(WIDTH, 2.8)
     axes = fig.subplots(2, 2, sharey=True, sharex="col")
     means: list[list[Means]] = [[], []]
     for k, _, here in _on_chips(r, found.shown):
@@ -208,6 +208,44 @@ def _cloud(ax: Axes, t: Float, values: Float) -> None:
 def _sample_words(r: ReportInput) -> str:
     words = f" Likely {r.words.false_rows} are left out."
     return f"{words} Drawn from {r.sample}." if r.sample else words
+
+
+@REPORT.figure("residuals", when=lambda r: int(np.count_nonzero(r.exposures.n)) > 1, printed=True)
+def chi_square_by_exposure(r: ReportInput) -> Plot:
+    """Chi-square per degree of freedom of each exposure, with the range that chance gives."""
+    found, table = _residuals_of(r), r.stars.table
+    codes, bins = table.exposure[found.shown], len(table.exposure_names)
+    n = np.bincount(codes, minlength=bins)
+    square = (found.residual**2 / found.variance).sum(axis=1)
+    present = np.flatnonzero(n)
+    dof = 2.0 * n[present]
+    ratio = np.bincount(codes, square, minlength=bins)[present] / dof
+    sd = np.sqrt(2.0 / dof)
+    fig = new_figure(WIDTH, 1.5)
+    ax = fig.subplots()
+    at = np.arange(1, len(present) + 1)
+    ax.fill_between(at, 1 - 2 * sd, 1 + 2 * sd, color=OUTLINE, alpha=0.3, lw=0, step="mid")
+    ax.axhline(1.0, color=INK, lw=0.6)
+    ax.plot(at, ratio, "o", ms=3.2, color=CYCLE[0])
+    ax.set_xlim(0.5, len(present) + 0.5)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_xlabel("exposure, in the order of the data [number]")
+    ax.set_ylabel("χ² / dof [no unit]")
+    guide_lines(ax)
+    worst = int(np.argmax(np.abs(ratio - 1) / sd))
+    name = table.exposure_names[present[worst]]
+    beyond = int((np.abs(ratio - 1) > 2 * sd).sum())
+    return Plot(
+        fig,
+        "Chi-square by exposure",
+        "Chi-square per degree of freedom with the errors that the posterior uses, jitter"
+        f" included. The band holds 95 % by chance; {count(beyond)} of {count(len(present))}"
+        f" exposures lie outside it, and the farthest is {name}, with"
+        f" {number(float(ratio[worst]))}. Exposures above the band have larger errors than the"
+        f" others (guiding, focus, breathing).{_sample_words(r)}",
+        f"Chi-square per degree of freedom of {len(present)} exposures; {beyond} lie outside the"
+        " band of chance.",
+    )
 
 
 @REPORT.figure("residuals", printed=True)
@@ -274,7 +312,7 @@ def _quantile_edges(values: Float) -> Float:
 def residuals_by_property(r: ReportInput) -> Plot:
     """Mean residuals against magnitude, colour and epoch, with their errors."""
     found, rows = _residuals_of(r), _properties(r)
-    fig = new_figure(WIDTH, 0.5 + 1.75 * len(rows))
+    fig = new_figure(WIDTH, 0.5 + 1.4 * len(rows))
     axes = fig.subplots(len(rows), 2, sharex="row", sharey="row", squeeze=False)
     worst = []
     for panels, (label, values) in zip(axes, rows, strict=True):
@@ -311,41 +349,3 @@ def residuals_by_property(r: ReportInput) -> Plot:
 def _listed(names: Sequence[str]) -> str:
     *others, last = names
     return f"{', '.join(others)} and {last}" if others else last
-
-
-@REPORT.figure("residuals", when=lambda r: int(np.count_nonzero(r.exposures.n)) > 1, printed=True)
-def chi_square_by_exposure(r: ReportInput) -> Plot:
-    """Chi-square per degree of freedom of each exposure, with the range that chance gives."""
-    found, table = _residuals_of(r), r.stars.table
-    codes, bins = table.exposure[found.shown], len(table.exposure_names)
-    n = np.bincount(codes, minlength=bins)
-    square = (found.residual**2 / found.variance).sum(axis=1)
-    present = np.flatnonzero(n)
-    dof = 2.0 * n[present]
-    ratio = np.bincount(codes, square, minlength=bins)[present] / dof
-    sd = np.sqrt(2.0 / dof)
-    fig = new_figure(WIDTH, 1.8)
-    ax = fig.subplots()
-    at = np.arange(1, len(present) + 1)
-    ax.fill_between(at, 1 - 2 * sd, 1 + 2 * sd, color=OUTLINE, alpha=0.3, lw=0, step="mid")
-    ax.axhline(1.0, color=INK, lw=0.6)
-    ax.plot(at, ratio, "o", ms=3.2, color=CYCLE[0])
-    ax.set_xlim(0.5, len(present) + 0.5)
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_xlabel("exposure, in the order of the data [number]")
-    ax.set_ylabel("χ² / dof [no unit]")
-    guide_lines(ax)
-    worst = int(np.argmax(np.abs(ratio - 1) / sd))
-    name = table.exposure_names[present[worst]]
-    beyond = int((np.abs(ratio - 1) > 2 * sd).sum())
-    return Plot(
-        fig,
-        "Chi-square by exposure",
-        "Chi-square per degree of freedom with the errors that the posterior uses, jitter"
-        f" included. The band holds 95 % by chance; {count(beyond)} of {count(len(present))}"
-        f" exposures lie outside it, and the farthest is {name}, with"
-        f" {number(float(ratio[worst]))}. Exposures above the band have larger errors than the"
-        f" others (guiding, focus, breathing).{_sample_words(r)}",
-        f"Chi-square per degree of freedom of {len(present)} exposures; {beyond} lie outside the"
-        " band of chance.",
-    )
