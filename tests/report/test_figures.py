@@ -344,7 +344,8 @@ def test_a_million_stars_are_drawn_as_counts():
         assert counts.sum() == n and counts.size < 200
     for ax in hexagons.axes[:2]:
         (cells,) = ax.collections
-        outside = int(re.match(r"[uv]: (\d+) of 1000000 ", ax.get_title(loc="left"))[1])
+        title = ax.get_title(loc="left").replace("\u202f", "")
+        outside = int(re.match(r"[uv]: (\d+) of 1000000 ", title)[1])
         assert cells.get_array().sum() == n - outside and outside < 1e-3 * n
         assert len(cells.get_array()) < 10_000
 
