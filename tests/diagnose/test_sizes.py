@@ -38,7 +38,7 @@ def p_values(name: str, seed: int) -> tuple[dict[str, float], bool]:
 @pytest.mark.slow
 def test_probabilities_are_even_and_alarms_are_rare(full):
     """Over all kinds of data: of 1 % at most 1 %, and one in a thousand has any finding."""
-    names, runs = list(NULL), 400 if full else 4
+    names, runs = list(NULL), 400 if full else 2
     jobs = [(name, seed) for name in names for seed in range(runs)]
     found = seeds.over(p_values, jobs, lot=10) if full else [p_values(*job) for job in jobs]
     pooled: dict[str, list[float]] = {}

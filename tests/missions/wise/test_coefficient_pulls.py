@@ -24,7 +24,7 @@ RARE = 1e-4  # probability of failing by chance, in each test
 def runs(request, full: bool):
     if not full and request.param is without_pattern:
         pytest.skip("sets with the pattern are run: set BAYESDIST_FULL=1")
-    return over_seeds(request.param, 4 * (40 if full else 4))
+    return over_seeds(request.param, 4 * (40 if full else 2))
 
 
 def pulls(runs, band: str | None = None) -> np.ndarray:

@@ -90,13 +90,13 @@ def test_sigma_is_that_of_independent_products():
     np.testing.assert_allclose(c.sigma_uv, one / np.sqrt(2), rtol=0.15)
 
 
-def test_noise_has_no_correlation():
+def test_noise_has_no_correlation(full):
     """P-values of noise that lost a cubic are uniform when the cubic is accounted for."""
     rng = np.random.default_rng(4)
     n = 10
     design = _polynomial(n, 3)
     p = []
-    for _ in range(60):
+    for _ in range(60 if full else 20):
         e = rng.standard_normal((n * n, 2))
         e -= design @ np.linalg.lstsq(design, e)[0]
         p.append(residual_correlation(_bins(0.01 * e.T.reshape(2, n, n), 0.01), order=3, rng=rng))
@@ -200,7 +200,7 @@ def test_noise_holds_no_partition(full):
     w = np.repeat(1 / sem[None, :], n, axis=0).ravel()[:, None]
     a = _polynomial(n, 3) * w
     p = []
-    for _ in range(100 if full else 30):
+    for _ in range(100 if full else 15):
         z = rng.standard_normal((n * n, 2))
         z -= a @ np.linalg.lstsq(a, z)[0]
         found = residual_partition(
