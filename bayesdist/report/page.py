@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import hashlib
 import re
 import struct
@@ -111,6 +112,7 @@ def picture_of(name: str, drawing: Drawing, *, printed: bool = True) -> Picture:
     return Picture(name, data, kind, pixels / DPI, drawing, printed)
 
 
+@functools.cache
 def template(name: str, package: str = REPORT) -> jinja2.Template:
     """Template of a package by its file name; it may include those of the report.
 
