@@ -350,7 +350,7 @@ def test_bands_of_another_instrument_have_no_word_of_wise(tmp_path):
     good("wise", "bands", run, "-o", tmp_path / "out", "--bins", 6)
     page = (tmp_path / "out" / "bands.html").read_text(encoding="utf-8")
     text = re.sub(r'src="data:[^"]*"', "", page)
-    for word in ("printed", "WISE", "W1", "frameset", "5-1"):
+    for word in ("published", "printed", "WISE", "W1", "frameset", "5-1"):
         assert word not in text
     assert not (tmp_path / "out" / "wise_meta.tbl").exists()
     assert not (tmp_path / "out" / "table_5_2.ecsv").exists()  # one band has no other

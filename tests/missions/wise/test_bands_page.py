@@ -94,7 +94,7 @@ def test_crosses_have_the_magnification_they_state(sigma, factor):
     [
         (True, False, 1.001, "pass", "no structure is found"),
         (True, True, 1.001, "warn", "structure is left in the residuals of W2"),
-        (True, False, 1.03, "warn", "is not the published one in W2"),
+        (True, False, 1.03, "warn", "differs from the published one in W2"),
         (False, True, 1.03, "fail", "not converged: W2"),
     ],
 )

@@ -26,7 +26,7 @@ BANDS = Registry(
         Section("histograms", "Residuals with and without calibration"),
         Section("tables", "Residuals in bins"),
         Section("structure", "Structure left in the residuals"),
-        Section("formal", "Formal uncertainties"),
+        Section("formal", "Uncertainties"),
         Section("coverage", "Coverage"),
         Section("provenance", "Provenance"),
     ),

@@ -48,8 +48,8 @@ def histograms(inputs: BandsInput) -> Plot:
     return Plot(
         fig,
         "Residuals of all pairs",
-        f"{said} and by this calibration (red); counts are logarithmic. In all cases the constant"
-        " is the calibrated one. What is alike in all, far from zero, are false matches.",
+        f"{said} and calibrated (orange); counts are logarithmic. The constant is the calibrated"
+        " one in all cases. The tails that all cases share, far from zero, are false matches.",
         "Histograms of the residuals in X and Y for each band: calibration makes a narrow peak.",
     )
 
@@ -96,8 +96,8 @@ def correlation(inputs: BandsInput) -> Plot:
     return Plot(
         fig,
         "Correlation of mean residuals",
-        "Mean product of the residuals of two bins by their separation; what noise makes of it is"
-        " subtracted. Points beyond the shaded bands are structure that the polynomial leaves.",
+        "Mean product of the residuals of two bins against their separation, less the expectation"
+        " from noise. Points beyond the shaded bands are structure that the polynomial leaves.",
         "Curves of the correlation of residuals against separation for each band.",
     )
 

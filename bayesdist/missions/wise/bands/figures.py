@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput
-from bayesdist.numbers import size_of
+from bayesdist.numbers import number, size_of
 from bayesdist.report.figures.arrows import Arrows, cross_map, magnification_of, spacing, vector_map
 from bayesdist.report.figures.fields import Grid, scalar_map
 from bayesdist.report.figures.panels import ArrayPanels
@@ -49,8 +49,8 @@ def vectors(inputs: BandsInput) -> Plot:
     return Plot(
         fig,
         "Distortion",
-        "From each position on the array towards the origin of its light, the constant suppressed."
-        " All bands are drawn to one scale in arcsec; the ring marks the longest vector.",
+        "Vectors run from each position on the array to where the distortion puts it, the constant"
+        " suppressed. All bands have one scale in arcsec; the ring marks the longest vector.",
         "Maps of arrows over the array of each band, longest in the corners.",
     )
 
@@ -108,7 +108,7 @@ def _flows(maps: Mapping[str, VectorMap], arcsec: Mapping[str, float]) -> Figure
         panels,
         list(arrows.values()),
         [
-            f"{name}\nMax = {length:.4g} pix ({length * arcsec[name]:.3g}″)"
+            f"{name}\nMax = {number(length, 4)} pix ({number(length * arcsec[name], 3)}″)"
             for name, length in longest.items()
         ],
         magnification=M,
@@ -130,7 +130,7 @@ def residuals(inputs: BandsInput, axis: str) -> Plot:
         _images(images, sizes, axis.upper(), "pix"),
         f"Mean residuals in {axis.upper()}",
         f"Of the pairs used, in {_bins(inputs)}; one colour scale for all bands, symmetric about"
-        " zero. Titles give the extremes. Blocks with sharp edges are no distortion.",
+        " zero. Titles give the extremes. Blocks with sharp edges are not distortion.",
         f"Images of the mean residual in {axis.upper()} over the array of each band.",
     )
 
@@ -152,7 +152,7 @@ def alignment(inputs: BandsInput, axis: str) -> Plot:
     return Plot(
         _images(images, sizes, axis.upper(), "arcsec", own_scale=True),
         f"Mean residuals in {axis.upper()} of two bands, one minus the other",
-        f"In arcsec, in {_bins(inputs)}: by how much two bands observed together are misaligned."
+        f"In arcsec, in {_bins(inputs)}: misalignment of two bands observed together."
         " Each panel has its own colour scale.",
         f"Images of differences of mean residuals in {axis.upper()} for each pair of bands.",
     )
@@ -238,7 +238,7 @@ def formal_uncertainty(inputs: BandsInput) -> Plot:
         fig,
         "Formal uncertainty",
         "Least squares: four vectors from each position to all combinations of ±1 σ in x and in y."
-        " Each panel states its magnification, 2000 or what shows the vectors.",
+        " Each panel states its magnification: 2000, or another where vectors would not be seen.",
         "Maps of small crosses over the array of each band, largest in the corners.",
     )
 

@@ -23,7 +23,7 @@ def overview_table(inputs: BandsInput) -> TextTable:
     """A line for each band, what matters most."""
     columns = ["Band", "Converged", "Pairs", "Structure", "Longest vector (pix)"]
     if inputs.wise:
-        columns += ["vector printed", "difference"]
+        columns += ["Published (pix)", "Difference"]
     columns += ["Largest σ per axis (pix)"]
     return TextTable(
         "Overview",
@@ -70,12 +70,14 @@ def verdict(inputs: BandsInput) -> Verdict:
     if structure:
         clauses.append(f"structure is left in the residuals of {', '.join(structure)}")
     if different:
-        clauses.append(f"the longest vector is not the published one in {', '.join(different)}")
+        clauses.append(
+            f"the longest vector differs from the published one in {', '.join(different)}"
+        )
     level = "fail" if inputs.provisional else "warn" if clauses else "pass"
     if not clauses:
         clauses.append("all bands have converged, and no structure is found in their residuals")
         if printed:
-            clauses.append("the longest vectors are those published")
+            clauses.append("the longest vectors agree with those published")
     headline = "; ".join(clauses)
     sentences = ("Requirements are judged in the report of each band's run.",)
     return Verdict(level, headline[:1].upper() + headline[1:], sentences)
@@ -129,19 +131,20 @@ def structure_table(inputs: BandsInput) -> TextTable:
         "Structure left in the residuals",
         (
             "Band/Axis",
-            "sigma without noise (pix)",
-            "its square (σ)",
-            "correlation of neighbours (σ)",
-            "reach (pix)",
-            "both axes by chance",
-            "best partition",
-            "by chance",
-            "its rms (pix)",
-            "edges seen",
+            "Sigma without noise (pix)",
+            "Its significance (σ)",
+            "Correlation of neighbours (σ)",
+            "Correlation length (pix)",
+            "p of correlation",
+            "Best partition",
+            "p of partition",
+            "Its rms (pix)",
+            "Edges seen",
         ),
         tuple(rows),
         words=(0, 5, 6, 7, 9),
-        note="The two probabilities are of both axes together; the reach is that of their sum.",
+        note="p, the probability of as much by chance, is of both axes together; the correlation"
+        " length is that of their sum.",
     )
 
 
@@ -167,7 +170,8 @@ def vector_table(inputs: BandsInput) -> TextTable | None:
     ]
     return TextTable(
         "Longest difference vectors",
-        ("Difference", "pixels of", "Max (pix)", "arcsec") + (("printed",) if inputs.wise else ()),
+        ("Difference", "In pixels of", "Max (pix)", "Max (arcsec)")
+        + (("Published (pix)",) if inputs.wise else ()),
         tuple(rows),
         words=(0, 1),
         note=f"Optical model: {inputs.optical}." if inputs.optical else "",
@@ -203,11 +207,11 @@ def histogram_table(inputs: BandsInput) -> TextTable:
         (
             "Band",
             "Case",
-            "half width X (pix)",
-            "half width Y (pix)",
-            "pairs",
+            "Half width X (pix)",
+            "Half width Y (pix)",
+            "Pairs",
             "X beyond the histogram",
-            "Y beyond",
+            "Y beyond it",
         ),
         tuple(rows),
         words=(0, 1),
@@ -234,12 +238,13 @@ def coverage_table(inputs: BandsInput) -> TextTable:
                 number(chi2 / (n.size - 1), 3),
             )
         )
-    heads = ("all pairs", "used", "even coverage", "fewest", "most", "chi² per bin")
+    heads = ("All pairs", "Used", "Expected per bin", "Fewest", "Most", "χ² / dof")
     return TextTable(
         "Coverage: pairs used by the fit, in bins",
         ("Band", *heads),
         tuple(rows),
-        note="Even coverage with its Poisson error; chi² per bin is 1 where that is all there is.",
+        note="Expected from even coverage, with its Poisson error; χ² / dof is 1 without variation"
+        " beyond it.",
     )
 
 
@@ -248,7 +253,7 @@ def formal_table(inputs: BandsInput) -> TextTable:
     """Table of the largest radii, with what printed ones imply, and of the errors per axis."""
     columns = ["Band", "Radius, least squares", "Radius, posterior"]
     if inputs.wise:
-        columns += ["Radius, printed", "Error of a pair it implies", "Half width found"]
+        columns += ["Radius, published", "Error per pair it implies", "Half width found"]
     columns += ["Posterior per axis", "CE68", "CE95"]
     rows = []
     for b in inputs.bands:
@@ -269,9 +274,9 @@ def formal_table(inputs: BandsInput) -> TextTable:
     )
     if inputs.wise:
         note += (
-            " A printed radius implies an error of each pair if all published pairs lie evenly"
-            " over the array; where that is not the scatter found, the print used other pairs or"
-            " weights."
+            " A published radius implies an error of each pair if all published pairs lie evenly"
+            " over the array; where it differs from the scatter found, other pairs or weights were"
+            " used for it."
         )
     unit = "pix" if inputs.bands[0].formal_map.unit == "pix" else "unit as given"
     return TextTable(

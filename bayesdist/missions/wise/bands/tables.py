@@ -41,14 +41,14 @@ def statistics_table(name: str, inputs: BandsInput) -> TextTable:
         free = [rounded(row.noise_free[s], row.error[s]) for s in STATISTICS]
         rows += [(row.label, "found", *found), ("", "error", *errors), ("", "noise-free", *free)]
         if one.printed is not None:
-            rows.append(("", "printed", *(as_printed(one.printed, s) for s in STATISTICS)))
+            rows.append(("", "published", *(as_printed(one.printed, s) for s in STATISTICS)))
     number_of = f"Table {name}. " if inputs.wise else ""
     title = f"{number_of}{TITLES[name]}, {inputs.n_bins} × {inputs.n_bins} bins ({table.unit})"
     note = ""
     if name != "5-3" and any(one.printed is not None for one in inputs.accounts[name]):
         note = (
-            "Found: the reference star minus the calibrated detection. The report speaks of WISE"
-            " minus 2MASS: there means and medians have the other sign, and minima and 1 % stand"
+            "Found: the reference star minus the calibrated detection. The published tables give"
+            " WISE minus 2MASS: means and medians have the other sign, and minima and 1 % stand"
             " for maxima and 99 %."
         )
     return TextTable(
@@ -67,18 +67,18 @@ def account_table(name: str, inputs: BandsInput) -> TextTable:
     unit = inputs.tables[name].unit
     several = inputs.accounts[name]
     printed = any(one.printed is not None for one in several)
-    columns = [inputs.tables[name].first, "Sigma", "noise", "partition", "rest"]
+    columns = [inputs.tables[name].first, "Sigma", "Noise", "Partition", "Remainder"]
     if printed:
-        columns += ["Printed", "its noise", "its structure", "more there", "Why"]
-    note = "sigma² = noise² + partition² + rest²; a partition counts where one was found."
+        columns += ["Published", "Its noise", "Its structure", "Excess", "Likely reason"]
+    note = "sigma² = noise² + partition² + remainder²; a partition counts where one was found."
     if printed:
         note += (
-            " The noise of a printed sigma follows from the printed radial mean and the number of"
-            " pairs, for errors that are normal or distributed as here; the last column but one is"
-            " the difference of the structures in quadrature."
+            " The noise of a published sigma follows from the published radial mean and the number"
+            " of pairs, for errors that are normal or distributed as here; the excess is the"
+            " difference of the structures in quadrature."
         )
     return TextTable(
-        f"What these sigmas are made of ({unit})",
+        f"Contributions to sigma ({unit})",
         tuple(columns),
         tuple(tuple(_account(one, printed=printed)) for one in several),
         words=(0, 9),
@@ -105,12 +105,12 @@ def _account(one: RowAccount, *, printed: bool) -> Iterator[str]:
 
 def _why(one: RowAccount) -> str:
     if any("sigma" in sentence for sentence in one.contradictions):
-        return "the printed sigma contradicts other rows"
+        return "the published sigma contradicts other rows"
     if one.verdict == "same":
         return "structure is the same within its error"
     if one.verdict == "below noise":
-        return "errors of the print are distributed otherwise"
-    where = "print" if one.verdict == "print has more" else "this set"
+        return "published errors are distributed otherwise"
+    where = "the published set" if one.verdict == "print has more" else "this set"
     if one.row.label.endswith("/radial"):
         return f"the scatter of stars changes more over the array in {where}"
     if "-" in one.row.label:
@@ -130,5 +130,5 @@ def contradiction_table(inputs: BandsInput) -> TextTable | None:
     if not rows:
         return None
     return TextTable(
-        "Where the printed tables contradict themselves", ("", ""), tuple(rows), words=(0, 1)
+        "Contradictions within the published tables", ("", ""), tuple(rows), words=(0, 1)
     )
