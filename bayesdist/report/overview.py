@@ -66,11 +66,11 @@ class OverviewRow:
 
 HEADS = (
     ("Worst margin [% of the limit]", True),
-    ("of requirement", False),
+    ("Requirement", False),
     ("Valid until [yr]", True),
     ("Judged at [yr]", True),
     ("Largest uncertainty, per axis", True),
-    ("Used", True),
+    ("Stars used", True),
     ("χ² / dof", True),
     ("Began", False),
 )

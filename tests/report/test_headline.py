@@ -41,7 +41,7 @@ def test_a_row_that_warns_is_in_the_headline(converged):
 def test_several_findings_of_a_file_are_counted_and_the_file_named_once(converged):
     found = [Check("Products", "as read", text, "", "warn") for text in ("no parity", "no CRVAL")]
     run = replace(_met_only(converged), products=(Product("a.hdr", "SIP", tuple(found)),))
-    assert verdict(run).headline.startswith("2 criteria warn (a.hdr: as read);")
+    assert verdict(run).headline.startswith("2 criteria warn (a.hdr: as read, 2 findings);")
     rows = [row for row in status_table(run).rows if row[0] == "Products"]
     assert [row[2] for row in rows] == ["no parity", "no CRVAL"]
 

@@ -34,11 +34,11 @@ class RequiredReduction:
         if not self.enough:
             return (
                 f"no term can do it alone: the largest, {self.term} ({self.now:.3g} {self.unit} "
-                "rms), could vanish and the limit would still be missed"
+                "radial rms), could vanish and the limit would still be missed"
             )
         return (
             f"it would be met if {self.term} fell from {self.now:.3g} to {self.needed:.3g} "
-            f"{self.unit} rms, all else being as it is"
+            f"{self.unit} radial rms, all else being as it is"
         )
 
 

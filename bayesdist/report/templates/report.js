@@ -146,7 +146,7 @@ class ChipMaps {
     this.reading.textContent = `pixel (${x}, ${y})${where}: ${this.text(this.value(k, x, y))}`;
   }
 
-  /** Draw a function of chip, x and y. */
+  /** Draw a function of chip, x and y from the first to the last pixel, where maps are extreme. */
   draw(value, marks = []) {
     Object.assign(this, { value, marks });
     const fields = this.canvases.map(({ canvas, chip }, k) => {
@@ -154,8 +154,8 @@ class ChipMaps {
       for (let row = 0; row < canvas.height; row++)
         for (let column = 0; column < canvas.width; column++)
           out[row * canvas.width + column] = value(k,
-            0.5 + (column + 0.5) / canvas.width * chip.size[0],
-            0.5 + (canvas.height - row - 0.5) / canvas.height * chip.size[1]);
+            1 + column / (canvas.width - 1) * (chip.size[0] - 1),
+            1 + (1 - row / (canvas.height - 1)) * (chip.size[1] - 1));
       return out;
     });
     const every = fields.map(f => f.filter(Number.isFinite).reduce((a, b) => [Math.min(a[0], b), Math.max(a[1], b)], [Infinity, -Infinity]));

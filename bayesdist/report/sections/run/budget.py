@@ -194,7 +194,7 @@ def _bars(ax: Axes, rows: Sequence[Mapping[str, str | float]], factor: float) ->
         values = np.array([row[key] for row in rows], float) * factor
         ax.plot(values, place + shift, marker, **_MARKER_STYLE)
     for k, value in enumerate(sizes):
-        ax.annotate(f"{value:.3g}", (value, k), (5, 0), textcoords="offset points", va="center")
+        ax.annotate(number(value), (value, k), (5, 0), textcoords="offset points", va="center")
     ax.spines[["top", "right"]].set_visible(False)
     ax.tick_params(axis="y", length=0)
 
@@ -229,10 +229,11 @@ def budget_dominating(r: ReportInput) -> Plot:
     top = int(share.argmax())
     return Plot(
         panels.figure,
-        "Dominating term",
-        f"Where which term is largest: {budget.names[top]} on {percent(share[top], 2)} of the grid."
-        " A better calibration helps only where a term of the model leads.",
-        f"Map of the dominating term, mostly {budget.names[top]}.",
+        "Dominant term",
+        f"Term that is largest at each position: {budget.names[top]} on"
+        f" {percent(share[top], 2)} of the grid. A better calibration helps only where a term of"
+        " the model leads.",
+        f"Map of the dominant term, mostly {budget.names[top]}.",
     )
 
 

@@ -97,7 +97,7 @@ def uncertainty_radius(r: ReportInput) -> Plot:
         panels,
         grids,
         [
-            panels.title(k, f"{kind}: {g.values.min():.3g} to {g.values.max():.3g}", ", ")
+            panels.title(k, f"{kind}: {number(g.values.min())} to {number(g.values.max())}", ", ")
             for (k, kind), g in zip(kinds, grids, strict=True)
         ],
         levels=contour_levels(np.concatenate([g.values.ravel() for g in grids])),
@@ -248,7 +248,7 @@ def pixel_area(r: ReportInput) -> Plot:
         panels,
         grids,
         [
-            panels.title(k, f"relative area {a.area.min():.5g} to {a.area.max():.5g}")
+            panels.title(k, f"relative area {number(a.area.min(), 6)} to {number(a.area.max(), 6)}")
             for k, a in enumerate(areas)
         ],
         levels=contour_levels(np.concatenate([g.values.ravel() for g in grids])),

@@ -87,7 +87,8 @@ def _judgement(m: Margin, several: bool) -> str:
     on = f" of chip {m.worst.chip}" if several else ""
     out = [
         f"{m.verdict}: {m.reason}" if m.reason else m.verdict,
-        f"largest at ({m.worst.x:.0f}, {m.worst.y:.0f}){on}: {number(m.worst.rms, 2)} {m.unit} rms",
+        f"largest at ({m.worst.x:.0f}, {m.worst.y:.0f}){on}:"
+        f" {number(m.worst.rms, 2)} {m.unit} radial rms",
     ]
     return "; ".join(out + ([] if m.remedy is None else [m.remedy.sentence]))
 
@@ -148,13 +149,14 @@ def margins(r: ReportInput) -> Plot:
     ax.spines[["top", "right"]].set_visible(False)
     ax.tick_params(axis="y", length=0)
     met = sum(m.verdict == "met" for m in margins)
+    verb = "is" if 1 in (met, len(margins)) else "are"
     return Plot(
         fig,
         "Margins",
         "Each statistic as a fraction of its limit: histogram of the draws, bar of their central"
         f" 95 %, marker at the median; left of the line is within the limit. {count(met)} of"
-        f" {count(len(margins))} are met with the probability asked for.",
-        f"Requirements against their limits; {met} of {len(margins)} are met.",
+        f" {count(len(margins))} {verb} met with the probability asked for.",
+        f"Requirements against their limits; {met} of {len(margins)} {verb} met.",
     )
 
 
@@ -178,7 +180,7 @@ def _statement(m: Margin) -> str:
     limit = scale.text(m.requirement.limit)
     met = counted(m.probability_met, m.mc_error, m.n_effective)
     return (
-        f"{m.verdict}: {m.value * scale.factor:.3g} of {limit}\n"
+        f"{m.verdict}: {number(m.value * scale.factor)} of {limit}\n"
         f"P(≤ limit): {met}, asked {m.requirement.probability:.3g}"
     )
 

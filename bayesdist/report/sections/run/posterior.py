@@ -259,7 +259,7 @@ def ranks(r: ReportInput) -> Plot:
     for ax in axes[: len(rows)]:
         spec = ax.get_subplotspec()
         if spec.colspan.start == 0:
-            ax.set_ylabel("draws / even share\n[no unit]")
+            ax.set_ylabel("draws / expected\n[no unit]")
         if spec.rowspan.start == (len(rows) - 1 - spec.colspan.start) // columns:
             ax.tick_params(labelbottom=True)
             ax.set_xlabel("rank [fraction]")

@@ -39,7 +39,7 @@ def product_table(r: ReportInput) -> TextTable:
     for cells, files in found.items():
         if len(files) > 1:
             rows.append((", ".join(files), MISSING, *cells))
-    heads = ("File", "What it is", "Check", "Found", "Limit", "Status")
+    heads = ("File", "Format", "Check", "Found", "Limit", "Status")
     return TextTable("Files written", heads, tuple(rows), words=tuple(range(6)), stacked=(3, 4))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -115,7 +116,7 @@ def verdict(r: ReportInput) -> Verdict:
             clauses.append((level, _rows_clause(names, verb)))
     if r.warnings:
         n = len(r.warnings)
-        clauses.append(("warn", "one warning below" if n == 1 else f"{n} warnings below"))
+        clauses.append(("warn", "one warning" if n == 1 else f"{n} warnings"))
     clauses.append((worst(groups.get("Validity", ())), validity_clause(r)))
     # the kind of solution first, then what is worst
     clauses.sort(key=lambda one: (one[1] == _UNSAMPLED, LEVELS.index(one[0])), reverse=True)
@@ -145,7 +146,9 @@ def _rows_clause(names: Sequence[str], verb: str) -> str:
     """Clause on the rows of the status table that fail or warn."""
     if len(names) == 1:
         return f"one criterion {verb} ({names[0]})"
-    different = tuple(dict.fromkeys(names))  # a file may have several findings
+    different = tuple(  # a file may have several findings
+        name if n == 1 else f"{name}, {n} findings" for name, n in Counter(names).items()
+    )
     shown, more = different[:_NAMED], len(different) - _NAMED
     named = "; ".join((*shown, f"and {more} more") if more > 0 else shown)
     return f"{len(names)} criteria {verb[:-1]} ({named})"

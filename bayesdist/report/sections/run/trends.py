@@ -172,7 +172,7 @@ def _against_pixels(r: ReportInput, most: int, *, points: bool) -> tuple[Plot, f
             total = sum(float(one.chi2[row]) for one in means[column])
             bins = sum(len(one.at) for one in means[column])
             ax.set_title(
-                f"d{'uv'[row]} against {'xy'[column]}: χ² of the means {total:.0f} of {bins} bins"
+                f"d{'uv'[row]} against {'xy'[column]}: χ² of the means {total:.0f} for {bins} bins"
             )
             guide_lines(ax)
     for row in (0, 1):
@@ -327,7 +327,7 @@ def residuals_by_property(r: ReportInput) -> Plot:
             values_of = one.mean[:, axis] * scale.factor, one.error[:, axis] * scale.factor
             _errorbar(ax, 0, one.at, *values_of)
             ax.set_title(
-                f"d{'uv'[axis]} against {what}: χ² {one.chi2[axis]:.0f} of {len(one.at)} bins"
+                f"d{'uv'[axis]} against {what}: χ² {one.chi2[axis]:.0f} for {len(one.at)} bins"
             )
             ax.set_xlabel(label)
             ax.xaxis.set_major_locator(MaxNLocator(5))
