@@ -184,8 +184,9 @@ class Posterior(Solution):
 
     @cached_property
     def cov(self) -> Float:
-        """Posterior covariance of theta, shape (D, D)."""
-        return np.atleast_2d(np.cov(self.flat, rowvar=False))
+        """Posterior covariance of theta, shape (D, D); zero for parameters that a gauge fixes."""
+        # from one of the draws: the mean of equal numbers is rounded, their difference is not
+        return np.atleast_2d(np.cov(self.flat - self.flat[0], rowvar=False))
 
     @property
     def sigma(self) -> Float:

@@ -281,6 +281,12 @@ def test_more_exposures_are_planned_as_these_are_dithered(three_rolls):
     free = before > 0
     assert free.sum() > n / 2
     np.testing.assert_allclose(after[free], before[free] / 2, rtol=1e-6)
+    # the draws of a parameter that the gauge fixes are equal: no rounding is taken for a variance
+    drawn = results.posterior
+    fixed = np.setdiff1d(np.arange(len(mode.theta)), mode.free)
+    assert len(fixed) and not drawn.cov[fixed].any()
+    planned = with_information(drawn, mode.distortion_information)
+    assert (planned.sigma[:n][free] < drawn.sigma[:n][free]).all()
 
 
 def test_requirements_are_judged(three_rolls, tmp_path):
