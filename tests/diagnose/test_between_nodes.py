@@ -50,7 +50,9 @@ def measured(kind, seed):
 
     def fitted(px, py):
         W, phi = grid.interpolation(px, py), grid.basis.evaluate(px, py)
-        return np.stack([W @ a.mean + phi @ a.polynomial for a in found.axes], axis=1)
+        return np.stack(
+            [W @ a.mean + phi @ a.sums.polynomial_of(a.mean) for a in found.axes], axis=1
+        )
 
     def taken(px, py):
         phi = grid.basis.evaluate(px, py)

@@ -13,7 +13,7 @@ from bayesdist.products.formats.common.document import BuildOptions
 from bayesdist.products.registry import build, product_settings, read_calibration
 
 ORDER = 12
-CHIP = bd.Chip(1, "MICADO", (4096.0, 4096.0), (2048.5, 2048.5))
+CHIP = bd.Chip(1, "MICADO", (2048.0, 2048.0), (1024.5, 1024.5))
 SIGMA = 0.005
 
 
@@ -27,7 +27,7 @@ def stars():
     for axis in (0, 1):
         part = model.coefficient_slice(1, axis)
         theta[part] = 0.01 * rng.normal(size=model.n_terms) * 0.5**total
-        theta[part.start + 1 + axis] = 0.004 * 2048
+        theta[part.start + 1 + axis] = 0.004 * 1024
     matches, truth = bd.simulate_matches(model, theta, 2000, sigma=SIGMA, fraction=0.0, rng=rng)
     return model, matches, truth.theta
 
@@ -41,7 +41,7 @@ def fit(stars):
 def test_the_fit_is_that_of_least_squares(stars, fit):
     """numpy.linalg.lstsq on Legendre products by numpy, to a ten-thousandth of the errors."""
     model, matches, _ = stars
-    X, Y = ((2 * matches.column(c) - 4097) / 4096 for c in "xy")
+    X, Y = ((2 * matches.column(c) - 2049) / 2048 for c in "xy")
     one = np.polynomial.legendre.legvander
     terms = [(n - j, j) for n in range(ORDER + 1) for j in range(n + 1)]
     design = np.stack([one(X, ORDER)[:, i] * one(Y, ORDER)[:, j] for i, j in terms], axis=1)

@@ -38,9 +38,9 @@ def _not_finite(tab: IdcTab) -> list[Finding]:
         if rows is None:
             continue
         for name in rows.dtype.names or ():
-            column = rows[name].reshape(len(rows), -1)
+            column = rows[name]
             if column.dtype.kind == "f" and not np.isfinite(column).all():
-                bad = np.flatnonzero(~np.isfinite(column).all(axis=1))
+                bad = np.unique(np.nonzero(~np.isfinite(column))[0])
                 where = f"{rows_text(bad)}{of}, column {name}"
                 out.append(Finding("error", where, "not a finite number"))
     return out

@@ -20,7 +20,7 @@ from bayesdist.products.formats.common.document import (
 )
 from bayesdist.products.formats.common.read_back import ReadBack
 from bayesdist.products.formats.sip.header import SIP_ORDERS, worst_closure
-from bayesdist.products.formats.sip.wcs_text import coefficient_lines
+from bayesdist.products.formats.sip.text import coefficient_lines
 from bayesdist.products.formats.wise.build import wise_text
 from bayesdist.products.formats.wise.lint import lint_wise_band
 from bayesdist.products.formats.wise.meta import (
