@@ -88,6 +88,8 @@ def solution_at(path: Path) -> Solution | None:
     was assessed with, or for the fit where there is no posterior yet.
     """
     if path.is_dir():
+        if not (path / "run.json").exists() and not (path / "posterior.nc").exists():
+            raise InputError("is a folder, and no run", where=str(path), do="give a file in it")
         if not (path / "run.json").exists():
             raise InputError(
                 "has no run.json, without which the errors that the run was assessed with are not "
