@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel
 from pydantic_core import to_jsonable_python
 
 __all__ = ["Adjustable", "as_json", "difference", "differences", "digest_of", "shown"]
@@ -25,9 +26,24 @@ def as_json(value: Any) -> Any:
     """A value as plain JSON: null for what is not a finite number; TypeError for unknown content.
 
     Settings, dataclasses, arrays, paths, and mappings and sequences of these become mappings,
-    lists, text, numbers and None.
+    lists, text, numbers and None.  A set has no order, and is refused.
     """
+    _refuse_sets(value)
     return to_jsonable_python(value, inf_nan_mode="null", fallback=_plain)
+
+
+def _refuse_sets(value: Any) -> None:
+    """TypeError for a set anywhere in a value: pydantic would list it in the order of hashes."""
+    if isinstance(value, set | frozenset):
+        raise TypeError(f"{type(value).__name__} is no JSON and cannot be in a record or a key")
+    if isinstance(value, BaseModel) or (is_dataclass(value) and not isinstance(value, type)):
+        value = vars(value)
+    if isinstance(value, Mapping):
+        value = value.values()
+    elif not isinstance(value, list | tuple):
+        return
+    for one in value:
+        _refuse_sets(one)
 
 
 def _plain(value: Any) -> Any:

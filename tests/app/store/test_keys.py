@@ -30,7 +30,7 @@ def test_equal_values_have_equal_keys():
 
 
 def test_a_value_of_unknown_content_is_in_no_key():
-    for value in (object(), open, {"a": [lambda: None]}):
+    for value in (object(), open, {1, 2}, {"a": [lambda: None]}, Settings(2, {1.0})):
         with pytest.raises(TypeError, match="cannot be in a record or a key"):
             as_json(value)
 
