@@ -203,8 +203,8 @@ def data_are(content, hdu, column, row, value):
     return _set(content, hdu, column, row, value, whole=True)
 
 
-@changes("bomb", OPEN, "fits")
+@changes("bomb", KNOWABLE, "fits")
 def deep_extensions(content):
-    """Two thousand empty extensions behind the file's own, which `inspect` counts."""
+    """Two thousand empty extensions behind the file's own."""
     empty = fits.ImageHDU().header.tostring().encode()
     return content + empty * 2000

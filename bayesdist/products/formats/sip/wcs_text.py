@@ -54,16 +54,16 @@ def describe_wcs(file: Content, extra: Sequence[Finding] = ()) -> list[str]:
     """
     extra = [*extra, *_truncated(file)]
     shown: dict[tuple[tuple[str, str], ...], list[Hdu]] = {}
-    several = sum(holds_wcs(hdu.header) for hdu in file.hdus) > 1
+    known = sum(holds_wcs(hdu.header) for hdu in file.hdus)
     for hdu in file.hdus:
         # the nodes of a table are described with the image that uses it
-        aside = several and hdu.label.partition(",")[0] in _TABLE_HDUS
+        aside = known > 1 and hdu.label.partition(",")[0] in _TABLE_HDUS
         if holds_wcs(hdu.header) and not aside:
             shown.setdefault((*_wcs_cards(hdu.header), _extent(hdu.header)), []).append(hdu)
     groups = list(shown.values())
     if len(file.hdus) == 1:
         return _hdu_lines(file, groups[0][0], file.name, extra=extra)
-    out = [f"{file.name}: {len(file.hdus)} HDUs, {len(groups)} different WCS"]
+    out = [f"{file.name}: {known} HDUs with a WCS, {len(groups)} different"]
     for first, *others in groups:
         out += ["", *_hdu_lines(file, first, _label(first), others, extra)]
         extra = ()
