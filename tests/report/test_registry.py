@@ -99,9 +99,16 @@ def test_a_page_of_its_own_needs_no_change_elsewhere():
     def figure(r, n):
         return Plot(None, f"Number {n}", "", "")
 
+    @registry.figure("part", printed=lambda r: len(r.numbers) > 2)
+    def summary(r):
+        return Plot(None, "All numbers", "", "")
+
     results = SimpleNamespace(title="A part", numbers=(3, 5))
     items = registry.items(results, "figure")
-    assert [(one.name, one.printed) for one in items] == [("figure_3", True), ("figure_5", True)]
+    printed = [("figure_3", True), ("figure_5", True), ("summary", False)]
+    assert [(one.name, one.printed) for one in items] == printed
+    more = registry.items(SimpleNamespace(title="", numbers=(1, 2, 3)), "figure")
+    assert all(one.printed for one in more)
     assert items[1].made(results).title == "Number 5"
     every, missing = parts_of(registry, results, {})
     assert [part.title for part in every.parts] == ["A part"]

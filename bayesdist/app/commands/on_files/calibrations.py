@@ -65,11 +65,9 @@ def calibration_at(
     if solution is None:
         found = read_calibration(path, filter=filter, size=size)
     else:
+        detector = _detector_of_run(path)
         found = calibration_of(
-            solution,
-            str(path),
-            detector=_detector_of_run(path).name,
-            scale=_scale_of_run(path, solution),
+            solution, str(path), detector=detector.name, scale=_scale(detector, solution)
         )
         summary = _summary_of(path)
         budget = [] if summary is None else summary.budget or []
@@ -150,13 +148,16 @@ def _detector_of_run(path: Path) -> Detector:
 
 def pixel_of_run(path: Path) -> float | None:
     """Arcseconds in a pixel as a run was configured; None where nothing says it."""
-    mas = _detector_of_run(path).scale_mas
-    return None if mas is None else 1e-3 * mas
+    return _pixel(_detector_of_run(path))
 
 
-def _scale_of_run(path: Path, solution: Solution) -> tuple[float, str] | None:
-    """Size of a corrected pixel as a run was configured; None where nothing says it."""
-    unit, pixel = solution.model.unit, pixel_of_run(path)
+def _pixel(detector: Detector) -> float | None:
+    return None if detector.scale_mas is None else 1e-3 * detector.scale_mas
+
+
+def _scale(detector: Detector, solution: Solution) -> tuple[float, str] | None:
+    """Size of a corrected pixel in the unit of a solution; None where nothing says it."""
+    unit, pixel = solution.model.unit, _pixel(detector)
     if unit == "pix" or pixel is None:
         return None
     return pixel / ARCSEC[unit], "detector.scale_mas"
