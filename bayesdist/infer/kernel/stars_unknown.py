@@ -166,6 +166,24 @@ def _add_products(coef, phi, start, out):
             out[d] += phi[-1] * coef[-1, d]
 
 
+@nb.njit(cache=True, forceinline=True, fastmath=FAST | {"reassoc"})
+def _dot(coef, phi):
+    """Sum of coef_k phi_k over the coefficients."""
+    total = 0.0
+    for k in range(len(coef)):
+        total += coef[k] * phi[k]
+    return total
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def _add_weights(h0, h1, h2, phi, out):
+    """Add h0 phi, h1 phi, h2 phi to out (3, M)."""
+    for k in range(len(phi)):
+        out[0, k] += h0 * phi[k]
+        out[1, k] += h1 * phi[k]
+        out[2, k] += h2 * phi[k]
+
+
 @nb.njit(**PASS)
 def _eliminate_stars(
     start, stop, first, last, starts, group, X, Y, offset, W, var, time, factor, centre, precision,
@@ -173,28 +191,25 @@ def _eliminate_stars(
     sums,
 ):  # fmt: skip
     q, K, m, odds = stars.shape[1], coef.shape[2], extra.shape[1], far_odds(log_core, log_out)
-    direct, edge, own, pull_direct, pull_own, scalars, rows, factors = sums
+    weights, pulls, scalars, rows, factors = sums
+    top = 2 * order
     step = -(-(last - first) // PIECES)
     for piece in range(start, stop):
         S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
-        px, py = np.empty(order + 1), np.empty(order + 1)
-        by = np.empty((2, max(m, 1)))
-        basis = np.empty((16, K))
+        px, py, by = np.empty(top + 1), np.empty(top + 1), np.empty((2, m))
+        basis = np.empty((16, weights.shape[3]))
         for s in range(first + piece * step, min(first + (piece + 1) * step, last)):
             a, e = starts[s], starts[s + 1]
             if e - a > len(basis):
-                basis = np.empty((2 * (e - a), K))
+                basis = np.empty((2 * (e - a), weights.shape[3]))
             mine = own_rows(W, var, a, e)
             when = time[a:e] if q >= 4 else time
             where = factor[a:e] if q == 5 else factor
             for i in range(a, e):
-                phi = basis[i - a]
-                legendre(X[i], Y[i], order, px, py, phi)
-                for axis in range(2):
-                    total = offset[i, axis]
-                    for k in range(K):
-                        total += coef[group[i], axis, k] * phi[k]
-                    mine[PLACE_U if axis == 0 else PLACE_V, i - a] = total
+                phi, g = basis[i - a], group[i]
+                legendre(X[i], Y[i], top, px, py, phi)
+                mine[PLACE_U, i - a] = offset[i, 0] + _dot(coef[g, 0], phi)
+                mine[PLACE_V, i - a] = offset[i, 1] + _dot(coef[g, 1], phi)
             p = stars[s]
             value, observed = to_mode(
                 mine, j2, log_core, log_out, when, where, centre[s], precision[s], p, S, A, b,
@@ -207,7 +222,7 @@ def _eliminate_stars(
                     factors[s - first, k, l] = A[k, l]
                     A[k, l] = precision[s, k, l]
             for i in range(a, e):
-                g, c = group[i], chip[group[i]]
+                g = group[i]
                 phi = basis[i - a]
                 design(S, q, i - a, when, where)
                 wu, wv, square = residual(i - a, mine, S, p, q)
@@ -216,49 +231,27 @@ def _eliminate_stars(
                 h0, h1, h2 = hessian(i - a, mine, wu, wv, s2, w, observed)
                 add_curvature(A, S, q, h0, h1, h2)
                 scalars[piece, 1] += w
-                scalars[piece, 2] += w * (1.0 - w)
-                scalars[piece, 3] += w * square / s2
+                scalars[piece, 2] += w * square / s2
+                _add_weights(h0, h1, h2, phi, weights[piece, g])
                 gu, gv = -w * wu / s2, -w * wv / s2
-                M = linear[g]
-                # H M, M^T H M and the gradient by coefficients before the frame
-                a0, a1 = h0 * M[0, 0] + h1 * M[1, 0], h0 * M[0, 1] + h1 * M[1, 1]
-                b0, b1 = h1 * M[0, 0] + h2 * M[1, 0], h1 * M[0, 1] + h2 * M[1, 1]
-                t0 = M[0, 0] * a0 + M[1, 0] * b0
-                t1 = M[0, 0] * a1 + M[1, 0] * b1
-                t2 = M[0, 1] * a1 + M[1, 1] * b1
-                f0, f1 = M[0, 0] * gu + M[1, 0] * gv, M[0, 1] * gu + M[1, 1] * gv
                 for k in range(K):
-                    pull_direct[piece, c, 0, k] += f0 * phi[k]
-                    pull_direct[piece, c, 1, k] += f1 * phi[k]
-                    u0, u1, u2 = t0 * phi[k], t1 * phi[k], t2 * phi[k]
-                    for l in range(k + 1):
-                        direct[piece, c, 0, k, l] += u0 * phi[l]
-                        direct[piece, c, 1, k, l] += u1 * phi[l]
-                        direct[piece, c, 2, k, l] += u2 * phi[l]
-                for n in range(m):
-                    for axis in range(2):
-                        total = 0.0
-                        for k in range(K):
-                            total += extra[g, n, axis, k] * phi[k]
-                        by[axis, n] = total
-                for n in range(m):
-                    hu, hv = h0 * by[0, n] + h1 * by[1, n], h1 * by[0, n] + h2 * by[1, n]
-                    pull_own[piece, g, n] += gu * by[0, n] + gv * by[1, n]
-                    for l in range(m):
-                        own[piece, g, n, l] += hu * by[0, l] + hv * by[1, l]
-                    e0, e1 = M[0, 0] * hu + M[1, 0] * hv, M[0, 1] * hu + M[1, 1] * hv
-                    for k in range(K):
-                        edge[piece, g, n, 0, k] += e0 * phi[k]
-                        edge[piece, g, n, 1, k] += e1 * phi[k]
-                    for k in range(q):
-                        if columns[g, n] >= 0:
-                            rows[row + k, columns[g, n]] += S[0, k] * hu + S[1, k] * hv
+                    pulls[piece, g, 0, k] += gu * phi[k]
+                    pulls[piece, g, 1, k] += gv * phi[k]
+                for axis in range(2):
+                    for n in range(m):
+                        by[axis, n] = _dot(extra[g, n, axis], phi)
+                at_u = 2 * K * chip[g]
                 for k in range(q):
-                    c0, c1 = S[0, k] * a0 + S[1, k] * b0, S[0, k] * a1 + S[1, k] * b1
-                    at_u = 2 * K * c
-                    for l in range(K):
-                        rows[row + k, at_u + l] += c0 * phi[l]
-                        rows[row + k, at_u + K + l] += c1 * phi[l]
+                    hu, hv = S[0, k] * h0 + S[1, k] * h1, S[0, k] * h1 + S[1, k] * h2
+                    mine_row = rows[row + k]
+                    # by coefficients before the frame, and by its parameters
+                    for axis in range(2):
+                        along = hu * linear[g, 0, axis] + hv * linear[g, 1, axis]
+                        for l in range(K):
+                            mine_row[at_u + axis * K + l] += along * phi[l]
+                    for n in range(m):
+                        if columns[g, n] >= 0:
+                            mine_row[columns[g, n]] += hu * by[0, n] + hv * by[1, n]
             # of these terms exactly, else directions that detections leave free would not be free:
             # those of the last step but one are slightly different
             same = cholesky(A, q)
@@ -290,21 +283,16 @@ def eliminate_stars(
     by its other parameters and the indices of these (G, m), -1 for none; `seen`: curvature of the
     mixture itself.
 
-    Returns direct (P, chips, 3, K, K), edge (P, G, m, 2, K), own (P, G, m, m): curvature by
-    coefficients (uu, uv, vv, lower halves), by these and the rest, by the rest; pull_direct (P,
-    chips, 2, K), pull_own (P, G, m): gradients; scalars (P, 4): log density, sums of w, of w (1 -
-    w), and of w times the squared normalised residual; rows (S q, D): L^-1 B of each star; factors
-    (S, q, q): L.
+    Returns sums by group, with the Legendre functions up to twice the order, by which products of
+    two are sums (`product_table`): weights (P, G, 3, M), of the curvature uu, uv, vv by position;
+    pulls (P, G, 2, K), of its gradient; then scalars (P, 3): log density, sums of w, and of w times
+    the squared normalised residual; rows (S q, D): L^-1 B of each star; factors (S, q, q): L.
     """
-    q, K, m = stars.shape[1], coef.shape[2], extra.shape[1]
-    n_chips, n_groups = chip.max() + 1, len(coef)
+    q, K = stars.shape[1], coef.shape[2]
     sums = (
-        np.zeros((PIECES, n_chips, 3, K, K)),
-        np.zeros((PIECES, n_groups, m, 2, K)),
-        np.zeros((PIECES, n_groups, m, m)),
-        np.zeros((PIECES, n_chips, 2, K)),
-        np.zeros((PIECES, n_groups, m)),
-        np.zeros((PIECES, 4)),
+        np.zeros((PIECES, len(coef), 3, (order + 1) * (2 * order + 1))),
+        np.zeros((PIECES, len(coef), 2, K)),
+        np.zeros((PIECES, 3)),
         np.zeros(((last - first) * q, n_params)),
         np.zeros((last - first, q, q)),
     )

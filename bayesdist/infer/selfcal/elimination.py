@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel.blocks import threads_for
+from bayesdist.infer.kernel.moments import product_table
 from bayesdist.infer.selfcal.problem import Problem
 
 __all__ = [
@@ -67,6 +68,7 @@ class PlaceDerivatives:
     # derivatives (G, m, 2, K) by drift and frames; zero where a group has fewer than m of them
     extra: Float
     columns: Int  # indices (G, m) of these parameters; -1 for none
+    jacobian: list[tuple[Int, Float]]  # as of `DistortionModel.effective_jacobian`
 
     @classmethod
     def at(cls, problem: Problem, theta: Float) -> PlaceDerivatives:
@@ -81,7 +83,7 @@ class PlaceDerivatives:
             n = len(which) - 2 * K
             columns[g, :n] = which[2 * K :]
             extra[g, :n] = np.moveaxis(derivative[..., 2 * K :], 2, 0)
-        return cls(problem.effective(theta), linear, extra, columns)
+        return cls(problem.effective(theta), linear, extra, columns, found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,21 +107,22 @@ def expand(
     of the mixture itself; otherwise that with EM weights, which is never indefinite.
     """
     structure, D = PlaceDerivatives.at(problem, theta), problem.model.n_params
+    order, K = problem.model.order, problem.model.n_terms
+    weights = np.zeros((len(problem.groups), 3, (order + 1) * (2 * order + 1)))
+    pulls, scalars = np.zeros((len(problem.groups), 2, K)), np.zeros(3)
     curvature, gradient = np.zeros((D, D)), np.zeros(D)
-    found, scalars = stars.copy(), np.zeros(4)
-    chips = problem.groups.chip
-    for sums in _passes(problem, structure, mixture, found, observed):
-        direct, edge, own, pull_direct, pull_own, some, rows, _ = sums
-        _assemble(curvature, structure, chips, direct, edge, own)
+    found = stars.copy()
+    for *sums, rows, _ in _passes(problem, structure, mixture, found, observed):
+        for total, pieces in zip((weights, pulls, scalars), sums, strict=True):
+            total += pieces.sum(axis=0)
         curvature -= rows.T @ rows
-        K = structure.coef.shape[2]
-        for c in range(pull_direct.shape[1]):
-            gradient[2 * K * c : 2 * K * (c + 1)] += pull_direct[:, c].sum(axis=0).ravel()
-        used = structure.columns >= 0
-        np.add.at(gradient, structure.columns[used], pull_own.sum(axis=0)[used])
-        scalars += some.sum(axis=0)
+    squares = np.einsum("gcm,klm->gckl", weights, product_table(order), optimize=True)
+    for (columns, by), (uu, uv, vv), pull in zip(structure.jacobian, squares, pulls, strict=True):
+        by = by.reshape(2 * K, -1)
+        curvature[np.ix_(columns, columns)] += by.T @ np.block([[uu, uv], [uv, vv]]) @ by
+        gradient[columns] += pull.ravel() @ by
     curvature = (curvature + curvature.T) / 2
-    value, members, _, chi2 = scalars
+    value, members, chi2 = scalars
     return Expansion(float(value), gradient, curvature, found, members, chi2)
 
 
@@ -166,25 +169,6 @@ def _passes(
                 observed,
             )
         yield found
-
-
-def _assemble(
-    N: Float, structure: PlaceDerivatives, chips: Int, direct: Float, edge: Float, own: Float
-) -> None:
-    """Add the sums of J^T H J to N (D, D)."""
-    K = structure.coef.shape[2]
-    for c, low in enumerate(direct.sum(axis=0)):
-        uu, uv, vv = (one + np.tril(one, -1).T for one in np.tril(low))
-        at = 2 * K * c
-        N[at : at + 2 * K, at : at + 2 * K] += np.block([[uu, uv], [uv, vv]])
-    edges, owns = edge.sum(axis=0), own.sum(axis=0)
-    for g, columns in enumerate(structure.columns):
-        used = columns >= 0
-        which, at = columns[used], 2 * K * chips[g]
-        block = edges[g].reshape(-1, 2 * K)[used].T
-        N[at : at + 2 * K, which] += block
-        N[which, at : at + 2 * K] += block.T
-        N[np.ix_(which, which)] += owns[g][np.ix_(used, used)]
 
 
 def memberships(problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> Float:

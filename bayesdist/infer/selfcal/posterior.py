@@ -39,7 +39,7 @@ __all__ = ["SelfTarget", "propose", "sample_selfcal"]
 Float = NDArray[np.float64]
 
 DROP = 18.0  # distance (in log density) below the top to which the nodes extend
-MAX_NODES, MIN_NODES = 25, 9
+N_NODES = 13  # 9 lose 0.2 % of the draws where the jitter has no lower end, 25 gain nothing
 MAX_DECREMENT = 1e-4  # decrement at which a node is found
 MAX_STEPS = 12
 MAX_ITERATIONS = 10  # in each of which the mesh of log j is narrowed by seven: to 1e-8
@@ -285,9 +285,7 @@ def _nodes_at(target: SelfTarget) -> tuple[Float, float]:
         felt = np.flatnonzero(np.abs(likelihood) > MIN_EFFECT)
         if len(felt):
             fine = fine[fine >= mesh[max(felt[0] - 2, 0)]]
-    # a peak is nearly Gaussian; a shoulder that falls off from a plateau is not
-    count = MAX_NODES if open_end else MIN_NODES
-    return np.linspace(fine[0], fine[-1], count), float(mesh[np.argmax(value)])
+    return np.linspace(fine[0], fine[-1], N_NODES), float(mesh[np.argmax(value)])
 
 
 def _node(target: SelfTarget, split: Split, at: Float, z: float, bend: float) -> Node:
