@@ -15,6 +15,7 @@ from bayesdist.data.reading.table import own_epoch, with_sky_columns
 from bayesdist.data.tables.column import Columns
 from bayesdist.data.tables.names import origin_of
 from bayesdist.data.tables.parquet import describe_part
+from bayesdist.errors import InputError
 from bayesdist.reading.tables import read_table
 
 __all__ = ["TableLayout", "table_layout"]
@@ -60,6 +61,8 @@ def table_layout(
         return None
     if file.suffix.lower() == ".parquet":
         part = describe_part(file)
+        if not part.n_rows:
+            raise InputError("holds no rows", where=str(file), do="give a table with stars")
         table: Columns = next(part.blocks(part.colnames, size=MAX_ROWS_READ))
         header: Mapping[str, Any] = {}
     else:
