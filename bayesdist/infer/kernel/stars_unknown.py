@@ -60,8 +60,8 @@ def _weighted_stars(
         when = time[a:e] if q >= 4 else time
         where = factor[a:e] if q == 5 else factor
         to_mode(
-            own, j2, log_core, log_out, when, where, centre[s], precision[s], stars[s], S, A, b,
-            False, least,
+            own, e - a, j2, log_core, log_out, when, where, centre[s], precision[s], stars[s], S,
+            A, b, False, least,
         )  # fmt: skip
         for i in range(a, e):
             design(S, q, i - a, when, where)
@@ -123,8 +123,8 @@ def _log_marginals(
                     )  # fmt: skip
                     continue
                 value, _ = to_mode(
-                    own, rows[d, 0], rows[d, 1], rows[d, 2], when, where, centre[s], precision[s],
-                    p, S, A, b, True, least,
+                    own, e - a, rows[d, 0], rows[d, 1], rows[d, 2], when, where, centre[s],
+                    precision[s], p, S, A, b, True, least,
                 )  # fmt: skip
                 sums[piece, d] += value - log_root(A, q, least)
 
@@ -212,8 +212,8 @@ def _eliminate_stars(
                 mine[PLACE_V, i - a] = offset[i, 1] + _dot(coef[g, 1], phi)
             p = stars[s]
             value, observed = to_mode(
-                mine, j2, log_core, log_out, when, where, centre[s], precision[s], p, S, A, b,
-                seen, least,
+                mine, e - a, j2, log_core, log_out, when, where, centre[s], precision[s], p, S,
+                A, b, seen, least,
             )  # fmt: skip
             scalars[piece, 0] += value - log_root(A, q, least)
             row = (s - first) * q
