@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable
 from textwrap import wrap
 
 from astropy.io import fits
 
+from bayesdist.errors import FormatError
 from bayesdist.infer.solution import Solution
 
 __all__ = [
@@ -16,6 +18,7 @@ __all__ = [
     "header_of",
     "holds_wcs",
     "keyword_of",
+    "named_in",
     "number_card",
     "printable",
     "text_card",
@@ -74,6 +77,14 @@ def convergence_cards(solution: Solution) -> list[str]:
 def keyword_of(card: str) -> str:
     """Keyword of a card."""
     return card[:8].rstrip()
+
+
+def named_in(header: fits.Header, keyword: str) -> str:
+    """Name that a keyword gives, empty where it is missing; FormatError where it cannot be one."""
+    value = header.get(keyword, "")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise FormatError(f"is {value}", where=f"keyword {keyword}", do="give a name")
+    return str(value).strip()
 
 
 def header_of(cards: Iterable[str]) -> fits.Header:

@@ -27,6 +27,7 @@ from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.products.formats.common.cards import named_in
 from bayesdist.products.formats.common.content import Content, Hdu, hdus_of
 
 __all__ = [
@@ -142,8 +143,8 @@ def stored_calibration(hdu: Hdu, name: str) -> Calibration:
         name,
         GaussianSolution(model, mean, cov),
         plane=Plane(kind, point=point),
-        detector=str(header.get("DETECTOR", "")),
-        filter=str(header.get("FILTER", "")),
+        detector=named_in(header, "DETECTOR"),
+        filter=named_in(header, "FILTER"),
         errors=errors,
         numbered=bool(header.get("BDNUMB", True)),
         scale=scale,

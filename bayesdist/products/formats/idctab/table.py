@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import polynomial_terms
+from bayesdist.products.formats.common.cards import named_in
 from bayesdist.products.formats.common.coefficients import evaluate, idctab_column
 from bayesdist.products.formats.common.content import Hdu, read_hdus, write_hdus
 from bayesdist.products.formats.idctab.drift import drift, scheme_of
@@ -148,12 +149,12 @@ class IdcTab:
     @property
     def instrument(self) -> str:
         """INSTRUME."""
-        return str(self.header["INSTRUME"]).strip()
+        return named_in(self.header, "INSTRUME")
 
     @property
     def detector(self) -> str:
         """DETECTOR, empty where the file has none."""
-        return str(self.header.get("DETECTOR", "")).strip()
+        return named_in(self.header, "DETECTOR")
 
     @property
     def is_acs_wfc(self) -> bool:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model.lookup import LookupTable
+from bayesdist.products.formats.common.cards import named_in
 from bayesdist.products.formats.common.content import Hdu, read_hdus, write_hdus
 from bayesdist.products.formats.lookup.plane import Plane
 
@@ -71,17 +72,17 @@ class LookupFile:
     @property
     def instrument(self) -> str:
         """INSTRUME, empty where the file has none."""
-        return str(self.header.get("INSTRUME", "")).strip()
+        return named_in(self.header, "INSTRUME")
 
     @property
     def detector(self) -> str:
         """DETECTOR, empty where the file has none."""
-        return str(self.header.get("DETECTOR", "")).strip()
+        return named_in(self.header, "DETECTOR")
 
     @property
     def filters(self) -> tuple[str, ...]:
         """Filter names of the primary header, in the order of the wheels."""
-        return tuple(str(self.header[k]).strip() for k in _FILTERS if k in self.header)
+        return tuple(named_in(self.header, k) for k in _FILTERS if k in self.header)
 
     @cached_property
     def planes(self) -> tuple[Plane, ...]:

@@ -13,6 +13,7 @@ from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError
 from bayesdist.model import LookupTable
+from bayesdist.products.formats.common.cards import named_in
 from bayesdist.products.formats.common.parameters import stored_calibration, stored_in
 from bayesdist.products.formats.stdgdc.file import CorrectedFrame, StdGdc
 
@@ -73,7 +74,7 @@ def stdgdc_calibration(file: StdGdc, name: str, *, as_used: bool = False) -> Cal
         name,
         plane=Plane("detector") if stored is None else stored.plane,
         numbered="BDCHIP" in file.header,
-        detector=str(file.header.get("DETECTOR", "")),
+        detector=named_in(file.header, "DETECTOR"),
     )
     if stored is not None:
         return replace(found, before=(table,), scale=stored.scale, scale_from=stored.scale_from)
