@@ -16,9 +16,18 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.kernel.polynomial import FAST
+from bayesdist.infer.kernel.lanes import FAST
 
-__all__ = ["BLOCK", "PASS", "pieces_of", "set_threads", "share_out", "threads_for"]
+__all__ = [
+    "BLOCK",
+    "PASS",
+    "lay_out",
+    "pieces_of",
+    "scratch",
+    "set_threads",
+    "share_out",
+    "threads_for",
+]
 
 Int = NDArray[np.int64]
 
@@ -40,6 +49,29 @@ def pieces_of(starts: Int, size: int) -> Int:
     begin = np.concatenate([*first, np.zeros(0, np.int64)]).astype(np.int64)
     end = np.minimum(begin + size, np.asarray(starts)[group + 1])
     return np.column_stack([group, begin, end]).astype(np.int64)
+
+
+@nb.njit(cache=True)
+def scratch(n):
+    """Empty rows (n, BLOCK) that begin where a vector does not cross lines of the cache."""
+    room = np.empty(n * BLOCK + 8)
+    first = -(room.ctypes.data // 8) % 8
+    return room[first : first + n * BLOCK].reshape(n, BLOCK)
+
+
+@nb.njit(cache=True)
+def lay_out(columns, first, end, rows):
+    """Copy X, Y, u, v, var_u, var_v of some stars to rows of `scratch`, and ones behind them."""
+    X, Y, u, v, var_u, var_v = columns[:6]
+    for s in range(BLOCK):
+        i = first + s
+        inside = i < end
+        rows[0, s] = X[i] if inside else 1.0
+        rows[1, s] = Y[i] if inside else 1.0
+        rows[2, s] = u[i] if inside else 1.0
+        rows[3, s] = v[i] if inside else 1.0
+        rows[4, s] = var_u[i] if inside else 1.0
+        rows[5, s] = var_v[i] if inside else 1.0
 
 
 def share_out(loop: Callable[..., None], n: int, *arguments: Any) -> None:

@@ -24,8 +24,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.infer.kernel.numeric import exp_negative
-from bayesdist.infer.kernel.polynomial import FAST
 
 __all__ = ["NODES", "inside", "log_circle", "nodes_for", "slopes"]
 

@@ -8,10 +8,21 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.kernel.blocks import BLOCK, PASS, share_out, threads_for
-from bayesdist.infer.kernel.mixture import Constants, log_of_product, packed, total_of
+from bayesdist.infer.kernel.blocks import PASS, lay_out, scratch, share_out, threads_for
+from bayesdist.infer.kernel.lanes import (
+    WIDTH,
+    choose,
+    first_lanes,
+    larger,
+    load,
+    put,
+    smaller,
+    spread,
+    total,
+)
+from bayesdist.infer.kernel.mixture import Constants, log_of_product, packed
 from bayesdist.infer.kernel.numeric import exp_negative, inverse_root
-from bayesdist.infer.kernel.polynomial import polynomial
+from bayesdist.infer.kernel.polynomial import evaluate
 
 __all__ = ["log_likelihood"]
 
@@ -22,44 +33,35 @@ SCRATCH = 16_000_000  # bytes of partial sums in memory at a time
 
 
 @nb.njit(**PASS)
-def _partial_sums(first, end, blocks, X, Y, u, v, var_u, var_v, coef, powers, rows, unit2, sums):
-    order = len(powers)  # in the type: it is compiled for one order
-    pu, pv, work = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
-    density, low = np.empty(BLOCK), np.empty(BLOCK)
+def _partial_sums(first, end, blocks, columns, coef, order, rows, unit2, sums):
+    stars, model, density = scratch(6), scratch(2), scratch(1)[0]
     for b in range(first, end):
         g, a, e = blocks[b]
         n = e - a
-        low[n:] = 0.0
-        Xb, Yb, ub, vb, su, sv = X[a:e], Y[a:e], u[a:e], v[a:e], var_u[a:e], var_v[a:e]
+        lay_out(columns, a, e, stars)
+        density[:] = 1.0
         for d in range(len(rows)):
-            cu, cv = coef[d, g, 0], coef[d, g, 1]
-            for s in range(n):
-                pu[s] = polynomial(cu, order, Xb[s], Yb[s])
-            for s in range(n):
-                pv[s] = polynomial(cv, order, Xb[s], Yb[s])
-            j2, core, outlier, half, never = (
-                rows[d, 0],
-                rows[d, 1],
-                rows[d, 2],
-                rows[d, 3],
-                rows[d, 4],
-            )
-            for s in range(n):
-                ru, rv = ub[s] - pu[s], vb[s] - pv[s]
-                ru *= ru
-                rv *= rv
-                au, av = su[s] + j2, sv[s] + j2
+            evaluate(coef[d, g], order, stars[0], stars[1], n, model)
+            j2, core, outlier = rows[d, 0], rows[d, 1], rows[d, 2]
+            half, never = rows[d, 3], rows[d, 4]
+            exponents = spread(0.0, load(density, 0))
+            for s in range(0, n, WIDTH):
+                ru = load(stars[2], s) - load(model[0], s)
+                rv = load(stars[3], s) - load(model[1], s)
+                ru, rv = ru * ru, rv * rv
+                au, av = load(stars[4], s) + j2, load(stars[5], s) + j2
                 root = inverse_root(au * av)
                 peak, inverse = core * root, root * root
-                # the smaller exponent is taken out, so that exp never overflows
                 q_in = 0.5 * (ru * av + rv * au) * inverse
                 q_out = (ru + rv) * half + never
-                t = exp_negative(-abs(q_in - q_out))
-                is_core = q_in <= q_out
-                low[s] = q_in if is_core else q_out
-                density[s] = peak + outlier * t if is_core else peak * t + outlier
-            exponents = total_of(low, work) + n * math.log(2 * math.pi * unit2)
-            sums[b, d] = log_of_product(density, n, work) - exponents
+                # the smaller exponent is taken out, so that exp never overflows
+                low = smaller(q_in, q_out)
+                t = exp_negative(low - larger(q_in, q_out))
+                both = choose(q_in, q_out, peak + outlier * t, peak * t + outlier)
+                put(density, s, first_lanes(n - s, both, 1.0))
+                exponents += first_lanes(n - s, low, 0.0)
+            constant = total(exponents) + n * math.log(2 * math.pi * unit2)
+            sums[b, d] = log_of_product(density) - constant
 
 
 def log_likelihood(
@@ -74,7 +76,7 @@ def log_likelihood(
     `blocks` (n, 3) are `pieces_of` size `BLOCK`; `columns` (N,) are X, Y, u, v, var_u, var_v;
     `coef` (D, G, 2, K) are effective coefficients of the scaled powers X^i Y^j.
     """
-    rows, coef, powers = packed(constants), np.ascontiguousarray(coef), (0,) * order
+    rows, coef = packed(constants), np.ascontiguousarray(coef)
     out = np.empty(len(coef))
     step = max(1, SCRATCH // (8 * max(len(blocks), 1)))
     with threads_for(len(columns[0]) * len(coef)):
@@ -85,9 +87,9 @@ def log_likelihood(
                 _partial_sums,
                 len(blocks),
                 blocks,
-                *columns,
+                columns,
                 coef[some],
-                powers,
+                order,
                 rows[some],
                 constants.unit2,
                 sums,

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.kernel.blocks import BLOCK
+from bayesdist.infer.kernel.lanes import WIDTH, choose, load, product, spread, total
 from bayesdist.infer.kernel.numeric import bits_of, from_bits
 
 __all__ = [
@@ -23,14 +24,12 @@ __all__ = [
     "Constants",
     "log_of_product",
     "packed",
-    "total_of",
 ]
 
 Float = NDArray[np.float64]
 
 NO_OUTLIERS, GAUSSIAN, UNIFORM = 0, 1, 2
 NEVER = 1e300  # chi-square of an outlier where there are none
-LANES = BLOCK // 8
 # A product of eight within these limits has lost no digits to underflow on the way, unless its
 # factors differ by more than 1e129: errors that differ by more than 1e64.
 LEAST, MOST = 1e-100, 1e100
@@ -72,45 +71,23 @@ def packed(constants: Constants) -> Float:
     return np.ascontiguousarray(np.stack(rows, axis=1))
 
 
-@nb.njit(cache=True, forceinline=True)
-def log_of_product(density, n, work):
-    """Sum of the logarithms of density[:n], which has room for a block; one logarithm in all."""
-    for s in range(n, BLOCK):
-        density[s] = 1.0
-    for s in range(LANES):
-        work[s] = density[s]
-    for m in range(1, 8):
-        for s in range(LANES):
-            work[s] *= density[s + LANES * m]
-    safe = True
-    for s in range(LANES):
-        safe &= (work[s] > LEAST) & (work[s] < MOST)
-    total = 0.0
-    if safe:
-        exponent = 0
-        for s in range(LANES):
-            bits = bits_of(work[s])
-            exponent += (bits >> 52) - 1023
-            work[s] = from_bits((bits & 0x000FFFFFFFFFFFFF) | 0x3FF0000000000000)
-        mantissa = 1.0  # at most 2^32
-        for s in range(LANES):
-            mantissa *= work[s]
-        total = math.log(mantissa) + exponent * 0.6931471805599453
-    else:  # extreme errors or fractions: each star alone
-        for s in range(n):
-            total += math.log(density[s])
-    return total
-
-
-@nb.njit(cache=True, forceinline=True)
-def total_of(values, work):
-    """Sum of the values of a whole block, those of one lane first."""
-    for s in range(LANES):
-        work[s] = values[s]
-    for m in range(1, 8):
-        for s in range(LANES):
-            work[s] += values[s + LANES * m]
-    total = 0.0
-    for s in range(LANES):
-        total += work[s]
-    return total
+@nb.njit(cache=True)
+def log_of_product(density):
+    """Sum of the logarithms of a block; one logarithm in all."""
+    mantissa = load(density, 0)
+    exponent, mantissa, safe = spread(0, mantissa), spread(1.0, mantissa), spread(0.0, mantissa)
+    for a in range(0, BLOCK, 8 * WIDTH):
+        eight = load(density, a)
+        for s in range(a + WIDTH, a + 8 * WIDTH, WIDTH):
+            eight = eight * load(density, s)
+        safe += choose(LEAST, eight, choose(eight, MOST, 1.0, spread(0.0, eight)), 0.0)
+        bits = bits_of(eight)
+        exponent += (bits >> 52) - 1023
+        mantissa = mantissa * from_bits((bits & 0x000FFFFFFFFFFFFF) | 0x3FF0000000000000)
+    if total(safe) == BLOCK / 8:
+        # the product of mantissas is at most 2^32
+        return math.log(product(mantissa)) + total(exponent) * 0.6931471805599453
+    result = 0.0
+    for s in range(BLOCK):  # extreme errors or fractions: each star alone
+        result += math.log(density[s])
+    return result

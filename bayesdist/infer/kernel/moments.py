@@ -16,17 +16,31 @@ import numpy as np
 from numpy.polynomial import legendre as series
 from numpy.typing import NDArray
 
-from bayesdist.infer.kernel.blocks import BLOCK, PASS, share_out, threads_for
+from bayesdist.infer.kernel.blocks import BLOCK, PASS, lay_out, scratch, share_out, threads_for
+from bayesdist.infer.kernel.lanes import (
+    AT_MOST,
+    ROWS,
+    WIDTH,
+    choose,
+    first_lanes,
+    larger,
+    load,
+    put,
+    smaller,
+    spread,
+    tile,
+    total,
+)
 from bayesdist.infer.kernel.mixture import Constants, log_of_product, packed
-from bayesdist.infer.kernel.numeric import exp_negative
-from bayesdist.infer.kernel.polynomial import FAST, horner, legendre
+from bayesdist.infer.kernel.numeric import exp_negative, inverse_root
+from bayesdist.infer.kernel.polynomial import evaluate, legendre
 
 __all__ = ["PIECE", "Moments", "least_squares_moments", "mixture_moments"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-PIECE = 4096  # stars whose sums are separate, to be shared among threads
+PIECE = 4096
 EVALUATIONS = 10  # cost of the sums of one star, in likelihood evaluations
 
 N_LEAST, N_MIXTURE = 9, 10  # scalar sums of the two passes
@@ -69,183 +83,207 @@ def product_table(order: int) -> Float:
     return one[np.ix_(i, i, mi)] * one[np.ix_(j, j, mj)]
 
 
-# Only here may the compiler choose the order of a sum.  Where it could reorder more, it makes other
-# last bits when it compiles the same code again, as it does for numba's cache.
-@nb.njit(cache=True, forceinline=True, fastmath=FAST | {"reassoc"})
-def _dot(a, b):
-    """Sum of the products of two blocks."""
-    total = 0.0
-    for s in range(BLOCK):
-        total += a[s] * b[s]
-    return total
+# Sums of three rows with as many Legendre functions as the registers hold: one function a number.
+_ONE, _TWO, _THREE, _FOUR, _FIVE, _SIX = (tile(n, BLOCK) for n in range(1, 7))
 
 
-@nb.njit(cache=True, forceinline=True, fastmath=FAST | {"reassoc"})
-def _nine_dots(a, b, c, p, q, r):
-    """Sums of the products of three blocks with three others, each loaded once for three sums."""
-    ap = aq = ar = bp = bq = br = cp = cq = cr = 0.0
-    for s in range(BLOCK):
-        ap += a[s] * p[s]
-        aq += a[s] * q[s]
-        ar += a[s] * r[s]
-        bp += b[s] * p[s]
-        bq += b[s] * q[s]
-        br += b[s] * r[s]
-        cp += c[s] * p[s]
-        cq += c[s] * q[s]
-        cr += c[s] * r[s]
-    return (ap, bp, cp), (aq, bq, cq), (ar, br, cr)
+@nb.njit(cache=True)
+def add_moments(columns, n, P, Q, sums):
+    """Add lanes of the moments of three rows of columns with P_i Q_j to sums (T, T, 3, WIDTH).
 
-
-@nb.njit(cache=True, forceinline=True, fastmath=FAST)
-def _add(columns, last, P, Q, order, work, out):
-    """Add the moments of columns (n, BLOCK) with P_i Q_j to out (n, M).
-
-    i + j is up to twice the order for the first three, the weights, and up to the order for others.
-    Columns are taken by three, and so are the j.
+    i + j is less than T.
     """
-    a, b, c = work[0], work[1], work[2]
-    for k in range(0, last, 3):
-        top = 2 * order if k == 0 else order
-        for i in range(top + 1):
-            for s in range(BLOCK):
-                a[s] = columns[k, s] * P[i, s]
-                b[s] = columns[k + 1, s] * P[i, s]
-                c[s] = columns[k + 2, s] * P[i, s]
-            n = top + 1 - i
-            for j in range(0, n - 2, 3):
-                three = _nine_dots(a, b, c, Q[j], Q[j + 1], Q[j + 2])
-                for m in range(3):
-                    t = i + j + m
-                    for column in range(3):
-                        out[k + column, t * (t + 1) // 2 + j + m] += three[m][column]
-            for j in range(n // 3 * 3, n):
-                t = i + j
-                for column in range(3):
-                    out[k + column, t * (t + 1) // 2 + j] += _dot(work[column], Q[j])
+    top = len(sums)
+    for i in range(top):
+        j = 0
+        while j < top - i:
+            left = top - i - j
+            some = left if left <= AT_MOST else min((left + 1) >> 1, AT_MOST)  # alike, rather
+            if some == 1:
+                _ONE(n, columns, P, i, Q, j, sums)
+            elif some == 2:
+                _TWO(n, columns, P, i, Q, j, sums)
+            elif some == 3:
+                _THREE(n, columns, P, i, Q, j, sums)
+            elif some == 4:
+                _FOUR(n, columns, P, i, Q, j, sums)
+            elif some == 5:
+                _FIVE(n, columns, P, i, Q, j, sums)
+            else:
+                _SIX(n, columns, P, i, Q, j, sums)
+            j += some
 
 
-@nb.njit(**PASS)
-def _least_squares(
-    start, stop, pieces, X, Y, u, v, var_u, var_v, coef, order, rules, sums, scalars
-):
-    top = 2 * order
-    chi2_limit, r2_limit, corner, power = rules[0], rules[1], rules[2], int(rules[3])
-    for b in range(start, stop):
-        g, first, end = pieces[b]
-        P, Q = np.empty((top + 1, BLOCK)), np.empty((top + 1, BLOCK))
-        model, work = np.empty((4, BLOCK)), np.empty((3, BLOCK))
-        pu, pv, tu, tv = model[0], model[1], model[2], model[3]
-        # the third and sixth are zeros, since they are taken by three
-        columns, parts = np.zeros((6, BLOCK)), np.empty((N_LEAST, BLOCK))
-        for a in range(first, end, BLOCK):
-            e = min(a + BLOCK, end)
-            n = e - a
-            Xb, Yb, ub, vb, su, sv = X[a:e], Y[a:e], u[a:e], v[a:e], var_u[a:e], var_v[a:e]
-            for axis in range(2):  # in loops, so that they are compiled once
-                legendre(Xb if axis == 0 else Yb, n, top, P if axis == 0 else Q)
-            for m in range(4):
-                horner(coef[g, m], order, Xb, Yb, n, model[m], work[0])
-            columns[:] = 0.0
-            parts[:] = 0.0
-            for s in range(n):
-                iu, iv = 1.0 / su[s], 1.0 / sv[s]
-                du, dv = ub[s] - tu[s], vb[s] - tv[s]
-                far = du * du + dv * dv > r2_limit
-                unlikely = du * du * iu + dv * dv * iv > chi2_limit
-                used = 0.0 if far or unlikely else 1.0
-                extra = 1.0 + (corner - 1.0) * 0.5 * (Xb[s] * Xb[s] + Yb[s] * Yb[s])
-                factor = used * (extra * extra if power == 2 else extra)
-                ru, rv = ub[s] - pu[s], vb[s] - pv[s]
-                wu, wv = factor * iu, factor * iv
-                columns[0, s], columns[1, s] = wu, wv
-                columns[3, s], columns[4, s] = wu * ru, wv * rv
-                parts[0, s], parts[1, s] = used, 1.0 if far else 0.0
-                parts[2, s] = used * (ru * ru * iu + rv * rv * iv)
-                parts[3, s], parts[4, s] = used * ru * ru, used * rv * rv
-                parts[5, s] = (1.0 - used) * (ru * ru + rv * rv)
-                parts[6, s] = wu * ru * ru + wv * rv * rv
-                parts[7, s], parts[8, s] = used * ru, used * rv
-            for k in range(N_LEAST):
-                scalars[b, k] += _dot(parts[k], P[0])
-            _add(columns, len(columns), P, Q, order, work, sums[b])
+@nb.njit(cache=True)
+def by_total_order(lanes, out):
+    """Write moments, (T, T, 3, WIDTH) with their lanes, to out (3, M)."""
+    for i in range(len(lanes)):
+        for j in range(len(lanes) - i):
+            at = (i + j) * (i + j + 1) // 2 + j
+            for k in range(3):
+                out[k, at] = total(load(lanes[i, j, k], 0))
 
 
-@nb.njit(**PASS)
-def _mixture(
-    start, stop, pieces, X, Y, u, v, var_u, var_v, coef, order, row, unit2, em, sums, scalars
-):
-    top = 2 * order
-    wavering, log_unit = 0.0 if em else 1.0, math.log(2 * math.pi * unit2)
-    j2, core, outlier, half, never, f, w = (
-        row[0],
-        row[1],
-        row[2],
-        row[3],
-        row[4],
-        row[5],
-        row[6],
+@nb.njit(cache=True)
+def empty_lanes(order, columns):
+    """Zeros for the moments of three weights, and of each three of the other columns."""
+    twice, once, others = 2 * order + 1, order + 1, columns // ROWS - 1
+    return (
+        np.zeros((twice, twice, ROWS, WIDTH)),
+        np.zeros((others, once, once, ROWS, WIDTH)),
     )
+
+
+@nb.njit(cache=True)
+def add_columns(columns, n, P, Q, lanes):
+    """Add the moments of some stars: of the first three columns, the weights, and of the others."""
+    add_moments(columns, n, P, Q, lanes[0])
+    for k in range(len(lanes[1])):
+        add_moments(columns[ROWS * (k + 1) :], n, P, Q, lanes[1][k])
+
+
+@nb.njit(cache=True)
+def write_columns(lanes, out):
+    """Write all moments to out (columns, M)."""
+    by_total_order(lanes[0], out)
+    for k in range(len(lanes[1])):
+        by_total_order(lanes[1][k], out[ROWS * (k + 1) :])
+
+
+@nb.njit(**PASS)
+def _least_squares(start, stop, pieces, columns, coef, order, rules, sums, scalars):
+    chi2_limit, r2_limit, corner, power = rules[0], rules[1], rules[2], int(rules[3])
+    P, Q, stars = scratch(2 * order + 1), scratch(2 * order + 1), scratch(6)
+    about, test, weighted = scratch(2), scratch(2), scratch(6)
+    weighted[:] = 0.0  # the third and sixth stay so, since they are taken by three
+    zero = spread(0.0, load(about[0], 0))
     for b in range(start, stop):
         g, first, end = pieces[b]
-        P, Q = np.empty((top + 1, BLOCK)), np.empty((top + 1, BLOCK))
-        pu, pv, work = np.empty(BLOCK), np.empty(BLOCK), np.empty((3, BLOCK))
-        density = np.empty(BLOCK)
-        columns, parts = np.empty((COLUMNS, BLOCK)), np.empty((N_MIXTURE, BLOCK))
+        lanes = empty_lanes(order, len(weighted))
+        used_sum = far_sum = chi2 = uu = vv = left_out = weighted_chi2 = u_sum = v_sum = zero
         for a in range(first, end, BLOCK):
             e = min(a + BLOCK, end)
             n = e - a
-            Xb, Yb, ub, vb, su, sv = X[a:e], Y[a:e], u[a:e], v[a:e], var_u[a:e], var_v[a:e]
-            for axis in range(2):  # in a loop, so that they are compiled once
-                horner(coef[g, axis], order, Xb, Yb, n, pu if axis == 0 else pv, work[0])
-                legendre(Xb if axis == 0 else Yb, n, top, P if axis == 0 else Q)
-            columns[:] = 0.0
-            parts[:] = 0.0
-            for s in range(n):
-                ru, rv = ub[s] - pu[s], vb[s] - pv[s]
-                iu, iv = 1.0 / (su[s] + j2), 1.0 / (sv[s] + j2)
+            lay_out(columns, a, e, stars)
+            legendre(stars[0], stars[1], n, 2 * order, P, Q)
+            evaluate(coef[g, :2], order, stars[0], stars[1], n, about)
+            evaluate(coef[g, 2:], order, stars[0], stars[1], n, test)
+            for s in range(0, n, WIDTH):
+                x, y = load(stars[0], s), load(stars[1], s)
+                u, v = load(stars[2], s), load(stars[3], s)
+                iu, iv = 1.0 / load(stars[4], s), 1.0 / load(stars[5], s)
+                du, dv = u - load(test[0], s), v - load(test[1], s)
+                there = first_lanes(n - s, spread(1.0, x), 0.0)
+                near = choose(du * du + dv * dv, r2_limit, there, 0.0)
+                used = choose(du * du * iu + dv * dv * iv, chi2_limit, near, 0.0)
+                extra = 1.0 + (corner - 1.0) * 0.5 * (x * x + y * y)
+                factor = used * extra * extra if power == 2 else used * extra
+                ru, rv = u - load(about[0], s), v - load(about[1], s)
+                wu, wv = factor * iu, factor * iv
+                put(weighted[0], s, wu)
+                put(weighted[1], s, wv)
+                put(weighted[3], s, wu * ru)
+                put(weighted[4], s, wv * rv)
+                used_sum, far_sum = used_sum + used, far_sum + (there - near)
+                chi2 += used * (ru * ru * iu + rv * rv * iv)
+                uu, vv = uu + used * ru * ru, vv + used * rv * rv
+                left_out += (there - used) * (ru * ru + rv * rv)
+                weighted_chi2 += wu * ru * ru + wv * rv * rv
+                u_sum, v_sum = u_sum + used * ru, v_sum + used * rv
+            add_columns(weighted, n, P, Q, lanes)
+        write_columns(lanes, sums[b])
+        scalars[b, 0] = total(used_sum)
+        scalars[b, 1] = total(far_sum)
+        scalars[b, 2] = total(chi2)
+        scalars[b, 3] = total(uu)
+        scalars[b, 4] = total(vv)
+        scalars[b, 5] = total(left_out)
+        scalars[b, 6] = total(weighted_chi2)
+        scalars[b, 7] = total(u_sum)
+        scalars[b, 8] = total(v_sum)
+
+
+@nb.njit(**PASS)
+def _mixture(start, stop, pieces, columns, coef, order, row, unit2, em, sums, scalars):
+    P, Q, stars = scratch(2 * order + 1), scratch(2 * order + 1), scratch(6)
+    model, density = scratch(2), scratch(1)[0]
+    weighted = scratch(6 if em else COLUMNS)
+    wavering, log_unit = 0.0 if em else 1.0, math.log(2 * math.pi * unit2)
+    j2, core, outlier, half, never = row[0], row[1], row[2], row[3], row[4]
+    f, w = row[5], row[6]
+    zero = spread(0.0, load(density, 0))
+    for b in range(start, stop):
+        g, first, end = pieces[b]
+        lanes = empty_lanes(order, len(weighted))
+        low = by_j = outliers = by_s = jj = jf = js = pp = fs = ss = zero
+        logs = 0.0
+        for a in range(first, end, BLOCK):
+            e = min(a + BLOCK, end)
+            n = e - a
+            lay_out(columns, a, e, stars)
+            legendre(stars[0], stars[1], n, 2 * order, P, Q)
+            evaluate(coef[g], order, stars[0], stars[1], n, model)
+            density[:] = 1.0
+            for s in range(0, n, WIDTH):
+                ru = load(stars[2], s) - load(model[0], s)
+                rv = load(stars[3], s) - load(model[1], s)
+                au, av = load(stars[4], s) + j2, load(stars[5], s) + j2
+                root = inverse_root(au * av)
+                inverse = root * root
+                iu, iv = av * inverse, au * inverse
                 eu, ev = ru * ru * iu, rv * rv * iv
                 r2 = ru * ru + rv * rv
                 q_in, q_out = 0.5 * (eu + ev), r2 * half + never
-                t = exp_negative(-abs(q_in - q_out))
-                is_core = q_in <= q_out
-                peak = core * math.sqrt(iu * iv)
-                d_in = peak if is_core else peak * t
-                d_out = outlier * t if is_core else outlier
-                density[s] = d_in + d_out
-                parts[0, s] = -q_in if is_core else -q_out
-                whole = 1.0 / (d_in + d_out)
+                least = smaller(q_in, q_out)
+                t = exp_negative(least - larger(q_in, q_out))
+                peak = core * root
+                d_in = choose(q_in, q_out, peak, peak * t)
+                d_out = choose(q_in, q_out, outlier * t, outlier)
+                both = d_in + d_out
+                put(density, s, first_lanes(n - s, both, 1.0))
+                low += first_lanes(n - s, least, 0.0)
+                whole = first_lanes(n - s, 1.0 / both, 0.0)
                 p, q = d_out * whole, d_in * whole
                 pq = p * q
                 # derivatives of log core minus log outlier, by u, v, log j, logit f, log s_out
-                D_u, D_v = -ru * iu + ru * w, -rv * iv + rv * w
+                D_u, D_v = ru * (w - iu), rv * (w - iv)
                 D_j = j2 * ((eu - 1.0) * iu + (ev - 1.0) * iv)
                 D_s = 2.0 - r2 * w
-                pq *= wavering
-                columns[0, s] = q * iu + p * w - pq * D_u * D_u
-                columns[1, s] = -pq * D_u * D_v
-                columns[2, s] = q * iv + p * w - pq * D_v * D_v
-                columns[3, s] = (q * iu + p * w) * ru
-                columns[4, s] = (q * iv + p * w) * rv
-                columns[5, s] = q * 2.0 * j2 * ru * iu * iu + pq * D_j * D_u
-                columns[6, s] = q * 2.0 * j2 * rv * iv * iv + pq * D_j * D_v
-                columns[7, s] = -pq * D_u
-                columns[8, s] = -pq * D_v
-                columns[9, s] = p * 2.0 * ru * w + pq * D_s * D_u
-                columns[10, s] = p * 2.0 * rv * w + pq * D_s * D_v
-                pq = p * q
+                turn = pq * wavering
+                wu, wv = q * iu + p * w, q * iv + p * w
+                put(weighted[0], s, wu - turn * D_u * D_u)
+                put(weighted[1], s, 0.0 - turn * D_u * D_v)
+                put(weighted[2], s, wv - turn * D_v * D_v)
+                put(weighted[3], s, wu * ru)
+                put(weighted[4], s, wv * rv)
+                put(weighted[5], s, q * 2.0 * j2 * ru * iu * iu + turn * D_j * D_u)
+                if not em:
+                    put(weighted[6], s, q * 2.0 * j2 * rv * iv * iv + turn * D_j * D_v)
+                    put(weighted[7], s, 0.0 - turn * D_u)
+                    put(weighted[8], s, 0.0 - turn * D_v)
+                    put(weighted[9], s, p * 2.0 * ru * w + turn * D_s * D_u)
+                    put(weighted[10], s, p * 2.0 * rv * w + turn * D_s * D_v)
+                    put(weighted[11], s, zero)
                 second = 2.0 * D_j + 2.0 * j2 * j2 * (
                     (1.0 - 2.0 * eu) * iu * iu + (1.0 - 2.0 * ev) * iv * iv
                 )
-                parts[1, s], parts[2, s], parts[3, s] = q * D_j, p, -p * D_s
-                parts[4, s] = -q * second - pq * D_j * D_j
-                parts[5, s], parts[6, s] = pq * D_j, -pq * D_j * D_s
-                parts[7, s], parts[8, s] = f * (1.0 - f) - pq, pq * D_s
-                parts[9, s] = 2.0 * p * r2 * w - pq * D_s * D_s
-            for k in range(N_MIXTURE):
-                scalars[b, k] += _dot(parts[k], P[0])
-            scalars[b, 0] += log_of_product(density, n, work[0]) - n * log_unit
-            _add(columns, 6 if em else COLUMNS, P, Q, order, work, sums[b])
+                by_j, outliers, by_s = by_j + q * D_j, outliers + p, by_s - p * D_s
+                jj, jf = jj - (q * second + pq * D_j * D_j), jf + pq * D_j
+                js, pp, fs = js - pq * D_j * D_s, pp + pq, fs + pq * D_s
+                ss += 2.0 * p * r2 * w - pq * D_s * D_s
+            logs += log_of_product(density) - n * log_unit
+            add_columns(weighted, n, P, Q, lanes)
+        write_columns(lanes, sums[b])
+        scalars[b, 0] = logs - total(low)
+        scalars[b, 1] = total(by_j)
+        scalars[b, 2] = total(outliers)
+        scalars[b, 3] = total(by_s)
+        scalars[b, 4] = total(jj)
+        scalars[b, 5] = total(jf)
+        scalars[b, 6] = total(js)
+        scalars[b, 7] = (end - first) * f * (1.0 - f) - total(pp)
+        scalars[b, 8] = total(fs)
+        scalars[b, 9] = total(ss)
 
 
 def empty_sums(n_pieces: int, order: int, columns: int, scalars: int) -> tuple[Float, Float]:
@@ -293,7 +331,7 @@ def least_squares_moments(
             _least_squares,
             len(pieces),
             pieces,
-            *columns,
+            columns,
             np.concatenate([about, test], axis=1),
             order,
             rules,
@@ -333,7 +371,7 @@ def mixture_moments(
             _mixture,
             len(pieces),
             pieces,
-            *columns,
+            columns,
             np.ascontiguousarray(coef),
             order,
             packed(constants)[0],

@@ -1,8 +1,8 @@
-"""Scalar functions that the compiler turns into vector instructions.
+"""Scalar functions, of a number or of lanes.
 
-numba calls `math.exp` once for each star, which costs more than the polynomial.  Here exp is a
-branch-free polynomial, and the logarithm of a product is split into exponents, which are integers
-in the bits of a double and are added, and mantissas, which are multiplied.
+exp is a branch-free polynomial, since that of the library is called once for each star.  The
+logarithm of a product is split into exponents, which are integers in the bits of a double and are
+added, and mantissas, which are multiplied.
 """
 
 from __future__ import annotations
@@ -10,27 +10,28 @@ from __future__ import annotations
 from typing import Any
 
 import numba as nb
-from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
+
+from bayesdist.infer.kernel.lanes import Lanes, larger
 
 __all__ = ["bits_of", "exp_negative", "from_bits", "inverse_root"]
 
 
-@intrinsic
-def bits_of(typingctx: Any, x: Any) -> Any:
-    """The 64 bits of a double as an integer."""
-    return types.int64(types.float64), lambda context, builder, signature, args: builder.bitcast(
-        args[0], ir.IntType(64)
-    )
+def _same_bits(element: Any) -> Any:
+    """Intrinsic that reads the bits of a number, or of lanes, as another type."""
+
+    @intrinsic
+    def same(typingctx: Any, x: Any) -> Any:
+        def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            return builder.bitcast(values[0], context.get_value_type(signature.return_type))
+
+        return (Lanes(x.width, element) if isinstance(x, Lanes) else element)(x), build
+
+    return same
 
 
-@intrinsic
-def from_bits(typingctx: Any, x: Any) -> Any:
-    """The double with these 64 bits."""
-    return types.float64(types.int64), lambda context, builder, signature, args: builder.bitcast(
-        args[0], ir.DoubleType()
-    )
+bits_of, from_bits = _same_bits(types.int64), _same_bits(types.float64)
 
 
 LOWEST = -700.0  # exp of less is 1e-304: negligible compared with the larger branch of a mixture
@@ -40,13 +41,13 @@ LOG2_E = 1.4426950408889634
 LN2_HIGH, LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 
 
-# By LLVM, not by numba: inside a loop that may reorder its sums, adding and subtracting ROUND must
-# stay as it is. And always: a function that is called is compiled twice, and which version is used,
-# hence the last bit of a sum, would depend on whether the cache was warm.
+# Inlined by LLVM, not by numba: inside a loop that may reorder its sums, adding and subtracting
+# ROUND must stay as it is. And always: a function that is called is compiled twice, and which
+# version is used, hence the last bit of a sum, would depend on whether the cache was warm.
 @nb.njit(cache=True, forceinline=True, fastmath={"contract"})
 def exp_negative(x):
     """exp(x) for x <= 0, within two units of the last digit; below -700 as at -700."""
-    x = x if x > LOWEST else LOWEST
+    x = larger(x, LOWEST)
     shifted = x * LOG2_E + ROUND
     n = shifted - ROUND
     r = (x - n * LN2_HIGH) - n * LN2_LOW

@@ -4,59 +4,44 @@ from __future__ import annotations
 
 import numba as nb
 
-__all__ = ["horner", "legendre", "polynomial"]
+from bayesdist.infer.kernel.lanes import FAST, WIDE, load_wide, put, spread
 
-# sums of products may be fused; nothing that would change NaN or infinity
-FAST = {"contract", "nsz", "arcp"}
-
-
-@nb.njit(cache=True, forceinline=True, fastmath=FAST)
-def horner(coef, order, X, Y, n, out, inner):
-    """Sum of c_ij X^i Y^j with i + j <= order, terms sorted as `polynomial_terms`."""
-    for s in range(n):
-        out[s] = 0.0
-    for i in range(order, -1, -1):
-        c = coef[order * (order + 1) // 2 + (order - i)]
-        for s in range(n):
-            inner[s] = c
-        for j in range(order - i - 1, -1, -1):
-            total = i + j
-            c = coef[total * (total + 1) // 2 + j]
-            for s in range(n):
-                inner[s] = inner[s] * Y[s] + c
-        for s in range(n):
-            out[s] = out[s] * X[s] + inner[s]
+__all__ = ["evaluate", "legendre"]
 
 
-@nb.njit(cache=True, forceinline=True, fastmath=FAST)
-def polynomial(coef, order, x, y):
-    """Sum of c_ij x^i y^j of one star, as `horner`, for an order that the compiler knows.
+@nb.njit(cache=True, fastmath=FAST)
+def evaluate(coef, order, X, Y, n, out):
+    """Write sums of c_ij X^i Y^j with i + j <= order for both axes to out (2, BLOCK).
 
-    Its loops are then unrolled and nothing is stored between terms: a loop over stars becomes
-    vector instructions at the rate of multiply-adds.  One such loop takes one polynomial: two of
-    high order exceed what the compiler unrolls.
+    `coef` (2, K) are sorted as `polynomial_terms`; X and Y are rows of `blocks.scratch`.
     """
-    value = 0.0
-    for i in range(order, -1, -1):
-        inner = 0.0
-        for j in range(order - i, -1, -1):
-            total = i + j
-            inner = inner * y + coef[total * (total + 1) // 2 + j]
-        value = value * x + inner
-    return value
+    cu, cv, pu, pv = coef[0], coef[1], out[0], out[1]
+    for s in range(0, n, WIDE):
+        x, y = load_wide(X, s), load_wide(Y, s)
+        u = v = spread(0.0, x)
+        for i in range(order, -1, -1):
+            k = order * (order + 1) // 2 + (order - i)
+            inner_u, inner_v = spread(cu[k], x), spread(cv[k], x)
+            for j in range(order - i - 1, -1, -1):
+                k = (i + j) * (i + j + 1) // 2 + j
+                inner_u, inner_v = inner_u * y + cu[k], inner_v * y + cv[k]
+            u, v = u * x + inner_u, v * x + inner_v
+        put(pu, s, u)
+        put(pv, s, v)
 
 
-@nb.njit(cache=True, forceinline=True, fastmath=FAST)
-def legendre(X, n, top, P):
-    """P[k, s] = P_k(X[s]) for k <= top; zero beyond n."""
-    for s in range(P.shape[1]):
-        P[0, s] = 1.0
-    if top > 0:
-        for s in range(n):
-            P[1, s] = X[s]
-        for s in range(n, P.shape[1]):
-            P[1, s] = 0.0
-    for k in range(1, top):
-        a, b = (2.0 * k + 1.0) / (k + 1.0), k / (k + 1.0)
-        for s in range(P.shape[1]):
-            P[k + 1, s] = a * P[1, s] * P[k, s] - b * P[k - 1, s]
+@nb.njit(cache=True, fastmath=FAST)
+def legendre(X, Y, n, top, P, Q):
+    """P[k, s] = P_k(X[s]) for k <= top, and Q of Y; X and Y are rows of `blocks.scratch`."""
+    for s in range(0, n, WIDE):
+        x, y = load_wide(X, s), load_wide(Y, s)
+        a = b = spread(1.0, x)
+        p, q = x, y
+        put(P[0], s, a)
+        put(Q[0], s, a)
+        for k in range(1, top + 1):
+            put(P[k], s, p)
+            put(Q[k], s, q)
+            part = 1.0 / (k + 1)
+            a, p = p, x * p * (2.0 - part) - a * (1.0 - part)
+            b, q = q, y * q * (2.0 - part) - b * (1.0 - part)

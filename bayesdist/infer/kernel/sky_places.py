@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.kernel.blocks import PASS, share_out
-from bayesdist.infer.kernel.polynomial import FAST
+from bayesdist.infer.kernel.lanes import FAST
 
 __all__ = ["legendre", "linearised", "positions", "powers"]
 

@@ -27,8 +27,8 @@ import math
 import numba as nb
 import numpy as np
 
+from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.infer.kernel.numeric import exp_negative
-from bayesdist.infer.kernel.polynomial import FAST
 
 __all__ = [
     "DOUBTFUL",

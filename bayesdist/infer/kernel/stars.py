@@ -8,10 +8,10 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.kernel.blocks import BLOCK, PASS, share_out, threads_for
+from bayesdist.infer.kernel.blocks import PASS, lay_out, scratch, share_out, threads_for
 from bayesdist.infer.kernel.mixture import Constants, packed
 from bayesdist.infer.kernel.numeric import exp_negative
-from bayesdist.infer.kernel.polynomial import horner
+from bayesdist.infer.kernel.polynomial import evaluate
 
 __all__ = ["memberships", "residuals"]
 
@@ -20,17 +20,15 @@ Int = NDArray[np.int64]
 
 
 @nb.njit(**PASS)
-def _residuals(first, end, blocks, X, Y, u, v, coef, order, out):
+def _residuals(first, end, blocks, columns, coef, order, out):
+    stars, model = scratch(6), scratch(2)
     for b in range(first, end):
         g, a, e = blocks[b]
-        n = e - a
-        p, work = np.empty(BLOCK), np.empty(BLOCK)
-        horner(coef[g, 0], order, X[a:e], Y[a:e], n, p, work)
-        for s in range(n):
-            out[a + s, 0] = u[a + s] - p[s]
-        horner(coef[g, 1], order, X[a:e], Y[a:e], n, p, work)
-        for s in range(n):
-            out[a + s, 1] = v[a + s] - p[s]
+        lay_out(columns, a, e, stars)
+        evaluate(coef[g], order, stars[0], stars[1], e - a, model)
+        for s in range(e - a):
+            out[a + s, 0] = stars[2, s] - model[0, s]
+            out[a + s, 1] = stars[3, s] - model[1, s]
 
 
 def residuals(blocks: Int, columns: tuple[Float, ...], coef: Float, order: int) -> Float:
@@ -45,7 +43,7 @@ def residuals(blocks: Int, columns: tuple[Float, ...], coef: Float, order: int) 
             _residuals,
             len(blocks),
             blocks,
-            *columns[:4],
+            columns,
             np.ascontiguousarray(coef),
             order,
             out,
@@ -54,21 +52,20 @@ def residuals(blocks: Int, columns: tuple[Float, ...], coef: Float, order: int) 
 
 
 @nb.njit(**PASS)
-def _memberships(first, end, blocks, X, Y, u, v, var_u, var_v, coef, order, rows, unit2, out):
+def _memberships(first, end, blocks, columns, coef, order, rows, unit2, out):
     share = 1.0 / len(rows)
     constant = math.log(2 * math.pi * unit2)
+    stars, model = scratch(6), scratch(2)
     for b in range(first, end):
         g, a, e = blocks[b]
         n = e - a
-        pu, pv, work = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
-        for s in range(a, e):
-            out[0, s] = out[1, s] = out[2, s] = 0.0
+        lay_out(columns, a, e, stars)
+        out[:, a:e] = 0.0
         for d in range(len(rows)):
-            horner(coef[d, g, 0], order, X[a:e], Y[a:e], n, pu, work)
-            horner(coef[d, g, 1], order, X[a:e], Y[a:e], n, pv, work)
+            evaluate(coef[d, g], order, stars[0], stars[1], n, model)
             for s in range(n):
-                ru, rv = u[a + s] - pu[s], v[a + s] - pv[s]
-                iu, iv = 1.0 / (var_u[a + s] + rows[d, 0]), 1.0 / (var_v[a + s] + rows[d, 0])
+                ru, rv = stars[2, s] - model[0, s], stars[3, s] - model[1, s]
+                iu, iv = 1.0 / (stars[4, s] + rows[d, 0]), 1.0 / (stars[5, s] + rows[d, 0])
                 q_in = 0.5 * (ru * ru * iu + rv * rv * iv)
                 q_out = (ru * ru + rv * rv) * rows[d, 3] + rows[d, 4]
                 t = exp_negative(-abs(q_in - q_out))
@@ -95,7 +92,7 @@ def memberships(
             _memberships,
             len(blocks),
             blocks,
-            *columns,
+            columns,
             np.ascontiguousarray(coef),
             order,
             packed(constants),

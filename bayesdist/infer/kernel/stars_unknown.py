@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.kernel.blocks import PASS, share_out
-from bayesdist.infer.kernel.polynomial import FAST
+from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.infer.kernel.sky_places import legendre
 from bayesdist.infer.kernel.star_modes import (
     DOUBTFUL,

@@ -19,21 +19,23 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.kernel.blocks import BLOCK, PASS, share_out, threads_for
+from bayesdist.infer.kernel.blocks import BLOCK, PASS, lay_out, scratch, share_out, threads_for
 from bayesdist.infer.kernel.circle import MOST, NODES, log_circle, slopes
+from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.infer.kernel.mixture import GAUSSIAN, Constants, packed
 from bayesdist.infer.kernel.moments import (
     COLUMNS,
     N_MIXTURE,
     Moments,
-    _add,
     _by_group,
-    _dot,
+    add_columns,
+    empty_lanes,
     empty_sums,
     mixture_sums,
+    write_columns,
 )
 from bayesdist.infer.kernel.numeric import exp_negative
-from bayesdist.infer.kernel.polynomial import FAST, horner, legendre
+from bayesdist.infer.kernel.polynomial import evaluate, legendre
 
 __all__ = [
     "truncated_log_likelihood",
@@ -55,17 +57,9 @@ N_TERMS = COLUMNS + N_MIXTURE  # columns and scalars of one star
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
-def _placed(stars, coef, order, a, e, pu, pv, inner):
-    """Write the model's positions of some stars of a group to pu and pv."""
-    X, Y = stars[0][a:e], stars[1][a:e]
-    horner(coef[0], order, X, Y, e - a, pu, inner)
-    horner(coef[1], order, X, Y, e - a, pv, inner)
-
-
-@nb.njit(cache=True, forceinline=True, fastmath=FAST)
-def _residual(stars, i, pu, pv, j2):
+def _residual(stars, i, model, s, j2):
     """Residual of a star, its distance from the nominal position, and its variances."""
-    ru, rv = stars[2][i] - pu, stars[3][i] - pv
+    ru, rv = stars[2][i] - model[0, s], stars[3][i] - model[1, s]
     return ru, rv, ru + stars[6][i], rv + stars[7][i], stars[4][i] + j2, stars[5][i] + j2
 
 
@@ -97,15 +91,16 @@ def _evaluated(first, end, blocks, stars, coef, order, rows, unit2, circle, sums
     share, constant = 1.0 / n_draws, math.log(2 * math.pi * unit2)
     for b in range(first, end):
         g, a, e = blocks[b]
-        pu, pv, inner = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+        places, model = scratch(6), scratch(2)
         q, work = np.empty(MOST), np.empty(MOST)
+        lay_out(stars, a, e, places)
         if wanted:
             out[:, a:e] = 0.0
         for d in range(n_draws):
-            _placed(stars, coef[d, g], order, a, e, pu, pv, inner)
+            evaluate(coef[d, g], order, places[0], places[1], e - a, model)
             total = 0.0
             for i in range(a, e):
-                star = _residual(stars, i, pu[i - a], pv[i - a], rows[d, 0])
+                star = _residual(stars, i, model, i - a, rows[d, 0])
                 d_in, d_out, least = _parts(star, rows[d], circle, q, work)
                 value = math.log(d_in + d_out) - least
                 total += value
@@ -181,41 +176,43 @@ def _terms(star, row, circle, wavering, q, work, zc, zo, out):
 
 @nb.njit(**PASS)
 def _moments(start, stop, pieces, stars, coef, order, row, unit2, circle, em, sums, scalars):
-    top = 2 * order
+    P, Q, places, model = scratch(2 * order + 1), scratch(2 * order + 1), scratch(6), scratch(2)
+    q, work, zc, zo = np.empty(MOST), np.empty(MOST), np.empty(10), np.empty(10)
+    one, weighted = np.empty(N_TERMS), scratch(6 if em else COLUMNS)
     wavering, log_unit = 0.0 if em else 1.0, math.log(2 * math.pi * unit2)
     for b in range(start, stop):
         g, first, end = pieces[b]
-        P, Q = np.empty((top + 1, BLOCK)), np.empty((top + 1, BLOCK))
-        pu, pv, inner = np.empty(BLOCK), np.empty(BLOCK), np.empty((3, BLOCK))
-        q, work, zc, zo = np.empty(MOST), np.empty(MOST), np.empty(10), np.empty(10)
-        one, columns = np.empty(N_TERMS), np.empty((N_TERMS, BLOCK))
+        lanes = empty_lanes(order, len(weighted))
         for a in range(first, end, BLOCK):
             e = min(a + BLOCK, end)
             n = e - a
-            _placed(stars, coef[g], order, a, e, pu, pv, inner[0])
-            legendre(stars[0][a:e], n, top, P)
-            legendre(stars[1][a:e], n, top, Q)
-            columns[:] = 0.0
+            lay_out(stars, a, e, places)
+            evaluate(coef[g], order, places[0], places[1], n, model)
+            legendre(places[0], places[1], n, 2 * order, P, Q)
+            weighted[:] = 0.0
             for s in range(n):
-                star = _residual(stars, a + s, pu[s], pv[s], row[0])
+                star = _residual(stars, a + s, model, s, row[0])
                 _terms(star, row, circle, wavering, q, work, zc, zo, one)
-                columns[:, s] = one
-            for k in range(N_MIXTURE):
-                scalars[b, k] += _dot(columns[COLUMNS + k], P[0])
+                for k in range(len(weighted)):
+                    weighted[k, s] = one[k]
+                for k in range(N_MIXTURE):
+                    scalars[b, k] += one[COLUMNS + k]
             scalars[b, 0] -= n * log_unit
-            _add(columns, 6 if em else COLUMNS, P, Q, order, inner, sums[b])
+            add_columns(weighted, n, P, Q, lanes)
+        write_columns(lanes, sums[b])
 
 
 @nb.njit(**PASS)
 def _scores(first, end, blocks, stars, coef, order, row, circle, out):
     for b in range(first, end):
         g, a, e = blocks[b]
-        pu, pv, inner = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+        places, model = scratch(6), scratch(2)
         q, work, zc, zo = np.empty(MOST), np.empty(MOST), np.empty(10), np.empty(10)
         one = np.empty(N_TERMS)
-        _placed(stars, coef[g], order, a, e, pu, pv, inner)
+        lay_out(stars, a, e, places)
+        evaluate(coef[g], order, places[0], places[1], e - a, model)
         for i in range(a, e):
-            star = _residual(stars, i, pu[i - a], pv[i - a], row[0])
+            star = _residual(stars, i, model, i - a, row[0])
             _terms(star, row, circle, 1.0, q, work, zc, zo, one)
             out[0, i], out[1, i] = one[3], one[4]
             for k in range(3):

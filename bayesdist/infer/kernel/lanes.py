@@ -1,0 +1,304 @@
+"""Stars side by side in the vectors of the processor, as a number type of compiled loops.
+
+`Lanes` are as many doubles as one vector holds, or those of four vectors, and arithmetic works on
+them as on one number.  A loop over them is compiled as it is written: it does not depend on what
+the compiler finds out about arrays, and no second loop takes the stars that are left over, since
+scratch arrays have room for whole vectors (`blocks.scratch`).  Four vectors are what a chain of
+multiply-adds needs to keep the processor busy.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from llvmlite import binding, ir
+from numba import types
+from numba.core import cgutils, typing
+from numba.core.typing.templates import AbstractTemplate, infer_global
+from numba.extending import intrinsic, lower_builtin, models, register_model
+
+__all__ = [
+    "AT_MOST",
+    "FAST",
+    "ROWS",
+    "WIDE",
+    "WIDTH",
+    "Lanes",
+    "choose",
+    "first_lanes",
+    "larger",
+    "load",
+    "load_wide",
+    "product",
+    "put",
+    "smaller",
+    "spread",
+    "tile",
+    "total",
+]
+
+# sums of products may be fused; nothing that would change NaN or infinity
+FAST = {"contract", "nsz", "arcp"}
+FLAGS = tuple(sorted(FAST))
+
+HAS_512 = bool(binding.get_host_cpu_features().get("avx512f"))
+WIDTH = 8 if HAS_512 else 4
+WIDE = 4 * WIDTH
+ROWS = 3  # of a tile
+AT_MOST = 6 if HAS_512 else 4  # columns of a tile, so that its sums stay in registers
+
+Build = Callable[[Any, Any, Any, Any], Any]  # (context, builder, signature, arguments)
+
+
+class Lanes(types.Type):
+    """Type of numbers side by side."""
+
+    def __init__(self, width: int, element: Any = types.float64) -> None:
+        self.width, self.element = width, element
+        super().__init__(name=f"Lanes({width}, {element})")
+
+
+def _vector(width: int, element: Any = types.float64) -> Any:
+    one = ir.DoubleType() if element == types.float64 else ir.IntType(64)
+    return ir.VectorType(one, width)
+
+
+@register_model(Lanes)
+class _Model(models.PrimitiveModel):
+    def __init__(self, manager: Any, lanes: Lanes) -> None:
+        super().__init__(manager, lanes, _vector(lanes.width, lanes.element))
+
+
+def _order(numbers: Sequence[int]) -> Any:
+    """Operand of a shuffle."""
+    return ir.Constant(ir.VectorType(ir.IntType(32), len(numbers)), list(numbers))
+
+
+def _all_alike(builder: Any, value: Any, width: int) -> Any:
+    vector = ir.Constant(ir.VectorType(value.type, width), ir.Undefined)
+    one = builder.insert_element(vector, value, cgutils.int32_t(0))
+    return builder.shuffle_vector(one, one, _order([0] * width))
+
+
+def _as_lanes(builder: Any, signature: Any, values: Any) -> list[Any]:
+    """Operands, scalars among them in all lanes."""
+    width = signature.return_type.width
+    return [
+        value if isinstance(kind, Lanes) else _all_alike(builder, value, width)
+        for value, kind in zip(values, signature.args, strict=True)
+    ]
+
+
+# -- operators: of lanes with lanes, and with a scalar on either side ------------------------------
+
+
+def _define(operation: Callable[..., Any], on_doubles: str, on_integers: str) -> None:
+    @infer_global(operation)
+    class _Typing(AbstractTemplate):
+        def generic(self, args: Any, kws: Any) -> Any:
+            lanes = [a for a in args if isinstance(a, Lanes)]
+            if not lanes:
+                return None
+            return typing.signature(
+                lanes[0], *(a if isinstance(a, Lanes) else lanes[0].element for a in args)
+            )
+
+    def lower(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        a, b = _as_lanes(builder, signature, values)
+        if signature.return_type.element == types.float64:
+            return getattr(builder, on_doubles)(a, b, flags=FLAGS)
+        return getattr(builder, on_integers)(a, b)
+
+    for kinds in ((Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes)):
+        lower_builtin(operation, *kinds)(lower)
+
+
+_define(operator.add, "fadd", "add")
+_define(operator.iadd, "fadd", "add")
+_define(operator.sub, "fsub", "sub")
+_define(operator.mul, "fmul", "mul")
+_define(operator.truediv, "fdiv", "sdiv")
+for _operation, _name in (
+    (operator.and_, "and_"),
+    (operator.or_, "or_"),
+    (operator.lshift, "shl"),
+    (operator.rshift, "ashr"),
+):
+    _define(_operation, _name, _name)
+
+
+# -- to memory and back ----------------------------------------------------------------------------
+
+
+def _start(context: Any, builder: Any, kind: Any, array: Any) -> Any:
+    return context.make_array(kind)(context, builder, array).data
+
+
+def _lanes_at(builder: Any, start: Any, index: Any, width: int) -> Any:
+    """Pointer to `width` doubles from an index on."""
+    return builder.bitcast(builder.gep(start, [index]), _vector(width).as_pointer())
+
+
+def _loading(width: int) -> Any:
+    @intrinsic
+    def loading(typingctx: Any, array: Any, index: Any) -> Any:
+        def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            start = _start(context, builder, signature.args[0], values[0])
+            return builder.load(_lanes_at(builder, start, values[1], width), align=8)
+
+        return Lanes(width)(array, types.intp), build
+
+    return loading
+
+
+load, load_wide = _loading(WIDTH), _loading(WIDE)  # lanes from an index of an array (n,) on
+
+
+@intrinsic
+def put(typingctx: Any, array: Any, index: Any, lanes: Any) -> Any:
+    """Write lanes to an array (n,) from an index on."""
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        start = _start(context, builder, signature.args[0], values[0])
+        where = _lanes_at(builder, start, values[1], signature.args[2].width)
+        builder.store(values[2], where, align=8)
+        return context.get_dummy_value()
+
+    return types.none(array, types.intp, lanes), build
+
+
+# -- choices, on scalars as well -------------------------------------------------------------------
+
+
+def _choosing(relation: str) -> Any:
+    @intrinsic
+    def one_of_two(typingctx: Any, a: Any, b: Any) -> Any:
+        def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            if isinstance(signature.return_type, Lanes):
+                values = _as_lanes(builder, signature, values)
+            return builder.select(builder.fcmp_ordered(relation, *values), *values)
+
+        second = b if isinstance(b, Lanes) else types.float64
+        return a(a, second), build
+
+    return one_of_two
+
+
+smaller, larger = _choosing("<"), _choosing(">")  # of a and b, by lanes
+
+
+@intrinsic
+def choose(typingctx: Any, a: Any, b: Any, x: Any, y: Any) -> Any:
+    """x in lanes where a <= b, else y."""
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        a, b, x, y = _as_lanes(builder, signature, values)
+        return builder.select(builder.fcmp_ordered("<=", a, b), x, y)
+
+    lanes = next(kind for kind in (a, b, x, y) if isinstance(kind, Lanes))
+    both = [kind if isinstance(kind, Lanes) else types.float64 for kind in (a, b, x, y)]
+    return lanes(*both), build
+
+
+@intrinsic
+def first_lanes(typingctx: Any, n: Any, x: Any, y: Any) -> Any:
+    """x in the first n lanes, y in the others."""
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        n, x, y = _as_lanes(builder, signature, values)
+        width = signature.return_type.width
+        numbers = ir.Constant(_vector(width, types.int64), list(range(width)))
+        return builder.select(builder.icmp_signed("<", numbers, n), x, y)
+
+    second = y if isinstance(y, Lanes) else types.float64
+    return x(types.int64, x, second), build
+
+
+@intrinsic
+def spread(typingctx: Any, value: Any, like: Any) -> Any:
+    """One number in all lanes, of which there are as many as in `like`."""
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return _all_alike(builder, values[0], signature.return_type.width)
+
+    element = types.int64 if isinstance(value, types.Integer) else types.float64
+    return Lanes(like.width, element)(element, like), build
+
+
+# -- over all lanes --------------------------------------------------------------------------------
+
+
+def _across(on_doubles: str, on_integers: str) -> Any:
+    @intrinsic
+    def across(typingctx: Any, lanes: Any) -> Any:
+        def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            (value,), width = values, signature.args[0].width
+            name = on_doubles if signature.return_type == types.float64 else on_integers
+            while width > 1:
+                width //= 2
+                low, high = (
+                    builder.shuffle_vector(value, value, _order(range(k, k + width)))
+                    for k in (0, width)
+                )
+                value = getattr(builder, name)(low, high)
+            return builder.extract_element(value, cgutils.int32_t(0))
+
+        return lanes.element(lanes), build
+
+    return across
+
+
+total, product = _across("fadd", "add"), _across("fmul", "mul")
+
+
+def tile(columns: int, length: int) -> Any:
+    """Function that adds sums over n stars of weights times P_i Q_j, for so many j from one on.
+
+    function(n, weights, P, i, Q, j, sums): rows of the arrays have `length` numbers, and there are
+    `ROWS` weights.  Lanes of the sums are added to sums[i, j:], of shape (..., ROWS, WIDTH), and
+    stay in registers until all stars are added.
+    """
+
+    @intrinsic
+    def add(typingctx: Any, n: Any, weights: Any, P: Any, i: Any, Q: Any, j: Any, sums: Any) -> Any:
+        def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            n, *_, i, _, j, _ = values
+            kinds = signature.args
+            w_start, p_start, q_start, sums_start = (
+                _start(context, builder, kinds[k], values[k]) for k in (1, 2, 4, 6)
+            )
+
+            def whole(k: int) -> Any:
+                return context.get_constant(types.intp, k)
+
+            def lanes(start: Any, row: Any, s: Any) -> Any:
+                index = builder.add(builder.mul(row, whole(length)), s)
+                return builder.load(_lanes_at(builder, start, index, WIDTH), align=8)
+
+            zero = ir.Constant(_vector(WIDTH), [0.0] * WIDTH)
+            found = [cgutils.alloca_once_value(builder, zero) for _ in range(columns * ROWS)]
+            with cgutils.for_range_slice(builder, whole(0), n, whole(WIDTH)) as (s, _):
+                p = lanes(p_start, i, s)
+                weighted = [builder.fmul(lanes(w_start, whole(r), s), p) for r in range(ROWS)]
+                for c in range(columns):
+                    q = lanes(q_start, builder.add(j, whole(c)), s)
+                    for r in range(ROWS):
+                        one = found[c * ROWS + r]
+                        more = builder.fmul(weighted[r], q, flags=FLAGS)
+                        builder.store(builder.fadd(builder.load(one), more, flags=FLAGS), one)
+            sums_shape = context.make_array(kinds[6])(context, builder, values[6]).shape
+            wide = builder.extract_value(sums_shape, 1)
+            first = builder.mul(builder.add(builder.mul(i, wide), j), whole(ROWS * WIDTH))
+            for k, one in enumerate(found):
+                index = builder.add(first, whole(k * WIDTH))
+                where = _lanes_at(builder, sums_start, index, WIDTH)
+                before = builder.load(where, align=8)
+                builder.store(builder.fadd(before, builder.load(one)), where, align=8)
+            return context.get_dummy_value()
+
+        whole = types.intp
+        return types.none(whole, weights, P, whole, Q, whole, sums), build
+
+    return add
