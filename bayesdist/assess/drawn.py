@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -194,21 +194,35 @@ class DrawnErrors:
         scale = scale or {}
         fields = self.at(domain)
         noises = [one for f in fields for one in f.noise(scale)]
-        noise, noisy = _together(noises, domain), any(np.any(one.sigma) for one in noises)
-        drawn = [f for f in fields if isinstance(f, DrawnField)]
-
-        def error_of(rows: slice, normal: Float) -> Float:
-            out = np.zeros((rows.stop - rows.start, domain.size, 2))
-            if noisy:
-                out += noise(rows, normal)
-            for one in drawn:
-                out += one.errors(rows, scale)
-            return out
-
-        return error_of
+        noisy = any(np.any(one.sigma) for one in noises)
+        drawn = tuple(f for f in fields if isinstance(f, DrawnField))
+        return _Sum(domain.size, drawn, scale, _together(noises, domain) if noisy else None)
 
 
-def _together(noises: Sequence[Noise], domain: EvaluationDomain) -> ErrorsOf:
+@dataclass(frozen=True, eq=False)
+class _Sum:
+    """Errors at the positions of a domain, summed over all terms."""
+
+    n_positions: int
+    drawn: tuple[DrawnField, ...]
+    scale: Mapping[str, float]
+    noise: Callable[[slice, Float], Float] | None
+
+    @property
+    def noisy(self) -> bool:
+        return self.noise is not None
+
+    def __call__(self, rows: slice, normal: Float) -> Float:
+        # in memory axis by axis, as the terms evaluate their errors
+        out = np.zeros((rows.stop - rows.start, 2, self.n_positions)).swapaxes(1, 2)
+        if self.noise is not None:
+            out += self.noise(rows, normal)
+        for one in self.drawn:
+            out += one.errors(rows, self.scale)
+        return out
+
+
+def _together(noises: Sequence[Noise], domain: EvaluationDomain) -> Callable[[slice, Float], Float]:
     """All independent errors: normal numbers times the root of the sum of variances."""
     variance = sum((one.sigma**2 for one in noises), np.zeros((domain.size, 2)))
     sized = [one for one in noises if one.sizes]

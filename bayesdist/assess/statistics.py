@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +25,20 @@ _BASE = ("max", "rms", "mean", *_PERCENTILES)
 STATISTICS = (*_BASE, *(f"u_{s}" for s in _BASE), *(f"v_{s}" for s in _BASE))
 
 
-# the errors (rows, N, 2) of some draws, from standard normal ones of that shape for what is
-# independent from position to position
-ErrorsOf = Callable[[slice, Float], Float]
-
 ROWS = 16  # draws whose noise comes from one generator: so that blocks do not change it
+
+
+class ErrorsOf(Protocol):
+    """Errors of all draws at N positions."""
+
+    @property
+    def noisy(self) -> bool:
+        """True if some are independent from position to position."""
+        ...
+
+    def __call__(self, rows: slice, normal: Float) -> Float:
+        """Errors (d, N, 2) of some draws, given as many normal numbers for the noise."""
+        ...
 
 
 def field_statistic(name: str, error: Float) -> Float:
@@ -52,10 +62,18 @@ def field_statistic(name: str, error: Float) -> Float:
     """
     require_known(name, STATISTICS, "statistic")
     axis, _, base = name.rpartition("_")
+    return _of_sizes(base, _sizes(axis, error))
+
+
+def _sizes(axis: str, error: Float) -> Float:
+    """Absolute errors (..., N) of an axis, or radial ones where none is named."""
     if axis:
-        size = np.abs(error[..., "uv".index(axis)])
-    else:
-        size = np.sqrt(error[..., 0] ** 2 + error[..., 1] ** 2)  # a fifth of the time of `hypot`
+        return np.abs(error[..., "uv".index(axis)])
+    return np.sqrt(error[..., 0] ** 2 + error[..., 1] ** 2)  # a fifth of the time of `hypot`
+
+
+def _of_sizes(base: str, size: Float) -> Float:
+    """A statistic of `_BASE` over the last axis."""
     if base == "max":
         return size.max(axis=-1)
     if base == "mean":
@@ -101,18 +119,24 @@ def drawn_statistics(
     width = max(n_positions, 0 if pairs is None else pairs.shape[1])
     step = ROWS * max(1, block // (ROWS * width))
 
-    def one(name: str, error: Float, seen: Float) -> Float:
-        if over_all and name.endswith("max"):
-            return extent(name, error)
-        return field_statistic(name, seen)
+    noisy = any(error_of.noisy for error_of in errors)
+    by_axis = [tuple(name.rpartition("_")[::2]) for name in names]
 
     def found(start: int) -> list[list[Float]]:
-        rows = slice(start, min(start + step, n_draws))
-        noise, out = _noise(seed, rows, n_positions), []
+        rows, out = slice(start, min(start + step, n_draws)), []
+        noise = _noise(seed, rows, n_positions) if noisy else np.zeros(1)
         for error_of in errors:
             error = error_of(rows, noise)
             seen = error if pairs is None else error[:, pairs[0]] - error[:, pairs[1]]
-            out.append([one(name, error, seen) for name in names])
+            sizes = {axis: _sizes(axis, seen) for axis, _ in by_axis}
+            out.append(
+                [
+                    extent(name, error)
+                    if over_all and base == "max"
+                    else _of_sizes(base, sizes[axis])
+                    for name, (axis, base) in zip(names, by_axis, strict=True)
+                ]
+            )
         return out
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:

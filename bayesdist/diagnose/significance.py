@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import beta, chi2
+
+from bayesdist.distributions import beta_ppf, beta_sf, chi2_isf
 
 __all__ = ["chi_square_of", "clopper_pearson", "holm", "hotelling_p"]
 
@@ -34,12 +35,12 @@ def hotelling_p(statistic: float, dof: float, n: float) -> float:
     `dof` is the number of directions, `n` that of stars, or other vectors that are independent of
     each other.
     """
-    return float(beta.sf(min(statistic / n, 1.0), dof / 2, max(n - dof, 1) / 2))
+    return float(beta_sf(min(statistic / n, 1.0), dof / 2, max(n - dof, 1) / 2))
 
 
 def chi_square_of(p: float, dof: float) -> float:
     """Chi-square of a probability, for sums of tests that have other distributions."""
-    return float(chi2.isf(max(p, MIN_P), dof))
+    return float(chi2_isf(max(p, MIN_P), dof))
 
 
 def clopper_pearson(fraction: float, n: float, confidence: float) -> tuple[float, float]:
@@ -49,6 +50,6 @@ def clopper_pearson(fraction: float, n: float, confidence: float) -> tuple[float
     neither the trials nor the successes need be whole.
     """
     tail, k = (1.0 - confidence) / 2.0, fraction * n
-    low = float(beta.ppf(tail, k, n - k + 1.0)) if k > 0 else 0.0
-    high = float(beta.ppf(1.0 - tail, k + 1.0, n - k)) if k < n else 1.0
+    low = float(beta_ppf(tail, k, n - k + 1.0)) if k > 0 else 0.0
+    high = float(beta_ppf(1.0 - tail, k + 1.0, n - k)) if k < n else 1.0
     return low, high

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2
 
 from bayesdist.checks import EITHER, Check, level_of
+from bayesdist.distributions import chi2_cdf
 from bayesdist.infer.convergence import Convergence
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.posterior import Posterior
@@ -28,7 +28,7 @@ FIT, SAMPLING = "Fit", "Sampling"
 
 def scatter_too_small(total: float, dof: float) -> bool:
     """True if residuals with this chi-square scatter less than their quoted errors."""
-    by_chance = float(chi2.cdf(total, max(dof, 1)))
+    by_chance = float(chi2_cdf(total, max(dof, 1)))
     return total < CHI2_TOO_SMALL.value * dof and by_chance < CHI2_TOO_SMALL_CHANCE.value
 
 

@@ -75,7 +75,7 @@ STAGES = {
     "match": Stage(),
     "fit": Stage(),
     "sample": Stage(checkpoints=("chain-*.h5",)),
-    "diagnose": Stage(),
+    "diagnose": Stage(revision=2),
     "evaluate": Stage(revision=2),
     "export": Stage(),
     "report": Stage(),

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import f as fisher
 
 from bayesdist.assess.comparison.compare import Comparison, compare
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.diagnose.residuals.misfit import Misfit
+from bayesdist.distributions import f_sf
 from bayesdist.infer.compare.change_date import ChangeDate
 from bayesdist.infer.compare.monitoring import Change
 from bayesdist.limits import DIFFERENCE
@@ -56,7 +56,7 @@ class Monitored:
     def _judged(self, chi2: float, dof: int, p: float) -> float:
         if not self.scatters or self.date is None:
             return p
-        return float(fisher.sf(chi2 / dof / self.date.scatter, dof, self.date.scatter_dof))
+        return float(f_sf(chi2 / dof / self.date.scatter, dof, self.date.scatter_dof))
 
     @property
     def p_either(self) -> float:

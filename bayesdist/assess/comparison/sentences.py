@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import norm
 
 from bayesdist.assess.comparison.compare import Comparison, comparison_table
 from bayesdist.assess.comparison.gap import GapDifference
+from bayesdist.distributions import norm_sf
 from bayesdist.limits import DIFFERENCE
 from bayesdist.numbers import p_words
 
@@ -85,7 +85,7 @@ def _singly(found: Comparison) -> str:
         return "no coefficient can be tested"
     k = int(np.nanargmax(z))
     row = table[k]
-    p = min(1.0, tested * 2 * float(norm.sf(z[k])))  # Bonferroni: correlations are not known
+    p = min(1.0, tested * 2 * float(norm_sf(z[k])))  # Bonferroni: correlations are not known
     return (
         f"most significant of {tested} coefficients: x^{row['i']} y^{row['j']} of {row['axis']}, "
         f"{z[k]:.3g} sigma, {_share(p)} for the largest of so many"

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import beta
 
 from bayesdist.assess.checks import visits_of
 from bayesdist.checks import LARGER, Check, doubts_of
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.significance import clopper_pearson
+from bayesdist.distributions import beta_std
 from bayesdist.limits import CONFIDENCE
 from bayesdist.model import DistortionModel
 from bayesdist.numbers import count
@@ -25,7 +25,7 @@ Float = NDArray[np.float64]
 def counting_error(fraction: float, n: float) -> float:
     """Standard deviation of a probability counted in n draws, under Jeffreys' prior: never zero."""
     k = fraction * n
-    return float(beta.std(k + 0.5, n - k + 0.5))
+    return beta_std(k + 0.5, n - k + 0.5)
 
 
 def verdict_of(

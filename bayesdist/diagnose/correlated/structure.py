@@ -13,12 +13,12 @@ shows in neighbouring stars (`SharedVariance`), whose likelihood is a factor.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions
@@ -41,31 +41,76 @@ UNLIKE = 0.2  # prior probability that the field differs on the two axes, by abo
 
 
 @dataclass(frozen=True, eq=False)
+class _Field:
+    """What the data say along one axis of a field of one length, before its amplitude is known.
+
+    The sines are seen along the eigenvectors of the information of coefficients that have unit
+    variance where the field has: these serve every amplitude.
+    """
+
+    root: Float  # (n_sines,) standard deviations of the coefficients in a field of unit variance
+    values: Float  # eigenvalues of the sines' information
+    vectors: Float  # eigenvectors of the same
+    score: Float  # of the sines, along these
+    tied: Float  # (n_sines, T), likewise the coupling of the sines to the terms
+    terms: Float  # information (T, T) of the terms
+    terms_score: Float
+
+    @classmethod
+    def of(cls, functions: StructureFunctions, length: float, S: Float, s: Float) -> _Field:
+        """From information and score of terms and sines."""
+        T, scale = functions.n_terms, functions.decline()
+        root = np.sqrt(functions.spectrum(length))
+        values, vectors = np.linalg.eigh(S[T:, T:] * np.outer(root, root))
+        along = vectors.T * root
+        return cls(
+            root,
+            np.maximum(values, 0.0),
+            vectors,
+            along @ s[T:],
+            along @ S[T:, :T] * scale,
+            S[:T, :T] * np.outer(scale, scale),
+            s[:T] * scale,
+        )
+
+    def at(self, amplitude: float) -> _Axis:
+        """The likelihood for an amplitude."""
+        variance = 1 / (self.values + amplitude**-2)
+        weighted = self.tied.T * variance
+        values, vectors = np.linalg.eigh(self.terms - weighted @ self.tied)
+        along = vectors.T @ (self.terms_score - weighted @ self.score)
+        return _Axis(self, amplitude, variance, np.maximum(values, 0.0), vectors, along)
+
+
+@dataclass(frozen=True, eq=False)
 class _Axis:
     """Likelihood along one axis, given length and amplitude of the field."""
 
-    factor: Float  # lower Cholesky factor of the sines' precision
-    right: Float  # its inverse times the sines' score
-    tied: Float  # its inverse times the coupling of the sines to the terms
+    field: _Field
+    amplitude: float
+    variance: Float  # of the sines along their eigenvectors, given the terms
     values: Float  # eigenvalues of the terms' information without the sines
     vectors: Float  # eigenvectors of the same
     score: Float  # of the terms, along these
 
     def log_evidence(self, amplitudes: Float) -> Float:
-        """Log evidence by the amplitude of the terms, without the part of the sines' spectrum."""
-        out = 0.5 * self.right @ self.right - np.log(np.diag(self.factor)).sum()
+        """Log evidence by the amplitude of the terms."""
+        out = 0.5 * self.variance @ self.field.score**2
+        out -= 0.5 * np.log1p(self.field.values * self.amplitude**2).sum()
         out += 0.5 * (self.score**2 / (self.values + amplitudes[:, None] ** -2)).sum(axis=1)
         return np.asarray(out - 0.5 * np.log1p(self.values * amplitudes[:, None] ** 2).sum(axis=1))
 
     def draws(self, amplitude: Float, rng: np.random.Generator) -> tuple[Float, Float]:
         """Terms (m, T) and sines (m, n_sines), given amplitudes (m,) of the terms."""
         precision = self.values + amplitude[:, None] ** -2
-        # noise through the symmetric root, which signs and order of eigenvectors do not change
+        # noise through symmetric roots, which signs and order of eigenvectors do not change
         noise = rng.standard_normal((len(precision), len(self.values))) @ self.vectors
         terms = (self.score / precision + noise / np.sqrt(precision)) @ self.vectors.T
-        right = self.right[:, None] - self.tied @ terms.T
-        right += rng.standard_normal(right.shape)
-        return terms, _solve(self.factor, right, trans=1).T
+        field = self.field
+        noise = rng.standard_normal((len(precision), len(field.values))) @ field.vectors
+        along = self.variance * (field.score - terms @ field.tied.T)
+        along += np.sqrt(self.variance) * noise
+        return terms, (along @ field.vectors.T) * field.root
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,61 +180,28 @@ def chip_structure(
     prior medians of the amplitudes, in the unit of the positions.
     """
     T = functions.n_terms
-    scale = functions.decline()
     best_known = max((np.diag(S)[:T] for S in information), key=np.median)
     amplitudes = AmplitudeGrid.of(
         best_known, noise=noise, higher_order=higher_order, structure=structure
     )
-    prior = amplitudes.log_prior
-
-    def axis_at(S: Float, s: Float, variance: Float) -> _Axis:
-        matrix = S[T:, T:] + np.diag(1 / variance)
-        factor = scipy.linalg.cholesky(matrix, lower=True, check_finite=False)
-        solved = _solve(factor, np.column_stack([s[T:], S[T:, :T] * scale]))
-        right, tied = solved[:, 0], solved[:, 1:]
-        values, vectors = np.linalg.eigh(S[:T, :T] * np.outer(scale, scale) - tied.T @ tied)
-        along = vectors.T @ (s[:T] * scale - tied.T @ right)
-        return _Axis(factor, right, tied, np.maximum(values, 0.0), vectors, along)
-
-    def at(length: float, log_amplitude: float) -> _Sized:
-        amplitude = float(np.exp(log_amplitude))
-        variance = amplitude**2 * functions.spectrum(length)
-        axes, evidence = [], []
-        for S, s, known in zip(information, score, shared[length], strict=True):
-            axes.append(axis_at(S, s, variance))
-            found = axes[-1].log_evidence(amplitudes.terms) - 0.5 * np.log(variance).sum()
-            evidence.append(found if known is None else found + known(amplitude))
-        return _Sized(amplitude, (axes[0], axes[1]), np.stack(evidence))
-
-    shared = {
-        length: [None if p is None else p.of_field(length) for p in pairs] for length in LENGTHS
-    }
-    points, log_weight = list[_Point](), list[Float]()
+    by_length = list[tuple[float, list[_Sized], Float]]()
     for length in LENGTHS:
-        grid = list(np.linspace(np.log(amplitudes.low), np.log(amplitudes.high), STEPS))
-        sized = [at(length, a) for a in grid]
-        for _ in range(HALVINGS):
-            tops = np.array([(prior + one.views).max(axis=1) for one in sized])
-            tops += log_half_cauchy(np.exp(grid), structure)[:, None]
-            best = tops.max(axis=0)  # of this length: a peak may lie between two points
-            # axis by axis only where they may differ
-            views = (0, 1, 2) if best[1] + best[2] > best[0] + prior.max() + CHANGE else (0,)
-            middles = set[float]()
-            for k in views:
-                middles.update(_middles(grid, tops[:, k].tolist(), float(best[k])))
-            if not middles:
-                break
-            sized += [at(length, a) for a in middles]
-            grid += middles
-            order = np.argsort(grid)
-            grid, sized = [grid[k] for k in order], [sized[k] for k in order]
-        for point, density in _combined(length, grid, sized, structure):
-            points.append(point)
-            log_weight.append(prior + density)
-    every = np.array(log_weight)
-    likely = every.max(axis=1) > every.max() - NEGLIGIBLE
-    weight = np.exp(every[likely] - every.max())
-    points = [p for p, k in zip(points, likely, strict=True) if k]
+        fields = [
+            _Field.of(functions, length, S, s) for S, s in zip(information, score, strict=True)
+        ]
+        shared = [None if p is None else p.of_field(length) for p in pairs]
+        sized = _refined(
+            partial(_Sized.of, fields, shared, amplitudes.terms), amplitudes, structure
+        )
+        by_length.append((length, sized, amplitudes.log_prior + _density(sized, structure)))
+    largest = max(density.max() for _, _, density in by_length)
+    points, log_weight = list[_Point](), list[Float]()
+    for length, sized, density in by_length:
+        for i, j in np.argwhere(density.max(axis=2) > largest - NEGLIGIBLE):
+            u, v = sized[i], sized[j]
+            points.append(_Point(length, (u.amplitude, v.amplitude), (u.axes[0], v.axes[1])))
+            log_weight.append(density[i, j] - largest)
+    weight = np.exp(log_weight)
     return Structure(functions, amplitudes.terms, tuple(points), weight / weight.sum())
 
 
@@ -201,27 +213,62 @@ class _Sized:
     axes: tuple[_Axis, _Axis]
     evidence: Float
 
+    @classmethod
+    def of(
+        cls,
+        fields: Sequence[_Field],
+        shared: Sequence[Callable[[float], float] | None],
+        of_terms: Float,
+        log_amplitude: float,
+    ) -> _Sized:
+        """By the fields on both axes, the evidence of neighbours, and amplitudes of the terms."""
+        amplitude = float(np.exp(log_amplitude))
+        u, v = (field.at(amplitude) for field in fields)
+        near = [0.0 if known is None else known(amplitude) for known in shared]
+        evidence = [one.log_evidence(of_terms) + k for one, k in zip((u, v), near, strict=True)]
+        return cls(amplitude, (u, v), np.stack(evidence))
+
     @property
     def views(self) -> Float:
         """Evidence (3, TERM_STEPS) of both axes together, and of each."""
         return np.stack([self.evidence.sum(axis=0), *self.evidence])
 
 
-def _combined(
-    length: float, grid: Sequence[float], sized: Sequence[_Sized], median: float
-) -> Iterator[tuple[_Point, Float]]:
-    """Amplitudes of the field on both axes, and the density of each for all of the terms."""
-    width = log_widths(np.exp(grid))
-    for i, u in enumerate(sized):
-        for j, v in enumerate(sized):
-            both = (u.amplitude, v.amplitude)
-            density = float(log_half_cauchy(np.sqrt(np.mean(np.square(both))), median)) + width[i]
-            if i == j:
-                density += np.log(1 - UNLIKE)
-            else:
-                density += np.log(UNLIKE / 2) - abs(grid[i] - grid[j]) + width[j]
-            point = _Point(length, both, (u.axes[0], v.axes[1]))
-            yield point, density + u.evidence[0] + v.evidence[1]
+def _refined(
+    at: Callable[[float], _Sized], amplitudes: AmplitudeGrid, median: float
+) -> list[_Sized]:
+    """Ascending amplitudes of the field, denser where the density changes."""
+    prior = amplitudes.log_prior
+    grid = list(np.linspace(np.log(amplitudes.low), np.log(amplitudes.high), STEPS))
+    sized = [at(a) for a in grid]
+    for _ in range(HALVINGS):
+        tops = np.array([(prior + one.views).max(axis=1) for one in sized])
+        tops += log_half_cauchy(np.exp(grid), median)[:, None]
+        best = tops.max(axis=0)  # of this length: a peak may lie between two points
+        # axis by axis only where they may differ
+        views = (0, 1, 2) if best[1] + best[2] > best[0] + prior.max() + CHANGE else (0,)
+        middles = set[float]()
+        for k in views:
+            middles.update(_middles(grid, tops[:, k].tolist(), float(best[k])))
+        if not middles:
+            break
+        sized += [at(a) for a in middles]
+        grid += middles
+        order = np.argsort(grid)
+        grid, sized = [grid[k] for k in order], [sized[k] for k in order]
+    return sized
+
+
+def _density(sized: Sequence[_Sized], median: float) -> Float:
+    """Log density (n, n, TERM_STEPS) of amplitudes of the field on u and on v, and of the terms."""
+    amplitude = np.array([one.amplitude for one in sized])
+    u, v = (np.stack([one.evidence[axis] for one in sized]) for axis in (0, 1))
+    width, both = log_widths(amplitude), np.add.outer(amplitude**2, amplitude**2) / 2
+    apart = np.abs(np.subtract.outer(np.log(amplitude), np.log(amplitude)))
+    differ = np.log(UNLIKE / 2) - apart + width
+    np.fill_diagonal(differ, np.log(1 - UNLIKE))
+    density = log_half_cauchy(np.sqrt(both), median) + width[:, None] + differ
+    return np.asarray(density[..., None] + u[:, None] + v)
 
 
 def _middles(grid: Sequence[float], tops: Sequence[float], best: float) -> list[float]:
@@ -234,9 +281,3 @@ def _middles(grid: Sequence[float], tops: Sequence[float], best: float) -> list[
         if changes or (top > best - NEAR_TOP and b - a > WIDEST):
             out.append(0.5 * (a + b))
     return out
-
-
-def _solve(factor: Float, right: Float, trans: int = 0) -> Float:
-    return np.asarray(
-        scipy.linalg.solve_triangular(factor, right, trans=trans, lower=True, check_finite=False)
-    )

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import gamma, norm
 
 from bayesdist.diagnose.holdout.predictive import SCALES, Predictive
+from bayesdist.distributions import gamma_cdf, gamma_sf, norm_sf
 
 __all__ = ["SpreadMoments", "scale_of", "sum_tails"]
 
@@ -80,10 +80,10 @@ def sum_tails(value: float, variance: float, third: float) -> float:
     z = value / np.sqrt(variance)
     skew = third / variance**1.5
     if abs(skew) < MIN_SKEW:
-        return float(2 * norm.sf(abs(z)))
+        return float(2 * norm_sf(abs(z)))
     shape = 4 / skew**2
     x = shape + np.sign(skew) * z * np.sqrt(shape)
-    below, above = gamma.cdf(x, shape), gamma.sf(x, shape)
+    below, above = float(gamma_cdf(x, shape)), float(gamma_sf(x, shape))
     return float(min(1.0, 2 * min(below, above)))
 
 

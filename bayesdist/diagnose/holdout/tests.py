@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betainc, erf
-from scipy.stats import chi2, norm
 
 from bayesdist.diagnose.holdout.bins import ALL, Partition
 from bayesdist.diagnose.holdout.frames import Frame
@@ -21,6 +20,7 @@ from bayesdist.diagnose.holdout.grouped import ScaleSums
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.sums import LEVELS, PIT_BINS, STEP, TAILS, BinSums, HeldSums
 from bayesdist.diagnose.significance import clopper_pearson, hotelling_p
+from bayesdist.distributions import chi2_sf, norm_sf
 from bayesdist.limits import HELD_OUT_DISTRIBUTION, HELD_OUT_RATIO, HELD_OUT_TAILS
 
 __all__ = ["AXIS", "AxisCoverage", "HeldTest", "all_tests", "axis_coverage", "deviation_tests"]
@@ -143,7 +143,7 @@ def _offsets(
         along = vectors.T @ (found.place.sums[rows] / root)
         known = values > SINGULAR
         t, dof = float((along[known] ** 2 / values[known]).sum()), int(known.sum())
-        p = float(chi2.sf(t, dof))
+        p = float(chi2_sf(t, dof))
         if sums.shared is not None:
             p = hotelling_p(t, dof, sums.shared.n_stars)
         worst = min(out, key=lambda one: (one.p_value, -one.value))
@@ -200,7 +200,7 @@ def _distributions(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
         cov += counts.covariance(predictive, sums.frames, mixture=True)
         rest = counts.sums[:-1]
         t = float(rest @ np.linalg.solve(cov[:-1, :-1], rest))
-        p = float(chi2.sf(t, m - 1))
+        p = float(chi2_sf(t, m - 1))
         if shared is not None and shared.stars_repeat:
             p = hotelling_p(t, m - 1, n)
         below = np.cumsum(sums.pit[k].sums) / sums.n
@@ -282,7 +282,7 @@ def deviation_tests(predictive: Predictive, frames: Mapping[str, Frame]) -> list
             # without what its own prior has said
             b = frame.values[k] / taken[k]
             v = frame.spent[k, k] / taken[k] + extra[k] / taken[k] ** 2
-            p = float(np.mean(2 * norm.sf(abs(b) / np.sqrt(tau**2 + v))))
+            p = float(np.mean(2 * norm_sf(abs(b) / np.sqrt(tau**2 + v))))
             where = f"the {kind.replace('_', ' ')} of exposure {name}, held out whole"
             scatter = float(np.sqrt(np.mean(tau**2)))
             out.append(

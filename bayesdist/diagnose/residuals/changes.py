@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
 from bayesdist.diagnose.residuals.binned import BAND_AXES, BinnedSums, BinValues
+from bayesdist.distributions import chi2_isf, chi2_sf, f_sf
 from bayesdist.errors import DegenerateError
 
 __all__ = ["PatternChange", "pattern_changes"]
@@ -75,5 +74,5 @@ def _change(period: str, axis: str, one: BinValues, rest: BinValues) -> PatternC
 
 def _p_value(t2: Float, dof: Float) -> float:
     """Probability of larger squared t variables (n,), each by its normal variable."""
-    z2 = chi2.isf(f_distribution.sf(t2, 1, dof), 1)
-    return float(chi2.sf(z2.sum(), z2.size))
+    z2 = chi2_isf(f_sf(t2, 1, dof), 1)
+    return float(chi2_sf(z2.sum(), z2.size))

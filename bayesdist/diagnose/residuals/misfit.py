@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, BinnedSums
+from bayesdist.distributions import chi2_sf
 from bayesdist.limits import STRUCTURE, STRUCTURE_SEEN
 from bayesdist.model import Chip
 from bayesdist.model.basis import polynomial_terms
@@ -184,7 +184,7 @@ def _test(cells: BinnedResiduals, absorbed: float) -> tuple[float, float]:
     sem = np.stack([cells.sem_u[good], cells.sem_v[good]]) / shrink
     total = float(((mean / sem) ** 2).sum())
     dof = max(mean.size - absorbed * n.size / cells.count.size, 1.0)
-    p = float(chi2.sf(total, dof))
+    p = float(chi2_sf(total, dof))
     excess = (mean**2 - sem**2).sum(axis=0).mean() if n.size else 0.0
     if excess <= 0 and not STRUCTURE.met_by(p):  # hidden by the noisiest cells: by its precision
         excess = 2 * (total - dof) / (1 / sem**2).sum()

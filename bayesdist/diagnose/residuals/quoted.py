@@ -7,9 +7,9 @@ single stars would be lost beside it, so all of them are multiplied by what the 
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2
 
 from bayesdist.data.matches import Matches
+from bayesdist.distributions import chi2_ppf
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.stars.stars import prepare
@@ -30,7 +30,7 @@ def error_scale(fit: LinearFit, table: Matches) -> float:
     stars, _ = prepare(fit.model, table)
     r = stars.residuals(np.asarray(fit.mean))
     found = np.quantile(r[:, 0] ** 2 / stars.var_u + r[:, 1] ** 2 / stars.var_v, LOW_QUANTILE)
-    factor = float(np.sqrt(found / chi2.ppf(LOW_QUANTILE, 2)))
+    factor = float(np.sqrt(found / chi2_ppf(LOW_QUANTILE, 2)))
     return 1.0 if QUOTED_ERRORS.met_by(factor) else factor
 
 

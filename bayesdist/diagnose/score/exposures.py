@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.linalg import cho_solve
 
 from bayesdist.diagnose.clusters import add_over, sums_over
@@ -28,6 +27,7 @@ from bayesdist.diagnose.score.projection import (
 from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import Block
 from bayesdist.diagnose.significance import chi_square_of, hotelling_p
+from bayesdist.distributions import chi2_sf
 from bayesdist.model.frames import LINEAR_MATRICES, frame_names
 
 __all__ = ["EXPOSURES", "exposure_test"]
@@ -153,7 +153,7 @@ def exposure_test(projection: Projection) -> Outcome | None:
         T,
         dof,
         None,
-        float(stats.chi2.sf(T, dof)),
+        float(chi2_sf(T, dof)),
         square=square,
         noise=noise,
         unit=model.unit,

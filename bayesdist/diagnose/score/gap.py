@@ -22,12 +22,12 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.projection import Projection
 from bayesdist.diagnose.score.result import Family, Outcome, outcome, smallest_pattern
 from bayesdist.diagnose.score.sample import Block
+from bayesdist.distributions import f_sf
 from bayesdist.model.frames import DEVIATIONS, LINEAR_MATRICES, RIGID, frame_names
 
 __all__ = ["gap_test", "visit_codes"]
@@ -76,7 +76,7 @@ class _Line:
     @property
     def p_value(self) -> float:
         """Probability of a larger statistic, of this line by itself."""
-        return float(stats.f.sf(self.statistic, 1, self.free))
+        return float(f_sf(self.statistic, 1, self.free))
 
 
 def gap_test(projection: Projection) -> Outcome | None:

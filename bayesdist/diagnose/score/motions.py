@@ -18,11 +18,11 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.score.result import Family, Outcome, noncentrality, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
+from bayesdist.distributions import t_sf
 
 __all__ = ["MOTIONS", "StarResiduals", "motion_outcome", "motion_test"]
 
@@ -148,7 +148,7 @@ def _above_zero(values: Float) -> tuple[float, float]:
     n, mean, s = len(values), float(values.mean()), float(values.std(ddof=1))
     skew = float(((values - mean) ** 3).mean())
     t = (mean + skew / (6 * s**2 * n) + skew * mean**2 / (3 * s**4)) * np.sqrt(n) / s
-    return t, float(stats.t.sf(t, n - 1))
+    return t, float(t_sf(t, n - 1))
 
 
 def _smallest(unit_square: float, own: float, variance: float, n: int, level: float) -> float:

@@ -13,12 +13,12 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.result import Family, Outcome, outcome, smallest_pattern
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.significance import hotelling_p
+from bayesdist.distributions import chi2_sf
 from bayesdist.model.grid import cell_index
 
 __all__ = ["noise_tests"]
@@ -184,7 +184,7 @@ def _by_part(squares: _Squares, family: Family, code: Int) -> Outcome | None:
         T,
         m - 1,
         None,
-        float(stats.chi2.sf(T, m - 1)),
+        float(chi2_sf(T, m - 1)),
         square=float(np.average(step**2, weights=n)),
         noise=noise,
         unit=squares.unit,

@@ -18,7 +18,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.linalg import block_diag
 
 from bayesdist.diagnose.clusters import add_over
@@ -33,6 +32,7 @@ from bayesdist.diagnose.score.regressors import Regressors, one_of_each
 from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import Block
 from bayesdist.diagnose.significance import chi_square_of
+from bayesdist.distributions import chi2_sf, f_sf
 
 __all__ = ["regressor_tests"]
 
@@ -85,7 +85,7 @@ def _outcome(projection: Projection, family: Family, parts: Sequence[_Part]) -> 
     p = parts[0].p_value
     if len(parts) > 1:
         T = sum(chi_square_of(one.p_value, one.dof) for one in parts)
-        residual, p = None, float(stats.chi2.sf(T, dof))
+        residual, p = None, float(chi2_sf(T, dof))
     return outcome(
         family,
         T,
@@ -115,7 +115,7 @@ def _parts_of(projection: Projection, chips: list[int]) -> Iterator[tuple[Regres
         dof_residual = float(np.clip(found, MIN_DOF, quoted))
         dof = dof_residual + one.q - 1
         T = dof_residual / dof * float(one.score @ np.linalg.solve(V, one.score))
-        p = float(stats.f.sf(T / one.q, one.q, dof_residual))
+        p = float(f_sf(T / one.q, one.q, dof_residual))
         square = np.repeat(projection.functions.mean_square[one.regressors.every], 2)
         Q = (one.basis.T * np.tile(square, len(chips)) / len(chips)) @ one.basis
         squares = squares_of(one.score, np.eye(one.q), V, Q)

@@ -8,9 +8,10 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from bayesdist.diagnose.significance import holm
+from bayesdist.distributions import chi2_isf, f_isf
 from bayesdist.limits import SCORE_TESTS
 from bayesdist.numbers import p_words
 
@@ -211,8 +212,8 @@ def noncentrality(level: float, dof: float, dof_residual: float | None = None) -
     `dof_residual` is that of an F test.
     """
     if dof_residual is None or dof_residual > 1e5:  # where F and chi-square are alike
-        return float(special.chndtrinc(stats.chi2.isf(level, dof), dof, 1 - POWER))
-    limit = stats.f.isf(level, dof, dof_residual)
+        return float(special.chndtrinc(chi2_isf(level, dof), dof, 1 - POWER))
+    limit = f_isf(level, dof, dof_residual)
     return float(special.ncfdtrinc(dof, dof_residual, 1 - POWER, limit))
 
 

@@ -19,10 +19,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from scipy.stats import f as f_distribution
 
 from bayesdist.diagnose.residuals.misfit import Misfit, bin_means, partitions_for, worst_misfit
 from bayesdist.diagnose.selfcal.scores import StarBlock, star_blocks
+from bayesdist.distributions import f_sf
 from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.basis import polynomial_terms
@@ -157,5 +157,5 @@ def _test(shifts: _Shifts, fields: Float) -> _Test:
     square = (vectors @ (along / values)) ** 2
     noise = rest * np.einsum("kn,n->k", vectors**2, 1 / values)
     excess = 2 * float(np.sum(square - noise) / np.sum(weight))  # both axes together
-    p = float(f_distribution.sf(explained / k / rest, k, left)) if rest > 0 else 1.0
+    p = float(f_sf(explained / k / rest, k, left)) if rest > 0 else 1.0
     return _Test(p, float(np.sqrt(max(excess, 0.0))), k, free.shape[1])

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm, truncnorm
+from scipy.special import log_ndtr
 
 from bayesdist.diagnose.clusters import squares_over, sums_over
 from bayesdist.errors import DegenerateError
@@ -275,6 +275,8 @@ class MeanSquare:
 
     def relative_draws(self, n: int, rng: np.random.Generator) -> Float:
         """Draws (n, 2) of the mean squares relative to their mean."""
+        from scipy.stats import truncnorm  # a second, and few runs have tables
+
         mean, variance = self._moments
         out = np.ones((n, 2))
         for axis in np.flatnonzero(variance > 0):
@@ -289,7 +291,7 @@ class MeanSquare:
         error = np.where(exact, 1.0, self.error)
         z = self.measured / error
         # density over probability, in logarithms: z is far below zero where errors are too small
-        ratio = np.exp(norm.logpdf(z) - norm.logcdf(z))
+        ratio = np.exp(-(z**2) / 2 - log_ndtr(z)) / np.sqrt(2 * np.pi)
         mean = np.where(exact, np.maximum(self.measured, 0.0), error * (z + ratio))
         variance = error**2 * np.maximum(1 - ratio * (z + ratio), 0.0)
         return mean, np.where(exact, 0.0, variance)

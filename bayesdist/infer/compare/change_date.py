@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space
-from scipy.stats import chi2 as chi_square
 
 from bayesdist.data.matches import Matches
+from bayesdist.distributions import chi2_sf
 from bayesdist.infer.compare.frame_fields import mean_squares, without
 from bayesdist.infer.compare.monitoring import Change, NewFit
 from bayesdist.infer.equations.normal import NormalEquations, mixture
@@ -199,11 +199,11 @@ def scan_dates(scores: tuple[PeriodScore, ...], change: Change) -> ChangeDate:
         interval=(float(starts[inside].min()), float(ends[inside].max())),
         gain=gain,
         dof=int(dofs[best]),
-        p_value=min(1.0, len(gain) * float(chi_square.sf(gain[best], dofs[best]))),
+        p_value=min(1.0, len(gain) * float(chi2_sf(gain[best], dofs[best]))),
         change=_from_then_on(change, *ahead[best], free),
         scatter=chi2 / dof if dof > 0 else 1.0,
         scatter_dof=dof,
-        p_scatter=float(chi_square.sf(chi2, dof)) if dof > 0 else 1.0,
+        p_scatter=float(chi2_sf(chi2, dof)) if dof > 0 else 1.0,
     )
 
 

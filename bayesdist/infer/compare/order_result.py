@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
+from bayesdist.distributions import chi2_sf, f_sf, norm_sf
 from bayesdist.numbers import p_words
 
 __all__ = ["HeldOutOrders", "OrderSelection", "OrderSurfaces"]
@@ -17,7 +17,7 @@ __all__ = ["HeldOutOrders", "OrderSelection", "OrderSurfaces"]
 Float = NDArray[np.float64]
 
 CLEAR = 3.0  # standard errors from which on a higher order counts as better
-CLEAR_P = float(stats.norm.sf(CLEAR))
+CLEAR_P = float(norm_sf(CLEAR))
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class OrderSurfaces:
 
     def p_noise(self) -> Float:
         """Probability (orders, 2) of a larger chi-square if only noise is left."""
-        return np.asarray(stats.chi2.sf(self.chi2, self.dof[:, None]))
+        return np.asarray(chi2_sf(self.chi2, self.dof[:, None]))
 
     def f_test(self, low: int, high: int) -> tuple[float, float]:
         """F of both axes together, and the probability of a larger F if the lower order is right.
@@ -50,7 +50,7 @@ class OrderSurfaces:
         left = self.chi2.sum(axis=1)
         more, free = 2 * (self.dof[a] - self.dof[b]), 2 * self.dof[b]
         F = float((left[a] - left[b]) / more / (left[b] / free))
-        return F, float(stats.f.sf(F, more, free))
+        return F, float(f_sf(F, more, free))
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.stats import norm
 
+from bayesdist.distributions import norm_sf
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.compare.positions import (
     DifferenceField,
@@ -209,7 +209,7 @@ class CoefficientChange:
     @property
     def p_value(self) -> Float:
         """Two-sided probability (D,) of each difference, regardless of the others."""
-        return np.asarray(2 * norm.sf(np.abs(self.z)))
+        return np.asarray(2 * norm_sf(np.abs(self.z)))
 
 
 @dataclass(frozen=True, eq=False)

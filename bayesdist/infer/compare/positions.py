@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi_square_distribution
 
+from bayesdist.distributions import chi2_sf
 from bayesdist.infer.equations.scaled import chi_square, scaled_cholesky
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh
@@ -113,7 +113,5 @@ def difference_field(
         for b, other in enumerate(parts):
             joint[:, a, b] = np.einsum("nk,kl,nl->n", phi, cov[one, other], phi, optimize=True)
     z2 = np.einsum("na,na->n", field, np.linalg.solve(joint, field[..., None])[..., 0])
-    du, dv, p_value = (
-        a.reshape(len(y), len(x)) for a in (*field.T, chi_square_distribution.sf(z2, 2))
-    )
+    du, dv, p_value = (a.reshape(len(y), len(x)) for a in (*field.T, chi2_sf(z2, 2)))
     return DifferenceField(chip, x, y, du, dv, p_value)

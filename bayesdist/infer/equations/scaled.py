@@ -14,8 +14,9 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi_square_distribution
 from threadpoolctl import threadpool_limits
+
+from bayesdist.distributions import chi2_sf
 
 __all__ = [
     "FieldTest",
@@ -93,7 +94,7 @@ class FieldTest(NamedTuple):
     def of(cls, white: Float, *, shrink: float = 1.0) -> FieldTest:
         """Test of independent standard normal numbers (dof,), their squares times `shrink`."""
         chi2, dof = float(white @ white) * shrink, len(white)
-        return cls(chi2, dof, float(chi_square_distribution.sf(chi2, dof)))
+        return cls(chi2, dof, float(chi2_sf(chi2, dof)))
 
 
 def chi_square(

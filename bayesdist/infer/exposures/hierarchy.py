@@ -24,9 +24,9 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
 from bayesdist.data.matches import Matches
+from bayesdist.distributions import f_sf
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.normal import least_squares
 from bayesdist.infer.equations.priors import GaussianPriors
@@ -372,4 +372,4 @@ def trend_p_values(values: Float, epoch: Float, breaks: ArrayLike = ()) -> Float
     left = (bent**2).sum(axis=0)
     gain = np.maximum((flat**2).sum(axis=0) - left, 0.0)
     ratio = np.divide(gain / lines.shape[1], left / free, out=np.zeros_like(gain), where=left > 0)
-    return np.asarray(stats.f.sf(ratio, lines.shape[1], free))
+    return np.asarray(f_sf(ratio, lines.shape[1], free))

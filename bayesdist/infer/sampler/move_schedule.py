@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
+from bayesdist.distributions import chi2_isf
 from bayesdist.infer.convergence import Convergence, Limits
 from bayesdist.limits import DRAWS_PER_WALKER, PARETO_K
 
@@ -187,7 +187,7 @@ def _chance_rhat(limits: Limits, n_params: int, ensembles: int) -> float:
     With c split chains of n draws R-hat - 1 is (chi2_(c-1) / (c-1) - 1) / 2n.
     """
     chains = 2 * ensembles
-    worst = stats.chi2(chains - 1).isf(1 / (2 * n_params)) / (chains - 1)
+    worst = float(chi2_isf(1 / (2 * n_params), chains - 1)) / (chains - 1)
     return chains * (worst - 1) / 2 / max(limits.rhat - 1, 1e-6)
 
 

@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
-from scipy.stats import t as student_t
 
+from bayesdist.distributions import t_ppf
 from bayesdist.errors import InputError
 from bayesdist.infer.series.breaks import BreakMoves
 from bayesdist.infer.series.design import Design
@@ -77,7 +77,7 @@ class Comparison:
         value, error = self.difference(a, b)
         fold = self.scores[a].fold
         n = len(np.unique(fold)) if self.scheme == "blocks" else len(fold)
-        quantile = float(student_t.ppf((1 + CONFIDENCE) / 2, n - 1))
+        quantile = float(t_ppf((1 + CONFIDENCE) / 2, n - 1))
         return value >= MIN_DIFFERENCE and value >= quantile * error
 
     @property

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
-from scipy.stats import f as f_distribution
 
+from bayesdist.distributions import f_isf
 from bayesdist.numbers import size_of
 from bayesdist.report.figures.panels import Panels
 from bayesdist.report.figures.style import CYCLE, INK, PALE, PALETTE, figure_style, nice_below
@@ -66,7 +66,7 @@ def significant_cells(binned: BinnedResiduals) -> Bool:
     False where a standard error is unknown or zero.
     """
     # the errors are those of as few stars as the cell has: the tails are nearly Fisher's
-    beyond = 2.0 * f_distribution.isf(CHANCE, 2, np.maximum(binned.count - 1, 1))
+    beyond = 2.0 * f_isf(CHANCE, 2, np.maximum(binned.count - 1, 1))
     with np.errstate(divide="ignore", invalid="ignore"):
         z2 = (binned.mean_u / binned.sem_u) ** 2 + (binned.mean_v / binned.sem_v) ** 2
     return np.isfinite(z2) & (z2 > beyond)

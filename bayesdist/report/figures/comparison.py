@@ -9,9 +9,8 @@ import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi_square
-from scipy.stats import norm
 
+from bayesdist.distributions import chi2_ppf, chi2_sf, norm_isf
 from bayesdist.numbers import size_of
 from bayesdist.report.figures.arrows import Arrows, vector_map
 from bayesdist.report.figures.mosaic import Mosaic
@@ -46,8 +45,8 @@ def gaussian_sigmas(chi2: Float) -> Float:
 
     NaN stays NaN; not above 37, where probabilities underflow.
     """
-    p = np.clip(chi_square.sf(chi2, 2), 1e-300, 1.0)
-    return np.asarray(norm.isf(p / 2))
+    p = np.clip(chi2_sf(chi2, 2), 1e-300, 1.0)
+    return np.asarray(norm_isf(p / 2))
 
 
 @figure_style()
@@ -102,7 +101,7 @@ def change_over_time(first: Float, gain: Float, dof: int, p_value: float | None)
     for.
     """
     first, gain = np.asarray(first, float), np.asarray(gain, float)
-    low, high = chi_square.ppf([0.025, 0.975], dof)
+    low, high = chi2_ppf([0.025, 0.975], dof)
     fig = new_figure(WIDTH, 2.8)
     ax = fig.subplots()
     ax.axhspan(low, high, color=PALETTE["sky"], alpha=0.3, lw=0, zorder=0)

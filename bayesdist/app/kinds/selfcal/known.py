@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from bayesdist.app.config import SelfcalConfig
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import find_columns
 from bayesdist.data.tables.units import conversion
+from bayesdist.distributions import chi2_sf
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.priors import GaussianPriors, Prior
 from bayesdist.infer.selfcal.prior import frame_prior, pointing_prior, tie
@@ -182,7 +182,7 @@ class GaugeConstraints:
             measured = values > 1e-10 * values[-1]
             right = vectors[:, measured].T @ known.right
             square, n = float(np.sum(right**2 / values[measured])), int(measured.sum())
-            if chi2.sf(square, n) < GAUGE_CONTRADICTION.value:
+            if chi2_sf(square, n) < GAUGE_CONTRADICTION.value:
                 yield (
                     f"the {name} contradict the detections: chi-square {square:.4g} of {n}; an "
                     "error is too small, or a value is wrong"

@@ -127,7 +127,8 @@ class FunctionField(DrawnField):
             some = values[number % len(values)]
             parts.append(some if phi is None else np.swapaxes(some @ phi.T, 1, 2))
         out = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
-        return np.asarray(scale.get(self.of.row.name, 1.0) * out, float)
+        size = scale.get(self.of.row.name, 1.0)
+        return np.asarray(out if size == 1.0 else size * out, float)
 
     def total(self) -> Float:
         """Mean squares (P, 2): by the covariance, or over all rows of coefficients."""

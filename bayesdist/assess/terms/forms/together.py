@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +75,7 @@ class TogetherField(DrawnField):
     def errors(self, draws: slice, scale: Scale = {}) -> Float:  # noqa: B006
         """The joint error (d, N, 2), each row multiplied by its factor."""
         if self.whole is None:
-            out = np.asarray(sum(part.errors(draws, scale) for part in self._added))
+            out = reduce(np.add, (part.errors(draws, scale) for part in self._added))
         else:
             out = self.whole.errors(draws, {})
             for part in self._added:

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
-from scipy.stats import f as f_distribution
 
 from bayesdist.diagnose.residuals.binned import BinnedResiduals
+from bayesdist.distributions import f_sf
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.limits import STRUCTURE
 from bayesdist.missions.wise.assess.residual_field import ResidualField, residual_field, scaled
@@ -207,7 +207,7 @@ def _gain(field: ResidualField, white: Float, base: Base) -> Float:
 
 def _tail(field: ResidualField, base: Base) -> float:
     q, d, rest, free = _squares(field, field.white, base)
-    return float(f_distribution.sf((q / d) / (rest / free), d, free))
+    return float(f_sf((q / d) / (rest / free), d, free))
 
 
 def _described(field: ResidualField, base: Base) -> tuple[tuple[float, float], Float]:

@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.patches import Rectangle
-from scipy.stats import binom
 
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
+from bayesdist.distributions import binom_ppf
 from bayesdist.numbers import count, number
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
@@ -138,7 +138,7 @@ def holdout(r: ReportInput) -> Plot:
 def _histogram(ax: Axes, found: HoldoutValidation, k: int) -> None:
     counts = found.pit[k]
     bins = len(counts)
-    low, high = binom.ppf([0.005, 0.995], found.n, 1 / bins) * bins / found.n
+    low, high = binom_ppf([0.005, 0.995], found.n, 1 / bins) * bins / found.n
     ax.axhspan(low, high, color=CYCLE[0], alpha=0.18, lw=0)
     ax.axhline(1.0, color=INK, lw=0.8)
     ax.stairs(counts * bins / found.n, np.linspace(0, 1, bins + 1), color=CYCLE[0], lw=1.3)
