@@ -15,6 +15,7 @@ from PIL import Image
 from bayesdist.report import drawing
 from bayesdist.report.drawing import DPI, MARGIN, png_of, render
 from bayesdist.report.figures.style import figure_style, new_figure, plain_ticks
+from bayesdist.report.figures.ticks import OneTickAxes, OneTickFigure
 from bayesdist.report.page import picture_of
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections import REPORT
@@ -111,6 +112,44 @@ def test_numbers_are_those_of_matplotlib(limits, scale):
             found.append([*texts, ax.xaxis.get_offset_text().get_text()])
     assert [as_plain(t) for t in found[0]] == found[1]
     assert any(found[1]) and not any("$" in t for t in found[1])
+
+
+def many_kinds_of_axes(figure: Figure) -> None:
+    """Scales, grids, marks between numbers, turned and hidden labels, colour bars, shared axes."""
+    axes = figure.subplots(2, 3, sharex="col")
+    left, log, symlog = axes[0]
+    left.grid(True)
+    left.set(xlim=(-0.1, 0.3), ylim=(0, 4e7), xlabel="x [pix]", ylabel="y [pix]")
+    log.set(xscale="log", xlim=(1e-6, 1e3), yscale="log", ylim=(0.02, 0.07))
+    log.grid(True, which="both")
+    symlog.set(yscale="symlog", ylim=(-100, 100), ylabel="v")
+    symlog.yaxis.set_label_position("right")
+    symlog.yaxis.tick_right()
+    names, _, cells = axes[1]
+    names.tick_params(axis="x", labelrotation=90)
+    names.tick_params(axis="y", length=0)
+    names.set_yticks([0, 1, 2], ["one", "two\nlines", ""])
+    names.invert_yaxis()
+    for one in axes.ravel():
+        one.label_outer()
+    image = cells.imshow([[1, 2], [3, 1000]], norm="log", origin="lower")
+    figure.colorbar(image, ax=cells, label="count [stars]")
+    figure.colorbar(image, ax=names, location="top", ticks=[1, 30])
+
+
+def test_axes_of_one_tick_look_like_those_of_matplotlib():
+    """To the last pixel."""
+    files = []
+    with figure_style():
+        for figure in (
+            Figure(figsize=(7.0, 4.0), layout="constrained"),
+            OneTickFigure(figsize=(7.0, 4.0), layout="constrained"),
+        ):
+            many_kinds_of_axes(figure)
+            files.append(png_of(figure))
+            assert isinstance(figure.axes[0], OneTickAxes) == isinstance(figure, OneTickFigure)
+    expected, drawn = (pixels(file) for file in files)
+    np.testing.assert_array_equal(drawn, expected)
 
 
 # -- several processes ----------------------------------------------------------------------------

@@ -22,6 +22,8 @@ from matplotlib.ticker import LogFormatterSciNotation, ScalarFormatter
 from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
+from bayesdist.report.figures.ticks import OneTickFigure
+
 __all__ = [
     "COLORBAR",
     "CYCLE",
@@ -154,7 +156,7 @@ def new_figure(
     layout: Literal["constrained", "compressed", "none"] = "constrained",
 ) -> Figure:
     """Empty figure (inches) that belongs to no window and to no pyplot state."""
-    fig = Figure(figsize=(width, height))
+    fig = OneTickFigure(figsize=(width, height))
     fig.set_layout_engine("none" if layout == "none" else _Layout(compress=layout == "compressed"))
     FigureCanvasAgg(fig)
     return fig
