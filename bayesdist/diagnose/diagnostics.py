@@ -37,7 +37,12 @@ from bayesdist.diagnose.residuals.misfit import (
     worst_misfit,
 )
 from bayesdist.diagnose.residuals.quoted import majority_sentence
-from bayesdist.diagnose.residuals.sample import StarSample, centroid_scatter, star_sample
+from bayesdist.diagnose.residuals.sample import (
+    StarSample,
+    centroid_scatter,
+    likelihood_shown,
+    star_sample,
+)
 from bayesdist.diagnose.residuals.star_sums import StarSums, flagged_by_exposure, star_sums
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.diagnose.score.tests import score_tests
@@ -196,8 +201,8 @@ def diagnose_fit(
     Diagnostics
     """
     model, survey = fit.model, shards.survey
-    solution = None if posterior is None else posterior.likelihood
-    partitions, sums = residual_sums(fit, shards, solution)
+    shown = likelihood_shown(fit, posterior)
+    partitions, sums = residual_sums(fit, shards, None if posterior is None else shown)
     several = len(model.chips) > 1
     sample = star_sample(table, len(stars), fit, posterior)
     if eliminated is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +12,18 @@ from bayesdist.data.matches import Matches
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.posterior.memberships import memberships_of
+from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import in_table_order, prepare
 from bayesdist.limits import EXPOSURE_CHI2
 
-__all__ = ["SAMPLE", "ExposureScatter", "StarSample", "centroid_scatter", "star_sample"]
+__all__ = [
+    "SAMPLE",
+    "ExposureScatter",
+    "StarSample",
+    "centroid_scatter",
+    "likelihood_shown",
+    "star_sample",
+]
 
 Float = NDArray[np.float64]
 
@@ -149,21 +157,33 @@ def star_sample(
     StarSample
     """
     stars, order = prepare(fit.model, table)
-    solution = fit if posterior is None else posterior
+    solution = likelihood_shown(fit, posterior)
     said = None if posterior is None else memberships_of(posterior, stars).in_table_order(order)
 
-    def residual(solution: LinearFit | Posterior) -> Float:
-        return in_table_order(stars.residuals(solution.mean), order)
+    def residual(theta: Float) -> Float:
+        return in_table_order(stars.residuals(theta), order)
 
     return StarSample(
         table=table,
-        fit_residual=residual(fit),
+        fit_residual=residual(fit.mean),
         used=in_table_order(fit.clip.keeps_of(stars), order),
         n_total=n_total,
-        variance=in_table_order(solution.likelihood.variances(stars).T, order),
-        posterior_residual=None if posterior is None else residual(posterior),
+        variance=in_table_order(solution.variances(stars).T, order),
+        posterior_residual=None if posterior is None else residual(solution.theta),
         outlier_probability=None if said is None else said.outlier_probability,
     )
+
+
+def likelihood_shown(fit: LinearFit, posterior: Posterior | None) -> Likelihood:
+    """Likelihood at the solution whose residuals are shown: the posterior's, where there is one.
+
+    Positions of stars that were fitted belong to the parameters of the fit: at the mean of the
+    draws the residuals would hold its distance from there, which the stars would follow.
+    """
+    if posterior is None:
+        return fit.likelihood
+    found = posterior.likelihood
+    return replace(found, theta=np.asarray(fit.mean)) if posterior.own_places else found
 
 
 def centroid_scatter(stars: StarSample, *, n_params: int = 0) -> MagnitudeErrors | None:
