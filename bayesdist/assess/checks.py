@@ -53,7 +53,8 @@ def catalogue_checks(catalogue_stated: bool | None) -> Iterator[Check]:
             ""
             if catalogue_stated
             else "no error of the reference catalogue is stated: give a [[budget]] row that names "
-            "the catalogue, of size 0 with its source where it has none",
+            "the catalogue ('reference catalogue', 'Gaia DR3'), of size 0 with its source where it "
+            "has none",
             "" if catalogue_stated else LARGER,
         )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from bayesdist.app.config import CATALOGUE_WORDS, Config
+from bayesdist.app.config import Config
 from bayesdist.app.kinds.campaign.checks import campaign_checks
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.kind import kind_of
@@ -33,9 +33,10 @@ def run_checks(
     `series` is the section 'time_dependence' of summary.json, of runs that have one.
     """
     kind, circle = kind_of(config), in_circle(data, config)
-    has, words = data.matched.has_catalogue, CATALOGUE_WORDS
-    errors = (data.matched.states_errors or config.states(*words)) if has else None
-    motions = (data.matched.states_motion_errors or config.states("motion")) if has else None
+    errors = motions = None
+    if data.matched.has_catalogue:
+        errors = data.matched.states_errors or config.states_catalogue
+        motions = data.matched.states_motion_errors or config.states_motions
     return (
         *_kind_checks(data, series),
         *sampling_checks(posterior),
