@@ -1,4 +1,7 @@
-"""Checks: what was found, against what limit, and what it means for whoever uses the numbers."""
+"""Checks: what was found, against what limit, and what it means for whoever uses the numbers.
+
+Each is a row of the status table: nothing warns, and nothing keeps a verdict open, that has none.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from dataclasses import dataclass
 
 __all__ = [
     "EITHER",
+    "GROUPS",
     "LARGER",
     "LEVELS",
     "Check",
@@ -22,8 +26,8 @@ LARGER, EITHER = "larger", "either"
 
 # in which order a reader meets them
 GROUPS = (
-    "Sampling",
     "Held-out truth",
+    "Sampling",
     "Campaign",
     "Gauge",
     "Score tests",
@@ -40,16 +44,16 @@ GROUPS = (
 
 @dataclass(frozen=True)
 class Check:
-    """One criterion, or one remark.
+    """One criterion.
 
     Parameters
     ----------
     group : str
         What it concerns: one of `GROUPS`.
     name : str
-        What was checked, with its unit; empty for a remark, which has a sentence alone.
+        What was checked, with its unit.
     value : float or str
-        What was found.
+        What was found; empty where the sentence says it.
     limit : str
         What is asked, in words; empty where nothing is.
     level : str
@@ -63,7 +67,7 @@ class Check:
     """
 
     group: str
-    name: str = ""
+    name: str
     value: float | str = ""
     limit: str = ""
     level: str = "note"

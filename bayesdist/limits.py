@@ -62,6 +62,9 @@ CHI2_TOO_SMALL_CHANCE = Limit(1e-3, "at least", "probability of so small a chi-s
 CHI2_TOO_LARGE = Limit(
     1.5, "at most", "per degree of freedom: quoted errors right within some twenty percent"
 )
+EXPOSURE_CHI2 = Limit(
+    1.5, "at most", "times the chi-square of all exposures, or less by it: errors of one differ"
+)
 LEFT_OUT = Limit(
     0.2, "at most", "of the stars: rejection that takes more has shaped what it was to protect"
 )

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from bayesdist.checks import EITHER, LARGER, Check, doubts_of, level_of, warnings_of, worst
 
-NOTE = Check("Errors", sentence="no error is stated", doubt=LARGER)
-WARN = Check("Fit", level="warn", sentence="residuals are large")
+NOTE = Check("Errors", "Stated", sentence="no error is stated", doubt=LARGER)
+WARN = Check("Fit", "Size", level="warn", sentence="residuals are large")
 GOOD = Check("Fit", "Condition", 12.0, "at most 1e8", level_of(True))
 BAD = Check("Sampling", "Converged", "NO", "yes", level_of(False), "it is not", EITHER)
 ALL = (NOTE, WARN, GOOD, BAD)

@@ -30,10 +30,14 @@ def matching_checks(
         return
     yield Check(
         GROUP,
-        sentence=f"stars were matched within {match_radius / sigma:.1f} of their errors of nominal "
+        "Match radius, in errors of a star",
+        match_radius / sigma,
+        MATCH_RADIUS.words,
+        "warn",
+        f"stars were matched within {match_radius / sigma:.1f} of their errors of nominal "
         "positions that are not given, which cuts the scatter and draws the fit: match again with "
         "a wider match radius, or give the columns u_nominal and v_nominal",
-        doubt=LARGER,
+        LARGER,
     )
 
 
@@ -46,13 +50,12 @@ def catalogue_checks(catalogue_stated: bool | None) -> Iterator[Check]:
             "stated" if catalogue_stated else "not stated",
             "a row of [[budget]] or of the table",
             level_of(catalogue_stated, "warn"),
-        )
-    if catalogue_stated is False:
-        yield Check(
-            GROUP,
-            sentence="no error of the reference catalogue is stated: give a [[budget]] row that "
-            "names the catalogue, of size 0 with its source where it has none",
-            doubt=LARGER,
+            ""
+            if catalogue_stated
+            else "no error of the reference catalogue is stated: give a [[budget]] row that names "
+            "the catalogue ('reference catalogue', 'Gaia DR3'), of size 0 with its source where it "
+            "has none",
+            "" if catalogue_stated else LARGER,
         )
 
 
@@ -71,6 +74,8 @@ def time_checks(
     if visits.size and counts[counts > 0].min() <= 2:
         yield Check(
             GROUP,
+            "Dates that the drift is fitted to",
+            level="warn",
             sentence=f"a drift is fitted to {counts[counts > 0].min()} dates, so that neither the "
             "variation between exposures nor the curvature of the drift is measured",
             doubt=EITHER,
@@ -78,10 +83,14 @@ def time_checks(
     if motions_stated is False:
         yield Check(
             GROUP,
-            sentence="no error of the catalogue's proper motions is stated, and the drift is "
+            "Error of the proper motions",
+            "not stated",
+            "a row of [[budget]] or of the table",
+            "warn",
+            "no error of the catalogue's proper motions is stated, and the drift is "
             "measured against them: give a [[budget]] row that names the motions, of size 0 with "
             "its source where they have none",
-            doubt=LARGER,
+            LARGER,
         )
 
 

@@ -142,8 +142,9 @@ class Evaluation:
 
 def _of_margin(margin: Margin) -> Check:
     """A margin as a check."""
-    sentence = f"{margin.requirement.name}: {margin.verdict}: {margin.reason}"
-    return Check("Requirements", level=VERDICT_LEVELS[margin.verdict], sentence=sentence)
+    name = margin.requirement.name
+    sentence = f"{name}: {margin.verdict}: {margin.reason}"
+    return Check("Requirements", name, level=VERDICT_LEVELS[margin.verdict], sentence=sentence)
 
 
 def evaluate(
@@ -333,6 +334,7 @@ def _own_checks(
     if settings.single and not measured:
         yield Check(
             ERRORS,
+            "Errors of single exposures",
             level="warn",
             sentence="assess.exposure is 'single', and how single exposures deviate is not known "
             "here, so that errors are those in their mean",
@@ -340,7 +342,7 @@ def _own_checks(
     error = _contradiction(diagnostics, settings)
     if error is not None:
         what = f"{error.where}: {error.cause}, so that no budget of single positions can be made"
-        yield Check(ERRORS, level="warn", sentence=what)
+        yield Check(ERRORS, "Terms within the scatter", level="warn", sentence=what)
 
 
 def _contradiction(diagnostics: Diagnostics, settings: EvaluationSettings) -> InputError | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 from collections.abc import Mapping, Sequence
@@ -190,10 +189,9 @@ def _of_table(
     keys = [key for key in ("x", "y", "mag", "q") if key in found]
     values: dict[str, NDArray[np.float64]] = {key: column(key).numbers() for key in keys}
     if "mag" not in values and "flux" in found:
-        with contextlib.suppress(InputError):  # magnitudes help, and are not needed
-            flux = column("flux").numbers()
-            if (flux > 0).all():
-                values["mag"] = -2.5 * np.log10(flux)
+        mag = column("flux").magnitudes_of_fluxes()
+        if mag is not None:
+            values["mag"] = mag
     if errors:
         values["sigma"] = np.sqrt((_variance(column("sigma_x")) + _variance(column("sigma_y"))) / 2)
     if "exposure" in found:

@@ -8,12 +8,28 @@ from bayesdist.checks import LARGER, Check
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.correlated.deviations import CURVATURE
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
+from bayesdist.diagnose.residuals.coverage import Coverage
 from bayesdist.diagnose.residuals.misfit import Misfit, worst_misfit
+from bayesdist.diagnose.residuals.sample import ExposureScatter
 from bayesdist.diagnose.score.result import ScoreTest
-from bayesdist.limits import HELD_OUT_DOUBTFUL, STRUCTURE, STRUCTURE_IN_BUDGET
+from bayesdist.limits import (
+    EXPOSURE_CHI2,
+    HELD_OUT_DOUBTFUL,
+    STRUCTURE,
+    STRUCTURE_IN_BUDGET,
+    STRUCTURE_SEEN,
+)
+from bayesdist.limits import SCORE_TESTS as SCORE_LIMIT
 from bayesdist.numbers import count, number, percent, probability, size_of
 
-__all__ = ["SCORE_TESTS", "holdout_checks", "score_checks", "structure_checks"]
+__all__ = [
+    "SCORE_TESTS",
+    "coverage_checks",
+    "exposure_checks",
+    "holdout_checks",
+    "score_checks",
+    "structure_checks",
+]
 
 FIT, HELD_OUT, SCORE_TESTS = "Fit", "Held-out truth", "Score tests"
 
@@ -47,7 +63,7 @@ def structure_checks(
             doubt = LARGER
     yield Check(
         FIT,
-        "Structure in the residuals of the fit, beyond noise",
+        "Structure in the residuals, beyond noise",
         f"{found}, {probability(one.p_value)}",
         f"p at least {number(STRUCTURE.value, 1)}",
         "warn" if one.significant or one.underpowered else "pass",
@@ -60,16 +76,25 @@ def structure_checks(
                 f"{100 * (1 - one.power):.0f} % of the structure that the model might leave is "
                 "hidden: positions of stars take it up where dithers are small"
             )
-            yield Check(FIT, level="warn", sentence=sentence)
+            yield Check(
+                FIT,
+                "Structure that positions of stars hide"
+                + ("" if one.chip is None else f" on {one.chip.name}"),
+                percent(1 - one.power, 2),
+                f"at most {percent(1 - STRUCTURE_SEEN.value, 2)}",
+                "warn",
+                sentence,
+            )
 
 
 def score_checks(
     tests: Sequence[ScoreTest], correlated: Discrepancy | None = None
 ) -> Iterator[Check]:
-    """Checks of what targeted tests have found, a remark for each remedy.
+    """Checks of what targeted tests have found, one for each remedy, or that they found nothing.
 
     Verdicts stand where correlated errors hold what the tests have found.
     """
+    limit = f"p at least {number(SCORE_LIMIT.value, 1)} over all {len(tests)} tests"
     found: dict[str, list[ScoreTest]] = {}
     for test in tests:
         if test.significant:
@@ -77,7 +102,14 @@ def score_checks(
     for remedy, several in found.items():
         sentence = f"{'; '.join(test.finding for test in several)}: {remedy}"
         doubt = "" if all(_held(correlated, test) for test in several) else LARGER
-        yield Check(SCORE_TESTS, level="warn", sentence=sentence, doubt=doubt)
+        names = ", ".join(test.name for test in several)
+        value = "; ".join(
+            f"{size_of(test.size, test.unit, 2)} rms, {probability(test.p_value)}"
+            for test in several
+        )
+        yield Check(SCORE_TESTS, f"Residuals: {names}", value, limit, "warn", sentence, doubt)
+    if tests and not found:
+        yield Check(SCORE_TESTS, "Tests of the residuals", "nothing found", limit, "pass")
 
 
 def _held(correlated: Discrepancy | None, test: ScoreTest) -> bool:
@@ -93,6 +125,49 @@ def _held(correlated: Discrepancy | None, test: ScoreTest) -> bool:
         "curvature": CURVATURE in scatter,
     }
     return held[test.held_by]
+
+
+def coverage_checks(chips: Sequence[Coverage]) -> Iterator[Check]:
+    """Checks of the area of each chip that stars cover: of those that lack too much, or the worst.
+
+    Nothing is checked where an earlier calibration knows the rest.
+    """
+    asked = [one for one in chips if not one.known]
+    if not asked:
+        return
+    bad = [one for one in asked if one.significant]
+    for one in bad or [max(asked, key=lambda one: one.gap / one.most)]:
+        yield Check(
+            FIT,
+            "Area beyond the stars" + (f" of {one.chip.name}" if one.several else ""),
+            percent(one.gap, 2),
+            f"at most {percent(one.most, 2)}",
+            "warn" if one.significant else "pass",
+            one.sentence if one.significant else "",
+        )
+
+
+def exposure_checks(found: ExposureScatter | None) -> Iterator[Check]:
+    """Check that no exposure has larger or smaller errors than all; nothing for one exposure."""
+    if found is None:
+        return
+    low, high, most = found.relative.min(), found.relative.max(), EXPOSURE_CHI2.value
+    sentence = ""
+    if found.deviating.any():
+        names = [name for name, off in zip(found.names, found.deviating, strict=True) if off]
+        shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+        sentence = (
+            f"{len(names)} of {len(found.names)} exposures have other errors than all together "
+            f"({shown}): give errors of each exposure, or leave out what went wrong"
+        )
+    yield Check(
+        FIT,
+        "Chi-square of single exposures, relative to that of all",
+        f"{number(low)} to {number(high)} in {count(len(found.names))} exposures",
+        f"{number(1 / most, 2)} to {number(most, 2)}",
+        "warn" if sentence else "pass",
+        sentence,
+    )
 
 
 def holdout_checks(found: HoldoutValidation | None) -> Iterator[Check]:

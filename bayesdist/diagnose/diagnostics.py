@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from bayesdist.checks import EITHER, Check
 from bayesdist.data import MagnitudeErrors, Matches
-from bayesdist.diagnose.checks import holdout_checks, score_checks, structure_checks
+from bayesdist.diagnose.checks import (
+    coverage_checks,
+    exposure_checks,
+    holdout_checks,
+    score_checks,
+    structure_checks,
+)
 from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors, estimate_discrepancy
 from bayesdist.diagnose.correlated.result import as_stored
 from bayesdist.diagnose.holdout.predictive import Predictive
@@ -31,7 +37,12 @@ from bayesdist.diagnose.residuals.misfit import (
     worst_misfit,
 )
 from bayesdist.diagnose.residuals.quoted import majority_sentence
-from bayesdist.diagnose.residuals.sample import StarSample, centroid_scatter, star_sample
+from bayesdist.diagnose.residuals.sample import (
+    StarSample,
+    centroid_scatter,
+    likelihood_shown,
+    star_sample,
+)
 from bayesdist.diagnose.residuals.star_sums import StarSums, flagged_by_exposure, star_sums
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.diagnose.score.tests import score_tests
@@ -43,6 +54,7 @@ from bayesdist.infer import GaussianPriors, LinearFit, Posterior, Shards
 from bayesdist.infer.catalogue.star_errors import StarCovariance, StarErrors, star_covariance
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.selfcal import SelfCalibrationMode
+from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.streams import restarted
 
 __all__ = [
@@ -70,11 +82,11 @@ class Diagnostics:
     Parameters
     ----------
     sums : StarSums
-        Of residuals of the least-squares fit over all stars.
+        Of residuals over all stars.
     partitions : mapping of int to mapping of str to tuple of int
         Bins of each chip, by its number and the name of the partition.
     misfits : tuple of Misfit
-        Structure that the fit leaves, of each chip or, where these share stars, of all.
+        Structure that the solution leaves, of each chip or, where these share stars, of all.
     coverage : tuple of Coverage
         The area of each chip that its stars cover.
     sample : StarSample
@@ -134,15 +146,19 @@ class Diagnostics:
             *score_checks(self.score_tests, self.correlated),
             *structure_checks(self.misfits, self.correlated),
         ]
-        texts = [one.sentence for one in self.coverage if one.significant]
+        out += [*coverage_checks(self.coverage), *exposure_checks(self.sample.by_exposure)]
         if self.epoch_shift is not None and self.epoch_shift.significant:
-            texts.append(self.epoch_shift.sentence)
-        out += [Check("Fit", level="warn", sentence=text) for text in texts]
+            text = self.epoch_shift.sentence
+            out.append(Check("Fit", "Epochs of the exposures", level="warn", sentence=text))
         if self.majority:
-            out.append(Check("Fit", level="warn", sentence=self.majority, doubt=EITHER))
+            out.append(
+                Check(
+                    "Fit", "More false than true pairs", "", "none", "warn", self.majority, EITHER
+                )
+            )
         if self.periods is not None and self.periods.is_material:
             verdict = self.periods.verdict.rstrip(".")
-            out.append(Check("Periods", level="warn", sentence=verdict))
+            out.append(Check("Periods", "Differences of periods", level="warn", sentence=verdict))
         return tuple(out)
 
 
@@ -185,7 +201,8 @@ def diagnose_fit(
     Diagnostics
     """
     model, survey = fit.model, shards.survey
-    partitions, sums = residual_sums(fit, shards)
+    shown = likelihood_shown(fit, posterior)
+    partitions, sums = residual_sums(fit, shards, None if posterior is None else shown)
     several = len(model.chips) > 1
     sample = star_sample(table, len(stars), fit, posterior)
     if eliminated is not None:
@@ -217,10 +234,13 @@ def diagnose_fit(
     )
 
 
-def residual_sums(fit: LinearFit, shards: Shards) -> tuple[dict[int, dict[str, Bins]], StarSums]:
+def residual_sums(
+    fit: LinearFit, shards: Shards, solution: Likelihood | None = None
+) -> tuple[dict[int, dict[str, Bins]], StarSums]:
     """Bins of each chip by the name of the partition, and sums of residuals in them.
 
-    `shards` has all stars that were fitted.
+    `shards` has all stars that were fitted; `solution` says where they lie and which are true, by
+    default the fit.
     """
     partitions = {}
     for chip, found in zip(fit.model.chips, shards.survey.chips, strict=True):
@@ -228,7 +248,8 @@ def residual_sums(fit: LinearFit, shards: Shards) -> tuple[dict[int, dict[str, B
         side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 4, MAX_BINS))
         partitions[chip.number] = partitions_for(n) | {SHOWN: (side, side)}
     wanted = {chip: tuple(dict.fromkeys(bins.values())) for chip, bins in partitions.items()}
-    return partitions, shards.sum(star_sums, fit.mean, fit.clip, wanted)
+    clipped = fit.likelihood
+    return partitions, shards.sum(star_sums, clipped, solution or clipped, wanted)
 
 
 def misfits_of(

@@ -119,10 +119,10 @@ def sampling_checks(posterior: Posterior | None) -> tuple[Check, ...]:
     with np.errstate(divide="ignore", invalid="ignore"):
         mcse = float(np.nanmax(np.where(sd > 0, c.mcse_mean[:D] / sd, 0.0), initial=0.0))
     label = posterior.approximation
-    remarks = [Check(SAMPLING, level="warn", sentence=label)] if label else []
+    method = [Check(SAMPLING, "Method", level="warn", sentence=label)] if label else []
     # what only advises does not fail by itself: the limits of R-hat and ESS decide
     return (
-        *remarks,
+        *method,
         convergence_check(c),
         Check(
             SAMPLING,

@@ -84,7 +84,7 @@ def listing(
 def check_cells(check: Check) -> tuple[str, str, Level]:
     """Value, limit and outcome of a check, as cells of a table."""
     found = check.value if isinstance(check.value, str) else number(check.value)
-    return found, check.limit or MISSING, Level(check.level)
+    return found or check.text, check.limit or MISSING, Level(check.level)
 
 
 def further(n: int) -> str:

@@ -474,6 +474,26 @@ def test_inspect_of_a_netcdf_file_of_somebody_else(tmp_path):
 # -- other commands -------------------------------------------------------------------------------
 
 
+def test_init_says_what_to_give(tmp_path):
+    """Whoever names the table alone is shown the command that has it."""
+    for given, example in (("stars.csv", "stars.toml --matches stars.csv"), ("my.toml", "my.toml")):
+        result = cli("init", tmp_path / given)
+        assert result.code == 2 and not any(tmp_path.iterdir())
+        text = " ".join(result.err.replace(str(tmp_path) + "/", "").split())
+        assert f"bayesdist init {example}" in text
+        assert "its reference position" in text and "draft" in text
+
+
+def test_init_warns_of_pixels_before_the_first(tmp_path, stars):
+    table = stars.copy()
+    table["x"] -= CENTRE[0]
+    table.write(tmp_path / "middle.ecsv")
+    err = good("init", tmp_path / "c.toml", "--matches", tmp_path / "middle.ecsv").err
+    n = int(((table["x"] < 0.5) | (table["y"] < 0.5)).sum())
+    assert f"middle.ecsv: {n} of {len(table)} positions lie before the first pixel" in err
+    assert f"x from {table['x'].min():.1f}" in err
+
+
 def test_init_refuses(tmp_path, stars):
     stars.write(tmp_path / "stars.ecsv")
     (tmp_path / "mine.toml").write_text("# mine\n")

@@ -19,12 +19,14 @@ ROW = {"name": "Gaia catalogue", "kind": "systematic", "sigma_u": 0.0, "sigma_v"
         (ROW, False),
         (ROW | {"source": "exact in the simulation"}, True),
         (ROW | {"sigma_v": 0.002}, True),
+        (ROW | {"name": "Gaia DR1", "sigma_v": 0.002}, True),
+        (ROW | {"name": "Gaia proper motions", "sigma_v": 0.002}, False),
         (ROW | {"name": "camera", "sigma_v": 0.002, "source": "see reference [3]"}, False),
     ],
 )
 def test_an_error_of_the_catalogue_is_stated_by_its_row(row, stated):
     config = parse_config(config_text(budget=[row]), "config.toml")
-    assert config.states("catalog", "reference") == stated
+    assert config.states_catalogue == stated
 
 
 def test_exposures_of_a_visit_are_one_date():

@@ -177,6 +177,7 @@ def test_bad_requests_get_a_sentence(tmp_path):
             (pixels, "--to", "siaf", "--option", "aperture=A", *new),
             "give the pixel scale (of convert: --scale)",
         ),
+        ((path, "--to", "siaf", *new), "(of convert: --option aperture=NIS_CEN)"),
         ((path, "--to", "wise_meta", *new), "give a run whose detector.name is the band"),
         ((path, "--to", "tpv", "--order", 11, *new), "choose one from 1 to 7 for TPV headers"),
         ((high, "--to", "tpv", *new), "up to order 7"),

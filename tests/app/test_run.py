@@ -23,7 +23,7 @@ from astropy.table import Table
 from astropy.wcs import WCS, FITSFixedWarning
 
 import bayesdist
-from bayesdist.app.config import CATALOGUE_WORDS, load_config, parse_config
+from bayesdist.app.config import load_config, parse_config
 from bayesdist.app.report import title_of
 from bayesdist.app.screen import progress_bar
 from bayesdist.app.store.rundir import RunDirectory
@@ -746,9 +746,9 @@ def test_init_writes_what_check_accepts(tmp_path, finished, suffix, errors):
     # the catalogue's row is there to be filled in, and states nothing until it is
     config = load_config(tmp_path / "c.toml")[0]
     assert [row.name for row in config.budget] == ["reference catalogue"]
-    assert not config.states(*CATALOGUE_WORDS) and config.user_terms() == ()
+    assert not config.states_catalogue and config.user_terms() == ()
     filled = text.replace("sigma_u = 0.0 ", "sigma_u = 0.01 ")
-    assert parse_config(filled, "c.toml").states(*CATALOGUE_WORDS)
+    assert parse_config(filled, "c.toml").states_catalogue
 
 
 def test_inspect(finished, posterior):

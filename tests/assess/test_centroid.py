@@ -19,7 +19,9 @@ def sample(n=20_000, *, seed=1, catalogue=0.015, false=0.03, with_mag=True):
         x=np.arange(1.0, n + 1), y=np.ones(n), u=np.zeros(n), v=np.zeros(n), unit="pix",
         mag=mag if with_mag else None,
     )  # fmt: skip
-    return StarSample(table, residual, ~wrong, n, residual, np.where(wrong, 0.99, 0.01))
+    variance = np.repeat(centroid[:, None] ** 2, 2, axis=1)
+    doubted = np.where(wrong, 0.99, 0.01)
+    return StarSample(table, residual, ~wrong, n, variance, residual, doubted)
 
 
 def test_what_is_known_to_be_in_the_residuals_is_taken_off():

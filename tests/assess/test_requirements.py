@@ -212,7 +212,7 @@ def test_a_posterior_that_is_not_converged_leaves_everything_undecided(shifting)
 def test_what_is_missed_is_missed_for_sure_where_errors_can_only_be_larger(shifting):
     reqs = [Requirement("easy", "rms", 5.0), Requirement("hard", "rms", 1e-6)]
     for doubt, verdicts in ((EITHER, ["undecided"] * 2), (LARGER, ["undecided", "missed"])):
-        checks = [Check("Fit", sentence="structure is left", doubt=doubt)]
+        checks = [Check("Fit", "Residuals", sentence="structure is left", doubt=doubt)]
         found = margins_of(shifting(), reqs, checks=checks)
         assert [m.verdict for m in found] == verdicts
         for m in found:
@@ -220,7 +220,7 @@ def test_what_is_missed_is_missed_for_sure_where_errors_can_only_be_larger(shift
                 assert m.reason.startswith("structure is left; the stated errors alone would")
         assert all(m.remedy is None for m in found)
     # draws that are not to be trusted decide nothing, in either direction
-    checks = [Check("Fit", sentence="structure is left", doubt=LARGER)]
+    checks = [Check("Fit", "Residuals", sentence="structure is left", doubt=LARGER)]
     for m in margins_of(shifting(converged=False), reqs, checks=checks):
         assert m.verdict == "undecided"
 
@@ -322,7 +322,7 @@ def test_a_catalogue_that_varies_is_judged_by_its_worst_form(exact):
     (moving,) = margins_of(exact, limit, terms=[catalogue("a", 0.01)])
     assert still[0].verdict == "met"
     assert moving.probability_met < still[0].probability_met and moving.verdict != "met"
-    doubt = Check("Fit", sentence="the residuals go with magnitude", doubt=LARGER)
+    doubt = Check("Fit", "Residuals", sentence="the residuals go with magnitude", doubt=LARGER)
     (doubted,) = margins_of(exact, limit, terms=[catalogue("a", 0.01)], checks=[doubt])
     assert doubt.sentence in doubted.reason and "varies over the field" in doubted.reason
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
+from bayesdist.data import read_matches
 from bayesdist.data.detections import Detections, detections_of
 from bayesdist.data.starlists import StarCuts, read_star_lists
 from bayesdist.errors import InputError
@@ -83,6 +84,25 @@ def test_pixels_that_count_from_zero_are_converted(tmp_path, caplog, names):
         [one] = read_star_lists(tmp_path / "j1.ecsv")
     assert (one.x.tolist(), one.y.tolist()) == ([11.0, 21.0], [11.0, 21.0])
     assert "j1.ecsv: 1 is added to its pixels" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("flux", "why"),
+    [([100.0, -1.0], "not all fluxes are positive"), (["a", "b"], "where a number must be")],
+)
+def test_fluxes_that_make_no_magnitudes_are_named(tmp_path, caplog, flux, why):
+    lists, matched = tmp_path / "j1.ecsv", tmp_path / "m.ecsv"
+    table = Table({"x": [1.0, 2.0], "y": [3.0, 4.0], "flux": flux})
+    table.write(lists)
+    [one] = read_star_lists(lists)
+    table["u"], table["v"] = table["x"] + 0.1, table["y"] - 0.1
+    table["colour"] = ["blue", "red"]
+    table.write(matched)
+    found = read_matches(matched, unit="pix", sigma=0.1)
+    assert one.mag is None and found.mag is None and found.colour is None
+    lines = caplog.text.splitlines()
+    for words in ((str(lists), "flux", why), (str(matched), "flux", why), (str(matched), "colour")):
+        assert any(all(one in line for one in words) for line in lines)
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,12 @@ import pytest
 from numpy.polynomial import legendre
 from scipy.stats import binom
 
+from bayesdist.data import Matches
+from bayesdist.diagnose.diagnostics import misfits_of, residual_sums
 from bayesdist.diagnose.residuals.binned import binned_sums
 from bayesdist.diagnose.residuals.misfit import Misfit, misfit_of, partitions_for, worst_misfit
-from bayesdist.model import Chip
+from bayesdist.infer import OutlierMixture, Rejection, fit_linear, load, sample
+from bayesdist.model import Chip, DistortionModel
 from tests.reduced import case_in_full
 
 SIZE = (1000.0, 800.0)
@@ -97,6 +100,34 @@ def test_a_wave_over_the_field_is_found_in_cells():
     r[:, 1] += 0.03 * np.sin(x / 60) * np.sin(y / 60)
     found = _misfit(x, y, r)
     assert found.significant and found.partition == "cells"
+
+
+@pytest.mark.parametrize("wave", [0.0, 0.1])
+def test_false_pairs_within_the_clip_hide_nothing_from_a_posterior(rng, wave):
+    """As of a ground-based camera: most pairs are false, and lie within 8 of the true position."""
+    n, radius = 6000, 8.0
+    model = DistortionModel(2, (Chip(1, "A", SIZE, (500.5, 400.5)),))
+    x, y = rng.uniform(0.5, 1000.5, n), rng.uniform(0.5, 800.5, n)
+    r = 0.1 * rng.standard_normal((n, 2))
+    r[:, 1] += wave * np.sin(y / 15)
+    false = rng.random(n) < 0.55
+    turn, far = rng.uniform(0, 2 * np.pi, n), radius * np.sqrt(rng.random(n))
+    r[false] = (far[:, None] * np.column_stack([np.cos(turn), np.sin(turn)]))[false]
+    sigma = np.full(n, 0.1)
+    table = Matches(x, y, x + r[:, 0], y + r[:, 1], sigma_u=sigma, sigma_v=sigma)
+    fit = fit_linear(table, model, rejection=Rejection(1e6, clip_abs=6.0))
+    mixture = OutlierMixture(model="uniform", match_radius=radius)
+    posterior = sample(fit, table, outliers=mixture, target_ess=50, target_rhat=1.1)
+    shards = load(model, table)
+    (of_fit,), (found,) = (
+        misfits_of(fit, *residual_sums(fit, shards, solution.likelihood))
+        for solution in (fit, posterior)
+    )
+    shards.close()
+    assert not of_fit.significant
+    assert found.significant is bool(wave)
+    if wave:
+        assert found.structure == pytest.approx(wave / np.sqrt(2), rel=0.15)
 
 
 def test_the_worst_of_several_chips_pays_for_their_number():

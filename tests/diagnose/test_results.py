@@ -135,6 +135,13 @@ def test_verdicts_stand_where_correlated_errors_hold_a_finding(scatter, structur
         assert bool(beside.doubt) == (kind not in held)
 
 
+def test_tests_that_find_nothing_are_one_row():
+    rows = list(score_checks(corrected([outcome(0.5), outcome(0.7)])))
+    assert [row.level for row in rows] == ["pass"] and not rows[0].doubt
+    [found] = score_checks(corrected([outcome(0.5), outcome(0.0)]))
+    assert found.level == "warn" and found.doubt
+
+
 def test_findings_name_another_one_that_may_explain_them():
     first = replace(outcome(0.0), family=Family("a", "", "a", "", group="g", denial="it is not a"))
     second = replace(outcome(0.0), family=Family("b", "", "b", "", explained_by="g"))

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from bayesdist.data import Matches
+from bayesdist.diagnose.checks import exposure_checks
 from bayesdist.diagnose.residuals.binned import binned_residuals, binned_sums
-from bayesdist.diagnose.residuals.sample import star_sample
+from bayesdist.diagnose.residuals.sample import StarSample, star_sample
 from bayesdist.diagnose.residuals.star_sums import flagged_by_exposure, star_sums
 from bayesdist.infer import (
     OutlierMixture,
@@ -100,11 +101,16 @@ def several():
     return table, fit_linear(table, model)
 
 
+def by_fit(fit):
+    clipped = fit.likelihood
+    return clipped, clipped
+
+
 def test_a_piece_without_a_chip_adds_nothing(several):
     table, fit = several
-    both = load(fit.model, table).sum(star_sums, fit.mean, fit.clip, BINS)
+    both = load(fit.model, table).sum(star_sums, *by_fit(fit), BINS)
     parts = [
-        load(fit.model, table.select(table.chip == code)).sum(star_sums, fit.mean, fit.clip, BINS)
+        load(fit.model, table.select(table.chip == code)).sum(star_sums, *by_fit(fit), BINS)
         for code in (0, 1)
     ]
     assert parts[0].binned[2, (5, 4)].n == 0
@@ -120,7 +126,7 @@ def test_one_pass_gives_what_arrays_give(several, monkeypatch):
     numbers = table.chip_number
     for piece in (10_000, 700):
         monkeypatch.setattr("bayesdist.data.batches.BATCH", piece)
-        sums = load(fit.model, table).sum(star_sums, fit.mean, fit.clip, BINS)
+        sums = load(fit.model, table).sum(star_sums, *by_fit(fit), BINS)
         assert set(sums.binned) == {
             (chip, bins) for chip, several in BINS.items() for bins in several
         }
@@ -145,7 +151,7 @@ def test_one_pass_gives_what_arrays_give(several, monkeypatch):
 
 def test_the_sums_over_exposures_are_those_of_the_fit(several):
     table, fit = several
-    e = load(fit.model, table).sum(star_sums, fit.mean, fit.clip, BINS).exposures
+    e = load(fit.model, table).sum(star_sums, *by_fit(fit), BINS).exposures
     assert (e.n.sum(), e.n_used.sum()) == (fit.n_rows, fit.n_used)
     rms = np.sqrt([e.uu.sum() / e.n_used.sum(), e.vv.sum() / e.n_used.sum()])
     np.testing.assert_allclose(rms, [fit.rms_u, fit.rms_v], rtol=1e-9)
@@ -154,9 +160,9 @@ def test_the_sums_over_exposures_are_those_of_the_fit(several):
 def test_the_task_and_what_it_returns_travel(several):
     """To workers and back."""
     table, fit = several
-    task, clip = pickle.loads(pickle.dumps((star_sums, fit.clip)))
-    one = load(fit.model, table).sum(star_sums, fit.mean, fit.clip, BINS)
-    other = pickle.loads(pickle.dumps(load(fit.model, table).sum(task, fit.mean, clip, BINS)))
+    task, clipped = pickle.loads(pickle.dumps((star_sums, by_fit(fit))))
+    one = load(fit.model, table).sum(star_sums, *by_fit(fit), BINS)
+    other = pickle.loads(pickle.dumps(load(fit.model, table).sum(task, *clipped, BINS)))
     np.testing.assert_array_equal(one.exposures.uu, other.exposures.uu)
     np.testing.assert_array_equal(one.binned[2, (5, 4)].second_2, other.binned[2, (5, 4)].second_2)
 
@@ -206,10 +212,28 @@ def test_what_belongs_to_the_detector_is_seen_in_turned_exposures(rng):
     )  # fmt: skip
     fit = fit_linear(table, model)
     shards = load(model, table)
-    sums = shards.sum(star_sums, fit.mean, fit.clip, {2: ((8, 1),)})
+    sums = shards.sum(star_sums, *by_fit(fit), {2: ((8, 1),)})
     shards.close()
     found = sums.binned[2, (8, 1)].residuals()
     left = pattern - np.polyval(np.polyfit(x, pattern, 1), x)  # what the polynomial leaves of it
     expected = [left[x // 127 == k].mean() for k in range(8)]
     np.testing.assert_allclose(found.mean_u[0], expected, atol=0.002)
     np.testing.assert_allclose(found.mean_v[0], 0.0, atol=0.002)
+
+
+def test_an_exposure_with_other_errors_is_named(rng):
+    """Twelve exposures of Gaussian residuals, and one of them with twice the errors."""
+    n, names = 6000, tuple(f"e{k:02d}" for k in range(12))
+    codes, sigma = np.arange(n) % 12, np.full((n, 2), 0.05)
+    x = np.arange(1.0, n + 1)
+    table = Matches(x, x, x, x, exposure=codes, exposure_names=names)
+    for factor in (1.0, 2.0):
+        residual = 0.05 * rng.standard_normal((n, 2)) * np.where(codes == 4, factor, 1.0)[:, None]
+        found = StarSample(table, residual, np.ones(n, bool), n, sigma**2).by_exposure
+        (check,) = exposure_checks(found)
+        assert found.of_all == pytest.approx((residual**2).sum() / 0.05**2 / (2 * n))
+        assert found.relative[4] == pytest.approx(factor**2 / found.of_all, rel=0.2)
+        assert list(np.flatnonzero(found.deviating)) == ([4] if factor > 1 else [])
+        assert check.level == ("warn" if factor > 1 else "pass")
+        assert ("(e04)" in check.sentence) == (factor > 1)
+    assert not list(exposure_checks(None))

@@ -235,7 +235,7 @@ def report_input(
     solution = posterior or fit
     shards = load(fit.model, table)
     bins = {chip.number: ((16, 16),) for chip in fit.model.chips}
-    sums = shards.sum(star_sums, fit.mean, fit.clip, bins)
+    sums = shards.sum(star_sums, fit.likelihood, solution.likelihood, bins)
     stars = star_sample(table.sample(shown), len(table), fit, posterior)
     mag, residual = (a[stars.used] for a in (stars.table.mag, stars.fit_residual))
     place = {"epoch": 2010.3}

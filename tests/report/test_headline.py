@@ -9,7 +9,8 @@ import pytest
 
 from bayesdist.assess.checks import catalogue_checks
 from bayesdist.assess.requirements.validity import ValidityPeriod
-from bayesdist.checks import Check
+from bayesdist.checks import GROUPS, LARGER, Check
+from bayesdist.report.contents import EXPLAINED, section_of
 from bayesdist.report.context import Product
 from bayesdist.report.sections.run.provenance import product_table
 from bayesdist.report.sections.run.status import status_checks, status_table, verdict
@@ -86,6 +87,26 @@ def test_the_validity_period_counts_and_stands_in_the_status_table(
     assert row.level == level
     if 2010.3 < end < 2020.3:
         assert f"until {end:.1f}" in row.value
+
+
+def test_what_keeps_a_verdict_open_stands_in_its_row(converged):
+    (met,) = _met_only(converged).margins[:1]
+    run = replace(converged, margins=(replace(met, verdict="undecided", reason="too few draws"),))
+    (row,) = status_checks(run)["Requirements"]
+    assert row.level == "warn" and row.value.endswith("; undecided: too few draws")
+    doubt = Check("Fit", "Odd stars", "three", "none", "warn", "stars are odd", LARGER)
+    doubted = status_checks(replace(run, checks=(*run.checks, doubt)))
+    (row,) = doubted["Requirements"]
+    assert row.value.endswith("; undecided: see “Odd stars”") and doubt in doubted["Fit"]
+
+
+@pytest.mark.parametrize("group", sorted(set(GROUPS) - {"Requirements", "Validity", "Products"}))
+def test_every_group_of_checks_has_its_rows_and_a_section(converged, group):
+    row = Check(group, "Odd stars", level="warn", sentence="stars are odd")
+    run = replace(_met_only(converged), checks=(row,))
+    assert verdict(run).headline.startswith("One criterion warns (Odd stars)")
+    assert [cells[2] for cells in status_table(run).rows if cells[0] == group] == ["Stars are odd"]
+    assert section_of(group) in EXPLAINED
 
 
 def test_an_error_of_the_catalogue_that_is_not_stated_is_amber(converged):

@@ -248,7 +248,7 @@ def test_structure_in_the_residuals_has_a_row(converged):
         assert found.significant == (level == "warn")
         checks = (*converged.checks, *structure_checks((found,)))
         *_, row = status_checks(replace(converged, checks=checks))["Fit"]
-        assert row.name.startswith("Structure in the residuals of the fit") and row.level == level
+        assert row.name.startswith("Structure in the residuals") and row.level == level
         assert row.value.startswith("0.0021\u202fpix rms in columns of W2, p ")
 
 

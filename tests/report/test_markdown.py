@@ -62,7 +62,7 @@ def test_what_a_user_writes_does_not_become_markup(converged, drawings):
         replace(
             converged,
             name=evil,
-            checks=(*converged.checks, Check("Fit", level="warn", sentence=evil)),
+            checks=(*converged.checks, Check("Fit", "A name", level="warn", sentence=evil)),
         ),
         drawings,
     )

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
-from bayesdist.app.config import CATALOGUE_WORDS, Config
-from bayesdist.app.kinds.campaign.checks import campaign_checks, campaign_remarks
+from bayesdist.app.config import Config
+from bayesdist.app.kinds.campaign.checks import campaign_checks
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matches.added_errors import knows_circle
 from bayesdist.assess.checks import catalogue_checks, matching_checks, time_checks
 from bayesdist.assess.units import pixel_doubt
 from bayesdist.checks import LARGER, Check
-from bayesdist.diagnose.checks import score_checks
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
 from bayesdist.infer.checks import fit_checks, sampling_checks
@@ -34,11 +33,12 @@ def run_checks(
     `series` is the section 'time_dependence' of summary.json, of runs that have one.
     """
     kind, circle = kind_of(config), in_circle(data, config)
-    has, words = data.matched.has_catalogue, CATALOGUE_WORDS
-    errors = (data.matched.states_errors or config.states(*words)) if has else None
-    motions = (data.matched.states_motion_errors or config.states("motion")) if has else None
+    errors = motions = None
+    if data.matched.has_catalogue:
+        errors = data.matched.states_errors or config.states_catalogue
+        motions = data.matched.states_motion_errors or config.states_motions
     return (
-        *_kind_checks(data, found, series),
+        *_kind_checks(data, series),
         *sampling_checks(posterior),
         *fit_checks(data.fit, in_circle=circle, things=kind.rows, chooser=kind.chooser),
         *_remarks(data, found.majority, config),
@@ -55,34 +55,40 @@ def in_circle(data: FitData, config: Config) -> bool:
     return knows_circle(config) and data.matched.stars.has_nominal
 
 
-def _kind_checks(
-    data: FitData, found: Diagnostics, series: Mapping[str, Any] | None
-) -> tuple[Check, ...]:
+def _kind_checks(data: FitData, series: Mapping[str, Any] | None) -> tuple[Check, ...]:
     """Checks of matching, tables and exposures, and of what fixes the gauge."""
     matched, fitted = data.matched, data.fitted
     if fitted.solved is not None:
         solved = fitted.solved
-        texts = (*solved.gauge.sentences, *solved.contradictions, *matched.warnings)
-        return tuple(Check("Gauge", level="warn", sentence=text) for text in texts)
+        named = {
+            "Degeneracies": solved.gauge.sentences,
+            "Constraints": solved.contradictions,
+            "Detections": matched.warnings,
+        }
+        return tuple(
+            Check("Gauge", name, level="warn", sentence=text)
+            for name, texts in named.items()
+            for text in texts
+        )
     if fitted.scatter is None:
         return ()
     facts = {matched.section: matched.facts, **fitted.facts, "time_dependence": series or {}}
-    remarks = campaign_remarks(facts)
-    tests: Sequence[Check] = tuple(score_checks(found.score_tests, found.correlated))
-    return (*remarks, *campaign_checks(facts, (*remarks, *tests)))
+    return campaign_checks(facts)
 
 
 def _remarks(data: FitData, majority: str, config: Config) -> Iterator[Check]:
     if doubt := pixel_doubt(data.fit):
-        yield Check("Fit", level="warn", sentence=doubt)
+        yield Check("Fit", "Size of a pixel", level="warn", sentence=doubt)
     if text := frames_doubt(data, majority, config):
-        yield Check("Fit", level="warn", sentence=text)
+        yield Check("Fit", "Frames of the exposures", level="warn", sentence=text)
     if data.error_scale_sentence:
-        yield Check("Fit", sentence=data.error_scale_sentence, doubt=LARGER)
+        text = data.error_scale_sentence
+        yield Check("Fit", "Scale of the quoted errors", level="warn", sentence=text, doubt=LARGER)
     if config.data is None or in_circle(data, config) or not data.placed.has_nominal:
         return
     yield Check(
         "Matching",
+        "Match radius",
         level="warn",
         sentence="the matches have nominal positions, and outliers.match_radius is not given: the "
         "likelihood does not know that they were selected",

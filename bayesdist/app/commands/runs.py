@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import click
 
@@ -13,7 +14,7 @@ STAGES = ("match", "fit", "sample", "diagnose", "evaluate", "assess", "export", 
 
 @command()
 @click.argument("config", metavar="CONFIG.toml")
-@click.option("--matches", required=True, metavar="FILE", help="Table of matched stars.")
+@click.option("--matches", metavar="FILE", help="Table of matched stars; needed.")
 @click.option(
     "--columns",
     type=column_names,
@@ -31,12 +32,20 @@ STAGES = ("match", "fit", "sample", "diagnose", "evaluate", "assess", "export", 
 @force
 def init(
     config: str,
-    matches: str,
+    matches: str | None,
     columns: Mapping[str, str] | None,
     size: tuple[int, int] | None,
     force: bool,
 ) -> None:
     """Write a commented configuration for a table of matched stars."""
+    if matches is None:
+        toml = Path(config).with_suffix(".toml").name
+        table = config if toml != Path(config).name else "stars.csv"
+        raise click.UsageError(
+            f"--matches names the table: bayesdist init {toml} --matches {table}. A row of it is a "
+            "star with its pixels and its reference position; match two lists first (bayesdist "
+            "docs your_table). Of one list without reference positions a draft is written."
+        )
     from bayesdist.app.commands.on_files.init import init as write_configuration
 
     click.echo(write_configuration(config, matches, columns=columns, size=size, force=force))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bayesdist.app.config.assess import CATALOGUE_WORDS
 from bayesdist.app.config.campaign import CampaignConfig
 from bayesdist.app.config.data import Data, MatchesConfig
 from bayesdist.app.config.reading import (
@@ -18,7 +17,6 @@ from bayesdist.app.config.section import ChipBlock
 from bayesdist.app.config.selfcal import SelfcalConfig
 
 __all__ = [
-    "CATALOGUE_WORDS",
     "KINDS",
     "CampaignConfig",
     "ChipBlock",

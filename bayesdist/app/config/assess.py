@@ -16,7 +16,6 @@ from bayesdist.assess.terms.parameters import one_size_kinds
 from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
 
 __all__ = [
-    "CATALOGUE_WORDS",
     "MEASURED_TERMS",
     "Assess",
     "BudgetBlock",
@@ -28,7 +27,10 @@ Probability = Annotated[float, Field(gt=0, lt=1)]
 GridPoints = Annotated[int, Field(ge=2, le=10_000)]  # more than a detector has pixels says nothing
 
 # by which a row of the budget says that it is the error of the reference catalogue
-CATALOGUE_WORDS = ("catalog", "reference")
+CATALOGUE_WORDS = (
+    *("catalog", "reference", "gaia", "2mass", "hipparcos", "tycho", "ucac", "urat", "usno"),
+    *("pan-starrs", "panstarrs", "ps1", "sdss", "skymapper", "hsc", "des dr"),
+)
 
 # rows of every budget, and what its totals are called
 MEASURED_TERMS = (
@@ -87,8 +89,13 @@ class BudgetBlock(Section):
 
     @property
     def of_catalogue(self) -> bool:
-        """Boolean: the row is the error of the reference catalogue."""
-        return self.names(*CATALOGUE_WORDS)
+        """Boolean: the row is the error of the reference catalogue's positions."""
+        return self.names(*CATALOGUE_WORDS) and not self.of_motions
+
+    @property
+    def of_motions(self) -> bool:
+        """Boolean: the row is the error of proper motions."""
+        return self.names("motion")
 
     @property
     def stated(self) -> bool:

@@ -137,9 +137,15 @@ class RunConfig(Section):
         """Begin and end of each of the periods, decimal years; empty where none are asked for."""
         return {}
 
-    def states(self, *words: str) -> bool:
-        """Boolean: a [[budget]] row with one of some words in its name states an error."""
-        return any(row.stated and row.names(*words) for row in self.budget)
+    @property
+    def states_catalogue(self) -> bool:
+        """Boolean: a [[budget]] row states the error of the catalogue's positions."""
+        return any(row.stated and row.of_catalogue for row in self.budget)
+
+    @property
+    def states_motions(self) -> bool:
+        """Boolean: a [[budget]] row states the error of proper motions."""
+        return any(row.stated and row.of_motions for row in self.budget)
 
     def user_terms(self) -> tuple[UserTerm, ...]:
         """The user's terms of the error budget that are the same at every position."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -198,14 +197,11 @@ def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any
     if "mag" in found:
         out["mag"] = column("mag").numbers()
     elif "flux" in found:
-        with contextlib.suppress(InputError):  # magnitudes are rarely needed: then no star has one
-            flux = column("flux").numbers()
-            if (flux > 0).all():
-                out["mag"] = -2.5 * np.log10(flux)
-    if "colour" in found:
-        # colours serve a test alone: where stars have none, the table is read without
-        with contextlib.suppress(InputError):
-            out["colour"] = column("colour").numbers()
+        mag = column("flux").magnitudes_of_fluxes()
+        out |= {} if mag is None else {"mag": mag}
+    if "colour" in found:  # it serves a test alone
+        colour = column("colour").numbers_if_readable("a colour")
+        out |= {} if colour is None else {"colour": colour}
     if "exposure" in found:
         out["exposure"], out["exposure_names"] = column("exposure").labels()
     if "filter" in found:

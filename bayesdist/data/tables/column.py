@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeVar
@@ -27,6 +28,8 @@ __all__ = [
     "row_number",
     "year_of",
 ]
+
+log = logging.getLogger("bayesdist")
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -154,6 +157,22 @@ class SourceColumn:
         if mask.any():
             filled[mask] = value
         return replace(self, values=filled).numbers()
+
+    def numbers_if_readable(self, what: str) -> Float | None:
+        """Numbers (N,); None and a warning that no star has `what`, where they cannot be read."""
+        try:
+            return self.numbers()
+        except InputError as error:
+            log.warning("%s: %s, so that no star has %s", error.where, error.cause, what)
+            return None
+
+    def magnitudes_of_fluxes(self) -> Float | None:
+        """Magnitudes (N,), or None and a warning where not all fluxes are positive numbers."""
+        flux = self.numbers_if_readable("a magnitude")
+        if flux is None or (flux > 0).all():
+            return None if flux is None else np.asarray(-2.5 * np.log10(flux))
+        log.warning("%s: not all fluxes are positive, so that no star has a magnitude", self.where)
+        return None
 
     def known(self) -> tuple[Int, SourceColumn]:
         """Rows (n,) that have a value, neither masked nor NaN, and the column of these alone."""

@@ -39,9 +39,12 @@ class Coverage:
     @property
     def significant(self) -> bool:
         """True where so much is missing that the corners or edges are extrapolated."""
-        return not self.known and self.gap > max(
-            UNCOVERED.value, UNCOVERED_BY_CHANCE.value * self.by_chance
-        )
+        return not self.known and self.gap > self.most
+
+    @property
+    def most(self) -> float:
+        """Fraction of the chip's area that may lie beyond the stars."""
+        return max(UNCOVERED.value, UNCOVERED_BY_CHANCE.value * self.by_chance)
 
     @property
     def sentence(self) -> str:

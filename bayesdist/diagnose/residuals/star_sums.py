@@ -16,7 +16,7 @@ from bayesdist.diagnose.residuals.binned import BinnedSums, binned_sums
 from bayesdist.infer.kernel import Constants
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.posterior.memberships import averaged_draws
-from bayesdist.infer.stars.likelihood import Clip, star_averages
+from bayesdist.infer.stars.likelihood import Likelihood, star_averages
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.sums import Sums
@@ -59,10 +59,11 @@ class StarSums(Sums):
     Parameters
     ----------
     binned : mapping of (int, (int, int)) to BinnedSums
-        Residuals of the stars used, by the chip's number and the numbers of bins on x and y.  Where
-        exposures have frames that turn, they are along the axes of the polynomials: what belongs to
-        the detector would cancel along those of the sky.
+        Residuals at the solution of its probably true stars, by the chip's number and the numbers
+        of bins on x and y.  Where exposures have frames that turn, they are along the axes of the
+        polynomials: what belongs to the detector would cancel along those of the sky.
     exposures : ExposureSums
+        At the least-squares fit.
     """
 
     binned: Mapping[tuple[int, Bins], BinnedSums]
@@ -70,17 +71,21 @@ class StarSums(Sums):
 
 
 def star_sums(
-    stars: Stars, theta: Float, clip: Clip, partitions: Mapping[int, tuple[Bins, ...]]
+    stars: Stars,
+    fit: Likelihood,
+    solution: Likelihood,
+    partitions: Mapping[int, tuple[Bins, ...]],
 ) -> StarSums:
     """Sums over some stars: a task for `Shards.sum`.
 
     Parameters
     ----------
     stars : Stars
-    theta : ndarray, shape (D,)
-        Where the residuals are taken.
-    clip : Clip
-        Says which stars are used.
+    fit : Likelihood
+        Of the least-squares fit.
+    solution : Likelihood
+        Of the posterior, or the fit again where nothing was sampled: the clip of a fit lets false
+        matches in that hide what residuals of the true ones show.
     partitions : mapping of int to tuple of (int, int)
         Bins on x and on y, by the number of the chip.
 
@@ -88,11 +93,12 @@ def star_sums(
     -------
     StarSums
     """
-    used = clip.keeps_of(stars)
-    residual = stars.residuals(theta)
+    used, residual = fit.inliers(stars) > 0.5, stars.residuals(fit.theta)
     exposures = _exposure_sums(stars, used, residual)
+    if solution is not fit:
+        used, residual = solution.inliers(stars) > 0.5, stars.residuals(solution.theta)
     code = _of_groups(stars, stars.groups.chip)
-    arrays = (*stars.pixels(), *_along_gauge(stars, theta, residual).T)
+    arrays = (*stars.pixels(), *_along_gauge(stars, solution.theta, residual).T)
     binned = {}
     for number, several in partitions.items():
         k = stars.model.chip_code(number)

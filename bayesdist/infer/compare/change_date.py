@@ -78,7 +78,7 @@ def period_scores(new: NewFit, change: Change, matches: Matches) -> tuple[Period
     """
     edges = _edges(matches)
     held: dict[int, tuple[NormalEquations, float, float, int]] = {}
-    constants = new.target.hyper.constants(new.psi[None, new.target.n_theta :])
+    constants = new.likelihood.constants
     for table in matches.batches():
         of_period = np.searchsorted(edges, table.column("epoch"), side="right")
         for b in np.unique(of_period):

@@ -27,6 +27,7 @@ from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.infer.exposures.hierarchy import held_in_reference
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.infer.solution import Solution, TransformedSolution
+from bayesdist.infer.stars.likelihood import MixtureAt
 from bayesdist.infer.stars.loading import load
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute
@@ -86,6 +87,12 @@ class NewFit:
     def model(self) -> DistortionModel:
         """Model of the new matches: the released structure with their exposures."""
         return self.fit.model
+
+    @property
+    def likelihood(self) -> MixtureAt:
+        """Mixture at its mode."""
+        h = self.psi[None, self.target.n_theta :]
+        return MixtureAt(self.theta, self.target.hyper.constants(h))
 
     @property
     def open(self) -> DistortionModel:

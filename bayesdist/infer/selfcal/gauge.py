@@ -196,7 +196,8 @@ def _fixed(one: NamedDirection) -> str:
     if one.by_detections:
         return "nothing that is given fixes it better"
     if np.isfinite(one.sigma_fixed):
-        return f"fixed by what is given besides, sigma {one.sigma_fixed:.2g} {one.unit}".strip()
+        size = f"{one.sigma_fixed:.2g} {one.unit}".strip()
+        return f"the constraints that are given determine it to {size} (1 sigma)"
     return "held by convention"
 
 

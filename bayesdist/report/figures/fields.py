@@ -114,7 +114,8 @@ def _contours(
     if crossed:
         lines = ax.contour(*at, fine, crossed, colors="white", linewidths=0.6)
         if labelled:
-            ax.clabel(lines, fontsize=7.5, fmt=lambda v: f"{v:.4g}".replace("-", "−"))
+            digits = max(len(f"{v:.10g}".partition(".")[2]) for v in levels)
+            ax.clabel(lines, fontsize=7.5, fmt=lambda v: f"{v:.{digits}f}".replace("-", "−"))
     return filled
 
 

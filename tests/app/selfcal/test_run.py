@@ -23,6 +23,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer import load_fit, load_posterior
 from bayesdist.infer.compare.planning import with_information
 from bayesdist.infer.selfcal import gauge_free
+from bayesdist.infer.stars.stars import in_table_order, prepare
 from tests.app.selfcal.support import affine_left
 from tests.app.support import cli, good, one_sentence, snapshot, summary_of, write_config
 from tests.reduced import only_in_full
@@ -299,3 +300,30 @@ def test_requirements_are_judged(three_rolls, tmp_path):
     assert margin["verdict"] == "met"
     planned = good("plan", tmp_path / "run").out
     assert "dithered as these 8 are" in planned and "dithered like these: met as it is" in planned
+
+
+def test_residuals_are_about_the_stars_that_were_fitted(three_rolls):
+    """The residuals of a star have no mean: about the mean of the draws they would have one."""
+    results = results_of(RunDirectory.open(three_rolls.path))
+    sample = results.diagnostics.sample
+    problem = results.fitted.solved.mode.problem
+    n, star = len(problem.starts) - 1, np.empty(problem.rows.max() + 1, int)
+    star[problem.rows] = np.repeat(np.arange(n), np.diff(problem.starts))
+    assert set(sample.table.row) == set(problem.rows)
+    star = star[sample.table.row]
+    # of these the mixture counts nearly all
+    true = sample.outlier_probability < 0.05
+    counted = np.where(true, 1.0 - sample.outlier_probability, 0.0)
+    weight = counted[:, None] / sample.variance
+    doubted = np.bincount(star[~true], minlength=n) > 0
+
+    def of_stars(values):
+        return np.array([np.bincount(star, one, minlength=n)[~doubted] for one in values.T])
+
+    def pull(residual):
+        return np.abs(of_stars(weight * residual) / np.sqrt(of_stars(weight)))
+
+    assert (~doubted).sum() > 50
+    stars, order = prepare(results.fit.model, results.data.stars)
+    of_mean = in_table_order(stars.residuals(results.posterior.mean), order)
+    assert np.median(pull(sample.residual)) < 0.5 * np.median(pull(of_mean))

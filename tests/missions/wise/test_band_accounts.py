@@ -139,7 +139,7 @@ def test_parts_add_in_quadrature():
     assert one.rest == pytest.approx(np.sqrt(0.49 - 0.04 - 0.09))
     assert one.printed_structure == pytest.approx(np.sqrt(0.81 - 0.01))
     assert one.remains == pytest.approx(np.sqrt(0.80 - 0.45))
-    assert one.verdict == "print has more" and "printed set has 0.59 more" in one.sentence
+    assert one.verdict == "print has more" and "published set has 0.59 more" in one.sentence
 
 
 def test_less_there_and_the_same():

@@ -156,6 +156,7 @@ def _of_matches(
     for reason, count in table.rejected.items():
         log.warning("%s: left out %d rows: %s", matches, count, reason)
     layout = table_layout(matches, columns, read_sigma=read_sigma)
+    _warn_of_pixels(table, str(matches))
     names = dict(zip(table.chip_numbers, _chip_names(table), strict=True))
     detector = detector_lines(_reach(table), names, size, Path(matches).stem)
     cx, cy = detector.middle
@@ -230,6 +231,20 @@ def _guessed_unit(table: Matches, layout: TableLayout | None) -> str:
     if LIKE_PIXELS[0] < ratio < LIKE_PIXELS[1]:
         return "arcsec" if is_angle else "pix"
     return "deg" if ratio < DEGREES else "mas" if ratio > MAS else "arcsec"
+
+
+def _warn_of_pixels(matches: Matches, where: str) -> None:
+    """Warn of positions that lie on no pixel, before the first one."""
+    found = [
+        (int(((t.x < 0.5) | (t.y < 0.5)).sum()), t.x.min(), t.y.min()) for t in matches.batches()
+    ]
+    n, (_, *least) = sum(one[0] for one in found), np.min(found, axis=0)
+    if n:
+        log.warning(
+            "%s: %d of %d positions lie before the first pixel, whose centre is (1, 1): x from "
+            "%.1f, y from %.1f; if they count from elsewhere on the detector, add its pixel there",
+            *(where, n, len(matches), *least),
+        )
 
 
 def _reach(matches: Matches) -> dict[int, tuple[float, float]]:

@@ -72,7 +72,9 @@ def monitor(
                 grid=(nx, ny),
             ),
             date=date,
-            misfit=worst_misfit(misfits_of(fitted.fit, *residual_sums(fitted.fit, shards))),
+            misfit=worst_misfit(
+                misfits_of(fitted.fit, *residual_sums(fitted.fit, shards, fitted.likelihood))
+            ),
             pixel_mas=pixel_scale_of(posterior, scale_mas=config.detector.scale_mas),
         )
         facts = _facts(fitted, posterior)

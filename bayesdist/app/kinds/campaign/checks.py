@@ -2,40 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from bayesdist.checks import LARGER, Check, level_of
 from bayesdist.limits import COMPLETENESS, FALSE_MATCHES
 from bayesdist.numbers import count, percent
 
-__all__ = ["campaign_checks", "campaign_remarks"]
+__all__ = ["campaign_checks"]
 
 GROUP = "Campaign"
 
-# sections whose warnings a reader has to know, and what these do to verdicts; deviations that go
-# with time are in no draw of the errors of a later exposure
-WARNING = {"matching": "", "deviations": LARGER, "tables": "", "time_dependence": ""}
+# sections whose warnings a reader has to know, with their names and what they do to verdicts;
+# deviations that go with time are in no draw of the errors of a later exposure
+WARNING = {
+    "matching": ("Matching", ""),
+    "deviations": ("Deviations of the exposures", LARGER),
+    "tables": ("Look-up tables", ""),
+    "time_dependence": ("Time dependence", ""),
+}
 
 
-def campaign_remarks(summary: Mapping[str, Any]) -> tuple[Check, ...]:
-    """Warnings of the stages."""
-    return tuple(
-        Check(GROUP, level="warn", sentence=text, doubt=doubt)
-        for part, doubt in WARNING.items()
-        for text in summary.get(part, {}).get("warnings", [])
-    )
-
-
-def campaign_checks(summary: Mapping[str, Any], remarks: Sequence[Check] = ()) -> tuple[Check, ...]:
-    """Criteria of matching, tables and series, and a row of remarks.
+def campaign_checks(summary: Mapping[str, Any]) -> tuple[Check, ...]:
+    """Criteria of matching, tables and series, and what their stages found odd.
 
     Parameters
     ----------
     summary : mapping
         As summary.json.
-    remarks : sequence of Check
-        What else was found odd: of the stages, and by tests of the residuals.
     """
     m, tables, time = (summary.get(k) or {} for k in ("matching", "tables", "time_dependence"))
     least = float(m["completeness"]["least"])
@@ -75,9 +69,11 @@ def campaign_checks(summary: Mapping[str, Any], remarks: Sequence[Check] = ()) -
     if skipped:
         what = "Exposures that could not be fitted alone"
         out.append(Check(GROUP, what, ", ".join(skipped), "none", "warn"))
-    texts = [one.text for one in remarks if one.sentence]
-    found = "; ".join(texts) or "none"
-    out.append(Check(GROUP, "Other warnings", found, "none", level_of(not texts, "warn")))
+    out += [
+        Check(GROUP, name, level="warn", sentence=text, doubt=doubt)
+        for part, (name, doubt) in WARNING.items()
+        for text in summary.get(part, {}).get("warnings", [])
+    ]
     return tuple(out)
 
 

@@ -131,15 +131,15 @@ class RowAccount:
         if self.printed is None or self.printed_noise is None:
             return ""
         ours, theirs = self.row.value["sigma"], self.printed.value["sigma"]
-        out = f"{ours:.4g} found, {theirs:.4g} printed: "
+        out = f"{ours:.4g} found, {theirs:.4g} published: "
         out += f"noise is {self.row.sigma_noise:.2g} here and {_range(*self.printed_noise)} there"
         if self.partition is not None:
             out += f", the partition {self.partition:.2g} here"
         if self.verdict == "same":
             return f"{out}; structure is the same within its error."
         if self.verdict == "below noise":
-            return f"{out}, more than was printed: its errors are distributed otherwise."
-        whose = "the printed set" if self.verdict == "print has more" else "this set"
+            return f"{out}, more than was published: its errors are distributed otherwise."
+        whose = "the published set" if self.verdict == "print has more" else "this set"
         if self.row.label.endswith("/radial"):
             what = "in the scatter of single stars over the array"
         elif "-" in self.row.label:

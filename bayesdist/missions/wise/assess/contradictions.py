@@ -116,7 +116,7 @@ def _open_triangles(band_to_band: Mapping[str, PrintedRow]) -> list[str]:
 def _unequal(row: PrintedRow, name: str, implied: float, slack: float) -> list[str]:
     if abs(row.value[name] - implied) <= slack + row.rounding[name]:
         return []
-    return [f"{row.label}: {name} {row.value[name]:g} is printed, {implied:.4g} follows."]
+    return [f"{row.label}: {name} {row.value[name]:g} is published, {implied:.4g} follows."]
 
 
 def _sigma_limits(a: float, first: PrintedRow, b: float, second: PrintedRow) -> tuple[float, float]:

@@ -114,7 +114,9 @@ def _build(
         aperture = (chip.name if several else settings.aperture) or calibration.detector
         if not aperture:
             raise InputError(
-                "the aperture has no name", where=WHERE, do="give aperture, as in 'NIS_CEN'"
+                "the aperture has no name",
+                where=WHERE,
+                do="give aperture, as in 'NIS_CEN' (of convert: --option aperture=NIS_CEN)",
             )
         made = siaf_files(
             calibration, chip.number, aperture, order=settings.order, options=options, where=WHERE

@@ -178,7 +178,7 @@ def coverage(r: ReportInput) -> Plot:
     return Plot(
         panels.figure,
         "Coverage of the detector",
-        f"Number of {rows} that the {r.words.rejection} used in each cell: {count(empty)} of"
+        f"Number of {rows} in each cell that are no likely {r.words.false_rows}: {count(empty)} of"
         f" {count(counts.size)} cells are empty, and the median is {np.median(counts):.0f}. Where"
         f" there are no {rows}, the solution is an extrapolation of the polynomial.",
         f"Map of the number of {rows} per cell; {empty} of {counts.size} cells are empty.",

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bayesdist.assess.maps import per_axis
-from bayesdist.checks import LEVELS, Check, warnings_of, worst
+from bayesdist.checks import GROUPS, LEVELS, Check, doubts_of, warnings_of, worst
 from bayesdist.numbers import counted, rounded, with_mas
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
@@ -21,6 +22,9 @@ from bayesdist.report.sections.run.validity import (
 )
 from bayesdist.report.texttable import TextTable, check_cells
 
+if TYPE_CHECKING:
+    from bayesdist.assess import Margin
+
 __all__ = [
     "Verdict",
     "status_checks",
@@ -28,7 +32,6 @@ __all__ = [
     "verdict",
 ]
 
-GROUPS = ("Held-out truth", "Campaign", "Sampling", "Fit", "Assumptions")
 _OWN_CLAUSE = ("Requirements", "Validity")  # of the headline
 _UNSAMPLED = "least squares only, no posterior was sampled"
 _NAMED = 2  # rows of the status table that the headline names
@@ -46,11 +49,10 @@ class Verdict:
 def status_checks(r: ReportInput) -> dict[str, tuple[Check, ...]]:
     """Criteria by subject; empty groups are left out.
 
-    Groups are 'Held-out truth', 'Campaign', 'Sampling', 'Fit', 'Assumptions', 'Requirements',
-    'Validity', 'Products'.
+    They stand in the order of `bayesdist.checks.GROUPS`.
     """
     groups = {
-        **{name: tuple(c for c in r.checks if c.group == name and c.name) for name in GROUPS},
+        **{name: tuple(c for c in r.checks if c.group == name) for name in GROUPS},
         "Requirements": _margin_checks(r),
         "Validity": validity_checks(r),
         "Products": tuple(
@@ -76,12 +78,20 @@ def status_table(r: ReportInput) -> TextTable:
 
 
 def _margin_checks(r: ReportInput) -> tuple[Check, ...]:
+    """Checks of requirements; those undecided name the rows that keep them so, or the reason."""
+    doubts = "; ".join(f"“{one.name}”" for one in doubts_of(r.checks))
+
+    def why(m: Margin) -> str:
+        if m.verdict != "undecided":
+            return ""
+        return f"; undecided: {f'see {doubts}' if doubts else m.reason}"
+
     return tuple(
         Check(
             "Requirements",
             f"{m.requirement.name}: {m.requirement.statistic}, {m.verdict}",
             f"{rounded(m.value, (m.interval[1] - m.interval[0]) / 4)}\u202f{m.unit}, probability"
-            f" {counted(m.probability_met, m.mc_error, m.n_effective)}",
+            f" {counted(m.probability_met, m.mc_error, m.n_effective)}{why(m)}",
             f"at most {m.requirement.limit:g}\u202f{m.unit}, with probability"
             f" {m.requirement.probability:g}",
             VERDICT_LEVELS[m.verdict],
@@ -114,9 +124,6 @@ def verdict(r: ReportInput) -> Verdict:
         names = [c.name for c in others if c.level == level]
         if names:
             clauses.append((level, _rows_clause(names, verb)))
-    if r.warnings:
-        n = len(r.warnings)
-        clauses.append(("warn", "one warning" if n == 1 else f"{n} warnings"))
     clauses.append((worst(groups.get("Validity", ())), validity_clause(r)))
     # the kind of solution first, then what is worst
     clauses.sort(key=lambda one: (one[1] == _UNSAMPLED, LEVELS.index(one[0])), reverse=True)

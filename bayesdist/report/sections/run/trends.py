@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bayesdist.numbers import count, display_scale, number
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput
+from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.style import (
     CYCLE,
     INK,
@@ -81,7 +81,7 @@ class _Residuals:
 
     shown: Mask  # (N,), of the sample
     residual: Float  # (n, 2), of those shown
-    variance: Float  # (n, 2), with the jitter
+    variance: Float  # (n, 2), expected of them
 
     @property
     def weight(self) -> Float:
@@ -104,18 +104,7 @@ def _residuals_of(r: ReportInput) -> _Residuals:
         for code in np.unique(codes):
             matrix, _ = model.frame(theta, model.exposures.index(table.exposure_names[code]))
             residual[codes == code] = np.linalg.solve(matrix, residual[codes == code].T).T
-    jitter = 0.0
-    if r.posterior is not None:
-        fixed = r.posterior.mixture.jitter
-        jitter = r.sampled_mean("j") if fixed is None else float(fixed)
-    if table.sigma_u is None or table.sigma_v is None:
-        variance = np.full_like(residual, r.fit.rms_u**2)
-    else:
-        sigma = np.column_stack([table.sigma_u[shown], table.sigma_v[shown]])
-        variance = sigma**2 + jitter**2
-    if r.stars.taken is not None:
-        variance = variance * (1.0 - r.stars.taken[shown])[:, None]
-    return _Residuals(shown, residual, variance)
+    return _Residuals(shown, residual, r.stars.expected_square[shown])
 
 
 def _on_chips(r: ReportInput, shown: Mask) -> Iterator[tuple[int, str, Mask]]:
@@ -210,41 +199,37 @@ def _sample_words(r: ReportInput) -> str:
     return f"{words} Drawn from {r.sample}." if r.sample else words
 
 
-@REPORT.figure("residuals", when=lambda r: int(np.count_nonzero(r.exposures.n)) > 1, printed=True)
+@REPORT.figure("residuals", when=lambda r: r.stars.by_exposure is not None, printed=True)
 def chi_square_by_exposure(r: ReportInput) -> Plot:
     """Chi-square per degree of freedom of each exposure, with the range that chance gives."""
-    found, table = _residuals_of(r), r.stars.table
-    codes, bins = table.exposure[found.shown], len(table.exposure_names)
-    n = np.bincount(codes, minlength=bins)
-    square = (found.residual**2 / found.variance).sum(axis=1)
-    present = np.flatnonzero(n)
-    dof = 2.0 * n[present]
-    ratio = np.bincount(codes, square, minlength=bins)[present] / dof
-    sd = np.sqrt(2.0 / dof)
+    found = needed(r.stars.by_exposure)
+    n, mean = len(found.names), found.of_all
+    width = 2 * mean * found.chance
     fig = new_figure(WIDTH, 1.5)
     ax = fig.subplots()
-    at = np.arange(1, len(present) + 1)
-    ax.fill_between(at, 1 - 2 * sd, 1 + 2 * sd, color=OUTLINE, alpha=0.3, lw=0, step="mid")
-    ax.axhline(1.0, color=INK, lw=0.6)
-    ax.plot(at, ratio, "o", ms=3.2, color=CYCLE[0])
-    ax.set_xlim(0.5, len(present) + 0.5)
+    at = np.arange(1, n + 1)
+    ax.fill_between(at, mean - width, mean + width, color=OUTLINE, alpha=0.3, lw=0, step="mid")
+    ax.axhline(mean, color=INK, lw=0.6)
+    ax.plot(at, found.ratio, "o", ms=3.2, color=CYCLE[0])
+    ax.set_xlim(0.5, n + 0.5)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("exposure, in the order of the data [number]")
     ax.set_ylabel("χ² / dof [no unit]")
     guide_lines(ax)
-    worst = int(np.argmax(np.abs(ratio - 1) / sd))
-    name = table.exposure_names[present[worst]]
-    beyond = int((np.abs(ratio - 1) > 2 * sd).sum())
+    away = np.abs(found.ratio - mean) / width
+    worst, beyond = int(np.argmax(away)), int((away > 1).sum())
     return Plot(
         fig,
         "Chi-square by exposure",
         "Chi-square per degree of freedom with the errors that the posterior uses, jitter"
-        f" included. The band holds 95 % by chance; {count(beyond)} of {count(len(present))}"
-        f" exposures lie outside it, and the farthest is {name}, with"
-        f" {number(float(ratio[worst]))}. Exposures above the band have larger errors than the"
-        f" others (guiding, focus, breathing).{_sample_words(r)}",
-        f"Chi-square per degree of freedom of {len(present)} exposures; {beyond} lie outside the"
-        " band of chance.",
+        f" included. The line is that of all exposures, {number(mean)}: below 1 where many"
+        f" parameters were fitted to few {r.words.rows}. The band about it holds 95 % by chance;"
+        f" {count(beyond)} of {count(n)} exposures lie outside it, and the farthest is"
+        f" {found.names[worst]}, with {number(float(found.ratio[worst]))}. Exposures above the band"
+        " have larger errors than the others (guiding, focus, breathing); the status says whether"
+        f" that is more than a trifle.{_sample_words(r)}",
+        f"Chi-square per degree of freedom of {n} exposures; {beyond} lie outside the band of"
+        " chance.",
     )
 
 
