@@ -209,8 +209,8 @@ def begin(folder: Path, config: Path) -> Path:
     """A folder that holds nothing but a configuration, whose files are named in full."""
     folder.mkdir()
     text = config.read_text(encoding="utf-8")
-    for name in ("stars.ecsv", "stars.csv", "stars.fits", "stars.parquet"):
-        text = text.replace(f'"{name}"', toml(str(config.parent / name)))
+    for path in config.parent.iterdir():
+        text = text.replace(f'"{path.name}"', toml(str(path)))
     (folder / "config.toml").write_text(text, encoding="utf-8")
     return folder
 
