@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import numba
@@ -38,6 +39,15 @@ def rng() -> np.random.Generator:
 def full() -> bool:
     """Whether the statistical suites run at full size (BAYESDIST_FULL=1) or reduced."""
     return FULL
+
+
+@pytest.fixture(scope="session", autouse=True)
+def unsynced(full) -> Iterator[None]:
+    """Files need not reach the disk, for which a run waits a hundred times; unless run in full."""
+    with pytest.MonkeyPatch.context() as patch:
+        if not full:
+            patch.setattr("bayesdist.files.os.fsync", lambda number: None)
+        yield
 
 
 # A run compiles the kernels that most tests need, and the files beside it none: a machine that has

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
+from .app.several import encoded, results_of
 from .docs_blocks import DOCS, blocks
 
 PAGE = DOCS / "new_instrument.md"
@@ -93,23 +94,23 @@ def followed(tmp_path_factory, pairs, full):
     texts = named_blocks()
     installed(folder, texts)
     path = os.pathsep.join([str(folder), str(DOCS.parent)])
-    program = "bayesdist" if full else "tests.sketches"
     printed = {}
     for language, text in blocks(PAGE):
         if language == "toml" and text.startswith("# megacam.toml\n"):
             config = folder / "megacam.toml"
             changes = text if full else f"{text}\n{FEW_DRAWS}"
             config.write_text(changed(config.read_text("utf-8"), changes), encoding="utf-8")
-        for line in text.splitlines() if language == "console" else ():
-            words = shlex.split(line)
-            assert words[:2] == ["$", "bayesdist"]
+        if language == "console":
+            commands = [shlex.split(line) for line in text.splitlines()]
+            assert all(words[:2] == ["$", "bayesdist"] for words in commands)
             done = subprocess.run(
-                [sys.executable, "-m", program, *words[2:]],
+                [sys.executable, "-m", "tests.app.several", *encoded(w[2:] for w in commands)],
                 cwd=folder, env={**os.environ, "PYTHONPATH": path},
                 capture_output=True, text=True, check=False,
             )  # fmt: skip
-            assert done.returncode == 0, done.stderr
-            printed[words[2]] = done.stdout
+            for words, result in zip(commands, results_of(done), strict=True):
+                assert result.code == 0, result.err
+                printed[words[2]] = result.out
     return folder, printed
 
 

@@ -24,6 +24,7 @@ RUNNERS = {
     "pd": {"read_pickle"},
     "pandas": {"read_pickle"},
 }
+NAMES = set[str]().union(*RUNNERS.values())
 MODULES = {"marshal", "shelve", "joblib", "dill", "cloudpickle", "yaml"}
 
 
@@ -38,13 +39,14 @@ def _dangers(source: str) -> Iterator[str]:
             names = {one.name for one in node.names} & RUNNERS.get(node.module or "", set())
             yield from (f"{node.module}.{name}" for name in names)
         elif isinstance(node, ast.Call):
-            whole = ast.unparse(node.func)
-            before, _, name = whole.rpartition(".")
-            if name in RUNNERS.get(before, ()):
-                yield whole
+            name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            if name in NAMES:
+                whole = ast.unparse(node.func)
+                if name in RUNNERS.get(whole.rpartition(".")[0], ()):
+                    yield whole
             for given in node.keywords:
                 if given.arg in ("allow_pickle", "shell") and ast.unparse(given.value) != "False":
-                    yield f"{whole}({given.arg})"
+                    yield f"{ast.unparse(node.func)}({given.arg})"
 
 
 def test_a_file_is_never_run():

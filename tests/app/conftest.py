@@ -54,6 +54,20 @@ def few_likelihoods(full) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="package", autouse=True)
+def coarse_structure(full) -> Iterator[None]:
+    """The structure that a fit leaves out is integrated over a coarse grid of its sizes.
+
+    Unless run in full; it takes a tenth of a small run, and tests/diagnose looks at it.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        if not full:
+            structure = "bayesdist.diagnose.correlated.structure"
+            patch.setattr(f"{structure}.LENGTHS", np.geomspace(0.02, 0.6, 3))
+            patch.setattr(f"{structure}.HALVINGS", 2)
+        yield
+
+
 @pytest.fixture(scope="module")
 def figures_made(sketched, full) -> Iterator[None]:
     """Figures of reports are made and have their words; they are drawn if run in full."""
@@ -62,7 +76,7 @@ def figures_made(sketched, full) -> Iterator[None]:
 
 
 @pytest.fixture(scope="package")
-def finished(sketched, few_likelihoods, tmp_path_factory) -> Finished:
+def finished(sketched, few_likelihoods, coarse_structure, tmp_path_factory) -> Finished:
     folder = tmp_path_factory.mktemp("finished")
     matches, truth = simulated(mag=np.linspace(12.0, 18.0, 400))
     config = write_job(

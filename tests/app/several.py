@@ -1,13 +1,19 @@
-"""Several commands, one after another, in one process of their own: it starts once."""
+"""Several commands, one after another, in one process of their own: it starts once.
+
+Figures of reports are neither made nor drawn, unless run in full.
+"""
 
 from __future__ import annotations
 
 import json
 import sys
 from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
 from subprocess import CompletedProcess
 
+from tests import sketches
 from tests.app.support import Result, cli
+from tests.reduced import FULL
 
 
 def encoded(commands: Iterable[Sequence[object]]) -> list[str]:
@@ -22,4 +28,5 @@ def results_of(done: CompletedProcess[str]) -> list[Result]:
 
 
 if __name__ == "__main__":
-    print(json.dumps([vars(cli(*json.loads(command))) for command in sys.argv[1:]]))
+    with nullcontext() if FULL else sketches.sketched(made=False):
+        print(json.dumps([vars(cli(*json.loads(command))) for command in sys.argv[1:]]))

@@ -20,7 +20,7 @@ from astropy.table import Table
 from bayesdist.app.cli import main
 from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results, results_of
-from bayesdist.app.run import make_stages
+from bayesdist.app.run import ASSESS, initialized, make_stages
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches
 from bayesdist.model import Chip, DistortionModel
@@ -205,16 +205,35 @@ def write_job(folder: Path, table: Table | None = None, **sections: Any) -> Path
     return write_config(folder / "config.toml", **({"budget": [EXACT]} | sections))
 
 
-def begin_stagewise(folder: Path, config: Path, *stages: str) -> Path:
-    """Stages one by one in a folder that holds a configuration only; no report, so it is quick."""
+def begin(folder: Path, config: Path) -> Path:
+    """A folder that holds nothing but a configuration, whose files are named in full."""
     folder.mkdir()
     text = config.read_text(encoding="utf-8")
-    for name in ("stars.ecsv", "stars.csv", "stars.fits", "stars.parquet"):
-        text = text.replace(f'"{name}"', toml(str(config.parent / name)))
+    for path in config.parent.iterdir():
+        text = text.replace(f'"{path.name}"', toml(str(path)))
     (folder / "config.toml").write_text(text, encoding="utf-8")
+    return folder
+
+
+def begin_stagewise(folder: Path, config: Path, *stages: str) -> Path:
+    """Stages of a run that begins here, each by a command."""
+    begin(folder, config)
     for stage in stages:
         good("stage", stage, folder)
     return folder
+
+
+def partly_run(folder: Path, config: Path, *stages: str) -> Path:
+    """Stages of a run that begins here, in one go; without a report it is quick."""
+    return carried_out(begin(folder, config), *stages)
+
+
+def carried_out(run: Path, *stages: str) -> Path:
+    """Stages of a run whose folder holds nothing but a configuration."""
+    names = [one for name in stages for one in (ASSESS if name == "assess" else (name,))]
+    with initialized(RunDirectory.open(run)) as results:
+        make_stages(results, names)
+    return run
 
 
 def summary_of(run: Path) -> dict[str, Any]:

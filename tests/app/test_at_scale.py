@@ -22,6 +22,7 @@ from tests.app.support import (
     begin_stagewise,
     good,
     model_of,
+    partly_run,
     refused,
     simulated,
     summary_of,
@@ -179,7 +180,7 @@ def test_errors_by_magnitude_on_disk(tmp_path, on_disk):
     data = {"matches": str(tmp_path / "stars"), "sigma": "by_magnitude"}
     config = write_config(tmp_path / "c.toml", data=data)
     assert "(by magnitude)" in good("check", config).out
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess")
+    run = partly_run(tmp_path / "run", config, "fit", "sample", "assess")
     posterior = load_posterior(run)
     assert posterior.n_stars == N and 0.01 < posterior.n_flagged / N < 0.03
     assert not summary_of(run)["warnings"]
@@ -200,7 +201,7 @@ def test_the_epoch_of_the_assessment_is_the_latest_of_the_data(tmp_path, on_disk
         data={"matches": str(tmp_path / "stars")},
         **{"model.tdd": {"epoch0": 2004.5, "terms": [["u", 1, 0]]}},
     )
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess")
+    run = partly_run(tmp_path / "run", config, "fit", "sample", "assess")
     assert summary_of(run)["map"]["epoch"] == 2008.0
 
 

@@ -22,7 +22,15 @@ from scipy import stats
 from bayesdist.data import read_matches
 from bayesdist.infer import load_fit
 from bayesdist.infer.transforms import without_frames
-from tests.app.support import cli, good, one_sentence, refused, summary_of, write_config
+from tests.app.support import (
+    carried_out,
+    cli,
+    good,
+    one_sentence,
+    refused,
+    summary_of,
+    write_config,
+)
 from tests.reduced import case_in_full
 
 SIDE, PIXEL = 1024, 0.05  # pixels, arcsec
@@ -206,9 +214,7 @@ def staged(config: Path, *stages: str) -> Path:
     run = config.parent / "run"
     run.mkdir()
     (run / "config.toml").write_text(in_place(config), encoding="utf-8")
-    for stage in stages:
-        good("stage", stage, run, "-q")
-    return run
+    return carried_out(run, *stages)
 
 
 def off_truth(run: Path) -> tuple[float, int]:

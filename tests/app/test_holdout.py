@@ -16,6 +16,7 @@ from tests.app.support import (
     begin_stagewise,
     good,
     model_of,
+    partly_run,
     refused,
     simulated,
     summary_of,
@@ -85,7 +86,7 @@ def test_stages_by_themselves_set_the_same_stars_aside(run, tmp_path):
 
 def test_a_resumed_run_sets_the_same_stars_aside(run, tmp_path):
     config, whole = run
-    folder = begin_stagewise(tmp_path / "run", config, "fit")
+    folder = partly_run(tmp_path / "run", config, "fit")
     # what a run that was interrupted after the fit goes on with
     good("run", folder / "config.toml", "-o", folder, "--resume")
     assert (folder / "holdout.ecsv").read_bytes() == (whole / "holdout.ecsv").read_bytes()
@@ -101,7 +102,7 @@ def test_data_on_disk_give_the_same_answer(run, tmp_path, monkeypatch):
     text = config.read_text(encoding="utf-8").replace("stars.ecsv", "stars.parquet")
     (folder / "config.toml").write_text(text, encoding="utf-8")
     monkeypatch.setattr(app_matches, "IN_MEMORY", 1000)
-    there = begin_stagewise(tmp_path / "run", folder / "config.toml", "fit", "sample", "assess")
+    there = partly_run(tmp_path / "run", folder / "config.toml", "fit", "sample", "assess")
     mine, theirs = (Table.read(path / "holdout.ecsv") for path in (whole, there))
     assert list(mine["where"]) == list(theirs["where"])
     np.testing.assert_allclose(mine["p_value"], theirs["p_value"], rtol=1e-6)
@@ -137,7 +138,7 @@ def test_whole_exposures_are_drawn_and_predicted(tmp_path):
         holdout={"exposures": 2},
         model={"order": 2, "frames": "shift_rotation"},
     )
-    folder = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess")
+    folder = partly_run(tmp_path / "run", config, "fit", "sample", "assess")
     summary = summary_of(folder)
     found = summary["holdout"]
     assert len(found["exposures"]) == 2 and found["n"] == 400 and found["level"] == "pass"

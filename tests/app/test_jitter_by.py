@@ -10,6 +10,7 @@ from tests.app.support import (
     SIZE,
     begin_stagewise,
     good,
+    partly_run,
     refused,
     summary_of,
     write_config,
@@ -109,7 +110,7 @@ def test_stages_by_themselves_and_a_fit_made_anew_see_the_same_errors(split, tmp
 @only_in_full("tests/diagnose/test_holdout names such an axis")
 def test_one_jitter_for_unequal_axes_is_flagged(tmp_path):
     config = job(tmp_path / "input", outliers={"jitter_by": "one"})
-    folder = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess")
+    folder = partly_run(tmp_path / "run", config, "fit", "sample", "assess")
     summary = summary_of(folder)
     assert "added_errors" not in summary["fit"]
     found = summary["holdout"]
@@ -127,7 +128,7 @@ def test_equal_axes_keep_one_jitter(tmp_path):
     config = job(tmp_path / "input", stars(2, sizes=(0.05, 0.05)))
     found = good("check", config).out
     assert "jitter       one jitter for both axes (ln evidence" in found
-    folder = begin_stagewise(tmp_path / "run", config, "fit")
+    folder = partly_run(tmp_path / "run", config, "fit")
     groups = summary_of(folder)["fit"]["added_errors"]
     assert groups["grouping"] == "one" and groups["evidence"]["axis"] < 3
     assert {row["excess"] for row in groups["groups"]} == {0.0}
@@ -145,7 +146,7 @@ def test_chips_have_jitters_of_their_own_on_request(tmp_path):
         model={"order": 3},
         chip=CHIPS,
     )
-    folder = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess")
+    folder = partly_run(tmp_path / "run", config, "fit", "sample", "assess")
     summary = summary_of(folder)
     found = summary["fit"]["added_errors"]
     assert (found["grouping"], found["by"]) == ("chip and axis", "chip")
@@ -164,7 +165,7 @@ def test_errors_far_too_small_are_scaled_first(tmp_path):
     table = stars(4)
     for name in ("sigma_u", "sigma_v"):
         table[name] /= 1000
-    folder = begin_stagewise(tmp_path / "run", job(tmp_path / "input", table), "fit")
+    folder = partly_run(tmp_path / "run", job(tmp_path / "input", table), "fit")
     fit = summary_of(folder)["fit"]
     assert fit["error_scale"] > 1000 and fit["added_errors"]["grouping"] == "axis"
 

@@ -16,10 +16,10 @@ from bayesdist.simulate import simulate_matches
 from tests.app.support import (
     SIZE,
     as_table,
-    begin_stagewise,
     cli,
     good,
     model_of,
+    partly_run,
     simulated,
     summary_of,
     truth_of,
@@ -69,7 +69,7 @@ def arcsec(tmp_path_factory):
             ],
             products={"sip": {"linear": "cd", "crval": CRVAL}},
         )
-    run = begin_stagewise(
+    run = partly_run(
         folder / "run", folder / "fits.toml", "fit", "sample", "assess", "export", "report"
     )
     assert config.exists()
@@ -81,7 +81,7 @@ def test_formats_hold_the_same_data(arcsec):
     one = load_fit(run / "fit.nc")
     for suffix in ("csv", "parquet"):
         other = load_fit(
-            begin_stagewise(folder / f"run_{suffix}", folder / f"{suffix}.toml", "fit") / "fit.nc"
+            partly_run(folder / f"run_{suffix}", folder / f"{suffix}.toml", "fit") / "fit.nc"
         )
         np.testing.assert_allclose(other.mean, one.mean, rtol=1e-12, atol=1e-15)
         np.testing.assert_allclose(other.cov, one.cov, rtol=1e-9)
@@ -98,7 +98,7 @@ def test_parts_of_a_table_are_not_exposures_but_files_are(arcsec):
     config = write_config(folder / "parts.toml", data={"matches": "parts"} | common)
     assert "1 exposure(s)" in good("check", config).out
     config.write_text(config.read_text().replace('"parts"', f'"{folder / "parts"}"'))
-    other = begin_stagewise(folder / "run_parts", config, "fit", "sample")
+    other = partly_run(folder / "run_parts", config, "fit", "sample")
     np.testing.assert_array_equal(load_fit(other / "fit.nc").mean, load_fit(run / "fit.nc").mean)
     for matches in ("part_*.fits", ["part_a.fits", "part_b.fits"]):
         config = write_config(folder / "list.toml", data={"matches": matches} | common)
@@ -164,7 +164,7 @@ def test_exposures_with_frames(tmp_path):
         data={"matches": "stars.ecsv", "columns": {"exposure": "exposure"}},
         products={"sip": {}},
     )
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess", "export")
+    run = partly_run(tmp_path / "run", config, "fit", "sample", "assess", "export")
     posterior = load_posterior(run)
     assert posterior.model.exposures == names and posterior.model.n_params == 20
     # frames turn about an origin of the program's choice: compare what does not depend on it
@@ -211,7 +211,7 @@ def test_drift_with_time(tmp_path):
         requirement=requirement,
         products={"sip": {}},
     )
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess", "export")
+    run = partly_run(tmp_path / "run", config, "fit", "sample", "assess", "export")
     posterior = load_posterior(run)
     pull = (posterior.mean - theta) / posterior.sigma
     assert np.abs(pull).max() < 4.5
@@ -240,7 +240,7 @@ def test_uniform_outliers_on_the_match_circle(tmp_path):
     config = write_job(
         tmp_path / "job", as_table(matches), outliers={"model": "uniform", "match_radius": 1.0}
     )
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess")
+    run = partly_run(tmp_path / "run", config, "fit", "sample", "assess")
     posterior = load_posterior(run)
     assert set(posterior.hyper) == {"j", "f"}
     outliers = summary_of(run)["outliers"]
@@ -263,7 +263,7 @@ def test_without_outliers_and_jitter_it_is_least_squares(tmp_path):
         outliers={"model": "none", "jitter": 0.0},
         fit={"clip_chi2": 1e6},
     )
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess", "report")
+    run = partly_run(tmp_path / "run", config, "fit", "sample", "assess", "report")
     fit, posterior = load_fit(run / "fit.nc"), load_posterior(run)
     assert fit.n_used == fit.n_rows == 400 and posterior.hyper == {}
     c = posterior.convergence
@@ -290,7 +290,7 @@ def test_errors_by_magnitude(tmp_path):
     config = write_job(
         tmp_path / "job", table, data={"matches": "stars.ecsv", "sigma": "by_magnitude"}
     )
-    run = begin_stagewise(tmp_path / "run", config, "fit")
+    run = partly_run(tmp_path / "run", config, "fit")
     errors = Table.read(run / "magnitude_errors.ecsv")
     true = quoted(np.asarray(errors["mag"]))[0]
     np.testing.assert_allclose(errors["sigma_u"], true, rtol=0.25)

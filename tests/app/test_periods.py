@@ -20,11 +20,11 @@ from bayesdist.model import Chip, DistortionModel
 from tests.app.support import (
     SIZE,
     as_table,
-    begin_stagewise,
     cli,
     good,
     model_of,
     one_sentence,
+    partly_run,
     refused,
     simulated,
     summary_of,
@@ -74,7 +74,7 @@ def job(folder, matches, **sections):
 
 def assessed(folder, matches, **sections):
     config = job(folder / "input", matches, **sections)
-    return begin_stagewise(folder / "run", config, "fit", "sample", "assess")
+    return partly_run(folder / "run", config, "fit", "sample", "assess")
 
 
 @pytest.fixture(scope="module")
@@ -265,7 +265,7 @@ def test_pairs_on_disk_give_the_same(quiet, tmp_path, monkeypatch):
     config = write_config(
         tmp_path / "c.toml", data={"matches": str(tmp_path / "stars")}, **sections
     )
-    there = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess")
+    there = partly_run(tmp_path / "run", config, "fit", "sample", "assess")
     one, other = Table.read(run / "periods.ecsv"), Table.read(there / "periods.ecsv")
     for name in ("difference", "sigma", "monomial_difference"):
         np.testing.assert_allclose(one[name], other[name], rtol=1e-6, atol=1e-12)
@@ -368,7 +368,7 @@ def test_a_period_with_too_few_pairs_is_named(tmp_path, kept, words):
     few = np.flatnonzero(period == 1)[kept:]
     matches = matches.select(np.setdiff1d(np.arange(3000), few))
     config = job(tmp_path / "input", matches)
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample")
+    run = partly_run(tmp_path / "run", config, "fit", "sample")
     result = cli("stage", "assess", run, "-q")
     assert result.code == 1
     one_sentence(result.err, *words)

@@ -17,7 +17,7 @@ from bayesdist.infer import load_fit
 from bayesdist.missions.wise.pairs.read import read_rvb
 from bayesdist.missions.wise.rvb.transform import RvbTransform
 from tests.app.rvb_jobs import DETECTORS, rvb_job, rvb_pairs, write_rvb_table
-from tests.app.support import cli, good, refused, snapshot, summary_of
+from tests.app.support import cli, good, partly_run, refused, snapshot, summary_of
 from tests.reduced import only_in_full
 
 RVB = {"colour": (-0.4, 0.9), "accept_centre": 1.0, "accept_corner": 2.5}
@@ -82,8 +82,8 @@ def test_on_disk_the_pairs_are_selected_once(tmp_path, monkeypatch):
         for stage in STAGES:
             good("stage", stage, run)
     assert summary_of(run)["data"] == summary["data"]
-    good("run", rvb_job(tmp_path / "other", table, **options), "-o", tmp_path / "memory")
-    fits = [load_fit(path / "fit.nc") for path in (run, tmp_path / "memory")]
+    memory = partly_run(tmp_path / "memory", rvb_job(tmp_path / "other", table, **options), "fit")
+    fits = [load_fit(path / "fit.nc") for path in (run, memory)]
     np.testing.assert_allclose(fits[0].mean, fits[1].mean, rtol=0, atol=1e-9)
     good("run", config, "-o", run, "--force")
     assert len(open_matches(run / "pairs")) == len(kept)

@@ -15,8 +15,8 @@ from bayesdist.report.sections.run.fit import fit_tables
 from tests.app.support import (
     CENTRE,
     as_table,
-    begin_stagewise,
     model_of,
+    partly_run,
     refused,
     simulated,
     summary_of,
@@ -46,7 +46,7 @@ def pair(tmp_path_factory):
     for name, fit in (("without", {}), ("with", {"skew": True})):
         config = write_job(folder / name, table, fit=fit, products={"sip": {}})
         stages = ("fit", "sample", "assess", "export", *(("report",) if fit else ()))
-        out.append(begin_stagewise(folder / name / "run", config, *stages))
+        out.append(partly_run(folder / name / "run", config, *stages))
     return out
 
 

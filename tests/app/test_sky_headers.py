@@ -22,7 +22,7 @@ from astropy.wcs.utils import fit_wcs_from_points
 from bayesdist.products import read_calibration
 from bayesdist.products.formats.common.content import read_content
 from bayesdist.products.formats.tpv.head import tpv_of
-from tests.app.support import EXACT, begin_stagewise, good, summary_of, write_config, write_job
+from tests.app.support import EXACT, good, partly_run, summary_of, write_config, write_job
 from tests.reduced import case_in_full, only_in_full
 
 SIZE = (2000, 1500)
@@ -78,7 +78,7 @@ def made(folder: Path, truth: WCS, rng, **sections) -> Path:
         }
         | sections,
     )
-    return begin_stagewise(folder / "run", config, "fit", "sample", "assess", "export")
+    return partly_run(folder / "run", config, "fit", "sample", "assess", "export")
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_of_several_exposures_it_is_the_first_one(tmp_path, rng) -> None:
         model={"order": 3, "frames": "shift_rotation_scale"},
         products={"sip": {}},
     )
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess", "export")
+    run = partly_run(tmp_path / "run", config, "fit", "sample", "assess", "export")
     assert np.sqrt(np.mean(separations(run, first, rng) ** 2)) < 2 * NOISE * np.sqrt(20 / N)
     sky = summary_of(run)["products"][0]["sky"]
     assert sky["n"] <= N and sky["solution_arcsec"] < 1e-5 * PIXEL
@@ -195,7 +195,7 @@ def test_two_chips_have_a_header_each(tmp_path, rng) -> None:
         model={"order": 3},
         products={"sip": {}},
     )
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess", "export")
+    run = partly_run(tmp_path / "run", config, "fit", "sample", "assess", "export")
     x, y = rng.uniform(0.5, np.array(SIZE) + 0.5, (1000, 2)).T
     for product, (number, truth) in zip(summary_of(run)["products"], chips.items(), strict=True):
         found = SkyCoord(*header_of(run, product["path"]).all_pix2world(x, y, 1), unit="deg")
@@ -241,7 +241,7 @@ def test_fields_of_astrometry_net(file, order, terms, data_dir, tmp_path) -> Non
         budget=[EXACT],
         products={"sip": {}},
     )
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess", "export")
+    run = partly_run(tmp_path / "run", config, "fit", "sample", "assess", "export")
     ours = SkyCoord(*header_of(run).all_pix2world(x, y, 1), unit="deg")
     # this fit counts pixels from 0
     fitted = fit_wcs_from_points((x - 1, y - 1), stars, projection="TAN", sip_degree=order)

@@ -27,7 +27,7 @@ from bayesdist.products import (
     write_sip,
     write_wise_meta,
 )
-from tests.app.support import begin_stagewise, cli, good, one_sentence, summary_of, write_config
+from tests.app.support import cli, good, one_sentence, partly_run, summary_of, write_config
 
 from .support import astropy_wcs, random_pixels, some_solution
 from .test_sip_wise import PRINTED, meta_data
@@ -253,7 +253,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     good("simulate", "wise", "--stars", 1500, "--band", "W4", "-o", folder)
     config = write_config(folder / "wise.toml", **W4)
-    return begin_stagewise(folder / "run", config, "fit", "sample", "assess", "export")
+    return partly_run(folder / "run", config, "fit", "sample", "assess", "export")
 
 
 def test_a_run_writes_its_band(run):

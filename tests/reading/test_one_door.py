@@ -41,6 +41,7 @@ ALLOWED = {
     ("infer/sampler/checkpoints.py", "h5py.File"): "a new file in memory",
     ("report/drawing.py", "Image.open"): "a picture in memory, of our own",
 }
+NAMES = set[str]().union(*OPENERS.values())
 RUNS = "RunDirectory.open"  # which reads run.json by the room
 
 
@@ -52,7 +53,7 @@ def _calls(source: str) -> Iterator[tuple[str, int]]:
         if isinstance(node.func, ast.Name):
             if node.func.id in ("open", "ParquetFile"):
                 yield node.func.id, node.lineno
-        elif isinstance(node.func, ast.Attribute):
+        elif isinstance(node.func, ast.Attribute) and node.func.attr in NAMES:
             before, name = ast.unparse(node.func.value), node.func.attr
             if name in OPENERS.get(before.rpartition(".")[2], set()) | OPENERS["*"]:
                 yield f"{before}.{name}", node.lineno

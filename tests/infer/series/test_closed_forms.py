@@ -120,15 +120,13 @@ def test_one_scatter_is_a_one_dimensional_integral(formal, rng):
     columns = Design(trend, series).matrix(epoch, series.group_code)[0]
     y, unit = values - series.centre[0], series.spread[0]
     grid = np.exp(np.linspace(np.log(1e-4), np.log(30), 4000)) * unit
-    log_p, mean, variance = np.empty(len(grid)), np.empty(len(grid)), np.empty(len(grid))
-    for i, sd in enumerate(grid):
-        v = sd**2 + formal**2
-        cov = np.linalg.inv(columns.T @ columns / v + np.eye(2) / (WIDE * unit) ** 2)
-        b = cov @ columns.T @ y / v
-        log_p[i] = -0.5 * (n * np.log(v) - np.linalg.slogdet(cov)[1] + y @ y / v)
-        log_p[i] += 0.5 * b @ np.linalg.solve(cov, b)
-        log_p[i] += stats.t(2, scale=unit).logpdf(sd) + np.log(sd)
-        mean[i], variance[i] = b[1], cov[1, 1]
+    v = grid[:, None, None] ** 2 + formal**2
+    cov = np.linalg.inv(columns.T @ columns / v + np.eye(2) / (WIDE * unit) ** 2)
+    b = cov @ (columns.T @ y)[:, None] / v
+    mean, variance, v = b[:, 1, 0], cov[:, 1, 1], v[:, 0, 0]
+    log_p = -0.5 * (n * np.log(v) - np.linalg.slogdet(cov)[1] + y @ y / v)
+    log_p += 0.5 * (b * np.linalg.solve(cov, b)).sum(axis=(1, 2))
+    log_p += stats.t(2, scale=unit).logpdf(grid) + np.log(grid)
     p = np.exp(log_p - log_p.max())
     p /= p.sum()
     years = Design(trend, series).years

@@ -27,10 +27,10 @@ from tests.app.support import (
     SIZE,
     Result,
     as_table,
-    begin_stagewise,
     cli,
     good,
     model_of,
+    partly_run,
     refused,
     truth_of,
     write_job,
@@ -88,11 +88,10 @@ def compared(tmp_path_factory) -> Compared:
         text = (folder / "set" / f"{name}.toml").read_text(encoding="utf-8")
         text = text.replace(f'matches = "{name}"', f'matches = "{folder / "set" / name}"')
         text += "\n[sampler]\ntarget_ess = 100\ntarget_rhat = 1.05\n"
-        run = folder / f"run_{name}"
-        run.mkdir()
-        (run / "config.toml").write_text(text, encoding="utf-8")
-        for stage in ("fit", "sample", "diagnose"):  # what comes after is not needed
-            good("stage", stage, run)
+        config = folder / f"{name}.toml"
+        config.write_text(text, encoding="utf-8")
+        # what comes after is not needed
+        partly_run(folder / f"run_{name}", config, "fit", "sample", "diagnose")
     optical = folder / "set" / "optical_w2.hdr"
     runs = [folder / "run_w4", folder / "run_w1"]  # the tables put them in order
     options = ["--bins", BINS, "--optical", optical, "--rotation", 270]
@@ -346,7 +345,7 @@ def test_bands_of_another_instrument_have_no_word_of_wise(tmp_path):
     """And where its stars are no longer those of the run, it is refused."""
     detector = {"name": "blue", "size": SIZE, "scale_mas": 50.0}
     config = write_job(tmp_path / "in", detector=detector)
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "diagnose")
+    run = partly_run(tmp_path / "run", config, "fit", "sample", "diagnose")
     good("wise", "bands", run, "-o", tmp_path / "out", "--bins", 6)
     page = (tmp_path / "out" / "bands.html").read_text(encoding="utf-8")
     text = re.sub(r'src="data:[^"]*"', "", page)
@@ -362,7 +361,7 @@ def test_bands_of_another_instrument_have_no_word_of_wise(tmp_path):
 
 def test_a_missing_scale_is_refused(tmp_path):
     config = write_job(tmp_path / "in", detector={"name": "blue", "size": SIZE})
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "diagnose")
+    run = partly_run(tmp_path / "run", config, "fit", "sample", "diagnose")
     words = ["size of a pixel", "detector.scale_mas"]
     refused(tmp_path, "wise", "bands", run, "-o", tmp_path / "out", words=words)
 
@@ -380,7 +379,7 @@ def test_several_chips_are_refused(tmp_path):
     ]
     settings = {"detector": {"name": "D", "scale_mas": 50.0}, "model": {"order": 2}}
     config = write_job(tmp_path / "in", table, chip=blocks, **settings)
-    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "diagnose")
+    run = partly_run(tmp_path / "run", config, "fit", "sample", "diagnose")
     refused(
         tmp_path,
         "wise",
