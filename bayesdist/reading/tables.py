@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 from astropy.table import Table, vstack
+from astropy.utils.xml.iterparser import get_xml_iterator
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.reading.faults import naming_faults
@@ -96,7 +97,46 @@ def _read_votable(path: Path) -> Table:
                 where=str(path),
                 do="fetch or write it again",
             )
-    return Table.read(io.BytesIO(raw), format="votable")
+    table = Table.read(io.BytesIO(raw), format="votable")
+    if any(np.ma.is_masked(table[name]) for name in table.colnames):
+        _refuse_unreadable_cells(raw, path)
+    return table
+
+
+# cells that state that there is no number; whatever is no number either, astropy takes for such
+_NO_NUMBER = {"", "nan", "null"}
+
+
+def _refuse_unreadable_cells(raw: bytes, path: Path) -> None:
+    """Refuse cells of a VOTable's columns of numbers that are neither numbers nor missing."""
+    fields, row, column = list[tuple[str, str]](), 0, 0
+    with get_xml_iterator(io.BytesIO(raw)) as steps:
+        for begins, tag, content, _ in steps:
+            if begins and tag == "FIELD":
+                single = "arraysize" not in content
+                kind = content.get("datatype", "") if single else ""
+                fields.append((content.get("name", ""), kind))
+            elif begins and tag == "TABLE":
+                fields, row = [], 0
+            elif begins and tag == "TR":
+                row, column = row + 1, 0
+            elif not begins and tag == "TD" and column < len(fields):
+                name, kind = fields[column]
+                column += 1
+                if kind in ("float", "double") and not _says_number(content):
+                    raise FormatError(
+                        f"{content.strip()[:40]!r} is no number",
+                        where=f"{path}, row {row}, column {name!r}",
+                        do="correct the cell or leave it empty",
+                    )
+
+
+def _says_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return cell.strip().lower() in _NO_NUMBER
+    return True
 
 
 def _read_fits(path: Path) -> Table:

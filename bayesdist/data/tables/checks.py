@@ -27,7 +27,8 @@ __all__ = [
 Bool = NDArray[np.bool_]
 
 NOT_FINITE = ("refuse", "reject")
-LARGEST = 1e30  # of a value: its square over that of an error is still a number
+# of a value, and of an error: the square of one over that of the other is still a number
+LARGEST, SMALLEST = 1e30, 1e-100
 COMPLETED: Any = None  # default of what a table of columns fills in itself: then it is there
 
 
@@ -99,13 +100,15 @@ def check_values(
     for name, values in columns.items():
         good, must = np.abs(values) < LARGEST, "finite"
         if name in positive:
-            good, must = good & (values > 0), "finite and positive"
+            good, must = good & (values > SMALLEST), "finite and positive"
         elif name in not_negative:
             good, must = good & (values >= 0), "finite and not negative"
         if not good.all():
             bad = int(np.argmin(good))
             if LARGEST <= abs(values[bad]) < np.inf:
                 must = f"below {LARGEST:g}"
+            elif 0 < values[bad] <= SMALLEST:
+                must = f"above {SMALLEST:g}"
             raise InputError(
                 f"value is {values[bad]:g}, and must be {must}",
                 where=f"{place(bad)}, column {name!r}",
