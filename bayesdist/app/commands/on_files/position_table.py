@@ -135,4 +135,11 @@ def write_positions(table: Table, output: Path) -> None:
     if kind == "fits":  # whose header has short names and takes no lists
         table.meta = {k.upper()[:8]: v for k, v in table.meta.items() if not isinstance(v, list)}
     with atomic_path(output) as temporary:
-        table.write(temporary, format=kind)
+        try:
+            table.write(temporary, format=kind)
+        except (TypeError, ValueError) as error:  # of columns that hold arrays, or objects
+            raise InputError(
+                f"not every column can be written as {output.suffix}",
+                where=str(output),
+                do=f"choose another of {', '.join(_FORMATS)}, or drop columns that hold arrays",
+            ) from error
