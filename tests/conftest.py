@@ -55,8 +55,8 @@ def unsynced(full) -> Iterator[None]:
 FIRST = (
     "tests/app/test_run.py",
     *("tests/data/", "tests/model/", "tests/missions/wise/", "tests/report/"),
-    *("tests/campaign/", "tests/test_new_instrument.py", "tests/test_docs.py"),
-    *("tests/test_examples.py", "tests/real/"),
+    *("tests/campaign/", "tests/app/campaign/", "tests/test_new_instrument.py"),
+    *("tests/test_docs.py", "tests/test_examples.py", "tests/real/"),
 )
 
 
@@ -76,7 +76,7 @@ def pytest_collection_finish() -> None:
 
 
 # folders whose files look at the same thing, which is long in the making
-TOGETHER = ("tests/campaign/", "tests/report/", "tests/app/selfcal/")
+TOGETHER = ("tests/campaign/", "tests/report/", "tests/app/selfcal/", "tests/app/campaign/")
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -1,7 +1,7 @@
-"""Reports whose figures are made but not drawn, or not even made.
+"""Runs that leave out what takes most of the time of a small one, and what other tests look at.
 
-That takes most of the time of a small run.  Figures as they look are the subject of tests/report,
-and the demo draws them in a process of its own.
+Figures of reports are made but not drawn, or not even made; as they look they are the subject of
+tests/report.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from unittest.mock import patch
 
+import numpy as np
 from PIL import Image
 
 
@@ -30,6 +31,24 @@ def sketched(*, made: bool = True) -> Iterator[None]:
         patch.object(drawing, "render", _sketch),
         patch.object(posterior, "corner_figure", lambda *_, **__: Figure()),
         patch.object(run_report, "draw_all", drawing.draw_all if made else _unmade),
+    ):
+        yield
+
+
+@contextmanager
+def quick() -> Iterator[None]:
+    """Context in which figures of runs are not made, and what else takes long is left out.
+
+    Posteriors leave out what those of large runs do, the likelihood of each star at each draw: a
+    fifth of a small run, and tests/infer/test_files looks at it.  Structure that a fit leaves out
+    is integrated over a coarse grid of its sizes: a tenth, and tests/diagnose looks at it.
+    """
+    structure = "bayesdist.diagnose.correlated.structure"
+    with (
+        sketched(made=False),
+        patch("bayesdist.infer.files.LARGEST", 0),
+        patch(f"{structure}.LENGTHS", np.geomspace(0.02, 0.6, 3)),
+        patch(f"{structure}.HALVINGS", 2),
     ):
         yield
 
@@ -54,10 +73,10 @@ def _unmade(registry, results, *, pdf=False, processes=1):
 
 
 def main() -> int:
-    """Exit code of a command of bayesdist whose report has no figures."""
+    """Exit code of a command of bayesdist whose runs are quick."""
     from bayesdist.app.cli import main as command
 
-    with sketched(made=False):
+    with quick():
         return command(sys.argv[1:])
 
 

@@ -36,47 +36,21 @@ class Finished:
 
 
 @pytest.fixture(scope="package", autouse=True)
-def sketched(full) -> Iterator[None]:
-    """Figures of reports are neither made nor drawn, unless run in full."""
-    with nullcontext() if full else sketches.sketched(made=False):
-        yield
-
-
-@pytest.fixture(scope="package", autouse=True)
-def few_likelihoods(full) -> Iterator[None]:
-    """Posteriors leave out what those of large runs do: the likelihood of each star at each draw.
-
-    Unless run in full; it takes a fifth of a small run, and tests/infer/test_files looks at it.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        if not full:
-            patch.setattr("bayesdist.infer.files.LARGEST", 0)
-        yield
-
-
-@pytest.fixture(scope="package", autouse=True)
-def coarse_structure(full) -> Iterator[None]:
-    """The structure that a fit leaves out is integrated over a coarse grid of its sizes.
-
-    Unless run in full; it takes a tenth of a small run, and tests/diagnose looks at it.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        if not full:
-            structure = "bayesdist.diagnose.correlated.structure"
-            patch.setattr(f"{structure}.LENGTHS", np.geomspace(0.02, 0.6, 3))
-            patch.setattr(f"{structure}.HALVINGS", 2)
+def quick_runs(full) -> Iterator[None]:
+    """Runs leave out what takes long and is not looked at here, unless in full."""
+    with nullcontext() if full else sketches.quick():
         yield
 
 
 @pytest.fixture(scope="module")
-def figures_made(sketched, full) -> Iterator[None]:
+def figures_made(quick_runs, full) -> Iterator[None]:
     """Figures of reports are made and have their words; they are drawn if run in full."""
     with nullcontext() if full else sketches.sketched():
         yield
 
 
 @pytest.fixture(scope="package")
-def finished(sketched, few_likelihoods, coarse_structure, tmp_path_factory) -> Finished:
+def finished(quick_runs, tmp_path_factory) -> Finished:
     folder = tmp_path_factory.mktemp("finished")
     matches, truth = simulated(mag=np.linspace(12.0, 18.0, 400))
     config = write_job(

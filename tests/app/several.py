@@ -1,6 +1,6 @@
 """Several commands, one after another, in one process of their own: it starts once.
 
-Figures of reports are neither made nor drawn, unless run in full.
+Runs are quick, unless in full.
 """
 
 from __future__ import annotations
@@ -28,5 +28,5 @@ def results_of(done: CompletedProcess[str]) -> list[Result]:
 
 
 if __name__ == "__main__":
-    with nullcontext() if FULL else sketches.sketched(made=False):
+    with nullcontext() if FULL else sketches.quick():
         print(json.dumps([vars(cli(*json.loads(command))) for command in sys.argv[1:]]))

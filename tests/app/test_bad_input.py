@@ -581,8 +581,8 @@ def test_the_same_from_a_shell(tmp_path, stars):
     one_sentence(done.stderr, "'odrer'", "'order'")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["job"]
 
-    done = process("run", cwd=tmp_path)
-    assert done.returncode == 2 and done.stderr.startswith("Usage")
+    usage = cli("run")
+    assert usage.code == 2 and usage.err.startswith("Usage")
 
 
 # -- frames of the exposures ----------------------------------------------------------------------

@@ -17,13 +17,12 @@ from bayesdist.app.kinds.campaign.inputs import read_campaign
 from bayesdist.app.kinds.campaign.matching import match_lists
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.pipeline import diagnose
-from bayesdist.app.results import open_results, results_of
-from bayesdist.app.run import make_stages
+from bayesdist.app.results import results_of
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import read_matches
 from bayesdist.infer import load_fit
 from bayesdist.reading.tables import read_table
-from tests.app.support import cli, good, one_sentence, refused, summary_of
+from tests.app.support import carried_out, cli, good, one_sentence, refused, summary_of
 from tests.reduced import only_in_full
 
 N, LATER = 14, 3  # exposures, and how many of them the release does not see
@@ -76,14 +75,9 @@ def begin(folder: Path, run: Path, names: list[str], *, holdout: str = "", drift
 @pytest.fixture(scope="module")
 def run(folder):
     run = begin(folder, folder.parent / "release", parts(folder)[0], holdout=HOLDOUT)
-    for stage in ("match", "fit", "sample"):
-        good("stage", stage, run, "-q")
-    directory = RunDirectory.open(run)
     # how linear terms went with time takes longer than all the rest, and is not asked here
-    without = patch("bayesdist.app.saving.write_series_tables")
-    with without, open_results(directory) as results:
-        make_stages(results, ("diagnose",))
-    return run
+    with patch("bayesdist.app.saving.write_series_tables"):
+        return carried_out(run, "match", "fit", "sample", "diagnose")
 
 
 @pytest.fixture(scope="module")

@@ -48,7 +48,7 @@ ROUGH = {("pattern", CENTROID), ("drift and pattern", CENTROID)}
 
 @pytest.fixture(scope="module")
 def found(full) -> dict[str, list[Covered]]:
-    kinds = KINDS if full else ("polynomial", "drift and pattern")
+    kinds = KINDS if full else ("drift and pattern",)
     return {kind: covered_by_term(kind, coverage(kind, full=full)) for kind in kinds}
 
 

@@ -170,7 +170,7 @@ def test_a_wrong_field_is_named_with_the_best_count(rng):
     [
         (0.05, 1),
         case_in_full(1000.0, 1, instead="another unit is named"),
-        (1.0, -1),
+        case_in_full(1.0, -1, instead="tests/app has a mirrored catalogue"),
     ],
 )
 def test_what_would_match_is_named(rng, factor, mirror):
@@ -220,7 +220,13 @@ def test_an_exposure_of_no_sky_is_left_out_and_counted(rng):
     np.testing.assert_array_equal(t.exposure, rest.exposure)
 
 
-@pytest.mark.parametrize("numbers", [(0, 1), (2, 4)], ids=["the first two", "more than a fifth"])
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        case_in_full((0, 1), instead="others are strewn", id="the first two"),
+        pytest.param((2, 4), id="more than a fifth"),
+    ],
+)
 def test_too_many_of_them_are_an_error(rng, numbers):
     catalog, lists, log, _, _ = campaign(rng, 6, stars=2500)
     bad = [strewn(rng, one) if k in numbers else one for k, one in enumerate(lists)]

@@ -23,7 +23,7 @@ from bayesdist.report.sections.run.holdout import holdout_coverage, holdout_tabl
 from tests.diagnose.held_campaign import field, judged, solved
 from tests.reduced import only_in_full
 
-RUNS = 60 if os.environ.get("BAYESDIST_FULL") else 6
+RUNS = 60 if os.environ.get("BAYESDIST_FULL") else 4
 WHOLE = ("j004", "j007")
 
 

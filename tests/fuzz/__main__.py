@@ -8,6 +8,7 @@ import json
 import resource
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from tests.fuzz.cases import drawn, kept
@@ -18,7 +19,7 @@ from tests.fuzz.verdicts import table_of, tried
 BEGUN = 1000  # cases, from which on runs are begun for them
 
 
-def main() -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code: 1 where a case failed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cases", type=int, default=300)
@@ -27,7 +28,7 @@ def main() -> int:
     parser.add_argument("--kept", action="store_true", help="only the cases that failed once")
     parser.add_argument("--failed", metavar="FILE", help="write the cases that failed")
     parser.add_argument("--json", metavar="FILE", help="write counts and failures")
-    given = parser.parse_args()
+    given = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="bayesdist-fuzz-") as folder:
         made = inputs(Path(folder), begun=given.cases >= BEGUN or bool(given.only))
         known = [one for one in made if given.only in f"{one.kind} {one.name}"]

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
-from tests.app.support import REPOSITORY
 from tests.fuzz import sandbox
+from tests.fuzz.__main__ import main
 from tests.fuzz.cases import Case, kept
 from tests.fuzz.inputs import Input
 from tests.fuzz.mutation import MUTATIONS
@@ -22,21 +21,24 @@ from tests.fuzz.sandbox import Answer, answers
 from tests.fuzz.verdicts import accepted, not_accepted
 
 FEW, MANY = 300, 20_000
-PATH = os.pathsep.join([str(REPOSITORY), *sys.path])
+
+
+@pytest.fixture(scope="module")
+def elsewhere():
+    """A process that forks: this one may have threads of libraries that other tests use."""
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("NUMBA_THREADING_LAYER", "workqueue")
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            yield pool
 
 
 @pytest.mark.slow
-def test_damaged_input_is_answered_warned_of_or_refused(full, tmp_path, capsys):
-    """In a process of its own, from which those with the cases are forked; and all that failed."""
-    subprocess.run(
-        [sys.executable, "-m", "tests.fuzz", "--cases", str(MANY if full else FEW),
-         "--json", tmp_path / "counts.json"],
-        cwd=REPOSITORY,
-        env=os.environ | {"PYTHONPATH": PATH, "NUMBA_THREADING_LAYER": "workqueue"},
-        capture_output=True,
-        check=False,
-    )  # fmt: skip
-    found = json.loads((tmp_path / "counts.json").read_text("utf-8"))
+def test_damaged_input_is_answered_warned_of_or_refused(elsewhere, full, tmp_path, capsys):
+    """Cases that are drawn, and all that failed once."""
+    counts = tmp_path / "counts.json"
+    given = ["--cases", str(MANY if full else FEW), "--json", str(counts)]
+    elsewhere.submit(main, given).result()
+    found = json.loads(counts.read_text("utf-8"))
     with capsys.disabled():
         print(f"\n{found['table']}")
     assert found["tried"] >= (MANY if full else FEW)
@@ -78,16 +80,11 @@ def _exits(line):
 
 def _answers_of(command, one):
     """Answers of a function in place of the command line, tried twice."""
-    sandbox.main = lambda line: bool(command(line)) * 0
-    sandbox.WAIT = 2.0
-    return list(answers([(one, CASE, "say")] * 2))
-
-
-@pytest.fixture(scope="module")
-def elsewhere():
-    """A process that forks: this one may have threads of libraries that other tests use."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        yield pool
+    with (
+        patch.object(sandbox, "main", lambda line: bool(command(line)) * 0),
+        patch.object(sandbox, "WAIT", 2.0),
+    ):
+        return list(answers([(one, CASE, "say")] * 2))
 
 
 CASE = Case("a.csv", "say", "cell_not_finite", {"line": 1, "cell": 0, "text": "nan"})

@@ -38,7 +38,7 @@ def _finished(folder: Path, rolls: tuple[float, ...], *, report: bool) -> Finish
 
 
 @pytest.fixture(scope="package")
-def three_rolls(sketched, full, tmp_path_factory) -> Finished:
+def three_rolls(quick_runs, full, tmp_path_factory) -> Finished:
     """With its report and the words of its figures."""
     with nullcontext() if full else sketches.sketched():
         return _finished(tmp_path_factory.mktemp("three"), ROLLS["three rolls"], report=True)

@@ -121,7 +121,7 @@ def test_a_catalogue_that_both_sides_share_is_no_change(full) -> None:
     Taken for independent they make probabilities that are anything but uniform.
     """
     values, ignored = [], []
-    for seed in range(60 if full else 6):
+    for seed in range(60 if full else 3):
         one = field(seed, n_exposures=30, n_stars=200, one_pointing=True, centroid=0.004)
         early = one.matches.exposure < 24
         old, new = one.matches.select(early), one.matches.select(~early)

@@ -271,7 +271,7 @@ def test_false_matches_are_found_and_do_not_pull(rng, method):
 
 
 @pytest.mark.slow
-@only_in_full("tests/app/test_filters has two filters")
+@only_in_full("tests/app/campaign has two filters")
 def test_filters_have_their_own_polynomial_and_table(rng):
     """Positions in a second filter, with few stars: error and stated sigma agree."""
     model = DistortionModel(ORDER, (CHIP,), frames="shift", exposures=("a", "b", "c"))

@@ -147,7 +147,7 @@ def test_moments(density, move, full, capsys):
     if not full and (density, move) not in REDUCED:
         pytest.skip("each move and each density is run with others: set BAYESDIST_FULL=1")
     known = DENSITIES[density]()
-    found = deviations(known, move, STEPS[move] * (10 if full else 1))
+    found = deviations(known, move, 10 * STEPS[move] if full else STEPS[move] // 2)
     with capsys.disabled():
         print(
             f"\n{move}: ESS {found.ess:.0f}, acceptance {found.accepted:.2f}, largest deviation of "

@@ -26,7 +26,7 @@ from tests.infer.selfcal import fields
 from tests.infer.workers import local_workers
 from tests.reduced import only_in_full
 
-PIECE = 200  # detections: some ten pieces on three workers
+PIECE = 200  # detections: some ten pieces on two workers
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -45,8 +45,8 @@ def solution():
 
 @pytest.fixture(scope="module")
 def cluster():
-    """Three workers that somebody else has started."""
-    with local_workers(3) as cluster:
+    """Two workers that somebody else has started."""
+    with local_workers(2) as cluster:
         yield cluster
 
 
@@ -120,7 +120,7 @@ def test_density_and_slope_are_those_of_the_whole(solution, compute):
     theta = solution.theta + off
     mixtures = np.column_stack([rng.uniform(0.001, 0.05, 20), rng.uniform(0.001, 0.1, 20)])
     with in_pieces(solution) as here, in_pieces(solution, compute) as there:
-        assert len(set(there.sum(pid_of))) == 3
+        assert len(set(there.sum(pid_of))) == 2
         assert_close(
             there.sum(log_density, theta, mixtures), here.sum(log_density, theta, mixtures)
         )
@@ -167,7 +167,7 @@ class Interrupted(Pieces):
 
 @pytest.mark.slow
 @only_in_full("tests/infer/stars kills one of them")
-def test_one_of_three_workers_is_killed_while_sampling(solution, compute, monkeypatch):
+def test_one_of_two_workers_is_killed_while_sampling(solution, compute, monkeypatch):
     struck = []
 
     def interrupted(solution, compute=None):

@@ -20,7 +20,7 @@ def by_filter(answer, draws) -> dict[str, Change]:
 
 
 @pytest.mark.slow
-@only_in_full("tests/app/test_filters has one")
+@only_in_full("tests/app/campaign has one")
 def test_a_common_drift():
     truth = campaign(11, filters=FILTERS)
     answer = filter_dependence(truth.series, LINES)

@@ -78,13 +78,13 @@ def answers(series: list[Series]) -> list[tuple[SeriesPosterior, HeldOut]]:
 
 @pytest.fixture(scope="module")
 def decam_answers(decam, full):
-    return answers(some(decam, full, 12))
+    return answers(some(decam, full, 24))
 
 
 @pytest.fixture(scope="module")
 def tess_answers(tess, full):
     measured = [s.take(np.array(s.names, int) <= LAST_MEASURED) for s in tess.values()]
-    return answers(measured if full else measured[::8])
+    return answers(measured if full else measured[::16])
 
 
 def check_coverage(name: str, given: list[tuple[SeriesPosterior, HeldOut]]) -> str:

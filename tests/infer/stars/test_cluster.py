@@ -241,7 +241,7 @@ def test_scheduler_knows_how_large_a_shard_is(there, cluster):
 class Interrupted(Shards):
     """Shards, of whose workers one is killed while a pass is under way."""
 
-    shards: ClusterShards
+    shards: Shards
     victim: int
     at: int
     passes: int = 0
@@ -266,11 +266,11 @@ class Interrupted(Shards):
             self.killed = True
 
 
-def test_one_of_three_workers_is_killed_while_sampling(there, by_threads, cluster):
+def test_one_of_three_workers_is_killed_while_sampling(there, problem, by_threads):
     fit, expected = by_threads
     before = there.sum(pid_of)
-    counted = Interrupted(there, 0, -1)
-    assert_same_draws(sample(fit, counted, seed=5), expected)
+    counted = Interrupted(load(*problem), 0, -1)
+    sample(fit, counted, seed=5)
     struck = Interrupted(there, before[0], counted.passes // 2)
     assert_same_draws(sample(fit, struck, seed=5), expected)
     assert struck.killed and struck.passes == counted.passes

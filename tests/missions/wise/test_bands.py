@@ -36,7 +36,7 @@ from tests.app.support import (
     write_job,
 )
 from tests.reduced import only_in_full
-from tests.sketches import sketched
+from tests.sketches import quick, sketched
 
 PAIRS = 20_000
 BINS = 9
@@ -71,8 +71,8 @@ class Compared:
 
 @pytest.fixture(scope="module", autouse=True)
 def quick_reports(full):
-    """Figures of reports are not drawn, unless run in full."""
-    with nullcontext() if full else sketched():
+    """Runs are quick and figures of bands are not drawn, unless in full."""
+    with nullcontext() if full else quick(), nullcontext() if full else sketched():
         yield
 
 

@@ -1,0 +1,1 @@
+"""Tests of campaigns through the command line."""

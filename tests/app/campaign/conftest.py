@@ -1,0 +1,56 @@
+"""One campaign in two filters, simulated and calibrated once for the files of this folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from bayesdist.app.assessment import series
+from tests.app.support import good
+
+# coarse nodes and few draws: quick.  Wider cells than the pattern's leave the linear terms alone;
+# 100 draws' worth moves a mean by a tenth of its sigma
+QUICK = {
+    'method = "field"': 'step = [256.0, 256.0]\nmethod = "field"',
+    "[assess]": "[sampler]\nensembles = 2\ntarget_ess = 100\ntarget_rhat = 1.05\n\n[assess]",
+    "grid = [33, 17]": "grid = [17, 9]\ndraws = 1000",
+}
+
+
+@pytest.fixture(scope="package")
+def folder(tmp_path_factory) -> Path:
+    """20 exposures in F606W, 8 in F814W, and a configuration of each filter."""
+    folder = tmp_path_factory.mktemp("campaign") / "acs"
+    options = ("--exposures", 20, "--secondary-exposures", 8, "--stars", 6000, "--seed", 5, "-q")
+    good("simulate", "acs", "-o", folder, "--filters", "F606W,F814W", *options)
+    for config in folder.glob("campaign_*.toml"):
+        text = config.read_text(encoding="utf-8")
+        for old, new in QUICK.items():
+            assert old in text
+            text = text.replace(old, new)
+        config.write_text(text, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="package")
+def run(folder, full) -> Path:
+    """The run of F606W.
+
+    In full the course over time is told of the first term, from few sweeps, and reported.  It
+    would take as long as all the rest; tests/infer/series shows what is said of it, and
+    tests/report what campaigns show.
+    """
+    out, of_term = folder / "run_f606w", series._verdict
+
+    def first(exposures, k, *options):
+        unsaid = {"term": exposures.coefficients[k], "claim": "not asked", "text": "Not asked."}
+        return of_term(exposures, k, *options) if full and k == 0 else unsaid
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(series, "_verdict", first)
+        patch.setattr(series, "MAX_SWEEPS", 1000 if full else 100)
+        if not full:
+            patch.setattr("bayesdist.app.run.report", lambda results, pdf: [])
+        good("run", folder / "campaign_f606w.toml", "-o", out, "-q")
+    return out
