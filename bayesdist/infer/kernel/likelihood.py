@@ -57,7 +57,9 @@ def _partial_sums(first, end, blocks, columns, coef, order, rows, unit2, sums):
                 # the smaller exponent is taken out, so that exp never overflows
                 low = smaller(q_in, q_out)
                 t = exp_negative(low - larger(q_in, q_out))
-                both = choose(q_in, q_out, peak + outlier * t, peak * t + outlier)
+                # the other product would be a denormal number for hopeless stars, which takes long
+                more = choose(q_in, q_out, peak, outlier)
+                both = more + t * choose(q_in, q_out, outlier, peak)
                 put(density, s, first_lanes(n - s, both, 1.0))
                 exponents += first_lanes(n - s, low, 0.0)
             constant = total(exponents) + n * math.log(2 * math.pi * unit2)

@@ -237,8 +237,9 @@ def _mixture(start, stop, pieces, columns, coef, order, row, unit2, em, sums, sc
                 least = smaller(q_in, q_out)
                 t = exp_negative(least - larger(q_in, q_out))
                 peak = core * root
-                d_in = choose(q_in, q_out, peak, peak * t)
-                d_out = choose(q_in, q_out, outlier * t, outlier)
+                # factors first: the product that is not needed may be denormal, which takes long
+                d_in = peak * choose(q_in, q_out, 1.0, t)
+                d_out = outlier * choose(q_in, q_out, t, 1.0)
                 both = d_in + d_out
                 put(density, s, first_lanes(n - s, both, 1.0))
                 low += first_lanes(n - s, least, 0.0)

@@ -53,15 +53,16 @@ def residuals(blocks: Int, columns: tuple[Float, ...], coef: Float, order: int) 
 
 @nb.njit(**PASS)
 def _memberships(first, end, blocks, columns, coef, order, rows, unit2, out):
-    share = 1.0 / len(rows)
-    constant = math.log(2 * math.pi * unit2)
+    each = len(rows) // len(out)
+    share, constant = 1.0 / each, math.log(2 * math.pi * unit2)
     stars, model = scratch(6), scratch(2)
     for b in range(first, end):
         g, a, e = blocks[b]
         n = e - a
         lay_out(columns, a, e, stars)
-        out[:, a:e] = 0.0
+        out[:, :, a:e] = 0.0
         for d in range(len(rows)):
+            mean = out[d // each]
             evaluate(coef[d, g], order, stars[0], stars[1], n, model)
             for s in range(n):
                 ru, rv = stars[2, s] - model[0, s], stars[3, s] - model[1, s]
@@ -74,20 +75,26 @@ def _memberships(first, end, blocks, columns, coef, order, rows, unit2, out):
                 d_in = peak if is_core else peak * t
                 d_out = rows[d, 2] * t if is_core else rows[d, 2]
                 loglik = math.log(d_in + d_out) - min(q_in, q_out) - constant
-                out[0, a + s] += share * d_out / (d_in + d_out)
-                out[1, a + s] += share * loglik
-                out[2, a + s] += share * loglik * loglik
+                mean[0, a + s] += share * d_out / (d_in + d_out)
+                mean[1, a + s] += share * loglik
+                mean[2, a + s] += share * loglik * loglik
 
 
 def memberships(
-    blocks: Int, columns: tuple[Float, ...], coef: Float, order: int, constants: Constants
+    blocks: Int,
+    columns: tuple[Float, ...],
+    coef: Float,
+    order: int,
+    constants: Constants,
+    each: int,
 ) -> Float:
-    """Outlier probability, log-likelihood and its square (3, N) of each star, averaged over draws.
+    """Outlier probability, log-likelihood and its square (D / each, 3, N) of each star.
 
-    `coef` (D, G, 2, K) and the constants are those of D draws; other arguments as in `residuals`.
+    They are averaged over `each` draws at a time.  `coef` (D, G, 2, K) and the constants are those
+    of D draws; other arguments as in `residuals`.
     """
-    out = np.empty((3, len(columns[0])))
-    with threads_for(4 * out.shape[1] * len(coef)):
+    out = np.empty((len(coef) // each, 3, len(columns[0])))
+    with threads_for(4 * out.shape[2] * len(coef)):
         share_out(
             _memberships,
             len(blocks),

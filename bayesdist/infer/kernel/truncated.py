@@ -86,16 +86,17 @@ def _parts(star, row, circle, q, work):
 
 @nb.njit(**PASS)
 def _evaluated(first, end, blocks, stars, coef, order, rows, unit2, circle, sums, out):
-    """Log-likelihood (n, D) of each block; star by star, averages to out (3, N) if not empty."""
-    n_draws, wanted = len(rows), out.shape[1] > 0
-    share, constant = 1.0 / n_draws, math.log(2 * math.pi * unit2)
+    """Log-likelihood (n, D) of each block; averages by star to out (D / each, 3, N) if any."""
+    n_draws, wanted = len(rows), len(out) > 0
+    each = n_draws // len(out) if wanted else 1
+    share, constant = 1.0 / each, math.log(2 * math.pi * unit2)
     for b in range(first, end):
         g, a, e = blocks[b]
         places, model = scratch(6), scratch(2)
         q, work = np.empty(MOST), np.empty(MOST)
         lay_out(stars, a, e, places)
         if wanted:
-            out[:, a:e] = 0.0
+            out[:, :, a:e] = 0.0
         for d in range(n_draws):
             evaluate(coef[d, g], order, places[0], places[1], e - a, model)
             total = 0.0
@@ -105,9 +106,10 @@ def _evaluated(first, end, blocks, stars, coef, order, rows, unit2, circle, sums
                 value = math.log(d_in + d_out) - least
                 total += value
                 if wanted:
-                    out[0, i] += share * d_out / (d_in + d_out)
-                    out[1, i] += share * (value - constant)
-                    out[2, i] += share * (value - constant) * (value - constant)
+                    mean = out[d // each]
+                    mean[0, i] += share * d_out / (d_in + d_out)
+                    mean[1, i] += share * (value - constant)
+                    mean[2, i] += share * (value - constant) * (value - constant)
             sums[b, d] = total - (e - a) * constant
 
 
@@ -237,7 +239,7 @@ def truncated_log_likelihood(
     of the circle; other arguments as in `log_likelihood`.
     """
     rows, coef = packed(constants), np.ascontiguousarray(coef)
-    stars, circle, nothing = (*columns, *offsets), _circle(constants), np.empty((3, 0))
+    stars, circle, nothing = (*columns, *offsets), _circle(constants), np.empty((0, 3, 0))
     out = np.empty(len(coef))
     step = max(1, SCRATCH // (8 * max(len(blocks), 1)))
     with threads_for(INTEGRAL * len(columns[0]) * len(coef)):
@@ -269,13 +271,14 @@ def truncated_memberships(
     coef: Float,
     order: int,
     constants: Constants,
+    each: int,
 ) -> Float:
-    """Outlier probability, log-likelihood and its square (3, N) of each star, averaged over draws.
+    """Outlier probability, log-likelihood and its square (D / each, 3, N) of each star.
 
     `offsets` (N,) are nominal position minus data, in u and v; other arguments as in `memberships`.
     """
-    out = np.empty((3, len(columns[0])))
-    with threads_for(INTEGRAL * out.shape[1] * len(coef)):
+    out = np.empty((len(coef) // each, 3, len(columns[0])))
+    with threads_for(INTEGRAL * out.shape[2] * len(coef)):
         share_out(
             _evaluated,
             len(blocks),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bayesdist.data.matches import Matches
 from bayesdist.infer.kernel import Constants
 from bayesdist.infer.posterior.posterior import Posterior
-from bayesdist.infer.stars.likelihood import star_averages
+from bayesdist.infer.stars.likelihood import star_averages, star_log_likelihoods
 from bayesdist.infer.stars.mixture import Hyper
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
@@ -29,6 +29,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 MOST_DRAWS, LEAST_DRAWS = 64, 8
+AT_A_TIME = 1_000_000  # log-likelihoods of a star that are in memory beside the result
 EVALUATIONS = 200_000_000  # largest number of evaluations of a star for the average
 
 
@@ -128,10 +129,11 @@ def star_log_likelihood(posterior: Posterior, matches: Matches) -> Float:
     theta, h = posterior.sampled_points
     constants = posterior.bound_mixture.constants(h)
     out = np.empty((len(theta), len(matches)))
-    for k in range(len(theta)):
-        rows = slice(k, k + 1)
-        values = star_averages(stars, theta[rows], constants.of(rows))[1]
-        out[k] = in_table_order(values, order)
+    step = max(1, AT_A_TIME // max(1, len(matches)))
+    for k in range(0, len(theta), step):
+        rows = slice(k, k + step)
+        values = star_log_likelihoods(stars, theta[rows], constants.of(rows))
+        out[rows] = in_table_order(values.T, order).T
     return out.reshape(*posterior.log_prob.shape, len(matches))
 
 

@@ -312,7 +312,8 @@ def _state_dependent(
         if verdict.converged or last:
             break
         ess = min(verdict.ess_bulk_min, verdict.ess_tail_min)
-        if trial and not has_mixed(ess, len(target.names), total):
+        hopeless = is_hopeless(len(target.names), s.n_stars, len(s.seeds))
+        if trial and not has_mixed(ess, len(target.names), total, hopeless=hopeless):
             return history.chains(warmup, verdict, passes), False
         wanted = next_check(made, verdict, s.n_stars, total)
     return history.chains(warmup, verdict, passes), True

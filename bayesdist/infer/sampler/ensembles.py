@@ -129,10 +129,8 @@ def _independence(proposal: Proposal, whitening: Whitening) -> MHMove:
         lost = ~np.all(np.isfinite(psi), axis=1)  # outside the support: target density zero
         white = np.where(np.asarray(lost)[:, None], coords, whitening.to_white(np.nan_to_num(psi)))
         # evaluated through the same coordinates on both sides, so that ratios are exact
-        factor = proposal.log_density(whitening.to_psi(coords)) - proposal.log_density(
-            whitening.to_psi(white)
-        )
-        return white, np.where(lost, -np.inf, factor)
+        both = proposal.log_density(whitening.to_psi(np.concatenate([coords, white])))
+        return white, np.where(lost, -np.inf, both[: len(coords)] - both[len(coords) :])
 
     return MHMove(propose)
 

@@ -96,8 +96,11 @@ def plan_moves(
     if efficiency > USABLE and (k < NO_MEAN or n_proposals < PROBATION):
         return Plan("independence + pCN", (0.6, 0.4, 0.0), walkers or 32, step, 1 if dear else 5)
     if n_params > MANY and efficiency > 0:
+        # the log weight, of variance -log(efficiency) if it is normal, then changes by sqrt(2), and
+        # two of five moves are accepted
+        step = float(np.clip(1 / np.sqrt(-np.log(efficiency)), step, 0.5))
         thin = 1 if dear else 5
-        return Plan("pCN + independence", (0.2, 0.8, 0.0), walkers or 32, step, thin)
+        return Plan("pCN + independence", (0.2, 0.8, 0.0), walkers or 20, step, thin)
     # emcee's red-blue moves need two walkers for each parameter
     least = max(2 * (n_params + 1), 32)
     walkers, thin = max(walkers or 0, least), 1 if dear else 10
@@ -112,13 +115,16 @@ def mixing_steps(n_params: int) -> int:
     return max(500, 10 * n_params)
 
 
-def has_mixed(ess: float, n_params: int, walkers: int) -> bool:
+def has_mixed(ess: float, n_params: int, walkers: int, *, hopeless: bool = False) -> bool:
     """True if Crank-Nicolson moves are to go on: every walker has made enough effective draws.
 
-    Of many parameters one is enough, since the other moves make fewer in as many passes;
+    Of many parameters one is enough, since the other moves make fewer in as many passes.  Where
+    these are `hopeless` it is two: with fewer, sampling would take more than about a minute.
     `walkers` are those of all ensembles together.
     """
-    return ess >= (1.0 if n_params > MANY else DRAWS_PER_WALKER.value) * walkers
+    if n_params <= MANY:
+        return ess >= DRAWS_PER_WALKER.value * walkers
+    return ess >= (2.0 if hopeless else 1.0) * walkers
 
 
 def is_hopeless(n_params: int, n_stars: int, ensembles: int) -> bool:

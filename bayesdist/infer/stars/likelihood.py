@@ -22,6 +22,7 @@ __all__ = [
     "good_probability",
     "log_densities",
     "star_averages",
+    "star_log_likelihoods",
 ]
 
 Float = NDArray[np.float64]
@@ -132,12 +133,21 @@ def star_averages(stars: Stars, theta: Float, constants: Constants) -> Float:
     `theta` is (n, D), and `constants` are those of the n draws.  With a sum over the stars it makes
     a task for `Shards.sum`.
     """
+    return np.asarray(_by_star(stars, theta, constants, len(theta))[0])
+
+
+def star_log_likelihoods(stars: Stars, theta: Float, constants: Constants) -> Float:
+    """Log-likelihood (n, N) of each star at draws (n, D), whose constants are given."""
+    return np.asarray(_by_star(stars, theta, constants, 1)[:, 1])
+
+
+def _by_star(stars: Stars, theta: Float, constants: Constants, each: int) -> Float:
     powers, order = stars.powers(theta), stars.model.order
     if circle := stars.circle(constants):
         return kernel.truncated_memberships(
-            stars.blocks, stars.columns, circle, powers, order, constants
+            stars.blocks, stars.columns, circle, powers, order, constants, each
         )
-    return kernel.memberships(stars.blocks, stars.columns, powers, order, constants)
+    return kernel.memberships(stars.blocks, stars.columns, powers, order, constants, each)
 
 
 def log_densities(square: Float, var: Float, f: float, wide: float) -> tuple[Float, Float]:

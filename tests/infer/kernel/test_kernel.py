@@ -162,13 +162,15 @@ def test_each_draw_is_by_itself(kind, monkeypatch):
 @pytest.mark.parametrize("far", [0.0, 1e6])
 def test_memberships_are_bayes_theorem(kind, far):
     starts, columns, coef, order, constants, phi, group = problem(kind, far=far)
-    found = kernel.memberships(
-        kernel.pieces_of(starts, kernel.BLOCK), columns, coef, order, constants
-    )
+    blocks = kernel.pieces_of(starts, kernel.BLOCK)
+    found = kernel.memberships(blocks, columns, coef, order, constants, len(coef))[0]
     loglik, p = plain(columns, coef, constants, phi, group)
     np.testing.assert_allclose(found[0], p.mean(axis=0), rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(found[1], loglik.mean(axis=0), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(found[2], (loglik**2).mean(axis=0), rtol=1e-12, atol=1e-12)
+    each = kernel.memberships(blocks, columns, coef, order, constants, 1)
+    np.testing.assert_allclose(each[:, 0], p, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(each[:, 1], loglik, rtol=1e-12, atol=1e-12)
     if kind == "gaussian":
         assert found[0].min() < 0.02 and found[0].max() > 0.99
 
@@ -189,8 +191,8 @@ def test_three_ways_to_the_same_likelihood(kind):
     for d in range(len(coef)):
         one = constants.of(slice(d, d + 1))
         stars = kernel.memberships(
-            kernel.pieces_of(starts, kernel.BLOCK), columns, coef[d : d + 1], order, one
-        )
+            kernel.pieces_of(starts, kernel.BLOCK), columns, coef[d : d + 1], order, one, 1
+        )[0]
         moments = kernel.mixture_moments(
             kernel.pieces_of(starts, kernel.PIECE), columns, coef[d], order, one
         )
@@ -203,7 +205,7 @@ def test_three_ways_to_the_same_likelihood(kind):
 
 PASSES: dict[str, Callable] = {
     "log_likelihood": lambda b, p, c, E, o, k: (kernel.log_likelihood(b, c, E, o, k),),
-    "memberships": lambda b, p, c, E, o, k: (kernel.memberships(b, c, E, o, k),),
+    "memberships": lambda b, p, c, E, o, k: (kernel.memberships(b, c, E, o, k, len(E)),),
     "residuals": lambda b, p, c, E, o, k: (kernel.residuals(b, c, E[0], o),),
     "least squares": lambda b, p, c, E, o, k: as_arrays(
         kernel.least_squares_moments(p, c, E[0], E[1], o, chi2_limit=25.0, abs_limit=1.0)

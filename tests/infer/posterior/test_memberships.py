@@ -63,7 +63,9 @@ def test_memberships_are_means_over_the_draws(known):
     )
 
 
-def test_log_likelihoods_of_the_stars_add_up_to_the_density(known):
+@pytest.mark.parametrize("at_a_time", [1, 1000, 1_000_000])
+def test_log_likelihoods_of_the_stars_add_up_to_the_density(known, at_a_time, monkeypatch):
+    monkeypatch.setattr(membership, "AT_A_TIME", at_a_time)
     target, posterior, matches, _, loglik, psi = known
     by_star = star_log_likelihood(posterior, matches)
     assert by_star.shape == (1, DRAWS, 400)

@@ -202,10 +202,14 @@ def test_plan_falls_back_as_the_proposal_gets_worse():
     # of many parameters differential evolution is the last resort
     many = plan_moves(0.01, 1.4, 184, 5000)
     assert not many.coupled and many.weights[1] > fair.weights[1]
+    # the worse the proposal, the shorter the steps from it
+    steps = [plan_moves(e, 1.4, 184, 5000).step for e in (0.04, 1e-3, 1e-9, 1e-300)]
+    assert 0.5 == steps[0] > steps[1] > steps[2] > steps[3] == 2 / np.sqrt(184)
     assert plan_moves(0.0, np.inf, 184, 5000).coupled
     # ... and one effective draw of each walker is asked for before it, of few parameters five
     assert mixing_steps(45) == 500 and mixing_steps(184) == 1840
     assert has_mixed(130, 184, 128) and not has_mixed(120, 184, 128)
+    assert has_mixed(160, 184, 80, hopeless=True) and not has_mixed(150, 184, 80, hopeless=True)
     assert has_mixed(650, 45, 128) and not has_mixed(630, 45, 128)
     # ... nor is it begun where a minute would not do
     assert is_hopeless(184, 5000, 4) and is_hopeless(60, 10**6, 4)

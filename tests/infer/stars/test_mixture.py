@@ -96,7 +96,8 @@ def by_kernel(hyper, values, residual, sigma) -> tuple[np.ndarray, np.ndarray]:
         np.zeros((1, 1, 2, 3)),
         1,
         hyper.constants(hyper.point(values)[None]),
-    )
+        1,
+    )[0]
     return p, loglik
 
 
