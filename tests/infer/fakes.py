@@ -12,9 +12,10 @@ from bayesdist.infer.density.laplace import Node
 from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.sampler.checkpoints import Walkers
-from bayesdist.infer.sampler.ensembles import Ensembles, Whitening
+from bayesdist.infer.sampler.ensembles import Ensembles
 from bayesdist.infer.sampler.move_schedule import Plan, StepRange
 from bayesdist.infer.sampler.proposal_batch import ProposalBatch
+from bayesdist.infer.sampler.whitening import Whitening
 
 
 class FakeTarget:

@@ -8,9 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from astropy import units as apu
-from astropy.coordinates import SkyCoord
-from astropy.io import fits
 from numpy.typing import NDArray
 
 from bayesdist.app.products.made_files import ProductInput
@@ -103,6 +100,10 @@ def sky_closure(
     point, solution = product.tangent_point, product.solution
     if point is None:
         return None
+    from astropy import units as apu
+    from astropy.coordinates import SkyCoord
+    from astropy.io import fits
+
     table, model = stars.table, solution.model
     mine = stars.used & (np.array(table.chip_numbers)[table.chip] == chip)
     if model.n_frame:

@@ -34,9 +34,11 @@ def as_json(value: Any) -> Any:
 
 def _refuse_sets(value: Any) -> None:
     """TypeError for a set anywhere in a value: pydantic would list it in the order of hashes."""
+    if value is None or isinstance(value, str | int | float | np.ndarray):
+        return  # at once: whether these are models or mappings takes long to find out
     if isinstance(value, set | frozenset):
         raise TypeError(f"{type(value).__name__} is no JSON and cannot be in a record or a key")
-    if isinstance(value, BaseModel) or (is_dataclass(value) and not isinstance(value, type)):
+    if (is_dataclass(value) and not isinstance(value, type)) or isinstance(value, BaseModel):
         value = vars(value)
     if isinstance(value, Mapping):
         value = value.values()

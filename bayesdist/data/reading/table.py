@@ -7,8 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from astropy.coordinates import SkyCoord
-from astropy.table import Table
+from astropy.table import Column, Table
 from astropy.time import Time
 from numpy.typing import NDArray
 
@@ -64,7 +63,12 @@ def with_sky_columns(table: Table) -> Table:
     `skycoord` becomes `skycoord.ra`, `skycoord.dec` (ICRS), and its motions and the time of its
     positions `pmra`, `pmdec` and `ref_epoch`; without such it is the table itself.
     """
-    coordinates = [name for name in table.colnames if isinstance(table[name], SkyCoord)]
+    others = [name for name in table.colnames if not isinstance(table[name], Column)]
+    if not others:
+        return table
+    from astropy.coordinates import SkyCoord
+
+    coordinates = [name for name in others if isinstance(table[name], SkyCoord)]
     if not coordinates:
         return table
     out = table.copy(copy_data=False)

@@ -8,10 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import astropy.units as apu
 import numpy as np
-from astropy.coordinates import Angle, SkyCoord
-from astropy.time import Time
 from numpy.typing import NDArray
 
 from bayesdist.data.sky.earth import parallax_factors
@@ -28,7 +25,7 @@ MOTIONS = ("pm_ra", "pm_dec", "sigma_pm_ra", "sigma_pm_dec")
 SPARED = ("parallax", "sigma_parallax", "corr_ra", "corr_dec")
 SKY_QUANTITIES = ("sigma_ra", "sigma_dec", *MOTIONS, *SPARED, "catalogue_epoch")
 
-_NO_MATTER = 100 * apu.pc  # without a radial velocity the path on the sky has no distance in it
+_NO_MATTER = 100  # parsecs: without a radial velocity the path on the sky has no distance in it
 _STANDS = 1e-3  # years, over which nothing moves
 
 
@@ -63,6 +60,9 @@ def _degrees(column: SourceColumn, key: str) -> Float:
 
 def _sexagesimal(column: SourceColumn, texts: NDArray[np.str_], key: str) -> Float:
     """Degrees of texts such as 10:00:24.1 (hours, of ra) and +02:12:00 (degrees)."""
+    import astropy.units as apu
+    from astropy.coordinates import Angle
+
     unit = apu.hourangle if key == "ra" else apu.deg
     try:
         return np.asarray(Angle(texts, unit=unit).deg, float)
@@ -170,20 +170,21 @@ def _moved(ra: Float, dec: Float, motion: Float, start: Float, end: Float) -> tu
     """Positions at the end by space motion without a radial velocity."""
     if np.max(np.abs(end - start), initial=0.0) < _STANDS:
         return ra, dec
+    import astropy.units as apu
+    from astropy.coordinates import SkyCoord
+    from astropy.time import Time
+
+    before, after = (Time(years, format="jyear", scale="tdb") for years in (start, end))
     sky = SkyCoord(
         ra=ra * apu.deg,
         dec=dec * apu.deg,
-        distance=np.broadcast_to(_NO_MATTER, ra.shape, subok=True),
+        distance=np.full(ra.shape, _NO_MATTER) * apu.pc,
         pm_ra_cosdec=motion[0] * apu.arcsec / apu.yr,
         pm_dec=motion[1] * apu.arcsec / apu.yr,
         radial_velocity=np.zeros(len(ra)) * apu.km / apu.s,
-        obstime=_times(start),
-    ).apply_space_motion(new_obstime=_times(end))
+        obstime=before,
+    ).apply_space_motion(new_obstime=after)
     return np.asarray(sky.ra.deg), np.asarray(sky.dec.deg)
-
-
-def _times(years: Float) -> Time:
-    return Time(years, format="jyear", scale="tdb")
 
 
 def _factors(epoch: Float, direction: tuple[float, float]) -> Float:

@@ -20,10 +20,10 @@ from bayesdist.infer.density.proposal import GridProposal, Random
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.posterior import Certificate
 from bayesdist.infer.sampler.chains import Chains, Settings, run_chains
-from bayesdist.infer.sampler.ensembles import Whitening
 from bayesdist.infer.sampler.move_schedule import Plan, expected_passes
 from bayesdist.infer.sampler.proposal_batch import ProposalBatch, pilot_batch
 from bayesdist.infer.sampler.surrogate import Surrogate, certify, draw_surrogate
+from bayesdist.infer.sampler.whitening import Whitening
 
 __all__ = ["PILOTS", "SECOND_STAGES", "SurrogateProposal", "has_second_stage", "run_certified"]
 

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,6 @@ from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Density
 from bayesdist.infer.posterior import SamplerInfo
 from bayesdist.infer.sampler.checkpoints import Block, Walkers
-from bayesdist.infer.sampler.ensembles import Ensembles, Whitening
 from bayesdist.infer.sampler.move_schedule import (
     EFFICIENT,
     Plan,
@@ -49,7 +49,11 @@ from bayesdist.infer.sampler.move_schedule import (
     walkers_for,
 )
 from bayesdist.infer.sampler.proposal_batch import ProposalBatch, pilot_batch
+from bayesdist.infer.sampler.whitening import Whitening
 from bayesdist.limits import PARETO_K
+
+if TYPE_CHECKING:
+    from bayesdist.infer.sampler.ensembles import Ensembles
 
 log = logging.getLogger("bayesdist")
 
@@ -183,6 +187,8 @@ def run_chains(target: Density, proposal: Proposal, settings: Settings) -> Chain
     DegenerateError when hardly a proposal falls inside the support; InputError for checkpoints that
     cannot be read or written.
     """
+    from bayesdist.infer.sampler.ensembles import Ensembles  # emcee takes a second to import
+
     s, E = settings, len(settings.seeds)
     W = s.walkers or walkers_for(s.n_stars)
     n = W * (pilot_steps(E, W) + 1)

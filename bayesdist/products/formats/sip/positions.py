@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from astropy.io import fits
-from astropy.wcs import WCS, FITSFixedWarning
 from numpy.typing import NDArray
 
 from bayesdist.calibration.calibration import Calibration
@@ -54,6 +53,8 @@ def sip_positions(
 
 def sky_of_header(header: fits.Header, x: Float, y: Float) -> tuple[Float, Float]:
     """RA and Dec (N,) in degrees of pixels by a header, as astropy.wcs has them."""
+    from astropy.wcs import WCS, FITSFixedWarning
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FITSFixedWarning)
         ra, dec = WCS(header).all_pix2world(x, y, 1)
