@@ -22,7 +22,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.spines import Spine
-from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 from PIL import Image
 
@@ -157,10 +156,10 @@ def _laid_out(figure: Figure) -> Bbox:
     figure.set_dpi(DPI)
     renderer = FigureCanvasAgg(figure).get_renderer()
     engine = figure.get_layout_engine()
-    with _measured_once(figure):
-        if engine is not None:
+    if engine is not None:
+        with _measured_once(figure):
             engine.execute(figure)
-        box = figure.get_tightbbox(renderer)
+    box = figure.get_tightbbox(renderer)
     # an engine, even 'none', would have each file drawn twice
     with rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
         figure.set_layout_engine(None)
@@ -171,8 +170,8 @@ def _laid_out(figure: Figure) -> Bbox:
 def _measured_once(figure: Figure) -> Iterator[None]:
     """Context in which the labels of each panel keep the room that they had at first.
 
-    Matplotlib measures them again after it has moved the panels, and for the area drawn on, which
-    takes as long as drawing them.
+    Matplotlib measures them again after it has moved the panels, which takes as long as drawing
+    them.
     """
     panels = figure.axes
     for ax in panels:
@@ -188,31 +187,17 @@ def _measuring_once(ax: Axes) -> Callable[..., Any]:
     """The function `get_tightbbox` of a panel, whose labels keep their room when it is moved."""
     measure, beyond = ax.get_tightbbox, list[Any]()
 
-    def box(renderer: Any, *, for_layout_only: bool = False, **options: Any) -> Any:
+    def box(renderer: Any, *options: Any, **more: Any) -> Any:
         if beyond:
             place = ax.get_axes_locator()
             ax.apply_aspect(None if place is None else place(ax, renderer))
-        else:
-            found = measure(renderer, for_layout_only=for_layout_only, **options)
-            if found is None:
-                return None
+            return Bbox(ax.bbox.get_points() + beyond[0])
+        found = measure(renderer, *options, **more)
+        if found is not None:
             beyond.append(found.get_points() - ax.bbox.get_points())
-        room = Bbox(ax.bbox.get_points() + beyond[0])
-        return room if for_layout_only else Bbox.union([room, *_words(ax, room, renderer)])
+        return found
 
     return box
-
-
-def _words(ax: Axes, room: Bbox, renderer: Any) -> Iterator[Bbox]:
-    """Extents of titles and labels of the axes, which may be longer than the panel."""
-    for text in ax.get_children():
-        if isinstance(text, Text) and text.get_text() and text not in ax.texts:
-            yield text.get_window_extent(renderer)
-    for label, side in ((ax.xaxis.label, 0), (ax.yaxis.label, 1)):
-        if label.get_text():  # it was laid out beside the panel where that was then
-            ends = room.get_points().copy()
-            ends[:, side] = label.get_window_extent(renderer).get_points()[:, side]
-            yield Bbox(ends)
 
 
 def _png(figure: Figure, box: Bbox) -> bytes:

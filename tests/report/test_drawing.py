@@ -160,6 +160,7 @@ def test_panels_with_long_words_are_cut_to_what_is_drawn(layout):
         many_kinds_of_axes(figure)
         figure.axes[2].set_title(12 * "beyond the panel ")
         figure.axes[3].set_ylabel(4 * "higher than the panel ")
+        figure.align_ylabels()
         image = pixels(png_of(figure))
     inked = (image != image[0, 0]).any(axis=2)
     for axis in (0, 1):
