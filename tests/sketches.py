@@ -53,13 +53,17 @@ def quick() -> Iterator[None]:
         yield
 
 
-def _sketch(plot, *, pdf=False, svg=False):
+def _sketch(plot, kind="png", *, pdf=False):
     """The words of a figure, and a speck in place of it."""
     from bayesdist.report.drawing import Drawing
 
-    page = io.BytesIO()
-    Image.new("RGB", (4, 3), "white").save(page, format="png")
-    return Drawing(page.getvalue(), b"%PDF-1.7" if pdf else None, plot.title, plot.text, plot.alt)
+    page = b"<svg xmlns='http://www.w3.org/2000/svg' width='3pt' height='2pt'/>"
+    if kind == "png":
+        pixels = io.BytesIO()
+        Image.new("RGB", (4, 3), "white").save(pixels, format="png")
+        page = pixels.getvalue()
+    words = plot.title, plot.text, plot.alt
+    return Drawing(page, kind, 0.04, b"%PDF-1.7" if pdf else None, *words)
 
 
 def _unmade(registry, results, *, pdf=False, processes=1):

@@ -1,27 +1,28 @@
-"""Figures as files: each laid out and drawn once as PNG, and once more as PDF if asked for."""
+"""Figures as files: each laid out and drawn once, and once more as PDF if asked for."""
 
 from __future__ import annotations
 
 import io
 import logging
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from pickle import PickleError
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.spines import Spine
 from matplotlib.transforms import Bbox
-from numpy.typing import NDArray
 from PIL import Image
 
 from bayesdist.files import atomic_path, made_folder
@@ -42,10 +43,11 @@ __all__ = [
 
 log = logging.getLogger("bayesdist")
 
-Pixels = NDArray[np.uint8]  # (rows, columns, colours), rows from the top
+Kind = Literal["png", "svg"]
 
 DPI = 150
 MARGIN = 8  # pixels around the drawing
+MOST_VECTORS = 1000  # marks: more are sooner drawn, and smaller, as pixels
 MIN_FIGURES_SHARED = 20  # fewer are drawn sooner than another process has started
 
 _received: list[Any] = []  # of a process that draws for another one
@@ -53,29 +55,31 @@ _received: list[Any] = []  # of a process that draws for another one
 
 @dataclass(frozen=True)
 class Drawing:
-    """Figure as files, with the title, text and text alternative of its `Plot`, and its numbers."""
+    """Figure as a file, with the words of its `Plot` and its numbers."""
 
-    png: bytes
+    file: bytes
+    kind: Kind
+    width: float  # inches, at which its letters have the size they were set in
     pdf: bytes | None = None
     title: str = ""
     text: str = ""
     alt: str = ""
     numbers: str = ""  # CSV
-    svg: str = ""  # of figures that are printed
 
 
 @figure_style()  # mathematical text and ticks read the settings only when drawn
-def render(plot: Plot, *, pdf: bool = False, svg: bool = False) -> Drawing:
-    """Figure as PNG, and as PDF and SVG with text as letters; equal figures give equal files."""
-    pixels, box = _laid_out(plot.figure)
+def render(plot: Plot, kind: Kind = "png", *, pdf: bool = False) -> Drawing:
+    """Figure as a file of one kind, and as PDF if asked for; equal figures give equal files."""
+    box = _laid_out(plot.figure)
     return Drawing(
-        _png(pixels),
+        _png(plot.figure, box) if kind == "png" else _svg(plot.figure, box),
+        kind,
+        box.width,
         _pdf(plot.figure, box) if pdf else None,
         plot.title,
         plot.text,
         plot.alt,
         numbers_of(plot.figure),
-        _svg(plot.figure, box) if svg else "",
     )
 
 
@@ -83,6 +87,8 @@ def draw_all(
     registry: Registry, results: Any, *, pdf: bool = False, processes: int = 1
 ) -> dict[str, Drawing]:
     """Figures of a page, by name in its order, each made, drawn and released; `pdf`: as PDF too.
+
+    Each is drawn once: as SVG what is on paper or has few marks, else as PNG.
 
     More than one of `processes` import the main module of this process anew: a script must guard
     its work by ``if __name__ == "__main__"``.
@@ -93,7 +99,7 @@ def draw_all(
             return _drawn_together(items, results, pdf, processes)
         except (BrokenProcessPool, OSError, PickleError) as error:
             log.warning("report: figures are drawn by one process, others failed: %s", error)
-    return {item.name: render(item.made(results), pdf=pdf, svg=item.printed) for item in items}
+    return {item.name: _drawing(item, results, pdf) for item in items}
 
 
 def _drawn_together(
@@ -113,19 +119,34 @@ def _receive(results: Any) -> None:
 
 
 def _drawn(item: Item, pdf: bool) -> Drawing:
-    return render(item.made(_received[0]), pdf=pdf, svg=item.printed)
+    return _drawing(item, _received[0], pdf)
+
+
+def _drawing(item: Item, results: Any, pdf: bool) -> Drawing:
+    plot = item.made(results)
+    vectors = item.printed or _marks(plot.figure) <= MOST_VECTORS
+    return render(plot, "svg" if vectors else "png", pdf=pdf)
+
+
+def _marks(figure: Figure) -> int:
+    """Number of single marks in the collections of a figure: points, arrows, segments, cells."""
+    found = 0
+    for ax in figure.axes:
+        for one in ax.collections:
+            found += max(len(one.get_paths()), len(np.asarray(one.get_offsets())))
+    return found
 
 
 @figure_style()
 def png_of(figure: Figure) -> bytes:
     """PNG file of 256 colours of a figure: a third of the size, without a visible difference."""
-    return _png(_laid_out(figure)[0])
+    return _png(figure, _laid_out(figure))
 
 
-def _laid_out(figure: Figure) -> tuple[Pixels, Bbox]:
-    """Pixels and box (inches) of the area of a figure that is drawn on, with room around it.
+def _laid_out(figure: Figure) -> Bbox:
+    """Box (inches) of the area of a figure that is drawn on, with room around it.
 
-    The figure is laid out and drawn once; a second time where artists lie outside the page as well.
+    All positions are fixed, so that each file is drawn once.
     """
     plain_ticks(figure)
     for ax in figure.axes:
@@ -133,50 +154,64 @@ def _laid_out(figure: Figure) -> tuple[Pixels, Bbox]:
             if type(spine) is Spine:  # it lies on the frame, and would measure all ticks again
                 spine.set_in_layout(False)
     figure.set_dpi(DPI)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    _settle(figure)
-    page = np.asarray(canvas.buffer_rgba())
-    edges = _inked(page)
-    if edges is None:
-        box = figure.get_tightbbox().padded(MARGIN / DPI)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=DPI, bbox_inches=box)
-        return np.asarray(Image.open(buffer).convert("RGB")), box
-    top, bottom, left, right = edges
-    area = np.empty((bottom - top + 2 * MARGIN, right - left + 2 * MARGIN, 3), np.uint8)
-    area[:] = page[0, 0, :3]
-    area[MARGIN:-MARGIN, MARGIN:-MARGIN] = page[top:bottom, left:right, :3]
-    drawn = Bbox([[left, len(page) - bottom], [right, len(page) - top]]).padded(MARGIN)
-    return area, Bbox(drawn.get_points() / DPI)
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        with _measured_once(figure):
+            engine.execute(figure)
+    box = figure.get_tightbbox(renderer)
+    # an engine, even 'none', would have each file drawn twice
+    with rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
+        figure.set_layout_engine(None)
+    return Bbox(box.padded(MARGIN / DPI).get_points())
 
 
-def _inked(page: Pixels) -> tuple[int, int, int, int] | None:
-    """First and last rows and columns that are drawn on; None for those of the page's own edge.
+@contextmanager
+def _measured_once(figure: Figure) -> Iterator[None]:
+    """Context in which the labels of each panel keep the room that they had at first.
 
-    Measured on the page, as asking all artists for their extents takes as long as laying them out.
+    Matplotlib measures them again after it has moved the panels, which takes as long as drawing
+    them.
     """
-    colors = page.view(np.uint32)[..., 0]
-    drawn = colors != colors[0, 0]
-    out = []
-    for axis in (1, 0):
-        (where,) = np.nonzero(drawn.any(axis=axis))
-        if not where.size or where[0] == 0 or where[-1] == drawn.shape[1 - axis] - 1:
-            return None
-        out += [int(where[0]), int(where[-1]) + 1]
-    top, bottom, left, right = out
-    return top, bottom, left, right
+    panels = figure.axes
+    for ax in panels:
+        ax.get_tightbbox = _measuring_once(ax)  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        for ax in panels:
+            del ax.get_tightbbox
 
 
-def _png(pixels: Pixels) -> bytes:
-    image = Image.fromarray(pixels)
+def _measuring_once(ax: Axes) -> Callable[..., Any]:
+    """The function `get_tightbbox` of a panel, whose labels keep their room when it is moved."""
+    measure, beyond = ax.get_tightbbox, list[Any]()
+
+    def box(renderer: Any, *options: Any, **more: Any) -> Any:
+        if beyond:
+            place = ax.get_axes_locator()
+            ax.apply_aspect(None if place is None else place(ax, renderer))
+            return Bbox(ax.bbox.get_points() + beyond[0])
+        found = measure(renderer, *options, **more)
+        if found is not None:
+            beyond.append(found.get_points() - ax.bbox.get_points())
+        return found
+
+    return box
+
+
+def _png(figure: Figure, box: Bbox) -> bytes:
+    drawn = io.BytesIO()
+    quick = {"compress_level": 0}
+    figure.savefig(drawn, format="png", dpi=DPI, bbox_inches=box, pil_kwargs=quick)
+    image = Image.open(drawn).convert("RGB")
     # colours are chosen on every other pixel each way, in a fourth of the time
-    some = Image.fromarray(np.ascontiguousarray(pixels[::2, ::2]))
+    some = image.resize((-(-image.width // 2), -(-image.height // 2)), Image.Resampling.NEAREST)
     colors = some.quantize(256, method=Image.Quantize.MEDIANCUT)
     few = image.quantize(palette=colors, dither=Image.Dither.NONE)
     palette = few.getpalette() or []
     page = 3 * int(few.getpixel((0, 0)))  # type: ignore[arg-type]  # one number of such an image
-    palette[page : page + 3] = pixels[0, 0].tolist()  # it would be a shade darker
+    palette[page : page + 3] = image.crop((0, 0, 1, 1)).tobytes()  # it would be a shade darker
     few.putpalette(palette)
     buffer = io.BytesIO()
     few.save(buffer, format="png", dpi=(DPI, DPI))
@@ -189,18 +224,12 @@ def _pdf(figure: Figure, box: Bbox) -> bytes:
     return buffer.getvalue()
 
 
-def _svg(figure: Figure, box: Bbox) -> str:
+def _svg(figure: Figure, box: Bbox) -> bytes:
     """Figure with letters as outlines: a page on paper has them whatever fonts there are."""
-    buffer = io.StringIO()
+    buffer = io.BytesIO()
     with rc_context({"svg.fonttype": "path", "svg.hashsalt": "bayesdist"}):
         figure.savefig(buffer, format="svg", dpi=DPI, bbox_inches=box, metadata={"Date": None})
     return buffer.getvalue()
-
-
-def _settle(figure: Figure) -> None:
-    """Fix all positions; an engine, even 'none', would have each file drawn twice."""
-    with rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
-        figure.set_layout_engine(None)
 
 
 def save_figures(figures: Mapping[str, Figure], folder: str | os.PathLike[str]) -> tuple[Path, ...]:
@@ -208,30 +237,26 @@ def save_figures(figures: Mapping[str, Figure], folder: str | os.PathLike[str]) 
 
     InputError when the folder cannot be made or a file cannot be written.
     """
-    images = {name: png_of(figure) for name, figure in figures.items()}
-    return _saved(images, "png", made_folder(folder))
+    images = {f"{name}.png": png_of(figure) for name, figure in figures.items()}
+    return _saved(images, made_folder(folder))
 
 
 def save_drawings(
     drawings: Mapping[str, Drawing], folder: str | os.PathLike[str]
 ) -> tuple[Path, ...]:
-    """Paths of figures, written as PNG files to a folder, which is made if need be.
-
-    Those that were drawn as PDF are written as such, too.
+    """Paths of figures, written as they were drawn to a folder, which is made if need be.
 
     InputError when the folder cannot be made or a file cannot be written.
     """
-    made = made_folder(folder)
-    return (
-        *_saved({name: one.png for name, one in drawings.items()}, "png", made),
-        *_saved({name: one.pdf for name, one in drawings.items() if one.pdf}, "pdf", made),
-    )
+    files = {f"{name}.{one.kind}": one.file for name, one in drawings.items()}
+    files |= {f"{name}.pdf": one.pdf for name, one in drawings.items() if one.pdf}
+    return _saved(files, made_folder(folder))
 
 
-def _saved(files: Mapping[str, bytes], kind: str, folder: Path) -> tuple[Path, ...]:
+def _saved(files: Mapping[str, bytes], folder: Path) -> tuple[Path, ...]:
     paths = []
     for name, content in files.items():
-        path = folder / f"{name}.{kind}"
+        path = folder / name
         with atomic_path(path) as temporary:
             temporary.write_bytes(content)
         paths.append(path)

@@ -6,7 +6,6 @@ import base64
 import functools
 import hashlib
 import re
-import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +15,7 @@ from markupsafe import Markup
 
 from bayesdist.numbers import MISSING
 from bayesdist.report.contents import explanation_of, section_of
-from bayesdist.report.drawing import DPI, Drawing
+from bayesdist.report.drawing import Drawing
 from bayesdist.report.figures.style import HALF_WIDTH
 from bayesdist.report.registry import Registry
 from bayesdist.report.texttable import Level, TextTable
@@ -24,6 +23,7 @@ from bayesdist.report.texttable import Level, TextTable
 __all__ = ["Part", "Picture", "parts_of", "picture_of", "template"]
 
 REPORT = "bayesdist.report"  # whose templates all pages share
+_AS_BROWSERS_SAY = {"svg": "svg+xml", "png": "png"}
 HALF, WIDE = HALF_WIDTH + 0.1, 5.3  # inches; margins are cut off, or added
 
 
@@ -106,10 +106,8 @@ def _several(made: TextTable | Iterable[TextTable] | None) -> Iterable[TextTable
 
 def picture_of(name: str, drawing: Drawing, *, printed: bool = True) -> Picture:
     """Figure as a page holds it."""
-    (pixels,) = struct.unpack(">I", drawing.png[16:20])  # width, in the first chunk of a PNG file
-    file, kind = (drawing.svg.encode("utf-8"), "svg+xml") if drawing.svg else (drawing.png, "png")
-    data = base64.b64encode(file).decode("ascii")
-    return Picture(name, data, kind, pixels / DPI, drawing, printed)
+    data = base64.b64encode(drawing.file).decode("ascii")
+    return Picture(name, data, _AS_BROWSERS_SAY[drawing.kind], drawing.width, drawing, printed)
 
 
 @functools.cache

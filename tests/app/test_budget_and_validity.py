@@ -140,7 +140,7 @@ def test_the_validity_period_is_said_written_and_drawn(run):
     assert low <= row["date"] <= high
     assert row["interval"][0] <= row["date"] <= row["interval"][1]
     assert "recalibrate before" in row["sentence"]
-    assert (run / "figures" / "validity_period.png").exists()
+    assert (run / "figures" / "validity_period.svg").exists()
     text = (run / "report.html").read_text()
     assert row["sentence"] in text and "How long the requirements are met" in text
     # an independent judgement on both sides of the date

@@ -228,7 +228,7 @@ def test_the_report_shows_it(moved, tmp_path):
     assert "Mean residuals of bins" in text and "Patterns of the residuals" in text
     (image,) = section.xpath(".//figure//img")
     assert "difference vectors between two periods" in image.get("alt")
-    assert (run / "figures" / "period_differences.png").exists()
+    assert (run / "figures" / "period_differences.svg").exists()
     # the stage by itself reads the pairs again, and says the same
     shutil.copytree(run, tmp_path / "again")
     good("stage", "report", tmp_path / "again")

@@ -48,6 +48,6 @@ def _speck() -> bytes:
 def drawings_of(plots: dict[str, Plot]) -> dict[str, Drawing]:
     """The words of figures, and specks in place of them."""
     return {
-        name: Drawing(_speck(), None, plot.title, plot.text, plot.alt)
+        name: Drawing(_speck(), "png", 0.03, None, plot.title, plot.text, plot.alt)
         for name, plot in plots.items()
     }

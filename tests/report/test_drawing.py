@@ -4,7 +4,7 @@ import base64
 import io
 import re
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import replace
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -17,7 +17,7 @@ from bayesdist.report.drawing import DPI, MARGIN, png_of, render
 from bayesdist.report.figures.style import figure_style, new_figure, plain_ticks
 from bayesdist.report.figures.ticks import OneTickAxes, OneTickFigure
 from bayesdist.report.page import picture_of
-from bayesdist.report.registry import Plot
+from bayesdist.report.registry import Item, Plot
 from bayesdist.report.sections import REPORT
 
 
@@ -53,23 +53,24 @@ def test_the_same_figure_gives_the_same_files():
     first, second = (square(0.1, 0.1, 0.5) for _ in range(2))
     one, other = (render(Plot(figure, "", "", ""), pdf=True) for figure in (first, second))
     assert one == other
-    assert one.png == png_of(second)
+    assert one.file == png_of(second)
 
 
-def test_what_is_printed_is_drawn_in_vectors():
+def test_vectors_have_the_area_of_the_picture():
     first, second = (
-        render(Plot(square(0.1, 0.1, 0.5), "A square", "", ""), svg=True) for _ in range(2)
+        render(Plot(square(0.1, 0.1, 0.5), "A square", "", ""), "svg") for _ in range(2)
     )
     assert first == second
-    tree = ElementTree.fromstring(first.svg)
+    tree = ElementTree.fromstring(first.file)
     # in points: the square and its margin
     assert float(tree.get("width").removesuffix("pt")) == pytest.approx(
         72 * (1 + 2 * MARGIN / DPI), abs=1
     )
-    assert not render(Plot(square(0.1, 0.1, 0.5), "", "", "")).svg
-    shown, plain = (picture_of("square", one) for one in (first, replace(first, svg="")))
+    picture = render(Plot(square(0.1, 0.1, 0.5), "A square", "", ""))
+    shown, plain = (picture_of("square", one) for one in (first, picture))
     assert (shown.kind, plain.kind) == ("svg+xml", "png") and shown.width == plain.width
-    assert base64.b64decode(shown.data).decode() == first.svg
+    assert base64.b64decode(shown.data) == first.file
+    assert pixels(picture.file).shape[1] == pytest.approx(DPI * plain.width, abs=1)
 
 
 # -- numbers at ticks ------------------------------------------------------------------------------
@@ -152,6 +153,22 @@ def test_axes_of_one_tick_look_like_those_of_matplotlib():
     np.testing.assert_array_equal(drawn, expected)
 
 
+@pytest.mark.parametrize("layout", ["constrained", "compressed", "none"])
+def test_panels_with_long_words_are_cut_to_what_is_drawn(layout):
+    with figure_style():
+        figure = new_figure(7.0, 4.0, layout=layout)
+        many_kinds_of_axes(figure)
+        figure.axes[2].set_title(12 * "beyond the panel ")
+        figure.axes[3].set_ylabel(4 * "higher than the panel ")
+        figure.align_ylabels()
+        image = pixels(png_of(figure))
+    inked = (image != image[0, 0]).any(axis=2)
+    for axis in (0, 1):
+        (where,) = np.nonzero(inked.any(axis=axis))
+        room = where[0], inked.shape[1 - axis] - 1 - where[-1]
+        assert min(room) > 0 and max(room) < 2.5 * MARGIN
+
+
 # -- several processes ----------------------------------------------------------------------------
 
 
@@ -197,9 +214,31 @@ def test_words_come_with_the_files(plots, alone):
         assert (one.title, one.text, one.alt) == words and all(words)
 
 
-def test_the_kinds_that_were_drawn_are_saved(tmp_path):
-    one, other = (render(Plot(square(0.1, 0.1, 0.5), "", "", ""), pdf=pdf) for pdf in (True, False))
+def cloud(_, n: int) -> Plot:
+    figure = new_figure(3.0, 2.0)
+    figure.subplots().scatter(*np.random.default_rng(5).normal(size=(2, n)))
+    return Plot(figure, "", "", "")
+
+
+def test_dense_figures_are_pixels_on_the_screen_and_vectors_on_paper():
+    many = drawing.MOST_VECTORS + 1
+    items = (
+        Item("few", "", cloud, (9,)),
+        Item("many", "", cloud, (many,)),
+        Item("paper", "", cloud, (many,), printed=True),
+    )
+    drawn = drawing.draw_all(SimpleNamespace(items=lambda *_: items), None)
+    assert {name: one.kind for name, one in drawn.items()} == {
+        "few": "svg",
+        "many": "png",
+        "paper": "svg",
+    }
+
+
+def test_the_files_that_were_drawn_are_saved(tmp_path):
+    plot = Plot(square(0.1, 0.1, 0.5), "", "", "")
+    one, other = render(plot, pdf=True), render(plot, "svg")
     paths = drawing.save_drawings({"a": one, "b": other}, tmp_path / "figures")
-    assert [p.name for p in paths] == ["a.png", "b.png", "a.pdf"]
-    assert paths[0].read_bytes() == one.png == other.png
-    assert paths[2].read_bytes().startswith(b"%PDF")
+    assert [p.name for p in paths] == ["a.png", "b.svg", "a.pdf"]
+    assert [p.read_bytes() for p in paths] == [one.file, other.file, one.pdf]
+    assert one.pdf.startswith(b"%PDF")

@@ -39,7 +39,7 @@ def test_headings_figures_and_captions_are_those_of_the_page(text, page):
     tree = lxml_html.fromstring(page)
     titles = [h.text_content() for h in tree.xpath("//h2")]
     assert re.findall(r"^## (.*)$", text, re.MULTILINE) == titles
-    links = re.findall(r"^!\[(.*)\]\(figures/(\w+)\.png\)$", text, re.MULTILINE)
+    links = re.findall(r"^!\[(.*)\]\(figures/(\w+)\.(?:png|svg)\)$", text, re.MULTILINE)
     assert [f"figure-{name}" for _, name in links] == tree.xpath("//figure/@id")
     for caption in tree.xpath("//figcaption"):
         title, _, words = caption.text_content().partition(". ")

@@ -52,7 +52,7 @@ def test_figures_and_words_stand_in_the_page_and_in_markdown(campaign_plots):
     drawings = drawings_of(plots)
     page, text = render_report(run, drawings), render_markdown(run, drawings)
     assert re.findall(r'<figure id="figure-(\w+)"', page) == list(plots)
-    assert re.findall(r"\(figures/(\w+)\.png\)", text) == list(plots)
+    assert re.findall(r"\(figures/(\w+)\.(?:png|svg)\)", text) == list(plots)
 
 
 def test_what_is_not_there_is_not_shown(converged):

@@ -36,18 +36,17 @@ def numbers_of(figure: Figure) -> str:
         title = ax.get_title() or ax.get_title(loc="left")
         words = (title, f"x: {ax.get_xlabel()}", f"y: {ax.get_ylabel()}")
         out.write(f"# panel {k}: {'; '.join(' '.join(one.split()) for one in words if one)}\n")
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(HEADS)
-    for row in islice(_rows(panels), MOST_ROWS):
-        writer.writerow(row)
+    out.write(",".join(HEADS) + "\n")
+    out.writelines(islice(_lines(panels), MOST_ROWS))
     return out.getvalue()
 
 
-def _rows(panels: Sequence[Axes]) -> Iterator[Row]:
+def _lines(panels: Sequence[Axes]) -> Iterator[str]:
     for k, ax in enumerate(panels, start=1):
         for mark, label, rows in _marks(ax):
+            head = f"{k},{mark},{_quoted(label)}"
             for row in rows:
-                yield (k, mark, label, *(f"{v:.6g}" for v in row))
+                yield head + (",%.6g" * len(row) % tuple(row)) + "\n"
 
 
 def _marks(ax: Axes) -> Iterator[tuple[str, str, Iterable[Sequence[float]]]]:
@@ -106,6 +105,13 @@ def _cells(image: AxesImage) -> Iterator[Row]:
     for j, row in enumerate(values):
         for i, value in enumerate(row):
             yield x[i], y[j], value
+
+
+def _quoted(text: str) -> str:
+    """Field of a line of CSV."""
+    line = io.StringIO()
+    csv.writer(line, lineterminator="").writerow([text])
+    return line.getvalue() if text else ""
 
 
 def _label(artist: Any) -> str:

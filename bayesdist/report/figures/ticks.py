@@ -22,9 +22,9 @@ Float = NDArray[np.float64]
 class _AllTicks:
     """Tick that stands for all of an axis: its lines have all marks, its labels are moved."""
 
-    def __init__(self, *place: Any, **look: Any) -> None:
+    def __init__(self: Any, *place: Any, **look: Any) -> None:
         super().__init__(*place, **look)
-        self.around: dict[tuple[Any, ...], Float] = {}  # extents of texts about their positions
+        self.around = self.axes.figure.around
 
     def place(self: Any, at: Float, texts: Sequence[str]) -> None:
         """Set positions, in the unit of the axis, and labels."""
@@ -53,7 +53,8 @@ class _AllTicks:
         out, dpi = [], self.axes.figure.dpi
         for moved in self.moved(label):
             at = moved.get_transform().transform(moved.get_position())
-            key = moved.get_text(), dpi, moved.get_rotation(), moved.get_fontsize()
+            look = moved.get_fontsize(), moved.get_rotation(), moved.get_ha(), moved.get_va()
+            key = moved.get_text(), dpi, *look
             if key not in self.around:
                 extent = moved.get_window_extent(renderer)
                 self.around[key] = extent.get_points() - at
@@ -98,8 +99,10 @@ class _OneTickAxis:
         if self._one_by_one:
             ticks: list[Any] = super()._update_ticks()  # type: ignore[misc]
             return ticks
+        bbox, dpi = self.axes.bbox, self.axes.figure.dpi  # ticks depend on the size, not the place
+        size = round(bbox.width / dpi, 6), round(bbox.height / dpi, 6)
         sources = (self.major.locator, self.major.formatter, self.minor.locator)
-        state = (*sources, *self.get_view_interval(), *self.axes.bbox.bounds)
+        state = (*sources, *self.get_view_interval(), *size)
         if not self._placed or self._placed[0] != state:
             found = []
             for major, locs, formatter in (
@@ -190,6 +193,10 @@ class OneTickAxes(Axes):
 
 class OneTickFigure(Figure):
     """Figure whose panels and colour bars are such axes."""
+
+    def __init__(self, *size: Any, **options: Any) -> None:
+        super().__init__(*size, **options)
+        self.around: dict[tuple[Any, ...], Float] = {}  # extents of labels about their positions
 
     def add_subplot(self, *place: Any, **options: Any) -> Any:
         """Panel in a grid."""

@@ -189,7 +189,7 @@ def test_the_report_shows_gauge_and_stars(three_rolls):
     assert "Degeneracies of the detections, and the constraints that remove them" in text
     assert "relative positions" in text
     assert not re.search(r" --(?!-)", text)  # units that are missing
-    assert (three_rolls.path / "figures" / "selfcal.png").is_file()
+    assert (three_rolls.path / "figures" / "selfcal.svg").is_file()
     # what is fitted are detections; the test for structure allows for their stars
     said = ("Detections of stars", "false detections", "Structure in the residuals")
     for words in (*said, "| outliers.model | uniform |"):

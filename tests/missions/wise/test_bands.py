@@ -259,7 +259,7 @@ def test_every_file_is_there_and_the_page_needs_no_other(compared):
     # the documentation is linked, and asked by readers alone
     assert not re.search(r'(?:src|href)="(?!data:|#)', page)
     assert not re.search(r"<(?:link|script|iframe|img)[^>]*https:", page)
-    assert page.count("<figure") == len([f for f in files if f.endswith(".png")])
+    assert page.count("<figure") == len([f for f in files if f.endswith((".svg", ".png"))])
     assert "NOT CONVERGED" not in page
     assert page.index(record["verdict"]["headline"]) < page.index("Overview")
     assert page.count("SIMULATED DATA") == 2  # on the screen, and on each page of paper
