@@ -57,7 +57,7 @@ def render_report(r: ReportInput, drawings: Mapping[str, Drawing]) -> str:
         **_contents(r, drawings),
         trace=f"{r.name} · {_maker(r)}",
         budget_words=_BUDGET_WORDS,
-        print_words=_PRINT_WORDS,
+        print_words=f"{_PRINT_WORDS} {_FOOTER}",
         data=data,
     )
 

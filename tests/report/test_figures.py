@@ -428,5 +428,5 @@ def test_levels_of_values_that_differ_by_far_are_1_2_5_10(low, high):
     assert levels[0] <= low < levels[1] and levels[-2] < high <= levels[-1]
     leading = levels / 10 ** np.floor(np.log10(levels) + 1e-9)
     assert set(np.round(leading, 6)) <= {1.0, 2.0, 5.0}
-    even = np.diff(contour_levels([low, 20 * low]))
+    even = np.diff(contour_levels([low, 10 * low]))
     np.testing.assert_allclose(even, even[0])

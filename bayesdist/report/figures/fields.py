@@ -23,7 +23,7 @@ __all__ = ["Grid", "contour_levels", "scalar_map"]
 Float = NDArray[np.float64]
 
 EMPTY = "#D9DEE3"  # of a cell without a value
-FAR = 30.0  # factor between values, from which on even steps would show the largest alone
+FAR = 15.0  # factor between values, from which on even steps would show the largest alone
 
 
 @dataclass(frozen=True, eq=False)
