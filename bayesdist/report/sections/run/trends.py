@@ -139,7 +139,7 @@ def _against_pixels(r: ReportInput, most: int, *, points: bool) -> tuple[Plot, f
     """Plot without words: u and v against x and y; and the largest mean in units of its error."""
     found, table = _residuals_of(r), r.stars.table
     pixels = table.x[found.shown], table.y[found.shown]
-    fig = new_figure(WIDTH, 2.5)
+    fig = new_figure(WIDTH, 2.4)
     axes = fig.subplots(2, 2, sharey=True, sharex="col")
     means: list[list[Means]] = [[], []]
     for k, _, here in _on_chips(r, found.shown):
