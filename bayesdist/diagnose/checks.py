@@ -94,7 +94,7 @@ def score_checks(
 
     Verdicts stand where correlated errors hold what the tests have found.
     """
-    limit = f"p at least {number(SCORE_LIMIT.value, 1)} over all {len(tests)} tests"
+    limit = f"p at least {number(SCORE_LIMIT.value, 1)}"
     found: dict[str, list[ScoreTest]] = {}
     for test in tests:
         if test.significant:
@@ -109,7 +109,8 @@ def score_checks(
         )
         yield Check(SCORE_TESTS, f"Residuals: {names}", value, limit, "warn", sentence, doubt)
     if tests and not found:
-        yield Check(SCORE_TESTS, "Tests of the residuals", "nothing found", limit, "pass")
+        name = f"Tests of the residuals ({len(tests)})"
+        yield Check(SCORE_TESTS, name, "nothing found", limit, "pass")
 
 
 def _held(correlated: Discrepancy | None, test: ScoreTest) -> bool:

@@ -37,8 +37,7 @@ _BUDGET_WORDS = (
     " the table gives the root of its size with a minus sign."
 )
 _PRINT_WORDS = (
-    "This print holds what the decision rests on. All tables and figures, and the budget at any"
-    " position and epoch, are in report.html; the figures are in figures/ as well."
+    "All tables and figures, and the budget at any position and epoch, are in report.html."
 )
 
 
@@ -57,7 +56,7 @@ def render_report(r: ReportInput, drawings: Mapping[str, Drawing]) -> str:
         **_contents(r, drawings),
         trace=f"{r.name} · {_maker(r)}",
         budget_words=_BUDGET_WORDS,
-        print_words=_PRINT_WORDS,
+        print_words=f"{_PRINT_WORDS} {_FOOTER}",
         data=data,
     )
 

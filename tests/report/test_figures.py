@@ -16,6 +16,7 @@ from bayesdist.assess import VectorMap
 from bayesdist.errors import InputError
 from bayesdist.report.drawing import save_figures
 from bayesdist.report.figures.arrows import Arrows, cross_map, square_cells
+from bayesdist.report.figures.fields import contour_levels
 from bayesdist.report.figures.mosaic import Mosaic
 from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import figure_style, nice_below
@@ -419,3 +420,13 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     blocked.write_text("in the way")
     with pytest.raises(InputError, match="file"):
         save_figures({}, blocked / "figures")
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0077, 1.65), (0.00041, 0.0297), (3.0, 100.0)])
+def test_levels_of_values_that_differ_by_far_are_1_2_5_10(low, high):
+    levels = contour_levels([low, high])
+    assert levels[0] <= low < levels[1] and levels[-2] < high <= levels[-1]
+    leading = levels / 10 ** np.floor(np.log10(levels) + 1e-9)
+    assert set(np.round(leading, 6)) <= {1.0, 2.0, 5.0}
+    even = np.diff(contour_levels([low, 10 * low]))
+    np.testing.assert_allclose(even, even[0])

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.colors import Colormap, Normalize
+from matplotlib.colors import BoundaryNorm, Colormap, Normalize
 from matplotlib.contour import QuadContourSet
 from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
@@ -22,6 +23,7 @@ __all__ = ["Grid", "contour_levels", "scalar_map"]
 Float = NDArray[np.float64]
 
 EMPTY = "#D9DEE3"  # of a cell without a value
+FAR = 15.0  # factor between values, from which on even steps would show the largest alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +37,12 @@ class Grid:
 
 
 def contour_levels(values: ArrayLike, n: int = 10) -> Float:
-    """Round levels that span some values, at least two."""
+    """Round levels that span some values, at least two; 1, 2, 5, 10 of values far apart."""
     low, high = float(np.min(values)), float(np.max(values))
+    if low > 0 and high > FAR * low:
+        decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+        steps = np.outer(decades, [1.0, 2.0, 5.0]).ravel()
+        return steps[max(int((steps <= low).sum()) - 1, 0) : int((steps < high).sum()) + 1]
     if not high > low:
         pad = max(abs(low), 1e-12) * 0.05
         low, high = low - pad, high + pad
@@ -109,7 +115,9 @@ def _contours(
     # the spline may overshoot a little, and values above the last level would stay white
     fine = np.clip(spline(fine_y, fine_x), values.min(), values.max())
     at = fine_x + offset[0], fine_y + offset[1]
-    filled = ax.contourf(*at, fine, levels, cmap=SEQUENTIAL)
+    even = np.ptp(np.diff(levels)) <= 1e-6 * levels[-1]
+    norm = None if even else BoundaryNorm(levels, colormaps[SEQUENTIAL].N)
+    filled = ax.contourf(*at, fine, levels, cmap=SEQUENTIAL, norm=norm)
     crossed = [v for v in levels if fine.min() < v < fine.max()]
     if crossed:
         lines = ax.contour(*at, fine, crossed, colors="white", linewidths=0.6)

@@ -168,10 +168,9 @@ def score_test_table(r: ReportInput) -> TextTable:
         rows,
         words=(0, 5),
         stacked=(5,),
-        note=f"An effect is found where p is below {SCORE_TESTS.value:g} after Holm's correction"
-        " for the number of tests. p allows for all that a test tried: of a repeating pattern it is"
-        " that of the largest of all periods and directions, whose own statistic is given. Size is"
-        " the rms over the detector; for noise, the rms difference of standard deviations; for the"
-        " gap between chips, its drift per year; for motions, their rms per year. Detectable is the"
-        f" smallest size that would have been found with probability {POWER:g}.",
+        note=f"Found: p below {SCORE_TESTS.value:g} after Holm's correction for the number of"
+        " tests. p allows for all that a test tried, as the periods and directions of a repeating"
+        " pattern. Size: rms over the detector; of noise the rms difference of standard deviations,"
+        " of gaps between chips and of motions the rms per year. Detectable: the smallest size that"
+        f" is found with probability {POWER:g}.",
     )

@@ -18,8 +18,8 @@ __all__ = [
     "provenance_tables",
 ]
 
-_DETAILS = ("stages", "timings")
-_PRINTED = {"inputs": 4, "versions": 3}  # rows on paper
+_DETAILS = ("stages", "timings", "versions")  # the margin of each page names our version
+_PRINTED = {"inputs": 4}  # rows on paper
 
 
 @REPORT.table("products", needs=("products",))

@@ -213,10 +213,7 @@ def residual_vectors(r: ReportInput) -> Plot:
     chance = CHANCE * filled
     axes, which, cannot = "", "", "the polynomial cannot follow"
     if r.fit.model.frames not in ("none", "shift"):  # they turn u and v
-        axes = (
-            ", along the axes of the polynomials, before the exposures' frames turn them: what"
-            " belongs to the detector adds up however exposures are rolled"
-        )
+        axes = ", along the axes of the polynomials, before the exposures' frames turn them"
     if r.campaign is not None:
         which = (
             " These are the residuals of the joint fit, with all tables, in the cells of the test"
@@ -228,8 +225,8 @@ def residual_vectors(r: ReportInput) -> Plot:
                 which += " They are fewer than by chance, as the tables follow these very stars."
     if r.words.leverage:
         which = (
-            " Stars were fitted to these very detections, so that fewer may do so than by chance:"
-            " the status has the test that allows for it."
+            " Stars were fitted to these detections, so that fewer may do so than by chance; the"
+            " status has the test that allows for it."
         )
     return Plot(
         panels.figure,

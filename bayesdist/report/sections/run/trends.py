@@ -139,7 +139,7 @@ def _against_pixels(r: ReportInput, most: int, *, points: bool) -> tuple[Plot, f
     """Plot without words: u and v against x and y; and the largest mean in units of its error."""
     found, table = _residuals_of(r), r.stars.table
     pixels = table.x[found.shown], table.y[found.shown]
-    fig = new_figure(WIDTH, 2.8)
+    fig = new_figure(WIDTH, 2.4)
     axes = fig.subplots(2, 2, sharey=True, sharex="col")
     means: list[list[Means]] = [[], []]
     for k, _, here in _on_chips(r, found.shown):
@@ -297,7 +297,7 @@ def _quantile_edges(values: Float) -> Float:
 def residuals_by_property(r: ReportInput) -> Plot:
     """Mean residuals against magnitude, colour and epoch, with their errors."""
     found, rows = _residuals_of(r), _properties(r)
-    fig = new_figure(WIDTH, 0.5 + 1.4 * len(rows))
+    fig = new_figure(WIDTH, 0.4 + 1.25 * len(rows))
     axes = fig.subplots(len(rows), 2, sharex="row", sharey="row", squeeze=False)
     worst = []
     for panels, (label, values) in zip(axes, rows, strict=True):
