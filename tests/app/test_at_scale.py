@@ -178,7 +178,9 @@ def test_errors_by_magnitude_on_disk(tmp_path, on_disk):
     )
     write_partitioned([matches], tmp_path / "stars", rows_per_group=500)
     data = {"matches": str(tmp_path / "stars"), "sigma": "by_magnitude"}
-    config = write_config(tmp_path / "c.toml", data=data)
+    exact = {"name": "reference catalogue", "kind": "random", "sigma_u": 0.0, "sigma_v": 0.0}
+    budget = [exact | {"source": "exact in the simulation"}]
+    config = write_config(tmp_path / "c.toml", data=data, budget=budget)
     assert "(by magnitude)" in good("check", config).out
     run = partly_run(tmp_path / "run", config, "fit", "sample", "assess")
     posterior = load_posterior(run)
