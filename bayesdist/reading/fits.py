@@ -57,14 +57,14 @@ def _refuse_unfounded(raw: bytes, where: str) -> None:
         at, number = begin + padded(size), number + 1
 
 
-MOST_AXES = 999  # of FITS 4.0, section 4.4.1
+MOST = 999  # axes, and columns of a table (FITS 4.0, sections 4.4.1 and 7.3.1)
 
 
 def data_size(header: fits.Header) -> int | None:
     """Bytes of data that a header announces (FITS 4.0, section 4.4.1); None for nonsense."""
     try:
         axes = header.get("NAXIS", 0)
-        if axes > MOST_AXES:
+        if max(axes, header.get("TFIELDS", 0)) > MOST:
             return None
         sides = [header[f"NAXIS{k + 1}"] for k in range(axes)]
         bits, groups, more = header["BITPIX"], header.get("GCOUNT", 1), header.get("PCOUNT", 0)
