@@ -302,7 +302,10 @@ class ParameterLayout:
         return slice(start, start + self.n_terms)
 
     def tdd_slice(self, chip: int | None = None) -> slice:
-        """Slice of theta with the time-dependent parameters of a chip (by number)."""
+        """Slice of theta with the time-dependent parameters of a chip (by number).
+
+        They are per year, and per half side of the chip for each power of x and y.
+        """
         return self.drift_slice(0 if chip is None else self.chip_code(chip))
 
     def drift_slice(self, chip_code: int) -> slice:

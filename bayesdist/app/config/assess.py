@@ -110,12 +110,12 @@ class BudgetBlock(Section):
         if self.kind not in TERM_KINDS:
             if self.sigma is None or not neither:
                 raise ValueError(
-                    f"a budget term of kind {self.kind!r} has one sigma, relative or in radians; "
-                    "give sigma, and neither sigma_u nor sigma_v"
+                    f"a budget term of kind {self.kind!r} has one sigma; give sigma, in the "
+                    "unit of its kind, and neither sigma_u nor sigma_v"
                 )
             if self.unit is not None:
                 raise ValueError(
-                    f"a budget term of kind {self.kind!r} is relative or in radians, and unit is "
+                    f"a budget term of kind {self.kind!r} has a unit of its own, and unit is "
                     f"{self.unit!r}; leave unit out"
                 )
         elif not axes or self.sigma is not None:
