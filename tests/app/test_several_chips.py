@@ -277,11 +277,10 @@ def test_validate_keeps_the_chip_and_the_report_takes_it_up(run, tmp_path):
 
 
 def test_structure_is_looked_for_on_each_chip(run):
-    """By arrays, chip by chip; the smaller probability counts twice."""
+    """By arrays of the true stars, chip by chip; the smaller probability counts twice."""
     results = results_of(RunDirectory.open(run))
-    fit, table = results.fit, results.data.stars
-    residual, used = residuals(fit, table), fit.uses(table)
-    found = results.diagnostics
+    fit, table, found = results.fit, results.data.stars, results.diagnostics
+    residual, used = residuals(results.posterior, table), found.sample.probably_true
     p = {}
     for chip in CHIPS:
         here = used & (table.chip_number == chip.number)

@@ -341,7 +341,7 @@ def test_what_the_printed_tables_contradict():
     named = {s.partition(":")[0] for s in across}
     assert all("W1" in label or "W4" in label for label in named)
     assert {"W1/X", "W1/Y", "W4/X", "W4/Y"} <= named
-    assert any(s.startswith("W1/X: sigma 0.2073 is printed, 0.0758 ") for s in across)
+    assert any(s.startswith("W1/X: sigma 0.2073 is published, 0.0758 ") for s in across)
     triangles = [s for s in across if "by way of" in s]
     assert len(triangles) == 1 and "0.01894 follows by way of W2, W3" in triangles[0]
 

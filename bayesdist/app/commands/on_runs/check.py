@@ -77,12 +77,10 @@ def _lines(results: Results) -> Iterator[str]:
     )
     yield _cost(data, config)
     idle = idle_dates(config, config.requirements())
-    scaled = data.error_scale_sentence
     for text in (
         *doubts_on_stars(data.sample, model, config),
         *warnings_of(results.checks),
         *([idle] if idle else []),
-        *([scaled] if scaled else []),
     ):
         yield f"WARNING      {text}"
 
