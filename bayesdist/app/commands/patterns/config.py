@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
 from bayesdist.app.config.assess import require_own_names
 from bayesdist.app.config.model import Polynomials
@@ -35,7 +35,8 @@ from bayesdist.simulate.patterns import (
 __all__ = ["PlanConfig", "load_plan"]
 
 Pair = tuple[PositiveFloat, PositiveFloat]
-Count = Annotated[int, Field(ge=1)]
+MOST_EXPOSURES = 10_000  # of one pattern
+Count = Annotated[int, Field(ge=1, le=MOST_EXPOSURES)]  # of exposures, or of one side of their grid
 Pointing = tuple[float, float] | tuple[float, float, float]
 
 
@@ -99,13 +100,18 @@ class PatternBlock(Section):
     scales: ScalesBlock | None = None
     unit: Literal["pix", "detector"] = "pix"
     rolls: list[float] | None = None
-    exposures: PositiveInt | None = None
+    exposures: Count | None = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> PatternBlock:
         where = f"pattern {self.name!r}"
         if sum(one is not None for one in (self.offsets, self.grid, self.scales)) != 1:
             raise ValueError(f"{where} has offsets, a grid, or scales; give one of the three")
+        if self.grid is not None and np.prod(self.grid.n) > MOST_EXPOSURES:
+            raise ValueError(
+                f"{where} has {np.prod(self.grid.n)} exposures, and {MOST_EXPOSURES} are the most; "
+                "give a smaller grid"
+            )
         if self.offsets == [] or self.rolls == []:
             key = "offsets" if self.offsets == [] else "rolls"
             raise ValueError(f"{where} has an empty list of {key}; fill it or leave it out")
