@@ -295,7 +295,7 @@ s = k.least_squares_moments(
     pieces, columns, coef[0], coef[0], order, chi2_limit=9.0, abs_limit=3.0
 )
 found = [k.log_likelihood(blocks, columns, coef, order, c), m.weight, m.right, m.cross, m.scalars]
-found += [s.weight, s.right, s.scalars, k.memberships(blocks, columns, coef, order, c)]
+found += [s.weight, s.right, s.scalars, k.memberships(blocks, columns, coef, order, c, 4)]
 found.append(k.residuals(blocks, columns, coef[0], order))
 print(hashlib.sha256(b"".join(np.ascontiguousarray(f).tobytes() for f in found)).hexdigest())
 """
