@@ -44,6 +44,9 @@ LARGEST = 16_000_000  # bytes of log-likelihood that are stored star by star and
 FIT_NUMBERS = ("n_rows", "n_used", "rms_u", "rms_v", "rms_rejected", "chi2", "dof", "condition")
 
 
+LEAST_RHAT = 0.5  # chains of four draws have 0.87 at least
+
+
 def save_posterior(
     posterior: Posterior,
     matches: Matches | None,
@@ -203,6 +206,8 @@ def load_posterior(path: str | Path) -> Posterior:
             _refuse_other_shape(one.values, shape[:2])
         for check in DIAGNOSTICS:  # NaN where a parameter does not move
             _refuse_other_shape(np.nan_to_num(checks[check].values), checks["sampled"].shape)
+        if (checks["rhat"].values < LEAST_RHAT).any():  # False for NaN
+            raise FormatError(f"R-hat is below {LEAST_RHAT}, which no draws have")
         return Posterior(
             model=model,
             mixture=OutlierMixture(**mixture),
