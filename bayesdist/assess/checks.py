@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.checks import EITHER, LARGER, Check, level_of
+from bayesdist.checks import EITHER, LARGER, Check
 from bayesdist.limits import MATCH_RADIUS
 from bayesdist.model.timedep import TimeDependence
 
@@ -43,20 +43,17 @@ def matching_checks(
 
 def catalogue_checks(catalogue_stated: bool | None) -> Iterator[Check]:
     """Check that the errors of the reference catalogue are stated; None without a catalogue."""
-    if catalogue_stated is not None:
-        yield Check(
-            GROUP,
-            "Error of the reference catalogue",
-            "stated" if catalogue_stated else "not stated",
-            "a row of [[budget]] or of the table",
-            level_of(catalogue_stated, "warn"),
-            ""
-            if catalogue_stated
-            else "no error of the reference catalogue is stated: give a [[budget]] row that names "
-            "the catalogue ('reference catalogue', 'Gaia DR3'), of size 0 with its source where it "
-            "has none",
-            "" if catalogue_stated else LARGER,
-        )
+    if catalogue_stated is None:
+        return
+    name, limit = "Error of the reference catalogue", "a row of [[budget]] or of the table"
+    if catalogue_stated:
+        yield Check(GROUP, name, "stated", limit, "pass")
+        return
+    sentence = (
+        "no error of the reference catalogue is stated: give a [[budget]] row that names the "
+        "catalogue ('reference catalogue', 'Gaia DR3'), of size 0 with its source where it has none"
+    )
+    yield Check(GROUP, name, "not stated", limit, "warn", sentence, LARGER)
 
 
 def time_checks(

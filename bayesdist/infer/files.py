@@ -41,10 +41,8 @@ SCHEMA = 2
 POSTERIOR_NUMBERS = ("n_stars", "n_flagged", "n_false", "reference_sigma")
 MOST_STARS = 1_000_000  # with more stars their data are not repeated in the file
 LARGEST = 16_000_000  # bytes of log-likelihood that are stored star by star and draw by draw
-FIT_NUMBERS = ("n_rows", "n_used", "rms_u", "rms_v", "rms_rejected", "chi2", "dof", "condition")
-
-
 LEAST_RHAT = 0.5  # chains of four draws have 0.87 at least
+FIT_NUMBERS = ("n_rows", "n_used", "rms_u", "rms_v", "rms_rejected", "chi2", "dof", "condition")
 
 
 def save_posterior(

@@ -104,7 +104,7 @@ def _read_votable(path: Path) -> Table:
 
 
 # cells that state that there is no number; whatever is no number either, astropy takes for such
-_NO_NUMBER = {"", "nan", "null"}
+_NO_NUMBER = {"", "null"}
 
 
 def _refuse_unreadable_cells(raw: bytes, path: Path) -> None:

@@ -277,6 +277,18 @@ def test_files_of_the_other_kind(reference, real) -> None:
         read_d2im(reference / "none.fits")
 
 
+def test_a_detector_without_a_name_is_refused_by_its_file(rng, tmp_path) -> None:
+    path = tmp_path / "d2i.fits"
+    write_d2im([table(1, rng)], path, instrument="ACS", detector="WFC")
+    found = path.read_bytes()
+    card = found.index(b"DETECTOR=")
+    path.write_bytes(
+        found[:card] + b"DETECTOR=                1E400".ljust(80) + found[card + 80 :]
+    )
+    with pytest.raises(FormatError, match=r"d2i.fits, keyword DETECTOR: is inf; give a name"):
+        _ = read_lookup_file(path).detector
+
+
 # -- lint ------------------------------------------------------------------------------------------
 
 

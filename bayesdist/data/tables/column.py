@@ -169,8 +169,10 @@ class SourceColumn:
     def magnitudes_of_fluxes(self) -> Float | None:
         """Magnitudes (N,), or None and a warning where not all fluxes are positive numbers."""
         flux = self.numbers_if_readable("a magnitude")
-        if flux is None or (flux > 0).all():
-            return None if flux is None else np.asarray(-2.5 * np.log10(flux))
+        if flux is None:
+            return None
+        if (flux > 0).all():
+            return np.asarray(-2.5 * np.log10(flux))
         log.warning("%s: not all fluxes are positive, so that no star has a magnitude", self.where)
         return None
 

@@ -27,7 +27,7 @@ import math
 import numba as nb
 import numpy as np
 
-from bayesdist.infer.kernel.lanes import FAST
+from bayesdist.infer.kernel.lanes import FAST, WIDTH
 from bayesdist.infer.kernel.numeric import exp_negative
 
 __all__ = [
@@ -60,7 +60,6 @@ RANGE = 1e150  # of products before their logarithm is taken
 # rows of a star's detections: sky position, W (uu, uv, vv), variance, e + o
 PLACE_U, PLACE_V, UU, UV, VV, VAR, TERM = range(7)
 ROWS = 7
-LANES = 8  # numbers in a vector
 
 # state of a detection, where the members of its star are chosen
 MEMBER, DOUBTFUL, FALSE = range(3)
@@ -72,7 +71,7 @@ def own_rows(W, var, a, e):
 
     (ROWS, n): n fills whole vectors, since what is left over would take as long as a vector each.
     """
-    own = np.zeros((ROWS, -(-(e - a) // LANES) * LANES))
+    own = np.zeros((ROWS, -(-(e - a) // WIDTH) * WIDTH))
     own[VAR] = 1.0
     for i in range(a, e):
         own[UU, i - a], own[UV, i - a], own[VV, i - a] = W[i, 0], W[i, 1], W[i, 2]
@@ -194,8 +193,9 @@ def _sums(own, j2, odds, pu, pv, share):
         ru, rv = own[PLACE_U, i] - pu, own[PLACE_V, i] - pv
         wu, wv = uu * ru + uv * rv, uv * ru + vv * rv
         near = exp_negative(-0.5 * (ru * wu + rv * wv) * inverse)
-        own[TERM, i] = near + odds * s2
-        w = near / (near + odds * s2)
+        term = near + odds * s2
+        own[TERM, i] = term
+        w = near / term
         core = w * inverse
         tie = share * (1.0 - w) * core * inverse
         a00 += core * uu - tie * wu * wu

@@ -107,9 +107,10 @@ class PatternBlock(Section):
         where = f"pattern {self.name!r}"
         if sum(one is not None for one in (self.offsets, self.grid, self.scales)) != 1:
             raise ValueError(f"{where} has offsets, a grid, or scales; give one of the three")
-        if self.grid is not None and np.prod(self.grid.n) > MOST_EXPOSURES:
+        on_grid = 0 if self.grid is None else self.grid.n[0] * self.grid.n[1]
+        if on_grid > MOST_EXPOSURES:
             raise ValueError(
-                f"{where} has {np.prod(self.grid.n)} exposures, and {MOST_EXPOSURES} are the most; "
+                f"{where} has {on_grid} exposures, and {MOST_EXPOSURES} are the most; "
                 "give a smaller grid"
             )
         if self.offsets == [] or self.rolls == []:

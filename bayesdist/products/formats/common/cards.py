@@ -79,11 +79,11 @@ def keyword_of(card: str) -> str:
     return card[:8].rstrip()
 
 
-def named_in(header: fits.Header, keyword: str) -> str:
-    """Name that a keyword gives, empty where it is missing; FormatError where it cannot be one."""
+def named_in(header: fits.Header, keyword: str, where: str) -> str:
+    """Name that a keyword of a file gives, empty where it is missing; FormatError if it is none."""
     value = header.get(keyword, "")
     if isinstance(value, float) and not math.isfinite(value):
-        raise FormatError(f"is {value}", where=f"keyword {keyword}", do="give a name")
+        raise FormatError(f"is {value}", where=f"{where}, keyword {keyword}", do="give a name")
     return str(value).strip()
 
 

@@ -149,12 +149,12 @@ class IdcTab:
     @property
     def instrument(self) -> str:
         """INSTRUME."""
-        return named_in(self.header, "INSTRUME")
+        return named_in(self.header, "INSTRUME", self.name)
 
     @property
     def detector(self) -> str:
         """DETECTOR, empty where the file has none."""
-        return named_in(self.header, "DETECTOR")
+        return named_in(self.header, "DETECTOR", self.name)
 
     @property
     def is_acs_wfc(self) -> bool:

@@ -72,17 +72,17 @@ class LookupFile:
     @property
     def instrument(self) -> str:
         """INSTRUME, empty where the file has none."""
-        return named_in(self.header, "INSTRUME")
+        return named_in(self.header, "INSTRUME", self.name)
 
     @property
     def detector(self) -> str:
         """DETECTOR, empty where the file has none."""
-        return named_in(self.header, "DETECTOR")
+        return named_in(self.header, "DETECTOR", self.name)
 
     @property
     def filters(self) -> tuple[str, ...]:
         """Filter names of the primary header, in the order of the wheels."""
-        return tuple(named_in(self.header, k) for k in _FILTERS if k in self.header)
+        return tuple(named_in(self.header, k, self.name) for k in _FILTERS if k in self.header)
 
     @cached_property
     def planes(self) -> tuple[Plane, ...]:

@@ -74,7 +74,7 @@ def stdgdc_calibration(file: StdGdc, name: str, *, as_used: bool = False) -> Cal
         name,
         plane=Plane("detector") if stored is None else stored.plane,
         numbered="BDCHIP" in file.header,
-        detector=named_in(file.header, "DETECTOR"),
+        detector=named_in(file.header, "DETECTOR", name),
     )
     if stored is not None:
         return replace(found, before=(table,), scale=stored.scale, scale_from=stored.scale_from)
