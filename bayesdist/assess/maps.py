@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
+from bayesdist.arrays import Float
 from bayesdist.assess.solution import place_of
 from bayesdist.calibration.chip_map import position_moments
 from bayesdist.infer.solution import Solution
@@ -25,7 +26,6 @@ __all__ = [
     "with_local",
 ]
 
-Float = NDArray[np.float64]
 RELATIVE = "relative positions"
 NODES = 33  # ratios of the axes between which radii are interpolated: to 1e-4
 ANGLES = 256

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import FormatError, InputError
@@ -65,7 +65,7 @@ def _faults(found: Calibration) -> list[str]:
     return []
 
 
-def _is_covariance(cov: NDArray[np.float64]) -> bool:
+def _is_covariance(cov: Float) -> bool:
     """Whether variances are positive or zero, and correlations lie between -1 and 1."""
     variance = np.diag(cov)
     if variance.min(initial=0.0) < 0:

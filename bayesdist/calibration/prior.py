@@ -16,8 +16,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import sampling_of
 from bayesdist.calibration.plane import ARCSEC
@@ -27,9 +27,6 @@ from bayesdist.model import DistortionModel
 from bayesdist.model.frames import LINEAR_MATRICES, frame_names
 
 __all__ = ["CalibrationPrior", "prior_of_calibration"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 FEWEST_DRAWS = 4.0  # effective draws for each parameter, whose covariance is inverted
 SINGULAR = 1e-12  # of the largest eigenvalue in units of the standard deviations

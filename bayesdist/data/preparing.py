@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.exposures import ExposureLog
 from bayesdist.data.magnitude_errors import MAD_TO_SIGMA, MagnitudeErrors
@@ -21,8 +22,6 @@ __all__ = [
     "neutralise_aberration",
     "select_motions",
 ]
-
-Float = NDArray[np.float64]
 
 _STARS_IN_BIN = 200  # stars of a bin in magnitude
 _MAX_BINS = 40

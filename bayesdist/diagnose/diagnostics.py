@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.checks import EITHER, Check
 from bayesdist.data import MagnitudeErrors, Matches
 from bayesdist.diagnose.checks import (
@@ -67,7 +67,6 @@ __all__ = [
     "residual_sums",
 ]
 
-Int = NDArray[np.int64]
 Bins = tuple[int, int]
 
 SHOWN = "shown"  # the partition that diagrams of mean residuals show
@@ -269,7 +268,7 @@ def misfits_of(
     return tuple(out)
 
 
-def _taken(eliminated: SelfCalibrationMode, rows: Int) -> NDArray[np.float64]:
+def _taken(eliminated: SelfCalibrationMode, rows: Int) -> Float:
     """Fraction (N,) of the variance that places of stars take out of detections."""
     own = eliminated.problem.rows
     taken = np.zeros(max(int(own.max(initial=-1)), int(rows.max(initial=-1))) + 1)

@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from bayesdist.arrays import Float, Int
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.data import Matches
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
@@ -21,9 +21,6 @@ from bayesdist.infer.transforms import without_frames
 from bayesdist.model import LookupTable, corrected
 
 __all__ = ["Alignment", "OverlapTest", "align", "chosen_exposures", "overlap_test"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 MIN_OVERLAP = 0.5  # of the stars of the exposure that has fewer: what "overlap well" means
 MIN_SHARED_STARS = 100  # shared stars below which there is no map to be drawn

@@ -9,8 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float, Int
 from bayesdist.model.frames import (
     CHIP_DEVIATIONS,
     RIGID,
@@ -25,9 +26,6 @@ from bayesdist.model.layout import ParameterLayout
 from bayesdist.model.timedep import TimeDependence
 
 __all__ = ["EffectiveCoefficients"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

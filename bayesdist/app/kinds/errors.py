@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data.magnitude_errors import AddedErrors, MagnitudeErrors
 from bayesdist.data.matches import Matches
 from bayesdist.infer import Posterior
@@ -65,7 +65,7 @@ class ExposureScatter:
     """
 
     kinds: tuple[str, ...]
-    tau: NDArray[np.float64]
+    tau: Float
     offsets: Settling
 
     def averaged(self, posterior: Posterior, rng: np.random.Generator) -> Posterior:

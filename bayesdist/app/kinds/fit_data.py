@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.matched import Matched
+from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.residuals.quoted import error_scale_sentence
 from bayesdist.diagnose.residuals.sample import SAMPLE
@@ -83,9 +83,6 @@ class StarReader:
         if self._shards is not None:
             self._shards.close()
             self._shards = None
-
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

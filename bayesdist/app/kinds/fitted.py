@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from bayesdist.app.kinds.errors import ErrorLaw, ExposureScatter
 from bayesdist.app.store.output import write_table
+from bayesdist.arrays import Bool, Float
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
@@ -38,7 +39,6 @@ __all__ = [
     "required",
     "write_tables",
 ]
-
 
 SOLUTION, GAUGE = "solution.h5", "gauge.ecsv"
 
@@ -84,7 +84,6 @@ class SelfCalibrated:
         write_table(self.gauge_table, folder / GAUGE)
 
 
-Float = NDArray[np.float64]
 T = TypeVar("T")
 
 FIT, PARTS, TABLES, MAGNITUDE_ERRORS = "fit.nc", "fit.h5", "tables.h5", "magnitude_errors.ecsv"
@@ -185,7 +184,7 @@ class Fitted:
             return stars
         return on_the_chips(corrected_matches(self.tables.tables, stars), self.linear.model)
 
-    def inside(self, stars: Matches) -> NDArray[np.bool_]:
+    def inside(self, stars: Matches) -> Bool:
         """Boolean mask (N,) of the stars that the tables do not move off their chip."""
         if not self.tables.tables:
             return np.ones(len(stars), bool)

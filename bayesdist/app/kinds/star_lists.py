@@ -8,9 +8,9 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.config.campaign import StarListsBlock
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.data import Detections, StarCuts, read_star_lists
 from bayesdist.errors import InputError
@@ -27,8 +27,6 @@ __all__ = [
     "refuse_other_chips",
     "start_of",
 ]
-
-Float = NDArray[np.float64]
 
 OFF_CHIP = 0.02  # of a list's detections beyond the edge of a chip: more are no stray ones
 EDGE = 1.0  # pixels: half of one to the edge, and half of one for lists that count from 0
@@ -61,11 +59,11 @@ class StarLists:
         return replace(self, lists=tuple(one for one in self.lists if one.name in names))
 
     @cached_property
-    def _tested(self) -> list[tuple[NDArray[np.bool_], dict[str, int]]]:
+    def _tested(self) -> list[tuple[Bool, dict[str, int]]]:
         return [self.cuts.passed(one) for one in self.lists]
 
     @property
-    def passed(self) -> list[NDArray[np.bool_]]:
+    def passed(self) -> list[Bool]:
         """Boolean mask of the detections that pass, by list."""
         return [good for good, _ in self._tested]
 
@@ -158,7 +156,7 @@ def start_of(tab: IdcTab | Path, unit_arcsec: float, filter: str | None = None) 
     return lambda x, y, chip: known.forward(x, y, chip=chip) / unit_arcsec
 
 
-def positions_by_chip(start: Start, x: Float, y: Float, chip: NDArray[np.int64]) -> Float:
+def positions_by_chip(start: Start, x: Float, y: Float, chip: Int) -> Float:
     """Positions (N, 2) of pixels on chips with numbers (N,)."""
     out = np.empty((len(x), 2))
     for number in np.unique(chip):

@@ -16,11 +16,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
 from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.products.made_files import ProductInput, ingredients, made_files, write_files
+from bayesdist.arrays import Float
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import MEASURED, PRODUCT, Known, Row
 from bayesdist.calibration.calibration import Calibration
@@ -36,7 +36,6 @@ __all__ = ["file_errors", "product_terms"]
 
 log = logging.getLogger("bayesdist")
 
-Float = NDArray[np.float64]
 
 FORWARD, INVERSE = "forward", "inverse"
 GRID = (33, 33)  # points over which files are laid on the solution

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.products.made_files import ProductInput
 from bayesdist.calibration.plane import ARCSEC
@@ -18,8 +17,6 @@ from bayesdist.limits import SKY_CLOSURE
 from bayesdist.products.formats.sip.positions import sky_of_header
 
 __all__ = ["sky_closure"]
-
-Float = NDArray[np.float64]
 
 FALSE = 0.5  # probability above which a match is taken for a false one
 

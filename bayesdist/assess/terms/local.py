@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import LOCAL, MEASURED, Independent, Row
@@ -19,7 +19,6 @@ from bayesdist.model.grid import grid_pixels, mesh
 
 __all__ = ["INTERPOLATION", "LocalErrors", "interpolation_term", "table_of"]
 
-Float = NDArray[np.float64]
 INTERPOLATION = "look-up tables, between nodes"
 SOURCE = f"{MEASURED}: neighbours in different exposures"
 

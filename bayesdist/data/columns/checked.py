@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.columns.labels import LABELS_OF_CODES, Labels, merged_counts
 from bayesdist.data.tables.checks import (
     COMPLETED,
@@ -24,9 +25,6 @@ from bayesdist.data.tables.units import check_unit, conversion, unit_of, without
 from bayesdist.errors import InputError
 
 __all__ = ["COLUMNS", "OPTIONAL", "POSITIONS", "SIGMAS", "MatchColumns", "refuse_repeated"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 POSITIONS = ("x", "y", "u", "v")
 SIGMAS = ("sigma_u", "sigma_v")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.errors import InputError, require_known
 
 __all__ = [
@@ -21,9 +22,6 @@ __all__ = [
     "binned_sums",
     "residual_statistics",
 ]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 BAND_AXES = ("X", "Y", "radial")
 
@@ -69,7 +67,7 @@ class BinValues:
     dof: Float  # (ny, nx) degrees of freedom of the standard errors: stars less one
 
     @property
-    def good(self) -> NDArray[np.bool_]:
+    def good(self) -> Bool:
         """Bins whose mean has a standard error."""
         return np.isfinite(self.mean) & np.isfinite(self.sem)
 

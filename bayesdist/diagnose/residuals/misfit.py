@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, BinnedSums
 from bayesdist.distributions import chi2_sf
 from bayesdist.limits import STRUCTURE, STRUCTURE_SEEN
@@ -29,8 +29,6 @@ __all__ = [
     "partitions_for",
     "worst_misfit",
 ]
-
-Float = NDArray[np.float64]
 
 STARS_PER_BIN = 25
 MAX_BINS = 32  # along each side

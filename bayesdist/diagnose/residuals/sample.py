@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
 from bayesdist.data.matches import Matches
 from bayesdist.infer.linear import LinearFit
@@ -25,8 +25,6 @@ __all__ = [
     "star_sample",
 ]
 
-Float = NDArray[np.float64]
-
 SAMPLE = 200_000  # stars that show what all of them look like
 MIN_STARS = 50  # stars whose scatter says anything by magnitude
 CERTAIN = 0.5  # probability of a false match from which on a star is left out
@@ -41,7 +39,7 @@ class ExposureScatter:
     """
 
     names: tuple[str, ...]  # of the E exposures that have stars
-    n: NDArray[np.int64]  # (E,), probably true stars
+    n: Int  # (E,), probably true stars
     ratio: Float  # (E,)
 
     @property
@@ -60,7 +58,7 @@ class ExposureScatter:
         return np.asarray(1.0 / np.sqrt(self.n))
 
     @property
-    def deviating(self) -> NDArray[np.bool_]:
+    def deviating(self) -> Bool:
         """Boolean mask (E,) of exposures with other errors than all, by more than chance."""
         factor = np.maximum(self.relative, 1.0 / self.relative)
         by_chance = np.abs(self.relative - 1.0) <= 3.0 * self.chance
@@ -93,7 +91,7 @@ class StarSample:
 
     table: Matches
     fit_residual: Float
-    used: NDArray[np.bool_]
+    used: Bool
     n_total: int
     variance: Float
     posterior_residual: Float | None = None
@@ -104,7 +102,7 @@ class StarSample:
         return len(self.table)
 
     @property
-    def probably_true(self) -> NDArray[np.bool_]:
+    def probably_true(self) -> Bool:
         """Boolean mask (N,) of the stars that are no likely false match, else that were used."""
         p = self.outlier_probability
         return self.used if p is None else p < CERTAIN

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.diagnose.residuals.binned import BinnedSums, binned_sums
 from bayesdist.infer.kernel import Constants
 from bayesdist.infer.posterior import Posterior
@@ -23,8 +23,6 @@ from bayesdist.infer.stars.sums import Sums
 
 __all__ = ["ExposureSums", "StarSums", "flagged_by_exposure", "star_sums"]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 Bins = tuple[int, int]
 
 
@@ -145,7 +143,7 @@ def _of_groups(stars: Stars, codes: Int) -> Int:
     return np.repeat(codes, np.diff(stars.starts))
 
 
-def _exposure_sums(stars: Stars, used: NDArray[np.bool_], residual: Float) -> ExposureSums:
+def _exposure_sums(stars: Stars, used: Bool, residual: Float) -> ExposureSums:
     exposure, n = _of_groups(stars, stars.groups.exposure), len(stars.model.exposures)
     of_used = exposure[used]
     u, v = residual[used].T

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes, between_nodes
 from bayesdist.errors import DegenerateError
@@ -24,8 +24,6 @@ from bayesdist.infer.nodes import (
 from bayesdist.model import Chip, LookupTable
 
 __all__ = ["measured_between"]
-
-Float = NDArray[np.float64]
 
 FAR = 6.0  # standard deviations
 

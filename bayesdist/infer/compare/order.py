@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.compare.order_result import HeldOutOrders, OrderSelection, OrderSurfaces
@@ -35,7 +35,6 @@ from bayesdist.model.basis import MAX_ORDER
 
 __all__ = ["in_one_frame", "select_order"]
 
-Float = NDArray[np.float64]
 DEFAULT_ORDERS = tuple(range(3, 10))
 
 

@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.model import DistortionModel
 
 __all__ = ["GaussianPriors", "JointPrior", "Prior"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

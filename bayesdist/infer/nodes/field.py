@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.nodes.grid import STEP, NodeGrid
@@ -22,8 +23,6 @@ from bayesdist.infer.nodes.sums import BLOCK, NodeSums, node_sums
 from bayesdist.model import Chip
 
 __all__ = ["checked_stars", "field_table"]
-
-Float = NDArray[np.float64]
 
 STEADY = 1e-5  # change of the stars' typical variance that is small against any error of the jitter
 MAX_ITERATIONS = 6

@@ -14,16 +14,13 @@ from functools import cached_property
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from bayesdist.arrays import Float, Int
 from bayesdist.infer.nodes.grid import NodeGrid
 from bayesdist.infer.nodes.sums import NodeSums
 
 __all__ = ["SMOOTHNESS", "Evidence", "FittedField", "Matern", "fitted_field", "refined_field"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 SMOOTHNESS = (0.5, 1.5, 2.5)
 

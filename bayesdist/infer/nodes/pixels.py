@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.solution import Solution
@@ -22,8 +22,6 @@ __all__ = [
     "on_the_chips",
     "pixel_shifts",
 ]
-
-Float = NDArray[np.float64]
 
 FOLDED = 1e-6  # area of a pixel's image over the square of its sides
 
@@ -106,7 +104,7 @@ def on_the_chips(matches: Matches, model: DistortionModel) -> Matches:
     return matches if inside.all() else matches.select(inside, reason="moved off the chip")
 
 
-def inside_chips(matches: Matches, model: DistortionModel) -> NDArray[np.bool_]:
+def inside_chips(matches: Matches, model: DistortionModel) -> Bool:
     """Boolean mask (N,) of the matches whose pixels lie on their chip."""
     size = np.array([model.chips[model.chip_code(c)].size for c in matches.chip_numbers])
     nx, ny = size[matches.chip].T

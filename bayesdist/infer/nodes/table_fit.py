@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.linear import LinearFit
@@ -17,8 +18,6 @@ from bayesdist.infer.nodes.posterior import TablePosterior
 from bayesdist.model.lookup import LookupTable, corrected
 
 __all__ = ["Iteration", "TableFit", "held_sigma", "table_of"]
-
-Float = NDArray[np.float64]
 
 BLOCK = 1024  # positions whose rows over all nodes are in memory at once
 

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
 from bayesdist.app.commands.on_files.init_detector import quoted
+from bayesdist.arrays import Float
 from bayesdist.data import Matches
 from bayesdist.data.formats.layout import TableLayout
 from bayesdist.model.basis import polynomial_terms
@@ -88,7 +88,7 @@ def guessed_sigma(table: Matches) -> float | None:
     """
     i, j = np.array(polynomial_terms(ORDER)).T
     groups = table.exposure * len(table.chip_numbers) + table.chip
-    residuals: list[NDArray[np.float64]] = []
+    residuals: list[Float] = []
     for group in np.unique(groups):
         rows = groups == group
         if rows.sum() < EACH * len(i):

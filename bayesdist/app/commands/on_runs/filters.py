@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 from astropy.table import Table
-from numpy.typing import NDArray
 
 from bayesdist.app.kinds.fitted import Fitted, required
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.infer.series import FilterDependence, Series, TrendModel, filter_dependence
 from bayesdist.infer.solution import Solution
@@ -23,8 +23,6 @@ from bayesdist.model import TimeDependence
 
 __all__ = ["FilterComparison", "compare_filters", "comparison_table", "draw_filters"]
 
-
-Float = NDArray[np.float64]
 Measured = tuple[float, float]  # value and standard deviation
 
 # places of the linear terms: power of x, power of y

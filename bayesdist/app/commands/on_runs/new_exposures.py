@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
@@ -21,8 +20,6 @@ from bayesdist.infer.compare.monitoring import NewFit, fit_new, with_star_errors
 from bayesdist.infer.linear import Rejection
 
 __all__ = ["fit_exposures_of", "read_new_exposures"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
+from bayesdist.arrays import Float
 from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel, TimeDependence
 
 __all__ = ["doubts_on_stars", "refuse_empty_segments"]
-
-Float = NDArray[np.float64]
 
 OFF = 1e3  # factor on the scale by which u and v cannot be those of the detector
 ODD = 3.0  # factor that is worth a warning

@@ -10,13 +10,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 
 __all__ = ["FunctionField", "Functions"]
-
-Float = NDArray[np.float64]
 
 MANY = 64  # functions from which on their values are kept, not their coefficients alone
 

@@ -7,14 +7,12 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms.rows import ErrorField, Image, Noise, Row, Scale
 
 __all__ = ["Independent", "Known", "KnownField", "NoiseField"]
-
-Float = NDArray[np.float64]
 
 
 class SigmaAt(Protocol):

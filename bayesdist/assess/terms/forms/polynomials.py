@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
@@ -16,9 +16,6 @@ from bayesdist.calibration.chip_map import position_moments
 from bayesdist.model import DistortionModel
 
 __all__ = ["PolynomialField", "Polynomials", "polynomial_errors", "without_rigid"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 def polynomial_errors(

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.assess.domain import EvaluationDomain
 
 __all__ = [
@@ -33,8 +33,6 @@ __all__ = [
     "Scale",
 ]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 Scale = Mapping[str, float]
 
 LOCAL, PRODUCT = "local", "product"

@@ -6,16 +6,14 @@ from dataclasses import dataclass
 from functools import cached_property, reduce
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms.functions import Functions
 from bayesdist.assess.terms.forms.polynomials import Polynomials
 from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
 
 __all__ = ["Together", "TogetherField"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
@@ -22,10 +22,6 @@ from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["BringUp", "bring_up"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 BINS = 12  # of the coverage, on each axis
 FIRST_ORDER = 2  # polynomial order of the first fit; each round may take one order more

@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["simulate_unpaired"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 MARGIN = 40.0  # pixels by which the reference catalogue reaches beyond the detector
 CENTROID = (0.05, 0.20)  # px, from the brightest to the faintest detection

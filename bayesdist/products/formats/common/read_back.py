@@ -6,14 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.model import TimeDependence
 
 __all__ = ["Positions", "ReadBack", "by_calibrations", "of_chips"]
 
-Float = NDArray[np.float64]
 Positions = Callable[[Float, Float, int, float | None], Float]
 
 
