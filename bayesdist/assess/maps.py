@@ -200,10 +200,7 @@ def uncertainty_map(
 def per_axis(sigma_u: ArrayLike, sigma_v: ArrayLike) -> Float:
     """Rms of the standard deviations of both axes: 1 sigma of one axis, whatever its direction.
 
-    Parameters
-    ----------
-    sigma_u, sigma_v : array_like
-        In one unit, which is that of the result.
+    `sigma_u`, `sigma_v`: in one unit, which is that of the result.
     """
     return np.asarray(np.hypot(sigma_u, sigma_v) / np.sqrt(2.0))
 

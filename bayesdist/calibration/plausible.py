@@ -19,16 +19,7 @@ OFF = 1e3  # factor between a stated scale and the size of a pixel
 
 
 def refuse_senseless(found: Calibration) -> None:
-    """Refuse sizes, scales and coefficients that no detector can have.
-
-    Parameters
-    ----------
-    found : Calibration
-
-    Raises
-    ------
-    FormatError
-    """
+    """Refuse sizes, scales and coefficients that no detector can have."""
     do = "correct the file, or fetch it again"
     for cause in _faults(found):
         raise FormatError(cause, where=found.name, do=do)

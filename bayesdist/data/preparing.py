@@ -32,14 +32,9 @@ _MIN_SCATTER = 0.05  # of ln(sigma): among errors all alike a slightly larger on
 
 @dataclass(frozen=True, eq=False)
 class MotionErrorLine:
-    """Largest error of a proper motion that counts as well measured, by magnitude.
+    """Largest error of a proper motion that counts as well measured, by magnitude."""
 
-    Parameters
-    ----------
-    mag, sigma : ndarray, shape (B,)
-        Knots in rising magnitude; linear in the logarithm between, constant beyond.
-    """
-
+    # mag, sigma (B,): knots in rising magnitude; linear in the logarithm between, constant beyond
     mag: Float
     sigma: Float
 

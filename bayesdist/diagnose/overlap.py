@@ -30,26 +30,13 @@ MAX_CELLS = 24  # along an axis
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """The similarity a = shift + scale R(rotation) b between two exposures, and what it leaves.
+    """The similarity a = shift + scale R(rotation) b between two exposures, and what it leaves."""
 
-    Parameters
-    ----------
-    shift : ndarray, shape (2,)
-        Pixels.
-    rotation : float
-        Radians, from xi to eta.
-    scale : float
-    position : ndarray, shape (N, 2)
-        (xi, eta) of the stars in exposure a, pixels.
-    residual : ndarray, shape (N, 2)
-        a minus the transformed b, pixels.
-    """
-
-    shift: Float
-    rotation: float
+    shift: Float  # (2,), pixels
+    rotation: float  # radians, from xi to eta
     scale: float
-    position: Float
-    residual: Float
+    position: Float  # (N, 2), (xi, eta) of the stars in exposure a, pixels
+    residual: Float  # (N, 2), a minus the transformed b, pixels
 
     @property
     def rms(self) -> Float:

@@ -226,12 +226,6 @@ class TransformedSolution(DerivedSolution):
 
 @dataclass(frozen=True, eq=False)
 class GaugedSolution(TransformedSolution):
-    """A solution rotated and shifted to the reference gauge.
+    """A solution rotated and shifted to the reference gauge."""
 
-    Parameters
-    ----------
-    gauge : ReferenceGauge
-        Rotation and shift that were applied.
-    """
-
-    gauge: ReferenceGauge
+    gauge: ReferenceGauge  # rotation and shift that were applied

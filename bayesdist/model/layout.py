@@ -275,10 +275,7 @@ class ParameterLayout:
     def chip_code(self, number: int) -> int:
         """Index of a chip by its number.
 
-        Raises
-        ------
-        InputError
-            When no chip has that number.
+        InputError when no chip has that number.
         """
         for code, chip in enumerate(self.chips):
             if chip.number == number:

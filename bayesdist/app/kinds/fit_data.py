@@ -25,10 +25,7 @@ __all__ = ["FitData", "StarReader"]
 class StarReader:
     """Reads stars, and remembers those that it was asked for last.
 
-    Parameters
-    ----------
-    compute : Compute, optional
-        Where the work is done.
+    `compute`: where the work is done.
     """
 
     def __init__(self, compute: Compute | None = None) -> None:
@@ -87,18 +84,11 @@ class StarReader:
 
 @dataclass(frozen=True, eq=False)
 class FitData:
-    """A fit and its stars: where its tables move them, with its errors.
-
-    Parameters
-    ----------
-    matched : Matched
-    fitted : Fitted
-    reader : StarReader
-        Reads the stars once for all passes over them.
-    """
+    """A fit and its stars: where its tables move them, with its errors."""
 
     matched: Matched
     fitted: Fitted
+    # reads the stars once for all passes over them
     reader: StarReader = field(default_factory=StarReader)
 
     @property

@@ -153,25 +153,9 @@ def set_aside(
 ) -> tuple[Matches, Matches | None, tuple[str, ...]]:
     """Matches that are fitted, those that are held out, and exposures that are so as a whole.
 
-    Parameters
-    ----------
-    config : Config
-    matches : Matches
-    needed : int
-        So many of the first exposures define the gauge and cannot be held out.
-
-    Returns
-    -------
-    fitted : Matches
-    held : Matches or None
-        None where the configuration holds nothing out.
-    whole : tuple of str
-
-    Raises
-    ------
-    InputError
-        For an unknown exposure or one that is needed, and when nothing would be left, or too
-        little set aside.
+    `needed`: so many of the first exposures define the gauge and cannot be held out. Result:
+    `fitted`; `held`: none where the configuration holds nothing out; `whole`. InputError for an
+    unknown exposure or one that is needed, and when nothing would be left, or too little set aside.
     """
     block = config.holdout
     if block is None:

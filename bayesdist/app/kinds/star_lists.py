@@ -34,13 +34,7 @@ EDGE = 1.0  # pixels: half of one to the edge, and half of one for lists that co
 
 @dataclass(frozen=True, eq=False)
 class StarLists:
-    """Star lists, and which of their detections pass the cuts.
-
-    Parameters
-    ----------
-    lists : tuple of Detections
-    cuts : StarCuts
-    """
+    """Star lists, and which of their detections pass the cuts."""
 
     lists: tuple[Detections, ...]
     cuts: StarCuts
@@ -100,10 +94,7 @@ def refuse_other_chips(lists: Sequence[Detections], chips: Sequence[Chip], key: 
     Nothing is checked without [[chip]] blocks.  `key` is the one of the configuration that names
     the lists.
 
-    Raises
-    ------
-    InputError
-        Naming the list.
+    InputError naming the list.
     """
     known = {chip.number: chip for chip in chips}
     if not known:

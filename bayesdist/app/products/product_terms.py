@@ -157,13 +157,8 @@ def _in_unit(product: ProductInput, missed: Positions) -> Positions:
 class _Laid:
     """Positions by a file, laid on those of the solution over all chips at once, less these.
 
-    Parameters
-    ----------
-    product : ProductInput
-    place : callable
-        Positions by the file, in a unit of its own where `scaled`.
-    scaled : bool
-        Whether the file's scale is a convention of its own, found at the date of the assessment.
+    `place`: positions by the file, in a unit of its own where `scaled`. `scaled`: whether the
+    file's scale is a convention of its own, found at the date of the assessment.
     """
 
     def __init__(self, product: ProductInput, place: Positions, *, scaled: bool) -> None:

@@ -110,16 +110,8 @@ def interpolation_term(
 ) -> tuple[LocalErrors, ...]:
     """The term of the budget; nothing where a chip has not been measured.
 
-    Parameters
-    ----------
-    between : mapping of int to BetweenNodes
-        By chip number.
-    solution : Solution
-        Its derivatives bring pixels to u and v, along the axes of the polynomials.
-    grid : tuple of int
-        Points on x and y of each chip.
-    epoch : float or None
-        Decimal years.
+    `between`: by chip number. `solution`: its derivatives bring pixels to u and v, along the axes
+    of the polynomials. `grid`: points on x and y of each chip. `epoch`: decimal years.
     """
     chips = solution.model.chips
     if not between or any(chip.number not in between for chip in chips):

@@ -111,32 +111,15 @@ class MatchColumns:
     def grouped(self, by: str) -> tuple[tuple[str, ...], Int]:
         """Labels of groups of stars, and the code (N,) of each star's group among them.
 
-        Parameters
-        ----------
-        by : str
-            'chip', 'exposure' or 'filter'; empty for one group of all stars, whose label is empty.
-
-        Returns
-        -------
-        labels : tuple of str
-        codes : ndarray of int, shape (N,)
+        `by`: 'chip', 'exposure' or 'filter'; empty for one group of all stars, whose label is
+        empty. Result: `labels`; `codes` (N,).
         """
         if not by:
             return ("",), np.zeros(len(self.x), np.int64)
         return tuple(map(str, getattr(self, LABELS_OF_CODES[by]))), getattr(self, by)
 
     def place(self, row: int, column: str = "") -> str:
-        """Name of a star for a message: file, row (from 1) and column.
-
-        Parameters
-        ----------
-        row : int
-        column : str, optional
-
-        Returns
-        -------
-        str
-        """
+        """Name of a star for a message: file, row (from 1) and column."""
         head = f"{self.sources[self.source[row]]}, row {self.row[row] + 1}"
         return f"{head}, column {column!r}" if column else head
 

@@ -67,35 +67,19 @@ class ExposureScatter:
 
 @dataclass(frozen=True, eq=False)
 class StarSample:
-    """Evenly spread stars of the data, or all of them.
+    """Evenly spread stars of the data, or all of them."""
 
-    Parameters
-    ----------
-    table : Matches
-        N stars.
-    fit_residual : ndarray, shape (N, 2)
-        Data minus the least-squares fit, in the unit of u and v.
-    used : ndarray of bool, shape (N,)
-        Whether the fit used the star.
-    n_total : int
-        Stars that there are in all.
-    variance : ndarray, shape (N, 2)
-        Of true matches along u and v: errors as quoted, with the jitter of the posterior.
-    posterior_residual : ndarray, shape (N, 2), or None
-        Data minus the model at the posterior mean; None where nothing was sampled.
-    outlier_probability : ndarray, shape (N,), or None
-    taken : ndarray, shape (N,), or None
-        Share of the variance that fitted places of the stars take out of the residuals; None where
-        places are known.
-    """
-
-    table: Matches
-    fit_residual: Float
-    used: Bool
-    n_total: int
+    table: Matches  # n stars
+    fit_residual: Float  # (N, 2), data minus the least-squares fit, in the unit of u and v
+    used: Bool  # (N,), whether the fit used the star
+    n_total: int  # stars that there are in all
+    # (N, 2), of true matches along u and v: errors as quoted, with the jitter of the posterior
     variance: Float
+    # (N, 2), data minus the model at the posterior mean; None where nothing was sampled
     posterior_residual: Float | None = None
-    outlier_probability: Float | None = None
+    outlier_probability: Float | None = None  # (N,)
+    # (N,), share of the variance that fitted places of the stars take out of the residuals; None
+    # where places are known
     taken: Float | None = None
 
     def __len__(self) -> int:
@@ -141,18 +125,7 @@ def star_sample(
 ) -> StarSample:
     """Residuals and probabilities of some stars, by a fit and a posterior.
 
-    Parameters
-    ----------
-    table : Matches
-        With errors: as of ``matches.sample(SAMPLE)``.
-    n_total : int
-        Stars that there are in all.
-    fit : LinearFit
-    posterior : Posterior, optional
-
-    Returns
-    -------
-    StarSample
+    `table`: with errors: as of ``matches.sample(SAMPLE)``. `n_total`: stars that there are in all.
     """
     stars, order = prepare(fit.model, table)
     solution = likelihood_shown(fit, posterior)

@@ -42,21 +42,10 @@ def measured_between(
 ) -> tuple[BetweenNodes, ...]:
     """Distortion that tables leave between their nodes, for each chip where it can be measured.
 
-    Parameters
-    ----------
-    pairs : Matches
-        At raw pixels, with errors.
-    fit : LinearFit
-        The polynomial that goes with the tables.
-    tables : sequence of LookupTable
-    filter : str
-        Of the pairs.
-    posteriors : sequence of TablePosterior
-        Of the tables that were fitted to these pairs.
-    mixture : ResidualMixture, optional
-        Of the pairs; by default that of their residuals.
-    fitted : bool
-        Whether the tables were fitted to these pairs.  Those that were not err by themselves.
+    `pairs`: at raw pixels, with errors. `fit`: the polynomial that goes with the tables. `filter`:
+    of the pairs. `posteriors`: of the tables that were fitted to these pairs. `mixture`: of the
+    pairs; by default that of their residuals. `fitted`: whether the tables were fitted to these
+    pairs. Those that were not err by themselves.
     """
     if pairs.star is None:
         return ()

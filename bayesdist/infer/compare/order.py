@@ -164,25 +164,10 @@ def _lost(
 def in_one_frame(solution: Solution, matches: Matches, chip: int) -> Matches:
     """Matches of one chip with the frames and the drift of a solution taken out.
 
-    Parameters
-    ----------
-    solution : Solution
-    matches : Matches
-        With errors, of the exposures of the solution's model.
-    chip : int
-        Number of the chip.
-
-    Returns
-    -------
-    Matches
-        In memory, of one exposure and without dates.  They lie as far from the polynomials alone,
-        at their first reference date, as they lay from the solution; residuals and errors are along
-        the axes of these polynomials.
-
-    Raises
-    ------
-    InputError
-        For matches without errors.
+    `matches`: with errors, of the exposures of the solution's model. `chip`: number of the chip.
+    Result: in memory, of one exposure and without dates. They lie as far from the polynomials
+    alone, at their first reference date, as they lay from the solution; residuals and errors are
+    along the axes of these polynomials. InputError for matches without errors.
     """
     matches = matches.load()
     if len(solution.model.chips) > 1:

@@ -28,42 +28,21 @@ FOLDED = 1e-6  # area of a pixel's image over the square of its sides
 
 @dataclass(frozen=True, eq=False)
 class PixelShifts:
-    """Residuals of matched stars in pixels of the detector.
+    """Residuals of matched stars in pixels of the detector."""
 
-    Parameters
-    ----------
-    shift : ndarray, shape (N, 2)
-        To be added to x and y, pixels.
-    variance : ndarray, shape (N, 2)
-        Square of the quoted error of each, square pixels.  The correlation that a skewed polynomial
-        makes between the two (some per cent) is left out.
-    """
-
-    shift: Float
+    shift: Float  # (N, 2), to be added to x and y, pixels
+    # (N, 2), square of the quoted error of each, square pixels. The correlation that a skewed
+    # polynomial makes between the two (some per cent) is left out
     variance: Float
 
 
 def pixel_shifts(solution: Solution, matches: Matches) -> PixelShifts:
     """Residuals of matches, mapped to the detector by the inverse of the local Jacobian.
 
-    Parameters
-    ----------
-    solution : Solution
-    matches : Matches
-        With errors, in the solution's unit.
-
-    Returns
-    -------
-    PixelShifts
-        To first order in the residual: at 0.2 pixels and the curvature of ACS/WFC the second one is
-        below 1e-5 pixels.
-
-    Raises
-    ------
-    InputError
-        For matches without errors or in another unit.
-    DegenerateError
-        Where the polynomial folds over: its Jacobian is singular at a star.
+    `matches`: with errors, in the solution's unit. Result: to first order in the residual: at 0.2
+    pixels and the curvature of ACS/WFC the second one is below 1e-5 pixels. InputError for matches
+    without errors or in another unit. DegenerateError where the polynomial folds over: its Jacobian
+    is singular at a star.
     """
     sigma_u, sigma_v = errors_of(matches)
     model, groups = solution.model, groups_of(solution.model, matches)

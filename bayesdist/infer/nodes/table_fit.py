@@ -24,25 +24,14 @@ BLOCK = 1024  # positions whose rows over all nodes are in memory at once
 
 @dataclass(frozen=True)
 class Iteration:
-    """Statistics of one iteration.
+    """Statistics of one iteration."""
 
-    Parameters
-    ----------
-    number : int
-        From 1.
-    moved : float
-        Largest change of a node, pixels.
-    rms : float
-        Rms residual of an axis before the new tables, stars weighted by their probability of being
-        true matches, pixels.
-    false_fraction : float
-        Of the matches.
-    """
-
-    number: int
-    moved: float
+    number: int  # from 1
+    moved: float  # largest change of a node, pixels
+    # rms residual of an axis before the new tables, stars weighted by their probability of being
+    # true matches, pixels
     rms: float
-    false_fraction: float
+    false_fraction: float  # of the matches
 
 
 def table_of(table: LookupTable | TablePosterior) -> LookupTable:

@@ -27,12 +27,8 @@ _NONE = """\
 def column_lines(layout: TableLayout | None, columns: Mapping[str, str] | None) -> str:
     """Lines of [data] that name the columns taken, the pixel origin and the epochs.
 
-    Parameters
-    ----------
-    layout : TableLayout or None
-        None of a format that fixes its columns.
-    columns : mapping of str to str, or None
-        As the user names them; empty names stay.
+    `layout`: none of a format that fixes its columns. `columns`: as the user names them; empty
+    names stay.
     """
     if layout is None:
         return _NONE + "# pixel_origin = 1              # of x, y: 1 as in FITS, or 0\n"

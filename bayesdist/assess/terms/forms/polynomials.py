@@ -91,30 +91,16 @@ class AddedPolynomials(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Polynomials:
-    """Errors of parameters: on any chip at any epoch a polynomial.
-
-    Parameters
-    ----------
-    row : Row
-    model : DistortionModel
-    mean : ndarray, shape (D,)
-        Where there is no error.
-    theta : ndarray, shape (n, D)
-    exposure : int or None
-        Code of an exposure whose frame errs, and takes the place of any new one.
-    frames : bool
-        Whether the frame of the exposure of each draw's star errs.
-    more : tuple
-        What is added to these polynomials.
-    """
+    """Errors of parameters: on any chip at any epoch a polynomial."""
 
     row: Row
     model: DistortionModel
-    mean: Float
-    theta: Float
+    mean: Float  # (D,), where there is no error
+    theta: Float  # (n, D)
+    # code of an exposure whose frame errs, and takes the place of any new one
     exposure: int | None = None
-    frames: bool = False
-    more: tuple[AddedPolynomials, ...] = ()
+    frames: bool = False  # whether the frame of the exposure of each draw's star errs
+    more: tuple[AddedPolynomials, ...] = ()  # what is added to these polynomials
 
     def on(self, domain: EvaluationDomain, image: Image) -> PolynomialField:
         """The errors at the positions of a domain, less what an alignment takes up."""

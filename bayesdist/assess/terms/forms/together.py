@@ -23,16 +23,10 @@ class Together:
     The joint error is the sum of the rows that are in the total.  Rows that are not are held by it:
     where one of them shrinks, the joint error does so at each position as the row's fraction of its
     variance says.
-
-    Parameters
-    ----------
-    draws : tuple
-        One for each row.
-    remainder : bool
-        Whether the last row counts as much as the joint error has beyond the other rows.
     """
 
-    draws: tuple[Polynomials | Functions, ...]
+    draws: tuple[Polynomials | Functions, ...]  # one for each row
+    # whether the last row counts as much as the joint error has beyond the other rows
     remainder: bool = False
 
     def on(self, domain: EvaluationDomain, image: Image) -> TogetherField:

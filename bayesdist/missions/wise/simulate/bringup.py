@@ -21,26 +21,14 @@ REFERENCE_SIGMA = 0.03  # px: 2MASS, some 80 mas
 
 @dataclass(frozen=True, eq=False)
 class UnpairedStars:
-    """Detections, reference stars, and the truth about them.
+    """Detections, reference stars, and the truth about them."""
 
-    Parameters
-    ----------
-    detections : Detections
-        On the detector, pixels; the exposures are the frames.
-    reference : Detections
-        Undistorted positions in the frames, pixels.
-    partner : ndarray of int, shape (N,)
-        Row of each detection's own reference star; -1 where the catalogue has none.
-    model : DistortionModel
-    theta : ndarray, shape (D,)
-        The true distortion.
-    """
-
-    detections: Detections
-    reference: Detections
+    detections: Detections  # on the detector, pixels; the exposures are the frames
+    reference: Detections  # undistorted positions in the frames, pixels
+    # (N,), row of each detection's own reference star; -1 where the catalogue has none
     partner: Int
     model: DistortionModel
-    theta: Float
+    theta: Float  # (D,), the true distortion
 
 
 def simulate_unpaired(
