@@ -8,19 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-__all__ = [
-    "EITHER",
-    "GROUPS",
-    "LARGER",
-    "LEVELS",
-    "Check",
-    "doubts_of",
-    "in_order",
-    "level_of",
-    "warnings_of",
-    "worst",
-]
-
 LEVELS = ("note", "pass", "warn", "fail")  # from the least to the worst
 LARGER, EITHER = "larger", "either"
 

@@ -13,25 +13,6 @@ from scipy import special
 
 from bayesdist.arrays import Float, Int
 
-__all__ = [
-    "beta_ppf",
-    "beta_sf",
-    "beta_std",
-    "binom_ppf",
-    "chi2_cdf",
-    "chi2_isf",
-    "chi2_ppf",
-    "chi2_sf",
-    "f_isf",
-    "f_sf",
-    "gamma_cdf",
-    "gamma_sf",
-    "norm_isf",
-    "norm_sf",
-    "t_ppf",
-    "t_sf",
-]
-
 
 def _where(known: ArrayLike, values: ArrayLike) -> Float:
     """Values where they are known, else NaN."""

@@ -12,16 +12,6 @@ from pathlib import Path
 from bayesdist.errors import InputError
 from bayesdist.reading.regular import opened
 
-__all__ = [
-    "atomic_path",
-    "is_leftover",
-    "made_folder",
-    "path_within",
-    "remove_leftovers",
-    "sha256_of",
-    "watched_writes",
-]
-
 _MARK = ".bayesdist-"
 _watchers: list[Callable[[Path], None]] = []
 

@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
-__all__ = ["lazy_name"]
-
 
 def lazy_name(package: str, homes: Mapping[str, Sequence[str]], name: str) -> Any:
     """Object that a package gives under a name, from the module where it is at home.

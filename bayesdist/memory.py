@@ -8,8 +8,6 @@ import sys
 
 from bayesdist.errors import MemoryLimitError
 
-__all__ = ["memory_limit", "require_memory", "size_text"]
-
 
 def memory_limit() -> int:
     """Bytes that one object may take: half the memory of the machine, or of what it allows us."""

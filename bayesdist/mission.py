@@ -17,8 +17,6 @@ from typing import Any
 
 from bayesdist.errors import InputError
 
-__all__ = ["GROUP", "Mission", "load_mission", "load_object", "mission_names", "missions"]
-
 GROUP = "bayesdist.missions"
 
 

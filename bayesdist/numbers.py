@@ -10,24 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = [
-    "MISSING",
-    "Scale",
-    "broken_name",
-    "count",
-    "counted",
-    "display_scale",
-    "interval",
-    "ladder",
-    "length_scale",
-    "number",
-    "percent",
-    "probability",
-    "rounded",
-    "size_of",
-    "with_mas",
-]
-
 MISSING = "–"
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _MINUS = str.maketrans("-", "−")

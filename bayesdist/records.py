@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from bayesdist.reading.documents import json_of
 
-__all__ = ["record_from_arrays", "record_to_arrays"]
-
 TREE = "tree"
 PACKAGE = "bayesdist."  # classes of others are not made from files
 

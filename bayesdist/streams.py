@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["mixed", "restarted"]
-
 
 def restarted(rng: np.random.Generator) -> np.random.Generator:
     """A generator of the same numbers from their beginning.

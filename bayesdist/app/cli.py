@@ -14,8 +14,6 @@ from bayesdist.errors import BayesdistError, RenamedError
 from bayesdist.mission import load_mission, mission_names, missions
 from bayesdist.version import __version__
 
-__all__ = ["main"]
-
 _LONGEST = 1000  # letters of a sentence
 COMMANDS = "bayesdist.app.commands"
 CORE = {

@@ -18,8 +18,6 @@ from bayesdist.assess.terms.centroid import centroid_errors
 from bayesdist.diagnose.residuals.sample import centroid_scatter, star_sample
 from bayesdist.errors import InputError
 
-__all__ = ["rehearse", "rehearse_solution"]
-
 REHEARSAL_DRAWS = 100
 
 

@@ -28,9 +28,6 @@ from bayesdist.model.grid import outline_pixels
 from bayesdist.reading.tables import read_ecsv
 from bayesdist.report.context import ChipResults, Product, ReportInput, SelfcalResults
 
-__all__ = ["report", "title_of"]
-
-
 log = logging.getLogger("bayesdist")
 
 VECTOR_GRID = 17  # vectors along the longer side of a diagram: more would hide each other

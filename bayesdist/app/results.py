@@ -29,8 +29,6 @@ from bayesdist.checks import Check, in_order
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import LinearFit, Posterior, load_posterior
 
-__all__ = ["Results", "open_results", "results_of"]
-
 T = TypeVar("T")
 
 # each rests on those before it

@@ -38,19 +38,6 @@ from bayesdist.infer.posterior.memberships import memberships_of
 from bayesdist.infer.skew import Skew, skew_of
 from bayesdist.infer.stars.stars import in_table_order, prepare
 
-__all__ = [
-    "fit_sections",
-    "save_diagnosed",
-    "save_evaluation",
-    "save_figures",
-    "save_fit",
-    "save_matches",
-    "save_products",
-    "save_sampled",
-    "write_star_files",
-]
-
-
 log = logging.getLogger("bayesdist")
 
 

@@ -14,8 +14,6 @@ from typing import Any
 
 from bayesdist.errors import InputError
 
-__all__ = ["log_file", "number", "open_streams", "progress_bar", "start_logging", "table_text"]
-
 log = logging.getLogger("bayesdist")
 FORMAT = "%(asctime)s %(levelname)-7s %(message)s"
 

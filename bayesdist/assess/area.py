@@ -14,8 +14,6 @@ from bayesdist.infer.solution import Solution
 from bayesdist.model.basis import point_blocks
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 
-__all__ = ["AreaMap", "area_map"]
-
 
 @dataclass(frozen=True, eq=False)
 class AreaMap:

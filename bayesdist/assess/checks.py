@@ -11,8 +11,6 @@ from bayesdist.checks import EITHER, LARGER, Check
 from bayesdist.limits import MATCH_RADIUS
 from bayesdist.model.timedep import TimeDependence
 
-__all__ = ["catalogue_checks", "matching_checks", "time_checks", "visits_of"]
-
 GROUP = "Assumptions"
 
 

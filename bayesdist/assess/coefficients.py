@@ -13,8 +13,6 @@ from bayesdist.model import AXES
 if TYPE_CHECKING:
     from bayesdist.infer import LinearFit, Posterior
 
-__all__ = ["coefficient_table"]
-
 
 def coefficient_table(fit: LinearFit, posterior: Posterior | None = None) -> Table:
     """Every parameter of the model, with its uncertainties.

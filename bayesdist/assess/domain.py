@@ -17,17 +17,6 @@ from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh
 
-__all__ = [
-    "QUADRANTS",
-    "WHOLE",
-    "EvaluationDomain",
-    "Region",
-    "WorstPosition",
-    "check_region",
-    "in_region",
-    "region_words",
-]
-
 MIN_POSITIONS = 4  # of a region
 Region: TypeAlias = "str | tuple[tuple[float, float], ...]"
 WHOLE = "whole"

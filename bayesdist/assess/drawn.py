@@ -29,8 +29,6 @@ from bayesdist.assess.terms.forms import (
 )
 from bayesdist.infer.solution import Solution
 
-__all__ = ["DrawnErrors", "generators"]
-
 BLOCK = 200_000  # positions times draws whose errors a thread holds at once
 MOST_PAIRS = 5000  # pairs of positions that stand for all: percentiles over them to about 1 %
 

@@ -32,15 +32,6 @@ from bayesdist.memory import require_memory
 from bayesdist.model import LookupTable
 from bayesdist.model.grid import DEFAULT_GRID
 
-__all__ = [
-    "ErrorModel",
-    "diagnosed_error_model",
-    "error_budget",
-    "error_model",
-    "with_diagnosed_errors",
-    "with_shared_stars",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class ErrorModel:

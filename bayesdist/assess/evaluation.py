@@ -34,16 +34,6 @@ from bayesdist.model import Chip
 from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.streams import restarted
 
-__all__ = [
-    "Evaluation",
-    "EvaluationSettings",
-    "budget_over",
-    "drawn_errors",
-    "evaluate",
-    "judged",
-    "validity_of",
-]
-
 VALIDITY_DRAWS = 1000  # for each of its epochs
 VALIDITY_EPOCHS = 40  # of a curve
 YEARS_AHEAD = 10.0  # to which the budget at every position is extrapolated

@@ -16,16 +16,6 @@ from bayesdist.calibration.chip_map import position_moments
 from bayesdist.infer.solution import Solution
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
 
-__all__ = [
-    "RELATIVE",
-    "UncertaintyMap",
-    "circular_error",
-    "per_axis",
-    "sigmas_of",
-    "uncertainty_map",
-    "with_local",
-]
-
 RELATIVE = "relative positions"
 NODES = 33  # ratios of the axes between which radii are interpolated: to 1e-4
 ANGLES = 256

@@ -17,8 +17,6 @@ from bayesdist.errors import InputError
 from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, DistortionModel, Groups, PolynomialBasis
 
-__all__ = ["Place", "chip_places", "place_of"]
-
 
 @dataclass(frozen=True, eq=False)
 class Place:

@@ -13,8 +13,6 @@ import numpy as np
 from bayesdist.arrays import Float, Int
 from bayesdist.errors import require_known
 
-__all__ = ["STATISTICS", "ErrorsOf", "drawn_statistics", "extent", "field_statistic"]
-
 _PERCENTILES = {"p50": 50.0, "p68": 68.0, "p90": 90.0, "p95": 95.0, "p99": 99.0}
 _DIRECTIONS = 64  # over half a turn
 _BASE = ("max", "rms", "mean", *_PERCENTILES)

@@ -9,8 +9,6 @@ from bayesdist.errors import InputError, require_known
 from bayesdist.infer.solution import Solution
 from bayesdist.limits import PIXEL_SIZE
 
-__all__ = ["UNITS", "convert", "pixel_doubt", "pixel_scale_of", "require_scale"]
-
 _MAS = {"mas": 1.0, "arcsec": 1e3, "deg": 3.6e6}
 
 

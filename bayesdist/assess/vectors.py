@@ -13,8 +13,6 @@ from bayesdist.errors import InputError, require_known
 from bayesdist.model.basis import point_blocks
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
 
-__all__ = ["PARTS", "VectorMap", "distortion_vectors"]
-
 PARTS = ("no_constant", "non_linear")
 
 # u, v in pixels count as positions on the array itself when the best similarity is as near to the

@@ -24,8 +24,6 @@ from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.subarray import FULL, Subarray
 from bayesdist.errors import InputError
 
-__all__ = ["Application", "OutputFrame", "Positions", "frame_that_holds"]
-
 # Points along each edge of a chip, whose image bulges.
 _EDGE = 257
 

@@ -20,8 +20,6 @@ from bayesdist.calibration.subarray import FULL, Subarray
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
 
-__all__ = ["PixelAreaMap", "determinant", "pixel_area_map", "pixel_areas"]
-
 _MAGNITUDES = 2.5 / np.log(10.0)
 
 

@@ -24,14 +24,6 @@ from bayesdist.infer.solution import Solution
 from bayesdist.infer.transforms import without_frames
 from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence, corrected
 
-__all__ = [
-    "Calibration",
-    "GaussianSolution",
-    "as_calibration",
-    "calibration_of",
-    "calibration_of_maps",
-]
-
 ORIGINS = ("stated", "reference", "chip")
 FOLLOWING_ORDER = 9  # of the polynomial that stands for look-up tables where two are compared
 

@@ -19,8 +19,6 @@ from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, LookupTable, PolynomialBasis
 from bayesdist.model.basis import point_blocks
 
-__all__ = ["ChipMap", "Monomials", "fitted_map", "position_moments", "sampling_of"]
-
 # Newton's method has converged when a step is this short in pixels, which rounding allows.
 STEP, MAX_STEPS = 1e-9, 30
 _FIT_NODES = 129  # points of each axis over which a map is followed by a polynomial

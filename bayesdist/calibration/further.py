@@ -8,8 +8,6 @@ from typing import Any
 
 from bayesdist.errors import FormatError
 
-__all__ = ["SHARED", "FurtherError", "further_from", "further_records", "scaled"]
-
 SHARED = "systematic"  # kind of an error that all stars of an image have in common
 
 

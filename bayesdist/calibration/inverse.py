@@ -22,8 +22,6 @@ from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.basis import MAX_ORDER
 
-__all__ = ["ExplicitInverse", "detector_grid", "fit_inverse", "fitted_inverse"]
-
 Terms = Mapping[tuple[int, int], float]
 Forward = Callable[[Float, Float], tuple[Float, Float]]
 

@@ -16,8 +16,6 @@ from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.model.similarity import turned, turned_model
 
-__all__ = ["lay_on", "oriented"]
-
 
 def lay_on(
     calibration: Calibration,

@@ -11,8 +11,6 @@ from bayesdist.calibration.further import scaled
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
 
-__all__ = ["placed_at"]
-
 
 def placed_at(
     calibration: Calibration,

@@ -9,8 +9,6 @@ import numpy as np
 from bayesdist.arrays import Float
 from bayesdist.infer.solution import Solution
 
-__all__ = ["ARCSEC", "Agreement", "Orientation", "Plane"]
-
 ARCSEC = {"arcsec": 1.0, "mas": 1e-3, "deg": 3600.0}
 
 PARAMETERS = ("shift_x", "shift_y", "log_scale", "angle")

@@ -9,8 +9,6 @@ from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import FormatError, InputError
 
-__all__ = ["FAR", "refuse_senseless"]
-
 MOST_PIXELS = 1e6  # columns or rows of a chip
 FAR = 1e7  # pixels from the chip to its reference pixel
 BEND = 10.0  # sizes of the chip by which positions may be off the linear terms

@@ -26,8 +26,6 @@ from bayesdist.infer.equations.priors import GaussianPriors, JointPrior
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import LINEAR_MATRICES, frame_names
 
-__all__ = ["CalibrationPrior", "prior_of_calibration"]
-
 FEWEST_DRAWS = 4.0  # effective draws for each parameter, whose covariance is inverted
 SINGULAR = 1e-12  # of the largest eigenvalue in units of the standard deviations
 SCALED = "shift_rotation_scale"  # frames that are flat whatever the turn

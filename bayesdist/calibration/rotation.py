@@ -21,8 +21,6 @@ from numpy.typing import ArrayLike
 from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 
-__all__ = ["coefficient_map", "is_exact", "pixel_matrix"]
-
 # Exact, as cosines and sines are not.
 _QUARTERS = {0.0: (1.0, 0.0), 90.0: (0.0, 1.0), 180.0: (-1.0, 0.0), 270.0: (0.0, -1.0)}
 

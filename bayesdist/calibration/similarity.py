@@ -15,8 +15,6 @@ from bayesdist.arrays import Complex, Float
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
 
-__all__ = ["as_real", "correlations", "similarity_fields", "turn_between"]
-
 
 def correlations(
     za: Complex, zb: Complex, basis: PolynomialBasis

@@ -23,8 +23,6 @@ from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.basis import MAX_ORDER
 
-__all__ = ["Reprojected", "reprojected"]
-
 LEFT = 1e-5  # of a pixel: a thousandth of the best centroids' errors
 _NODES = 33
 

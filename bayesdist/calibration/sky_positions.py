@@ -23,8 +23,6 @@ from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky.tangent import sky_of_plane, tangent_jacobian
 from bayesdist.errors import InputError
 
-__all__ = ["SkyPositions", "sky_positions"]
-
 
 @dataclass(frozen=True, eq=False)
 class SkyPositions:

@@ -20,14 +20,6 @@ from numpy.typing import ArrayLike
 from bayesdist.arrays import Float
 from bayesdist.errors import FormatError, InputError
 
-__all__ = [
-    "FULL",
-    "Subarray",
-    "subarray_at_corner",
-    "subarray_of_header",
-    "subarrays_of_image",
-]
-
 
 @dataclass(frozen=True)
 class Subarray:

@@ -6,8 +6,6 @@ import numpy as np
 
 from bayesdist.errors import InputError
 
-__all__ = ["BATCH", "batch_edges", "even_edges", "every_kth"]
-
 BATCH = 2**20  # rows of a batch at most: as many as a row group of Parquet has by default
 
 

@@ -30,8 +30,6 @@ from bayesdist.data.tables.units import check_unit
 from bayesdist.errors import InputError
 from bayesdist.reading.tables import read_table
 
-__all__ = ["ReferenceCatalog", "catalog_from_table", "read_catalog"]
-
 _PAIRS = (("sigma_u", "sigma_v"), ("pm_u", "pm_v"), ("sigma_pm_u", "sigma_pm_v"))
 _PARALLAX = ("parallax", "sigma_parallax")
 _COLUMNS = ("u", "v", "mag", *(name for pair in _PAIRS for name in pair), *_PARALLAX)

@@ -13,8 +13,6 @@ from bayesdist.arrays import Float, Int
 from bayesdist.data.tables.checks import COMPLETED, check_columns, columns_of
 from bayesdist.errors import InputError
 
-__all__ = ["NO_STAR", "Detections", "detections_of"]
-
 NO_STAR = -1
 
 _CODES = ("exposure", "chip", "star", "row")

@@ -20,8 +20,6 @@ from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 from bayesdist.reading.tables import read_table
 
-__all__ = ["Exposure", "ExposureLog", "read_exposures", "write_exposures"]
-
 _NUMBERS = ("exptime", "vafactor", "pa_v3", "ra", "dec")
 _SLOWEST = 2e-4  # |VAFACTOR - 1| of anything in orbit about the Earth stays below 1.4e-4
 _UNITS = {"epoch": "yr", "exptime": "s", "pa_v3": "deg", "ra": "deg", "dec": "deg"}

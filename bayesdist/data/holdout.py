@@ -18,15 +18,6 @@ from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.streams import mixed
 
-__all__ = [
-    "HELD_OUT",
-    "HoldoutSpec",
-    "Split",
-    "exposures_drawn",
-    "refuse_strangers",
-    "split_matches",
-]
-
 Bits = NDArray[np.uint64]
 
 HELD_OUT = "held out"  # reason under which they are counted

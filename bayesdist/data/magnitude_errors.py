@@ -13,8 +13,6 @@ from scipy.optimize import isotonic_regression
 from bayesdist.arrays import Float, Int
 from bayesdist.errors import InputError
 
-__all__ = ["AddedErrors", "MagnitudeErrors", "estimate", "no_magnitudes"]
-
 _MIN_STARS_IN_BIN = 40
 _MAX_BINS = 25
 _MIN_STARS = 10  # stars in all, below which the scatter is unknown

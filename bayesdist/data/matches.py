@@ -19,8 +19,6 @@ from bayesdist.data.columns.labels import Labels, merged_counts
 from bayesdist.data.magnitude_errors import AddedErrors, MagnitudeErrors, no_magnitudes
 from bayesdist.errors import InputError
 
-__all__ = ["BatchReader", "Matches"]
-
 Errors = MagnitudeErrors | AddedErrors | float | tuple[ArrayLike, ArrayLike]
 
 

@@ -15,14 +15,6 @@ from bayesdist.data.matches import Matches
 from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError, required
 
-__all__ = [
-    "MotionErrorLine",
-    "centroid_errors",
-    "motion_error_line",
-    "neutralise_aberration",
-    "select_motions",
-]
-
 _STARS_IN_BIN = 200  # stars of a bin in magnitude
 _MAX_BINS = 40
 # above the median, in the logarithm: 0.6 % of a log-normal distribution

@@ -34,9 +34,6 @@ from bayesdist.errors import InputError
 from bayesdist.reading.regular import read_lines
 from bayesdist.reading.tables import read_table
 
-__all__ = ["read_matches"]
-
-
 PathLike = str | os.PathLike[str]
 IN_MEMORY = "table"  # name of a table that is no file, in errors
 

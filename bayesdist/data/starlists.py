@@ -20,8 +20,6 @@ from bayesdist.data.tables.names import ALIASES, BASIC, find_columns, origin_of
 from bayesdist.errors import FormatError, InputError
 from bayesdist.reading.tables import TABLE_SUFFIXES, read_table
 
-__all__ = ["StarCuts", "read_star_lists"]
-
 log = logging.getLogger("bayesdist")
 
 

@@ -22,15 +22,6 @@ from bayesdist.limits import (
 from bayesdist.limits import SCORE_TESTS as SCORE_LIMIT
 from bayesdist.numbers import count, number, percent, probability, size_of
 
-__all__ = [
-    "SCORE_TESTS",
-    "coverage_checks",
-    "exposure_checks",
-    "holdout_checks",
-    "score_checks",
-    "structure_checks",
-]
-
 FIT, HELD_OUT, SCORE_TESTS = "Fit", "Held-out truth", "Score tests"
 
 

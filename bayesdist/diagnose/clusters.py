@@ -13,8 +13,6 @@ from scipy.sparse import csr_matrix
 
 from bayesdist.arrays import Float, Int
 
-__all__ = ["add_over", "joint_clusters", "products_over", "squares_over", "sums_over"]
-
 
 def sums_over(cluster: Int, values: Float, n: int = 0) -> Float:
     """Sums of values over clusters.

@@ -57,16 +57,6 @@ from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.streams import restarted
 
-__all__ = [
-    "Diagnostics",
-    "catalogue_covariance",
-    "diagnose",
-    "diagnose_fit",
-    "hold_out",
-    "misfits_of",
-    "residual_sums",
-]
-
 Bins = tuple[int, int]
 
 SHOWN = "shown"  # the partition that diagrams of mean residuals show

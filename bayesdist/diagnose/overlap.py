@@ -20,8 +20,6 @@ from bayesdist.infer.solution import Solution
 from bayesdist.infer.transforms import without_frames
 from bayesdist.model import LookupTable, corrected
 
-__all__ = ["Alignment", "OverlapTest", "align", "chosen_exposures", "overlap_test"]
-
 MIN_OVERLAP = 0.5  # of the stars of the exposure that has fewer: what "overlap well" means
 MIN_SHARED_STARS = 100  # shared stars below which there is no map to be drawn
 STARS_PER_CELL = 12  # stars in a cell, on average

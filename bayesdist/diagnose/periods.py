@@ -37,17 +37,6 @@ from bayesdist.infer.stars.stars import prepare
 from bayesdist.limits import DIFFERENCE
 from bayesdist.numbers import p_words
 
-__all__ = [
-    "PeriodPart",
-    "PeriodSettings",
-    "TimeVariation",
-    "all_below",
-    "bins_for",
-    "period_part",
-    "period_verdict",
-    "time_variation",
-]
-
 MAX_BINS = 45  # along each side, as in Appendix C
 COMBINED = "combined"
 

@@ -8,8 +8,6 @@ from numpy.typing import ArrayLike
 from bayesdist.arrays import Float
 from bayesdist.distributions import beta_ppf, beta_sf, chi2_isf
 
-__all__ = ["chi_square_of", "clopper_pearson", "holm", "hotelling_p"]
-
 MIN_P = 1e-300  # tails underflow: no probability is zero
 
 

@@ -21,8 +21,6 @@ from bayesdist.limits import (
 )
 from bayesdist.numbers import count, number, percent
 
-__all__ = ["convergence_check", "fit_checks", "sampling_checks", "scatter_too_small"]
-
 FIT, SAMPLING = "Fit", "Sampling"
 
 

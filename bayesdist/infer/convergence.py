@@ -17,16 +17,6 @@ from bayesdist.arrays import Float
 from bayesdist.limits import DRAWS_PER_WALKER
 from bayesdist.numbers import count
 
-__all__ = [
-    "DIAGNOSTICS",
-    "Convergence",
-    "Limits",
-    "diagnose",
-    "importance_efficiency",
-    "pareto_k",
-    "smoothed_weights",
-]
-
 AXES = {"chain_axis": 0, "draw_axis": 1}
 TAIL = (0.05, 0.95)  # quantiles whose effective sample sizes are those of the tails
 MIN_WEIGHTS = 25  # to a fifth of which a tail is fitted

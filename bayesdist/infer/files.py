@@ -35,8 +35,6 @@ from bayesdist.reading.documents import json_of
 from bayesdist.reading.faults import restoring
 from bayesdist.reading.hdf5 import netcdf_dataset, netcdf_tree
 
-__all__ = ["load_fit", "load_posterior", "save_fit", "save_posterior"]
-
 SCHEMA = 2
 POSTERIOR_NUMBERS = ("n_stars", "n_flagged", "n_false", "reference_sigma")
 MOST_STARS = 1_000_000  # with more stars their data are not repeated in the file

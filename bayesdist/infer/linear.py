@@ -31,8 +31,6 @@ from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
-__all__ = ["LinearFit", "Rejection", "build_model", "fit_linear", "residuals"]
-
 MEDIAN_STARS = 1_000_000  # largest number of stars whose median is taken
 MEDIAN_CHI2_2 = 2 * np.log(2)  # median of chi-square with two degrees of freedom
 

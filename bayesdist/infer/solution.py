@@ -19,16 +19,6 @@ if TYPE_CHECKING:  # a file is inspected without what they import
     from bayesdist.infer.stars.likelihood import Likelihood
     from bayesdist.infer.stars.mixture import OutlierMixture
 
-__all__ = [
-    "DerivedSolution",
-    "GaugedSolution",
-    "ReferenceGauge",
-    "Solution",
-    "TransformedSolution",
-    "likelihood_of",
-    "root_of_diagonal",
-]
-
 
 def root_of_diagonal(cov: Float) -> Float:
     """Standard deviations (D,), 0 where rounding leaves a fixed parameter's variance negative."""

@@ -22,17 +22,6 @@ from bayesdist.infer.solution import (
 from bayesdist.model import DistortionModel, TimeDependence
 from bayesdist.model.similarity import turned, turned_model
 
-__all__ = [
-    "LINEAR_TERMS",
-    "LinearTerms",
-    "bare_model",
-    "linear_terms",
-    "lines",
-    "reference_gauge",
-    "segment",
-    "without_frames",
-]
-
 # constant, x and y of both axes as ACS ISR 2015-06 numbers them (Equations 1-2)
 LINEAR_TERMS = ("A_1", "A_2", "A_3", "B_1", "B_2", "B_3")
 

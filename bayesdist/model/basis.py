@@ -20,8 +20,6 @@ from numpy.typing import ArrayLike
 from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 
-__all__ = ["MAX_ORDER", "PolynomialBasis", "as_pair", "point_blocks", "polynomial_terms"]
-
 MAX_ORDER = 12
 # Points whose basis values are held at once: 91 terms (order 12) of them are 24 MB.
 BLOCK = 32768

@@ -26,8 +26,6 @@ from bayesdist.errors import InputError
 from bayesdist.model.effective import EffectiveCoefficients
 from bayesdist.model.grouping import Groups, group_by
 
-__all__ = ["DistortionModel"]
-
 NO_EXPOSURE = -1  # code of the polynomial itself where it is no exposure's
 
 

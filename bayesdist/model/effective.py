@@ -25,8 +25,6 @@ from bayesdist.model.grouping import Groups
 from bayesdist.model.layout import ParameterLayout
 from bayesdist.model.timedep import TimeDependence
 
-__all__ = ["EffectiveCoefficients"]
-
 
 @dataclass(frozen=True)
 class EffectiveCoefficients(ParameterLayout):

@@ -24,20 +24,6 @@ from numpy.typing import ArrayLike
 
 from bayesdist.arrays import Float
 
-__all__ = [
-    "CHIP_DEVIATIONS",
-    "DEVIATIONS",
-    "FRAME_KINDS",
-    "LINEAR_MATRICES",
-    "RIGID",
-    "chip_matrix",
-    "frame_matrix",
-    "frame_names",
-    "frame_tangent",
-    "nearest_frame",
-    "rigid_part",
-]
-
 _NAMES: dict[str, tuple[str, ...]] = {
     "none": (),
     "shift": ("shift_u", "shift_v"),

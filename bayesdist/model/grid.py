@@ -8,15 +8,6 @@ from bayesdist.arrays import Float, Int
 from bayesdist.errors import InputError
 from bayesdist.memory import require_memory
 
-__all__ = [
-    "DEFAULT_GRID",
-    "cell_index",
-    "grid_pixels",
-    "mesh",
-    "outline_pixels",
-    "position_of_largest",
-]
-
 DEFAULT_GRID = (33, 17)
 BYTES_OF_POINT = 500  # at least: its position, the polynomial there, and some draws
 

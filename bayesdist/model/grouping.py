@@ -13,8 +13,6 @@ import numpy as np
 
 from bayesdist.arrays import Float, Int
 
-__all__ = ["Groups", "group_by", "merge_groups"]
-
 
 @dataclass(frozen=True, eq=False)
 class Groups:

@@ -16,8 +16,6 @@ from bayesdist.model.basis import PolynomialBasis
 from bayesdist.model.frames import CHIP_DEVIATIONS, FRAME_KINDS, RIGID, frame_names
 from bayesdist.model.timedep import AXES, TimeDependence
 
-__all__ = ["GAUGES", "Chip", "Parameter", "ParameterLayout"]
-
 GAUGES = ("first", "held")
 
 

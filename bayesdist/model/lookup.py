@@ -21,8 +21,6 @@ from bayesdist.arrays import Bool, Float, Int
 from bayesdist.errors import InputError
 from bayesdist.model.basis import as_pair
 
-__all__ = ["LookupTable", "corrected"]
-
 
 @dataclass(frozen=True, eq=False)
 class LookupTable:

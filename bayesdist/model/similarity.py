@@ -18,8 +18,6 @@ from bayesdist.arrays import Float
 from bayesdist.model.distortion import DistortionModel
 from bayesdist.model.timedep import TimeDependence
 
-__all__ = ["turned", "turned_model"]
-
 
 def turned_model(model: DistortionModel) -> DistortionModel:
     """Structure of a turned model without frames: drifting terms come in pairs of both axes.

@@ -16,8 +16,6 @@ from numpy.typing import ArrayLike
 from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 
-__all__ = ["AXES", "TimeDependence"]
-
 AXES = ("u", "v")
 
 

@@ -21,8 +21,6 @@ from bayesdist.calibration.area import PixelAreaMap
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 
-__all__ = ["write_maps", "write_pam"]
-
 PREFIX = {"least squares": "LSQ", "posterior": "MIX", RELATIVE: "REL"}
 
 

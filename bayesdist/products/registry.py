@@ -30,19 +30,6 @@ from bayesdist.products.formats.common.document import (
 )
 from bayesdist.products.formats.common.read_back import ReadBack, by_calibrations, of_chips
 
-__all__ = [
-    "all_formats",
-    "build",
-    "describe",
-    "format_of",
-    "lint",
-    "open_document",
-    "product_settings",
-    "read_back",
-    "read_calibration",
-    "recognized",
-]
-
 
 @cache
 def all_formats() -> tuple[Format, ...]:

@@ -25,8 +25,6 @@ from bayesdist.products.formats.idctab.table import IdcTab, write_idctab
 from bayesdist.products.formats.lookup.d2im import write_d2im
 from bayesdist.products.formats.lookup.npol import write_npol
 
-__all__ = ["Period", "Release", "write_release"]
-
 Filter = str | tuple[str, ...]
 
 

@@ -11,8 +11,6 @@ from typing import Any
 from bayesdist.errors import FormatError, InputError
 from bayesdist.reading.faults import reason_of
 
-__all__ = ["asdf_tree", "asdf_with_transforms"]
-
 
 def asdf_tree(raw: bytes, where: str) -> Mapping[str, Any]:
     """Tree of an ASDF file, its arrays in memory.

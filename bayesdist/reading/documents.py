@@ -13,8 +13,6 @@ from pydantic import TypeAdapter, ValidationError
 from bayesdist.errors import FormatError
 from bayesdist.reading.regular import MOST_TEXT, read_text
 
-__all__ = ["json_of", "model_of", "read_json", "read_json_as", "toml_of"]
-
 T = TypeVar("T")
 
 DEEPEST = 64  # brackets within each other; our own files have fewer than ten

@@ -10,8 +10,6 @@ from pathlib import Path
 
 from bayesdist.errors import BayesdistError, FormatError, InputError
 
-__all__ = ["naming_faults", "reason_of", "restoring"]
-
 
 @contextmanager
 def naming_faults(path: Path, where: str = "") -> Iterator[None]:

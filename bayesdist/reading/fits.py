@@ -9,8 +9,6 @@ from astropy.io import fits
 
 from bayesdist.errors import FormatError
 
-__all__ = ["FITS_START", "HDU_STARTS", "RECORD", "data_size", "open_fits", "padded"]
-
 FITS_START = b"SIMPLE  ="
 HDU_STARTS = (FITS_START, b"XTENSION=")
 RECORD = 2880  # bytes

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     import h5py
     import xarray as xr
 
-__all__ = ["NETCDF_ENGINE", "hdf5_arrays", "netcdf_dataset", "netcdf_tree"]
-
 NETCDF_ENGINE: Final = "h5netcdf"
 
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     import pyarrow
     import pyarrow.parquet
 
-__all__ = ["open_parquet", "parquet_column", "parquet_table", "parquet_units"]
-
 _BUFFER = 2**18  # bytes: without a buffer, Arrow loads the columns of a whole row group
 
 

@@ -12,8 +12,6 @@ from typing import BinaryIO
 from bayesdist.errors import FormatError, InputError
 from bayesdist.memory import memory_limit, size_text
 
-__all__ = ["head_of", "opened", "read_bytes", "read_lines", "read_text", "read_up_to"]
-
 PathLike = str | os.PathLike[str]
 
 MOST_HOLLOW = 1000  # times what was written: no file system compresses data as much

@@ -27,8 +27,6 @@ from bayesdist.reading.unpacked import unpacked
 
 _COMMAS = re.compile(r"# delimiter: ['\"]?,")
 
-__all__ = ["TABLE_SUFFIXES", "is_binary", "is_fits", "read_ecsv", "read_table"]
-
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:

@@ -10,8 +10,6 @@ from astropy.table import Table
 
 from bayesdist.errors import FormatError
 
-__all__ = ["is_text_table", "parse_text_table", "refuse_cut_end"]
-
 log = logging.getLogger("bayesdist")
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?|nan|inf", re.IGNORECASE)

@@ -10,8 +10,6 @@ from bayesdist.errors import FormatError
 from bayesdist.memory import memory_limit, size_text
 from bayesdist.reading.regular import read_up_to
 
-__all__ = ["most_unpacked", "refuse_inflated", "unpacked"]
-
 GZIP = b"\x1f\x8b"
 PLAUSIBLE = 2**28  # bytes that any file may hold, however well they are compressed
 RATIO = 100  # of larger content to the file: tables of stars are compressed by less than ten

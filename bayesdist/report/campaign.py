@@ -18,15 +18,6 @@ if TYPE_CHECKING:
     from bayesdist.diagnose.overlap import OverlapTest
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
-__all__ = [
-    "CampaignResults",
-    "CatalogStars",
-    "ChipResiduals",
-    "Detections",
-    "Footprints",
-    "LinearSeries",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class CatalogStars:

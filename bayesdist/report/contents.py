@@ -5,13 +5,6 @@ from __future__ import annotations
 from bayesdist.report.context import ReportInput
 from bayesdist.report.registry import Registry, Section
 
-__all__ = [
-    "EXPLAINED",
-    "REPORT",
-    "explanation_of",
-    "section_of",
-]
-
 
 def _fit_title(r: ReportInput) -> str:
     return "Least-squares fit" if r.selfcal is None else r.words.fit.capitalize()

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from bayesdist.model import Chip
     from bayesdist.report.campaign import CampaignResults
 
-__all__ = ["ChipResults", "Product", "ReportInput", "SelfcalResults", "needed"]
-
 T = TypeVar("T")
 
 

@@ -30,17 +30,6 @@ from bayesdist.report.figures.figure_numbers import numbers_of
 from bayesdist.report.figures.style import figure_style, plain_ticks
 from bayesdist.report.registry import Item, Plot, Registry
 
-__all__ = [
-    "DPI",
-    "MARGIN",
-    "Drawing",
-    "draw_all",
-    "png_of",
-    "render",
-    "save_drawings",
-    "save_figures",
-]
-
 log = logging.getLogger("bayesdist")
 
 Kind = Literal["png", "svg"]

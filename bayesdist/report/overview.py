@@ -14,8 +14,6 @@ from bayesdist.numbers import MISSING, count, number
 from bayesdist.report.page import template
 from bayesdist.report.texttable import Level
 
-__all__ = ["OverviewRow", "write_overview"]
-
 
 @dataclass(frozen=True)
 class OverviewRow:

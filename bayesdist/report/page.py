@@ -20,8 +20,6 @@ from bayesdist.report.figures.style import HALF_WIDTH
 from bayesdist.report.registry import Registry
 from bayesdist.report.texttable import Level, TextTable
 
-__all__ = ["Part", "Picture", "parts_of", "picture_of", "template"]
-
 REPORT = "bayesdist.report"  # whose templates all pages share
 _AS_BROWSERS_SAY = {"svg": "svg+xml", "png": "png"}
 HALF, WIDE = HALF_WIDTH + 0.1, 5.3  # inches; margins are cut off, or added

@@ -11,8 +11,6 @@ from matplotlib.figure import Figure
 
 from bayesdist.report.figures.style import figure_style
 
-__all__ = ["Entry", "Item", "Plot", "Registry", "Section"]
-
 Make = TypeVar("Make", bound=Callable[..., Any])
 Kind = Literal["figure", "table", "data"]
 When = Callable[[Any], bool]

@@ -18,8 +18,6 @@ from bayesdist.report.sections import REPORT
 from bayesdist.report.sections.run.status import verdict
 from bayesdist.report.texttable import moment
 
-__all__ = ["draw_report", "render_markdown", "render_report", "write_report"]
-
 _PROVISIONAL = (
     "The sampler did not reach its targets. Every number below is provisional; those marked † rest"
     " on its draws and may be wrong by more than their stated errors. Sample longer, or look at the"

@@ -10,17 +10,6 @@ from pathlib import PurePath
 from bayesdist.checks import Check
 from bayesdist.numbers import MISSING, number
 
-__all__ = [
-    "MAX_ROWS",
-    "Level",
-    "TextTable",
-    "check_cells",
-    "further",
-    "listing",
-    "moment",
-    "short_paths",
-]
-
 _FEW_ROWS, _FEW_LETTERS = 16, 100  # of a table that leaves room next to it
 MAX_ROWS = 60  # of frames and exposures; hundreds of them belong in the files
 

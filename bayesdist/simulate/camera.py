@@ -10,8 +10,6 @@ if TYPE_CHECKING:
     from astropy.table import Table
     from astropy.wcs import WCS
 
-__all__ = ["camera", "matched_to_gaia"]
-
 SIZE = 2048  # pixels on each axis
 SCALE = 0.2 / 3600  # degrees
 EPOCH = 2024.3  # of the exposure

@@ -9,14 +9,6 @@ import numpy as np
 from bayesdist.arrays import Bool, Float, Int
 from bayesdist.model import Chip, DistortionModel
 
-__all__ = [
-    "dither_pattern",
-    "dithered_model",
-    "pixels_of",
-    "sky_seen",
-    "stars_on_detector",
-]
-
 MOST_STEPS = 30
 CLOSE = 1e-9  # pixels
 EDGE = 9  # points along each side of a chip that its outline on the sky is found from

@@ -16,8 +16,6 @@ from bayesdist.data.storage.write import write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 
-__all__ = ["Truth", "simulate_matches", "simulate_partitioned"]
-
 _AT_ONCE, _STEP = 65_536, 8192
 CHUNK = 1_000_000  # matches in memory at a time
 

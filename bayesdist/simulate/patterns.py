@@ -13,8 +13,6 @@ from scipy.spatial.distance import pdist
 from bayesdist.arrays import Float
 from bayesdist.model import Chip, DistortionModel
 
-__all__ = ["DitherPattern", "flat_coefficients", "grid_offsets", "rolls_in_turn"]
-
 GAP = 50.0  # pixels between chips without a given position
 ONE_LINE = 0.02  # of the spread along the offsets, below which that across them counts as none
 

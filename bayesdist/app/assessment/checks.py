@@ -18,8 +18,6 @@ from bayesdist.infer import Posterior
 from bayesdist.infer.checks import fit_checks, sampling_checks
 from bayesdist.limits import CHI2_TOO_LARGE
 
-__all__ = ["frames_doubt", "in_circle", "run_checks"]
-
 
 def run_checks(
     data: FitData,

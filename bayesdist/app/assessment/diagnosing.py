@@ -16,8 +16,6 @@ from bayesdist.app.kinds.kind import kind_of
 from bayesdist.diagnose.diagnostics import Diagnostics, diagnose, diagnose_fit, hold_out
 from bayesdist.infer import Posterior
 
-__all__ = ["diagnose_fit_of_run", "diagnose_run"]
-
 
 def diagnose_run(posterior: Posterior, data: FitData, config: Config, base: Path) -> Diagnostics:
     """Diagnostics of a posterior, and of the stars that were held out."""

@@ -22,8 +22,6 @@ from bayesdist.infer import Posterior
 from bayesdist.infer.solution import Solution
 from bayesdist.model import LookupTable
 
-__all__ = ["errors_of_fit", "errors_of_run", "published_tables"]
-
 
 def errors_of_fit(solution: Solution, data: FitData, config: Config) -> ErrorModel:
     """The error model of a solution alone, without terms that rest on residuals."""

@@ -18,8 +18,6 @@ from bayesdist.diagnose.holdout.validation import HoldoutValidation
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_errors import StarInfluence, star_influence
 
-__all__ = ["holdout_summary", "holdout_table", "predictive_of_run"]
-
 TOGETHER = 1.5  # steps between nodes over which tables err as one: what their covariance comes to
 
 

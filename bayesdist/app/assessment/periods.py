@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from bayesdist.diagnose.residuals import PatternChange, StatisticsTable
     from bayesdist.infer.compare.positions import PositionChange
 
-__all__ = ["check_pairs", "period_settings", "periods_summary", "periods_table"]
-
 
 def check_pairs(raw: Matches, config: Config) -> dict[str, int]:
     """About how many pairs each period has, from the epochs of some; empty without periods.

@@ -12,14 +12,6 @@ from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.assess import Requirement
 from bayesdist.assess.evaluation import EvaluationSettings
 
-__all__ = [
-    "assessment_epoch",
-    "assessment_rng",
-    "evaluation_settings",
-    "idle_dates",
-    "rehearsal_settings",
-]
-
 ASSESSMENT = 2  # of the random streams that follow from the one seed; the sampler has the first
 
 

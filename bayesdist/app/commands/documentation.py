@@ -12,8 +12,6 @@ from bayesdist.app.commands.options import command
 from bayesdist.errors import InputError
 from bayesdist.reading.regular import read_text
 
-__all__ = ["docs"]
-
 _PACKAGE = Path(bayesdist.version.__file__).parent
 _FOLDERS = (_PACKAGE / "docs", _PACKAGE.parent / "docs")  # as installed, and in the source
 

@@ -11,8 +11,6 @@ from pathlib import Path
 
 from bayesdist.version import __version__
 
-__all__ = ["DEFECT", "NO_MEMORY", "NO_SYSTEM", "TOO_DEEP", "failure"]
-
 # as sysexits.h has them: EX_SOFTWARE, EX_OSERR, EX_IOERR, EX_DATAERR
 DEFECT, NO_MEMORY, NO_SYSTEM, TOO_DEEP = 70, 71, 74, 65
 

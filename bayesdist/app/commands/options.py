@@ -11,21 +11,6 @@ from bayesdist.app.screen import start_logging
 from bayesdist.errors import InputError
 from bayesdist.mission import load_object
 
-__all__ = [
-    "CommaList",
-    "LazyGroup",
-    "chip_of",
-    "column_names",
-    "command",
-    "epoch",
-    "filter_name",
-    "force",
-    "image_size",
-    "new_folder",
-    "pixel_scale",
-    "seed",
-]
-
 
 class LazyGroup(click.Group):
     """A group whose commands are named as "module:object"."""

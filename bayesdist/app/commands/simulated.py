@@ -11,8 +11,6 @@ from bayesdist.app.commands.options import command, force, seed
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 
-__all__ = ["camera"]
-
 
 @command()
 @click.option(

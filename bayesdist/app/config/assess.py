@@ -15,14 +15,6 @@ from bayesdist.assess.terms.given import TERM_KINDS
 from bayesdist.assess.terms.parameters import one_size_kinds
 from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
 
-__all__ = [
-    "MEASURED_TERMS",
-    "Assess",
-    "BudgetBlock",
-    "RequirementBlock",
-    "require_own_names",
-]
-
 Probability = Annotated[float, Field(gt=0, lt=1)]
 GridPoints = Annotated[int, Field(ge=2, le=10_000)]  # more than a detector has pixels says nothing
 

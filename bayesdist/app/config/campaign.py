@@ -20,8 +20,6 @@ from bayesdist.app.config.products import CampaignProducts
 from bayesdist.app.config.run import RunConfig
 from bayesdist.app.config.section import Epoch, Section, Unit
 
-__all__ = ["CampaignBlock", "CampaignConfig", "StarListsBlock"]
-
 
 class StarListsBlock(Section):
     """Star lists, and which of their detections are used."""

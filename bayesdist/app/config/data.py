@@ -38,8 +38,6 @@ from bayesdist.errors import InputError
 from bayesdist.infer.compare.period_dates import check_periods, mjd_periods
 from bayesdist.mission import load_object, missions
 
-__all__ = ["Data", "MatchesConfig", "data_sections", "names_nominal"]
-
 
 class Data(Section):
     """Matched stars, and how their files are read."""

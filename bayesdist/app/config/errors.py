@@ -11,8 +11,6 @@ from pydantic.fields import FieldInfo
 
 from bayesdist.errors import ConfigError
 
-__all__ = ["as_config_error"]
-
 Location = tuple[str | int, ...]
 
 # what pydantic asks for, in the words of TOML

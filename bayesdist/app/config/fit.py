@@ -13,19 +13,6 @@ from bayesdist.app.config.section import Pair, Section
 from bayesdist.diagnose.correlated import DiscrepancyPriors
 from bayesdist.infer import Compute, OutlierMixture
 
-__all__ = [
-    "CampaignFit",
-    "CampaignOutliers",
-    "ComputeBlock",
-    "DiscrepancyBlock",
-    "Fit",
-    "HoldoutBlock",
-    "Outliers",
-    "Sampler",
-    "SelfcalOutliers",
-    "SelfcalSampler",
-]
-
 
 class HoldoutBlock(Section):
     """Stars and exposures that are set aside before anything is fitted."""

@@ -10,17 +10,6 @@ from bayesdist.app.config.section import Epoch, Pair, Section
 from bayesdist.model import TimeDependence
 from bayesdist.model.basis import MAX_ORDER
 
-__all__ = [
-    "CampaignModel",
-    "MatchedModel",
-    "Polynomials",
-    "PriorBlock",
-    "PriorCalibrationBlock",
-    "SelfcalModel",
-    "TablesBlock",
-]
-
-
 FrameKind = Literal["none", "shift", "shift_rotation", "shift_rotation_scale", "affine"]
 
 

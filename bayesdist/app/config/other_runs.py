@@ -6,8 +6,6 @@ from pathlib import Path
 
 from bayesdist.errors import InputError
 
-__all__ = ["FREE", "POSTERIOR", "TABLES", "calibration_file", "rates_file", "tables_file"]
-
 FREE = "free"  # rates that no other run says anything of
 TABLES, POSTERIOR = "tables.h5", "posterior.nc"
 

@@ -13,8 +13,6 @@ from bayesdist.errors import InputError
 from bayesdist.products.formats.common.document import FormatSettings
 from bayesdist.products.registry import product_settings
 
-__all__ = ["CampaignProducts", "MatchedProducts", "Products", "ReleaseBlock", "SelfcalProducts"]
-
 _USEAFTER = ("%b %d %Y %H:%M:%S", "%b %d %Y")  # as reference files of HST have it
 
 

@@ -22,18 +22,6 @@ from bayesdist.errors import ConfigError, InputError
 from bayesdist.reading.documents import toml_of
 from bayesdist.reading.regular import MOST_TEXT, read_text
 
-__all__ = [
-    "KINDS",
-    "Config",
-    "config_of_record",
-    "load_config",
-    "load_requirements",
-    "load_text",
-    "parse_config",
-    "validated",
-]
-
-
 # by the section that says of which kind a configuration is
 KINDS: dict[str, type[RunConfig]] = {
     "data": MatchesConfig,

@@ -35,8 +35,6 @@ from bayesdist.infer import Compute, OutlierMixture
 from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, TimeDependence
 
-__all__ = ["RunConfig"]
-
 
 class RunConfig(Section):
     """Sections of every configuration of a run; each kind adds those that are of its own type."""

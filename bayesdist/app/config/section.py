@@ -9,21 +9,6 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
 
 from bayesdist.model import Chip
 
-__all__ = [
-    "ChipBlock",
-    "Detector",
-    "Epoch",
-    "Pair",
-    "RightAscensionDeclination",
-    "Section",
-    "Unit",
-    "chips_of",
-    "one_chip",
-    "reference_first",
-    "require_detector",
-]
-
-
 Unit = Literal["pix", "arcsec", "mas", "deg"]
 Epoch = Annotated[float, Field(ge=1800, le=2200)]  # decimal years; others are days, or slips
 RightAscensionDeclination = tuple[  # degrees

@@ -17,8 +17,6 @@ from bayesdist.app.config.run import RunConfig
 from bayesdist.app.config.section import Epoch, Section, Unit
 from bayesdist.infer import OutlierMixture
 
-__all__ = ["Frames", "MinDetections", "SelfcalConfig", "require_scales"]
-
 Frames = Literal["shift", "shift_rotation", "shift_rotation_scale"]
 MinDetections = Annotated[int, Field(ge=2)]
 

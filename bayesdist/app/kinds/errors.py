@@ -12,8 +12,6 @@ from bayesdist.data.matches import Matches
 from bayesdist.infer import Posterior
 from bayesdist.infer.exposures.chip_offsets import Settling
 
-__all__ = ["QUOTED", "ErrorLaw", "ExposureScatter"]
-
 
 @dataclass(frozen=True, eq=False)
 class ErrorLaw:

@@ -19,8 +19,6 @@ from bayesdist.infer.exposures.frame_choice import FrameChoice, frames_that_help
 from bayesdist.infer.stars.shards import Compute
 from bayesdist.model import DistortionModel
 
-__all__ = ["FitData", "StarReader"]
-
 
 class StarReader:
     """Reads stars, and remembers those that it was asked for last.

@@ -28,18 +28,6 @@ from bayesdist.model import LookupTable
 from bayesdist.reading.faults import restoring
 from bayesdist.records import record_from_arrays, record_to_arrays
 
-__all__ = [
-    "SOLUTION",
-    "Fitted",
-    "SelfCalibrated",
-    "StoredLookupTables",
-    "load_errors",
-    "load_fitted",
-    "read_tables",
-    "required",
-    "write_tables",
-]
-
 SOLUTION, GAUGE = "solution.h5", "gauge.ecsv"
 
 

@@ -29,8 +29,6 @@ from bayesdist.app.kinds.selfcal.matched import load_matched_selfcal
 from bayesdist.app.kinds.selfcal.matching import match_dithers, selfcal_lines
 from bayesdist.infer import Posterior
 
-__all__ = ["Kind", "kind_of"]
-
 
 class Sampler(Protocol):
     """The posterior of a fit; checkpoints are in the folder."""
@@ -42,7 +40,8 @@ class Sampler(Protocol):
         *,
         folder: Path | None = None,
         progress: Callable[[int, int], None] | None = None,
-    ) -> Posterior: ...
+    ) -> Posterior:
+        """Posterior of the stars of a fit."""
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,6 @@ from bayesdist.infer.solution import Solution
 from bayesdist.limits import HELD_OUT
 from bayesdist.model import LookupTable
 
-__all__ = ["Matched", "columns_by_code", "set_aside"]
-
 MATCHING = "matching.ecsv"
 
 

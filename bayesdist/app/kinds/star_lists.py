@@ -19,15 +19,6 @@ from bayesdist.model import Chip
 from bayesdist.products import IdcTab, read_idctab
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
 
-__all__ = [
-    "StarLists",
-    "known_calibration",
-    "lists_of",
-    "positions_by_chip",
-    "refuse_other_chips",
-    "start_of",
-]
-
 OFF_CHIP = 0.02  # of a list's detections beyond the edge of a chip: more are no stray ones
 EDGE = 1.0  # pixels: half of one to the edge, and half of one for lists that count from 0
 

@@ -20,8 +20,6 @@ from bayesdist.files import atomic_path, path_within
 from bayesdist.limits import FILE_ERROR
 from bayesdist.products.registry import format_of, lint
 
-__all__ = ["export_files"]
-
 log = logging.getLogger("bayesdist")
 
 

@@ -32,18 +32,6 @@ from bayesdist.products import Period, read_calibration, write_release
 from bayesdist.products.formats.common.document import BuildOptions, Built
 from bayesdist.products.registry import build, lint
 
-__all__ = [
-    "ProductInput",
-    "further_errors",
-    "ingredients",
-    "made_files",
-    "product_input",
-    "product_of",
-    "solution_of",
-    "write_files",
-]
-
-
 # rows of a budget that the covariance of the exported solution holds, or another row
 IN_COVARIANCE = (
     *(COEFFICIENTS, TIME_DEPENDENCE, EXPOSURE_FRAME, STRUCTURE_IN_FIT, DEVIATIONS),

@@ -32,8 +32,6 @@ from bayesdist.products import read_d2im, read_lookup_file
 from bayesdist.products.formats.common.read_back import Positions, ReadBack, by_calibrations
 from bayesdist.products.registry import read_back, read_calibration
 
-__all__ = ["file_errors", "product_terms"]
-
 log = logging.getLogger("bayesdist")
 
 

@@ -16,8 +16,6 @@ from bayesdist.diagnose.residuals.sample import StarSample
 from bayesdist.limits import SKY_CLOSURE
 from bayesdist.products.formats.sip.positions import sky_of_header
 
-__all__ = ["sky_closure"]
-
 FALSE = 0.5  # probability above which a match is taken for a false one
 
 

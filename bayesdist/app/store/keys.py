@@ -12,8 +12,6 @@ import numpy as np
 from pydantic import BaseModel
 from pydantic_core import to_jsonable_python
 
-__all__ = ["Adjustable", "as_json", "difference", "differences", "digest_of", "shown"]
-
 
 @dataclass(frozen=True)
 class Adjustable:

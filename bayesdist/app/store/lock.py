@@ -16,8 +16,6 @@ from typing import Any
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
 
-__all__ = ["LOCK", "locked"]
-
 # some systems know no such locks
 fcntl: Any = import_module("fcntl") if find_spec("fcntl") else None
 

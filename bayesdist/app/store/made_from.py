@@ -14,22 +14,6 @@ from bayesdist.data import input_files
 from bayesdist.files import sha256_of
 from bayesdist.version import __version__
 
-__all__ = [
-    "LATER",
-    "LIMITS",
-    "NEEDS",
-    "STAGES",
-    "base_of",
-    "changes",
-    "hashes_of",
-    "input_name",
-    "is_adjustable",
-    "made_from_of",
-    "places_of",
-    "settings_of",
-    "with_seed",
-]
-
 
 def input_name(path: Path, *bases: Path) -> str:
     """Name of an input: relative to the first of some folders that it is below, else its path.

@@ -17,8 +17,6 @@ from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 from bayesdist.infer import Posterior
 
-__all__ = ["provenance_notes", "record_folder", "refuse_existing", "write_table"]
-
 
 def refuse_existing(path: Path, force: bool) -> None:
     """Refuse a file that is there already, unless it may be replaced."""

@@ -20,8 +20,6 @@ from bayesdist.files import atomic_path, sha256_of
 from bayesdist.reading.documents import model_of, read_json
 from bayesdist.version import __version__
 
-__all__ = ["SCHEMA", "Artefact", "FileMark", "Record", "versions", "write_json"]
-
 SCHEMA = 2
 PACKAGES = ("arviz-stats", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
 

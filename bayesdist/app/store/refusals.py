@@ -13,14 +13,6 @@ from bayesdist.app.store.made_from import changes, input_name, is_adjustable, wi
 from bayesdist.errors import InputError
 from bayesdist.files import is_leftover
 
-__all__ = [
-    "refuse_another_solution",
-    "refuse_edited",
-    "refuse_foreign_files",
-    "refuse_inside_input",
-    "refuse_other_inputs",
-]
-
 
 def refuse_inside_input(folder: Path, config: Config, base: Path) -> None:
     """Refuse a run whose own Parquet files would become part of its input."""

@@ -35,8 +35,6 @@ from bayesdist.assess import Requirement
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.files import atomic_path, made_folder, remove_leftovers
 
-__all__ = ["PAIRS", "RunDirectory", "part_files"]
-
 T = TypeVar("T")
 
 PAIRS = "pairs"  # folder of matches, of a campaign and of formats that are selected from

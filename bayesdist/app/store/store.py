@@ -25,8 +25,6 @@ from bayesdist.app.store.record import (
 from bayesdist.files import is_leftover, path_within, remove_leftovers, watched_writes
 from bayesdist.reading.regular import read_bytes
 
-__all__ = ["ArtefactStore", "Made", "Stage"]
-
 T = TypeVar("T")
 
 RECORD, SUMMARY = "run.json", "summary.json"

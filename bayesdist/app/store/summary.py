@@ -8,9 +8,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-__all__ = ["Sections", "Summary", "head_of", "schema_text"]
-
-
 Number = float | None  # null where it is not finite, or not known
 
 

@@ -20,8 +20,6 @@ from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.reading.faults import restoring
 from bayesdist.records import record_from_arrays, record_to_arrays
 
-__all__ = ["fingerprint_of", "load_diagnostics", "write_diagnostics"]
-
 CORRELATED = "discrepancy.h5"
 OTHERS = "diagnostics.h5"
 

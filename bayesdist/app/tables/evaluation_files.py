@@ -27,8 +27,6 @@ from bayesdist.products.maps_file import write_maps
 from bayesdist.reading.faults import restoring
 from bayesdist.records import record_from_arrays, record_to_arrays
 
-__all__ = ["load_evaluation", "save_margins", "write_evaluation"]
-
 FILE = "evaluation.h5"
 COLUMNS = ("epoch", "probability", "low", "high", "value")
 

@@ -15,8 +15,6 @@ from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.maps import per_axis
 from bayesdist.numbers import rounded
 
-__all__ = ["judged_requirements", "margin_rows", "margin_table", "margins_text", "results_text"]
-
 # of what a requirement is, beside chip and epoch
 SCOPE = ("region", "epochs", "relative", "separation", "magnitude")
 

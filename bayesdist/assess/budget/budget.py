@@ -14,8 +14,6 @@ from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.terms.forms import PRODUCT
 
-__all__ = ["TOTAL", "BudgetTerm", "ErrorBudget", "budget_of", "place_budget", "with_product"]
-
 TOTAL = "total"
 TOGETHER = "all terms but products, combined by draws"
 

@@ -31,8 +31,6 @@ from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 
-__all__ = ["JOINT", "BudgetSpan", "BudgetSurface", "GridRow", "budget_surface"]
-
 JOINT = "model"  # all errors of parameters together
 CONSTANT = 1e-9  # moments that change less, relative to the largest, do not depend on time
 

@@ -16,8 +16,6 @@ from bayesdist.limits import DIFFERENCE
 from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.numbers import p_words
 
-__all__ = ["Monitored", "change_maps", "is_late"]
-
 
 @dataclass(frozen=True, eq=False)
 class Monitored:

@@ -24,17 +24,6 @@ from bayesdist.errors import InputError
 from bayesdist.infer.compare.frame_fields import term_squares
 from bayesdist.model import PolynomialBasis
 
-__all__ = [
-    "CommonFrame",
-    "Similarity",
-    "common_frame",
-    "draws_of_sum",
-    "least_squares",
-    "linear_part",
-    "turn_matrix",
-    "with_errors",
-]
-
 NEAR = 0.1  # radians, or of the scale: axes that lie alike
 
 

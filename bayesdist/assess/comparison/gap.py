@@ -30,8 +30,6 @@ from bayesdist.calibration.similarity import as_real, similarity_fields, turn_be
 from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.model import PolynomialBasis
 
-__all__ = ["ChipPair", "GapDifference", "gap_difference", "pair_of_chips"]
-
 
 @dataclass(frozen=True, eq=False)
 class ChipPair:

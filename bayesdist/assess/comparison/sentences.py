@@ -10,8 +10,6 @@ from bayesdist.distributions import norm_sf
 from bayesdist.limits import DIFFERENCE
 from bayesdist.numbers import p_words
 
-__all__ = ["comparison_lines", "gap_lines", "gap_verdict", "verdict"]
-
 IDENTICAL = 1e-9  # pixels
 
 

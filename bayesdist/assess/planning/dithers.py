@@ -31,17 +31,6 @@ from bayesdist.model.grid import outline_pixels
 from bayesdist.simulate.dithers import dithered_model, sky_seen, stars_on_detector
 from bayesdist.simulate.patterns import DitherPattern
 
-__all__ = [
-    "KINDS",
-    "Camera",
-    "PlannedPattern",
-    "PlannedStars",
-    "PriorInformation",
-    "compare_patterns",
-    "lacking",
-    "nearly_free",
-]
-
 KINDS = ("gauge-free", "shape", "absolute")
 LEAST_SHARED = 3  # stars that two exposures share at least, if they overlap at all
 MOST_STARS = 2_000_000  # of the sky that all patterns see together

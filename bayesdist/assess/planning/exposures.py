@@ -9,8 +9,6 @@ from bayesdist.arrays import Float
 from bayesdist.infer.compare.planning import with_information
 from bayesdist.infer.solution import Solution
 
-__all__ = ["Need", "Schedule", "exposures_needed"]
-
 MOST = 4096  # exposures beyond which more are no plan
 
 

@@ -24,8 +24,6 @@ from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import DEFAULT_GRID
 
-__all__ = ["Margin", "Requirement", "check_requirements", "domains_of", "judge"]
-
 EPOCHS = 9  # of a range that are judged, its ends and what lies evenly between
 
 

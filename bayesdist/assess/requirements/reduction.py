@@ -10,8 +10,6 @@ from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.requirements.requirement import Requirement
 
-__all__ = ["RequiredReduction", "required_reduction"]
-
 DRAWS = 1000  # a factor is wanted to a percent or two
 STEPS = 9  # halvings of the interval in which the factor lies
 

@@ -19,8 +19,6 @@ from bayesdist.errors import InputError, require_known
 from bayesdist.limits import BEYOND_STARS
 from bayesdist.model.grid import grid_pixels, mesh
 
-__all__ = ["Requirement"]
-
 
 @dataclass(frozen=True)
 class Requirement:

@@ -15,8 +15,6 @@ from bayesdist.assess.units import convert
 from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.model.grid import DEFAULT_GRID
 
-__all__ = ["ValidityPeriod", "validity_period"]
-
 BAND = 0.95
 
 

@@ -17,8 +17,6 @@ from bayesdist.limits import CONFIDENCE
 from bayesdist.model import DistortionModel
 from bayesdist.numbers import count
 
-__all__ = ["counting_error", "rests_on", "verdict_of"]
-
 
 def counting_error(fraction: float, n: float) -> float:
     """Standard deviation of a probability counted in n draws, under Jeffreys' prior: never zero."""

@@ -15,8 +15,6 @@ from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError
 
-__all__ = ["centroid_errors", "centroids_of"]
-
 
 def centroid_errors(
     scatter: MagnitudeErrors, contained: Sequence[tuple[str, float, float]] = ()

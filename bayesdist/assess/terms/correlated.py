@@ -24,8 +24,6 @@ from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.correlated.deviations import LinearDeviations
 from bayesdist.errors import required
 
-__all__ = ["DEVIATIONS", "STRUCTURE", "STRUCTURE_IN_FIT", "Deviations", "StructureErrors"]
-
 STRUCTURE = "unmodelled structure"
 STRUCTURE_IN_FIT = "unmodelled structure in coefficients"
 DEVIATIONS = "unmodelled exposure-to-exposure variation"

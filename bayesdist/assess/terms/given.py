@@ -25,8 +25,6 @@ from bayesdist.errors import InputError, require_known
 from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 
-__all__ = ["CENTROID", "TERM_KINDS", "Centroids", "SmoothTerm", "UserTerm", "said_by_user"]
-
 TERM_KINDS = ("random", "systematic")
 CENTROID = "centroid"
 

@@ -17,8 +17,6 @@ from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel, LookupTable
 from bayesdist.model.grid import grid_pixels, mesh
 
-__all__ = ["INTERPOLATION", "LocalErrors", "interpolation_term", "table_of"]
-
 INTERPOLATION = "look-up tables, between nodes"
 SOURCE = f"{MEASURED}: neighbours in different exposures"
 

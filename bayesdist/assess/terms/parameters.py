@@ -25,18 +25,6 @@ from bayesdist.infer.solution import Solution
 from bayesdist.mission import load_object, missions
 from bayesdist.model import DistortionModel
 
-__all__ = [
-    "CATALOGUE",
-    "EXPOSURE_SCATTER",
-    "MOTIONS",
-    "CatalogueErrors",
-    "ExposureVariation",
-    "ScaleError",
-    "catalogue_terms",
-    "one_size_kinds",
-    "one_size_term",
-]
-
 CATALOGUE = "reference catalogue (shared stars)"
 MOTIONS = "proper motions (shared stars)"
 EXPOSURE_SCATTER = "exposure-to-exposure variation"

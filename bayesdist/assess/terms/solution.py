@@ -23,8 +23,6 @@ from bayesdist.assess.terms.parameters import CatalogueErrors
 from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
 
-__all__ = ["COEFFICIENTS", "EXPOSURE_FRAME", "TIME_DEPENDENCE", "SolutionErrors"]
-
 COEFFICIENTS = "coefficients"
 TIME_DEPENDENCE = "time dependence"
 EXPOSURE_FRAME = "exposure frame"

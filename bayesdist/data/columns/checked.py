@@ -24,8 +24,6 @@ from bayesdist.data.tables.repeated import first_duplicate
 from bayesdist.data.tables.units import check_unit, conversion, unit_of, without_unit
 from bayesdist.errors import InputError
 
-__all__ = ["COLUMNS", "OPTIONAL", "POSITIONS", "SIGMAS", "MatchColumns", "refuse_repeated"]
-
 POSITIONS = ("x", "y", "u", "v")
 SIGMAS = ("sigma_u", "sigma_v")
 _NOMINAL = ("u_nominal", "v_nominal")

@@ -13,8 +13,6 @@ from bayesdist.data.columns.checked import OPTIONAL, POSITIONS, SIGMAS, MatchCol
 from bayesdist.data.columns.labels import LABELS_OF_CODES, merged_counts
 from bayesdist.errors import InputError
 
-__all__ = ["joined_arguments", "joined_columns", "merged_codes"]
-
 
 def joined_arguments(tables: Sequence[MatchColumns]) -> dict[str, Any]:
     """Arguments of `Matches` for the rows of several tables, in their order.

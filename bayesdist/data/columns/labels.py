@@ -12,8 +12,6 @@ import numpy as np
 from bayesdist.arrays import Int
 from bayesdist.errors import InputError
 
-__all__ = ["DEFAULT_LABELS", "LABELS_OF_CODES", "Labels", "merged_counts", "recoded"]
-
 LABELS_OF_CODES = {
     "exposure": "exposure_names",
     "chip": "chip_numbers",

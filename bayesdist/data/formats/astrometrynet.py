@@ -12,8 +12,6 @@ from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.reading.table import matches_from_table
 from bayesdist.data.tables.names import ALIASES
 
-__all__ = ["COLUMNS", "is_astrometrynet", "matches_from_corr"]
-
 # the other quantities are left out: 'mag', if there is one, is the index star's
 COLUMNS = dict.fromkeys(ALIASES, "") | {
     "x": "field_x",

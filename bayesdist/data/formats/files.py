@@ -18,15 +18,6 @@ from bayesdist.reading.regular import read_lines
 from bayesdist.reading.tables import TABLE_SUFFIXES, is_binary, is_fits, read_table
 from bayesdist.reading.text_tables import is_text_table
 
-__all__ = [
-    "FORMATS",
-    "MatchFormat",
-    "exposure_names",
-    "input_files",
-    "kind_of",
-    "mission_formats",
-]
-
 PathLike = str | os.PathLike[str]
 
 FORMATS = ("auto", "table", "hst1pass", "matchup", "astrometry.net")

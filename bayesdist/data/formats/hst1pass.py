@@ -21,8 +21,6 @@ from bayesdist.data.matches import Matches
 from bayesdist.errors import FormatError
 from bayesdist.reading.regular import read_lines
 
-__all__ = ["Hst1passList", "is_hst1pass", "is_matchup", "read_hst1pass", "read_matchup"]
-
 _COLUMN = re.compile(r"#\s*\((\d+)\)\s+(\S+)\s+--\s")
 _KEYWORD = re.compile(r"#\s*(\w+)\s*:\s*(.*?)\s*$")
 _SUFFIX = re.compile(r"\w*(xym|XYM|XYm)\w*")

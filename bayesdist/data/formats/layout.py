@@ -18,8 +18,6 @@ from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import InputError
 from bayesdist.reading.tables import read_table
 
-__all__ = ["TableLayout", "table_layout"]
-
 PathLike = str | os.PathLike[str]
 
 MAX_ROWS_READ = 200_000  # rows of a large table that are read to interpret its columns

@@ -19,21 +19,6 @@ from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
 from bayesdist.data.tables.units import check_unit
 from bayesdist.errors import InputError
 
-__all__ = [
-    "columns_read",
-    "is_on_sky",
-    "lacking_columns",
-    "match_columns",
-    "needed_columns",
-    "nominal_columns",
-    "numbered",
-    "numbered_chips",
-    "plane_unit",
-    "position_unit",
-    "present_columns",
-    "text_labels",
-]
-
 
 def position_unit(pair: tuple[SourceColumn, SourceColumn], unit: str | None) -> str:
     """Unit ('pix', 'arcsec', 'mas', 'deg') of a pair of columns, from the file or else the option.

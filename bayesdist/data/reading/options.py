@@ -11,8 +11,6 @@ from bayesdist.data.magnitude_errors import no_magnitudes
 from bayesdist.data.tables.checks import check_not_finite
 from bayesdist.errors import InputError
 
-__all__ = ["ReadOptions", "check_sigma", "refuse_missing_errors"]
-
 
 @dataclass(frozen=True)
 class ReadOptions:

@@ -20,8 +20,6 @@ from bayesdist.data.tables.column import Quantities, row_number
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns
 from bayesdist.errors import InputError
 
-__all__ = ["matches_from_table", "own_epoch", "sky_positions", "with_sky_columns"]
-
 _MOTION = "mas / yr"
 _SPARED = frozenset((*SPARED, "colour", "flux"))  # optional: a star may lack them
 

@@ -20,8 +20,6 @@ from bayesdist.errors import InputError
 if TYPE_CHECKING:
     from astropy.time import Time
 
-__all__ = ["parallax_factors", "velocity_aberration"]
-
 _LIGHT = 299_792.458  # km/s
 
 

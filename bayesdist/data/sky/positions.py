@@ -17,8 +17,6 @@ from bayesdist.data.sky.tangent import mean_direction
 from bayesdist.data.tables.column import Quantities, SourceColumn
 from bayesdist.errors import InputError
 
-__all__ = ["MOTIONS", "SKY_QUANTITIES", "SPARED", "ReferenceSky", "reference_sky", "sky_columns"]
-
 MOTIONS = ("pm_ra", "pm_dec", "sigma_pm_ra", "sigma_pm_dec")
 # that a star may lack: it then has none that counts
 SPARED = ("parallax", "sigma_parallax", "corr_ra", "corr_dec")

@@ -18,18 +18,6 @@ from bayesdist.arrays import Float
 from bayesdist.data.tables.column import Place, row_number
 from bayesdist.errors import InputError
 
-__all__ = [
-    "ARCSEC",
-    "direction_of",
-    "direction_sum",
-    "mean_direction",
-    "onto_plane",
-    "plane_axes",
-    "sky_of_plane",
-    "tangent_jacobian",
-    "tangent_plane",
-]
-
 ARCSEC = np.degrees(1.0) * 3600.0  # seconds of arc in a radian
 
 

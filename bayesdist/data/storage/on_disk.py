@@ -27,8 +27,6 @@ from bayesdist.data.storage.stored import StoredFile, scan, stored_file, tangent
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import FormatError, InputError
 
-__all__ = ["StoredRows", "open_matches"]
-
 PathLike = str | os.PathLike[str]
 Segment = tuple[int, int, int]  # file, first row, row after the last
 

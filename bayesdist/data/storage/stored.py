@@ -27,8 +27,6 @@ from bayesdist.data.tables.parquet import ParquetPart, RowBlock
 from bayesdist.data.tables.repeated import buckets_for, first_repetition
 from bayesdist.errors import InputError
 
-__all__ = ["StoredFile", "scan", "stored_file", "tangent_point_of"]
-
 _BLOCK = 2**18  # rows scanned together
 
 

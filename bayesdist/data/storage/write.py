@@ -20,8 +20,6 @@ from bayesdist.files import atomic_path, made_folder
 if TYPE_CHECKING:
     import pyarrow
 
-__all__ = ["write_columns", "write_partitioned", "write_parts"]
-
 Labelled = tuple[Int, tuple[str, ...]]
 Part = tuple[Mapping[str, NDArray[Any] | Labelled], Mapping[str, str]]
 

@@ -11,20 +11,6 @@ from numpy.typing import NDArray
 from bayesdist.arrays import Bool
 from bayesdist.errors import InputError
 
-__all__ = [
-    "COMPLETED",
-    "NOT_FINITE",
-    "absent",
-    "check_columns",
-    "check_not_finite",
-    "check_values",
-    "columns_of",
-    "counted",
-    "one_length",
-    "refuse_half",
-    "without_missing",
-]
-
 NOT_FINITE = ("refuse", "reject")
 # of a value, and of an error: the square of one over that of the other is still a number
 LARGEST, SMALLEST = 1e30, 1e-100

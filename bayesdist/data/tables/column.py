@@ -19,17 +19,6 @@ from bayesdist.data.tables.names import known_unit
 from bayesdist.data.tables.units import conversion, unit_of
 from bayesdist.errors import InputError
 
-__all__ = [
-    "Columns",
-    "EncodedColumn",
-    "Place",
-    "Quantities",
-    "SourceColumn",
-    "encoded",
-    "row_number",
-    "year_of",
-]
-
 log = logging.getLogger("bayesdist")
 
 Place = Callable[[int], str]  # name of a row in an error, by its index in the arrays

@@ -8,8 +8,6 @@ from typing import Any
 
 from bayesdist.errors import InputError
 
-__all__ = ["ALIASES", "BASIC", "PAIRS", "find_columns", "known_unit", "origin_of"]
-
 # lower case; the first that the file has is taken, and of a pair the first of which it has both
 BASIC: dict[str, tuple[str, ...]] = {
     "x": ("x", "x_pix", "xpix", "x_raw", "xraw", "xwin_image", "xpsf_image", "x_image"),

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     import pyarrow
     import pyarrow.parquet
 
-__all__ = ["ParquetPart", "RowBlock", "describe_part"]
-
 _BATCH = 65_536  # rows decoded at a time
 
 

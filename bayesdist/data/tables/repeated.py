@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from bayesdist.arrays import Int
 from bayesdist.errors import InputError
 
-__all__ = ["HELD", "buckets_for", "first_duplicate", "first_repetition"]
-
 UInt = NDArray[np.uint64]
 Keys = Sequence[NDArray[Any]]
 Batches = Callable[[], Iterable[Keys]]

@@ -9,8 +9,6 @@ import numpy as np
 
 from bayesdist.errors import InputError
 
-__all__ = ["UNITS", "check_unit", "conversion", "length_advice", "unit_of", "without_unit"]
-
 UNITS = ("pix", "arcsec", "mas", "deg")
 
 # names that other programs write where astropy expects 'pix' or 'deg'

@@ -18,8 +18,6 @@ from bayesdist.arrays import Float
 from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions
 from bayesdist.diagnose.correlated.priors import AmplitudeGrid, log_half_cauchy, log_widths
 
-__all__ = ["StructurePosterior", "structure_posterior"]
-
 # of the field, in longer half sides; all equally probable beforehand
 LENGTHS = np.geomspace(0.08, 0.6, 5)
 STEPS = 8  # of the amplitude, before the grid is refined

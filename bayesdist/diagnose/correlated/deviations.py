@@ -22,14 +22,6 @@ from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_cau
 from bayesdist.model import DistortionModel, Groups
 from bayesdist.model.frames import LINEAR_MATRICES
 
-__all__ = [
-    "DeviationColumns",
-    "LinearDeviations",
-    "deviation_columns",
-    "deviation_draws",
-    "linear_deviations",
-]
-
 # deviations of an exposure that scatter together, and the frames that fit them already
 KINDS = {
     "shift": ("shift", "shift_rotation", "shift_rotation_scale", "affine"),

@@ -36,8 +36,6 @@ from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import cell_index
 
-__all__ = ["estimate_discrepancy"]
-
 DRAWS = 2000
 
 

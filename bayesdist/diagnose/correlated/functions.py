@@ -17,8 +17,6 @@ from numpy.polynomial import legendre
 from bayesdist.arrays import Float, Int
 from bayesdist.model.basis import polynomial_terms
 
-__all__ = ["StructureFunctions", "legendre_products"]
-
 ORDERS = 3  # Legendre orders above the model's
 FALL = 0.5  # rms of an order relative to the one below it
 MARGIN = 0.3  # fraction of the longer half side by which the box is larger than the chip

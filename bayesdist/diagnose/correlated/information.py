@@ -23,8 +23,6 @@ from bayesdist.infer.stars.sums import Sums
 from bayesdist.model import DistortionModel, Groups
 from bayesdist.model.grid import cell_index
 
-__all__ = ["CellSums", "GroupCells", "Information", "cell_sums", "cells_per_side"]
-
 # A star that alone determines a parameter has no residual: its squared score is uninformative.
 MIN_FREE = 0.1
 # cells along each side of a chip, by largest number of groups: limits memory and time

@@ -25,8 +25,6 @@ from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
 
-__all__ = ["SharedVariance", "shared_variances"]
-
 # of separations, in pixels; the last bin is of pairs farther apart
 EDGES = np.array([0.0, 6.0, 12.0, 24.0, 48.0, 96.0])
 MAX_PAIRS = 2_000_000

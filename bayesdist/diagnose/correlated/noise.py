@@ -10,8 +10,6 @@ from bayesdist.diagnose.correlated.information import Information
 from bayesdist.infer.equations.scaled import scaled_inverse
 from bayesdist.model.grid import cell_index
 
-__all__ = ["block_ratios", "not_narrower", "score_excess"]
-
 STARS_PER_BLOCK = 60
 MAX_BLOCKS = 8  # along each side of a chip
 MIN_RATIO, MAX_RATIO = 0.25, 100.0

@@ -16,8 +16,6 @@ import numpy as np
 from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 
-__all__ = ["AmplitudeGrid", "DiscrepancyPriors", "log_half_cauchy", "log_widths"]
-
 TERM_STEPS = 24  # of the amplitude of the higher orders
 
 

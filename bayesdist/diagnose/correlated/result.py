@@ -15,14 +15,6 @@ from bayesdist.diagnose.correlated.deviations import KINDS, LinearDeviations
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.model import Chip, DistortionModel
 
-__all__ = [
-    "ChipStructure",
-    "Discrepancy",
-    "as_stored",
-    "discrepancy_from_arrays",
-    "discrepancy_to_arrays",
-]
-
 POINTS = 12  # on each axis of a chip, over which sizes are averaged
 
 

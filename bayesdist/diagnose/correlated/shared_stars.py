@@ -14,8 +14,6 @@ from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import DistortionModel
 
-__all__ = ["SharedStars", "shared_stars"]
-
 STEPS = 60
 RANGE = 300.0
 

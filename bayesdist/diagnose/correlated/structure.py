@@ -25,8 +25,6 @@ from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions
 from bayesdist.diagnose.correlated.neighbours import SharedVariance
 from bayesdist.diagnose.correlated.priors import AmplitudeGrid, log_half_cauchy, log_widths
 
-__all__ = ["Structure", "chip_structure"]
-
 # of the field, in longer half sides; all equally probable beforehand
 LENGTHS = np.geomspace(0.02, 0.6, 7)
 STEPS = 8  # of the amplitude, before the grid is refined

@@ -18,8 +18,6 @@ from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.model import Chip, DistortionModel
 
-__all__ = ["ALL", "Bin", "Partition", "partitions_of"]
-
 ALL = "all"
 STARS_PER_BIN = 60
 MAX_CELLS = 8  # along each side of a chip

@@ -27,8 +27,6 @@ from bayesdist.diagnose.holdout.predictive import (
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import RIGID, frame_names, nearest_frame
 
-__all__ = ["Frame", "framed", "frames_for"]
-
 SOFT, EXACT = 10, 6  # steps with weights that reach far, and with those of the mixture
 REACH = 4.0  # chi-square at which the former are one half
 STARS_PER_FRAME = 20

@@ -19,8 +19,6 @@ from bayesdist.diagnose.holdout.predictive import SCALES, Predictive
 from bayesdist.diagnose.holdout.rows import HeldRows
 from bayesdist.diagnose.holdout.spread import scale_of, sum_tails
 
-__all__ = ["GroupedScores", "ScaleSums", "StarScores", "membership"]
-
 
 @dataclass(frozen=True, eq=False)
 class StarScores:

@@ -22,20 +22,6 @@ from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.stars.stars import errors_of
 from bayesdist.model import DistortionModel, Groups, LookupTable
 
-__all__ = [
-    "ExposureDeviations",
-    "Prediction",
-    "Predictive",
-    "Scores",
-    "groups_of",
-    "marginals_of",
-    "noise_of",
-    "predictions",
-    "predictive_of",
-    "scores_of",
-    "uniforms_of",
-]
-
 NEVER = 1e-300
 AT_ONCE = 2**14  # stars
 SCALES = np.geomspace(0.5, 4.0, 13)  # of the errors, at which scores are taken

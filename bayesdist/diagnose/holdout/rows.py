@@ -24,8 +24,6 @@ from bayesdist.diagnose.holdout.predictive import (
     predictions,
 )
 
-__all__ = ["HeldRows", "predicted_rows"]
-
 
 @dataclass(frozen=True, eq=False)
 class HeldRows:

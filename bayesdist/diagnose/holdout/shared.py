@@ -25,8 +25,6 @@ from bayesdist.diagnose.clusters import joint_clusters, products_over, squares_o
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.rows import HeldRows
 
-__all__ = ["SharedErrors"]
-
 
 class SharedErrors:
     """Matches with the stars and cells that they share errors with.

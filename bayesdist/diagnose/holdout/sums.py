@@ -25,8 +25,6 @@ from bayesdist.diagnose.holdout.rows import HeldRows, predicted_rows
 from bayesdist.diagnose.holdout.shared import SharedErrors
 from bayesdist.diagnose.holdout.spread import SpreadMoments
 
-__all__ = ["LEVELS", "PIT_BINS", "TAILS", "BinSums", "HeldSums", "held_sums"]
-
 PIT_BINS = 20
 TAILS = (3.0, 4.0, 5.0)  # sigma
 LEVELS = (1.0, 2.0)  # sigma, within which stars are counted along each axis

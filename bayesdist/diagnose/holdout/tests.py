@@ -23,8 +23,6 @@ from bayesdist.diagnose.significance import clopper_pearson, hotelling_p
 from bayesdist.distributions import chi2_sf, norm_sf
 from bayesdist.limits import HELD_OUT_DISTRIBUTION, HELD_OUT_RATIO, HELD_OUT_TAILS
 
-__all__ = ["AXIS", "AxisCoverage", "HeldTest", "all_tests", "axis_coverage", "deviation_tests"]
-
 AXIS = "axis"  # a part: the stars along one axis
 
 INTERVAL = 0.95  # of fractions

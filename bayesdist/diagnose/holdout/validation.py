@@ -25,8 +25,6 @@ from bayesdist.errors import InputError
 from bayesdist.limits import HELD_OUT, HELD_OUT_DOUBTFUL, HELD_OUT_UNUSUAL
 from bayesdist.numbers import p_words
 
-__all__ = ["HoldoutValidation", "holdout_validation"]
-
 SAMPLE = 200_000  # stars that say where bins end
 ORDER = ("offset", "deviation", "spread", "tails", "distribution")  # of what tells most
 

@@ -12,17 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.arrays import Bool, Float, Int
 from bayesdist.errors import InputError, require_known
 
-__all__ = [
-    "BAND_AXES",
-    "BinValues",
-    "BinnedResiduals",
-    "BinnedSums",
-    "band_bins",
-    "binned_residuals",
-    "binned_sums",
-    "residual_statistics",
-]
-
 BAND_AXES = ("X", "Y", "radial")
 
 _BLOCK = 2**16  # stars

@@ -12,8 +12,6 @@ from bayesdist.diagnose.residuals.binned import BAND_AXES, BinnedSums, BinValues
 from bayesdist.distributions import chi2_isf, chi2_sf, f_sf
 from bayesdist.errors import DegenerateError
 
-__all__ = ["PatternChange", "pattern_changes"]
-
 _FEWEST_STARS = 5
 
 

@@ -17,8 +17,6 @@ from bayesdist.limits import UNCOVERED, UNCOVERED_BY_CHANCE
 from bayesdist.model import Chip
 from bayesdist.model.grid import mesh
 
-__all__ = ["Coverage", "coverage_of"]
-
 SPARSE = 0.02  # of the density where stars usually are: strays, not coverage
 _FINE = (65, 65)
 

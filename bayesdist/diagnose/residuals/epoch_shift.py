@@ -28,8 +28,6 @@ from bayesdist.infer.solution import Solution
 from bayesdist.limits import EPOCH_SHIFT
 from bayesdist.model.basis import polynomial_terms
 
-__all__ = ["EpochShift", "epoch_shift"]
-
 SAMPLE = 20_000  # detections that are looked at
 MIN_STARS = 30  # stars with motions
 FARTHEST = 60.0  # years that are scanned

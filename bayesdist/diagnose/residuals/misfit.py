@@ -20,16 +20,6 @@ from bayesdist.model import Chip
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.numbers import p_words, size_of
 
-__all__ = [
-    "MAX_BINS",
-    "STARS_PER_BIN",
-    "Misfit",
-    "bin_means",
-    "misfit_of",
-    "partitions_for",
-    "worst_misfit",
-]
-
 STARS_PER_BIN = 25
 MAX_BINS = 32  # along each side
 

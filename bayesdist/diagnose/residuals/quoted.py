@@ -15,8 +15,6 @@ from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.limits import FALSE_MAJORITY, QUOTED_ERRORS, WIDENED_ERRORS
 
-__all__ = ["error_scale", "error_scale_sentence", "majority_sentence"]
-
 LOW_QUANTILE = 0.1  # of the matches
 
 

@@ -20,8 +20,6 @@ from bayesdist.arrays import Bool, Float
 from bayesdist.diagnose.residuals.binned import BinValues
 from bayesdist.errors import DegenerateError
 
-__all__ = ["STATISTICS", "StatisticsRow", "bin_row", "pair_row", "pair_statistics"]
-
 STATISTICS = ("mean", "sigma", "min", "max", "median", "p01", "p99")
 DRAWS = 300  # of bins with fresh noise: errors to 4 %
 _FEWEST_BINS = 3

@@ -16,15 +16,6 @@ from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import in_table_order, prepare
 from bayesdist.limits import EXPOSURE_CHI2
 
-__all__ = [
-    "SAMPLE",
-    "ExposureScatter",
-    "StarSample",
-    "centroid_scatter",
-    "likelihood_shown",
-    "star_sample",
-]
-
 SAMPLE = 200_000  # stars that show what all of them look like
 MIN_STARS = 50  # stars whose scatter says anything by magnitude
 CERTAIN = 0.5  # probability of a false match from which on a star is left out

@@ -21,8 +21,6 @@ from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.sums import Sums
 
-__all__ = ["ExposureSums", "StarSums", "flagged_by_exposure", "star_sums"]
-
 Bins = tuple[int, int]
 
 

@@ -11,8 +11,6 @@ from astropy.table import Table
 from bayesdist.diagnose.residuals.binned import BAND_AXES, BinnedSums
 from bayesdist.diagnose.residuals.rows import STATISTICS, StatisticsRow, bin_row
 
-__all__ = ["StatisticsTable", "period_table"]
-
 _HEADS = dict(
     zip(STATISTICS, ("Mean", "Sigma", "Min", "Max", "Median", "1%-tile", "99%-tile"), strict=True)
 )

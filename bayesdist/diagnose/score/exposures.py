@@ -30,8 +30,6 @@ from bayesdist.diagnose.significance import chi_square_of, hotelling_p
 from bayesdist.distributions import chi2_sf
 from bayesdist.model.frames import LINEAR_MATRICES, frame_names
 
-__all__ = ["EXPOSURES", "exposure_test"]
-
 EXPOSURES = Family(
     "exposures",
     "use a campaign, whose exposures have a hierarchy of deviations",

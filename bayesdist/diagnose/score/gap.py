@@ -30,8 +30,6 @@ from bayesdist.diagnose.score.sample import Block
 from bayesdist.distributions import f_sf
 from bayesdist.model.frames import DEVIATIONS, LINEAR_MATRICES, RIGID, frame_names
 
-__all__ = ["gap_test", "visit_codes"]
-
 GAP = Family("gap", "", "", "no drift of the gap between the chips is left in the residuals")
 MIN_FREE = 3  # visits beyond those that the line takes
 MIN_STARS = 12  # of an exposure on a chip: six linear terms of both axes, and as many beside

@@ -24,8 +24,6 @@ from bayesdist.diagnose.score.result import Family, Outcome, noncentrality, outc
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.distributions import t_sf
 
-__all__ = ["MOTIONS", "StarResiduals", "motion_outcome", "motion_test"]
-
 MOTIONS = Family(
     "motions",
     "give the catalogue proper motions, or larger errors of those that it has, or leave out the "

@@ -21,8 +21,6 @@ from bayesdist.diagnose.significance import hotelling_p
 from bayesdist.distributions import chi2_sf
 from bayesdist.model.grid import cell_index
 
-__all__ = ["noise_tests"]
-
 BY_POSITION = Family(
     "noise by position",
     "give errors that depend on position",

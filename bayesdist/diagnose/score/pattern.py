@@ -12,8 +12,6 @@ from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.model.grid import cell_index
 
-__all__ = ["pattern_test"]
-
 REPEATING = Family(
     "repeating pattern",
     "fit a look-up table with nodes closer than half the period",

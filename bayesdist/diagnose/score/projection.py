@@ -20,17 +20,6 @@ from bayesdist.diagnose.score.regressors import Functions
 from bayesdist.diagnose.score.sample import Block, ScoredSample
 from bayesdist.infer.equations.priors import GaussianPriors
 
-__all__ = [
-    "LARGEST_LEVERAGE",
-    "Eliminated",
-    "Projection",
-    "beside_others",
-    "independent_directions",
-    "projection_of",
-    "squares_of",
-    "weighted",
-]
-
 RIDGE = 1e-12  # of a scaled information matrix: what the sample does not determine stays finite
 LARGEST_LEVERAGE = 0.95  # of one detection; it has next to no residual of its own there
 

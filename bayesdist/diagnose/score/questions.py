@@ -18,8 +18,6 @@ from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.model.basis import MAX_ORDER, polynomial_terms
 from bayesdist.model.timedep import TimeDependence
 
-__all__ = ["CONSTANT", "LINEAR", "Products", "Question", "questions"]
-
 Terms = tuple[tuple[int, int], ...]
 
 CONSTANT, LINEAR = polynomial_terms(0), polynomial_terms(1)

@@ -34,8 +34,6 @@ from bayesdist.diagnose.score.sample import Block
 from bayesdist.diagnose.significance import chi_square_of
 from bayesdist.distributions import chi2_sf, f_sf
 
-__all__ = ["regressor_tests"]
-
 MAX_TAKEN = 0.5  # of the noise, by fit and step: what is left then says nothing of it
 # power of what is left of a star's noise: 1/2 is exact where quoted errors are right (HC2), and 1,
 # the jackknife, too careful there (HC3); where they are not, 1/2 takes heavy stars for better

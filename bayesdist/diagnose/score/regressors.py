@@ -16,8 +16,6 @@ from bayesdist.diagnose.score.result import Family, Outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.model.basis import polynomial_terms
 
-__all__ = ["Functions", "Regressors", "functions_for", "one_of_each"]
-
 CONSTANT = 1e-9  # scatter of values, in magnitudes or of the time from -1 to 1
 SAYS_NOTHING = 0.2  # probability by chance above which an adjusted test has seen nothing
 

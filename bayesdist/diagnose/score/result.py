@@ -15,17 +15,6 @@ from bayesdist.distributions import chi2_isf, f_isf
 from bayesdist.limits import SCORE_TESTS
 from bayesdist.numbers import p_words
 
-__all__ = [
-    "POWER",
-    "Family",
-    "Outcome",
-    "ScoreTest",
-    "corrected",
-    "noncentrality",
-    "outcome",
-    "smallest_pattern",
-]
-
 HeldBy = Literal["", "noise", "structure", "exposures", "curvature"]
 
 POWER = 0.9  # with which the smallest effect that is stated would have been found

@@ -13,8 +13,6 @@ from bayesdist.infer.solution import Solution, likelihood_of
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import DistortionModel
 
-__all__ = ["SAMPLE", "Block", "ScoredSample", "scored_sample"]
-
 SAMPLE = 200_000  # detections that are looked at
 LARGEST_BLOCK = 4096  # detections, whose functions stay in the cache
 

@@ -19,8 +19,6 @@ from bayesdist.diagnose.score.truncation import truncation_test
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.solution import Solution
 
-__all__ = ["score_tests"]
-
 
 def score_tests(
     table: Matches,

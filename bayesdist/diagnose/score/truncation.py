@@ -20,8 +20,6 @@ from bayesdist.diagnose.score.result import Family, Outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.significance import chi_square_of
 
-__all__ = ["truncation_test"]
-
 TRUNCATION = Family(
     "truncation", "match again with a wider radius", "", "the residuals do not end abruptly"
 )

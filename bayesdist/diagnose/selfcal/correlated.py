@@ -28,8 +28,6 @@ from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 
-__all__ = ["MAX_EXPOSURES", "selfcal_discrepancy"]
-
 DRAWS = 2000
 MAX_DETECTIONS = 60_000  # from which structure is estimated, at most
 MAX_EXPOSURES = 150  # whose single deviations are estimated

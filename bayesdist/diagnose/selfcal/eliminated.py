@@ -29,19 +29,6 @@ from bayesdist.infer.selfcal.elimination import PlaceDerivatives
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 
-__all__ = [
-    "Absorbed",
-    "Columns",
-    "Piece",
-    "Remainder",
-    "absorbed_by_stars",
-    "add_products",
-    "eliminated",
-    "even_stars",
-    "pieces",
-    "without_parameters",
-]
-
 DETECTIONS = 8192  # in memory at a time
 UNKNOWN = 1e-10  # relative curvature below which a combination of numbers is undetermined
 

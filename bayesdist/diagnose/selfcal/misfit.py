@@ -28,8 +28,6 @@ from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.model.grid import cell_index
 
-__all__ = ["dithered_misfit"]
-
 MAX_SIDE = 16  # cells along each side of a chip
 MAX_CELLS = 512  # of all chips: the matrix of all shifts is decomposed
 MIN_INFORMATION = 0.05  # of a direction, relative to that with known stars

@@ -9,8 +9,6 @@ from bayesdist.diagnose.selfcal.eliminated import Columns, Piece, absorbed_by_st
 from bayesdist.diagnose.selfcal.scores import DetectionScores
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 
-__all__ = ["sandwich", "star_scores"]
-
 # A star that alone determines a parameter has no residual: its squared score is uninformative.
 MIN_FREE = 0.1
 

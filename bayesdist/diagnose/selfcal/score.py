@@ -47,8 +47,6 @@ from bayesdist.infer.selfcal.elimination import memberships
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 
-__all__ = ["selfcal_score_tests"]
-
 MAX_DETECTIONS = 60_000  # that are looked at
 STARS_PER_DIRECTION = 2  # below, a covariance of the scores says nothing
 MIN_INFORMATION = 0.02  # of a direction, relative to that with known stars

@@ -16,16 +16,6 @@ from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.grid import cell_index
 
-__all__ = [
-    "DetectionScores",
-    "StarBlock",
-    "places_by_star",
-    "score_excess",
-    "scores_of_detections",
-    "star_blocks",
-    "taken_by_stars",
-]
-
 LOOSE = 1e-9  # relative curvature below which a combination of a star's parameters is undetermined
 
 

@@ -26,8 +26,6 @@ from bayesdist.diagnose.clusters import squares_over, sums_over
 from bayesdist.errors import DegenerateError
 from bayesdist.model import Chip
 
-__all__ = ["BetweenNodes", "MeanSquare", "between_nodes"]
-
 FINE, COARSE = 8, 4  # cells along a side of the squares between nodes
 AREA_RATIO = (FINE / COARSE) ** 2  # areas of the cells
 MIN_PAIRS = 30  # pairs of stars

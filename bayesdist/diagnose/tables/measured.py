@@ -23,8 +23,6 @@ from bayesdist.infer.nodes import (
 )
 from bayesdist.model import Chip, LookupTable
 
-__all__ = ["measured_between"]
-
 FAR = 6.0  # standard deviations
 
 log = logging.getLogger("bayesdist")

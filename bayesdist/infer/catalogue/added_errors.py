@@ -45,8 +45,6 @@ from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.stars.likelihood import good_probability, log_densities
 from bayesdist.model import DistortionModel
 
-__all__ = ["ONE", "GroupedErrors", "grouped_errors"]
-
 ONE, AXIS = "one", "axis"
 STARS = 50_000  # from which the errors are estimated: they are then known to half a percent
 PER_EXPOSURE = 100  # mean number of stars of each exposure among these, at least

@@ -24,15 +24,6 @@ from bayesdist.infer.stars.shards import Compute
 from bayesdist.infer.stars.stars import groups_of, in_table_order, prepare
 from bayesdist.model import DistortionModel
 
-__all__ = [
-    "FALSE",
-    "false_matches",
-    "fit_by_magnitude",
-    "refitted",
-    "residuals_of",
-    "variances_of",
-]
-
 STARS = 200_000  # from which the law is estimated: it is then known to a part in a thousand
 PER_EXPOSURE = 100  # mean number of stars of each exposure among these, at least
 SETTLED = 1e-3  # change of ln sigma at which the maximisation ends

@@ -15,8 +15,6 @@ from scipy.optimize import minimize_scalar
 from bayesdist.arrays import Float, Int
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 
-__all__ = ["MagnitudeLaw"]
-
 CELLS = 1000  # cells of magnitude, within which the law hardly changes
 LOG_VARIANCE = 1.36  # variance of ln(scatter) times n, for the median absolute deviation
 BENDS = (1e-3, 1e2)  # limits of the prior size: changes of slope over the range of magnitudes

@@ -30,8 +30,6 @@ from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.solution import Solution
 from bayesdist.infer.stars.stars import prepare
 
-__all__ = ["StarCovariance", "StarErrors", "StarInfluence", "star_covariance", "star_influence"]
-
 
 @dataclass(frozen=True, eq=False)
 class StarErrors:

@@ -19,8 +19,6 @@ from bayesdist.arrays import Float, Int
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.model import DistortionModel, Groups
 
-__all__ = ["StarSums", "influence_by_group"]
-
 SCRATCH = 64_000_000  # bytes of the stars' sums in memory at a time
 
 

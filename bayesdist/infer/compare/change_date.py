@@ -28,8 +28,6 @@ from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import nearest_frame
 
-__all__ = ["ChangeDate", "PeriodScore", "period_scores", "scan_dates"]
-
 MOST_PERIODS = 24
 CREDIBLE = 0.95
 

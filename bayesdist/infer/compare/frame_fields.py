@@ -8,8 +8,6 @@ from bayesdist.arrays import Float
 from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.frames import frame_matrix, frame_names, nearest_frame
 
-__all__ = ["frame_between", "frame_fields", "mean_squares", "term_squares", "without"]
-
 
 def term_squares(basis: PolynomialBasis) -> Float:
     """Mean square (2 K,) over the detector of each term of u and then of v."""

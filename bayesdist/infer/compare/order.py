@@ -33,8 +33,6 @@ from bayesdist.infer.transforms import without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.basis import MAX_ORDER
 
-__all__ = ["in_one_frame", "select_order"]
-
 DEFAULT_ORDERS = tuple(range(3, 10))
 
 

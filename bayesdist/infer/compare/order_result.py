@@ -12,8 +12,6 @@ from bayesdist.arrays import Float, Int
 from bayesdist.distributions import chi2_sf, f_sf, norm_sf
 from bayesdist.numbers import p_words
 
-__all__ = ["HeldOutOrders", "OrderSelection", "OrderSurfaces"]
-
 CLEAR = 3.0  # standard errors from which on a higher order counts as better
 CLEAR_P = float(norm_sf(CLEAR))
 

@@ -22,8 +22,6 @@ from bayesdist.infer.stars.sums import Sums
 from bayesdist.model.grid import cell_index
 from bayesdist.streams import mixed
 
-__all__ = ["FoldStatistics", "bin_sums", "departures", "fold_sums", "held_out_gain", "truncated"]
-
 
 @dataclass(frozen=True, eq=False)
 class FoldStatistics(Sums):

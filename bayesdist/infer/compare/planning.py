@@ -14,8 +14,6 @@ from bayesdist.infer.equations.scaled import recolouring, scaled_cholesky, scale
 from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
 
-__all__ = ["ExposureContent", "exposure_content", "exposure_information", "with_information"]
-
 
 @dataclass(frozen=True, eq=False)
 class ExposureContent:

@@ -12,13 +12,6 @@ from bayesdist.infer.equations.scaled import chi_square, scaled_cholesky
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh
 
-__all__ = [
-    "DifferenceField",
-    "PositionChange",
-    "difference_field",
-    "largest_difference",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class PositionChange:

@@ -15,8 +15,6 @@ import numpy as np
 
 from bayesdist.arrays import Bool, Float
 
-__all__ = ["Split", "from_cube_root", "inside", "to_cube_root"]
-
 
 def to_cube_root(names: tuple[str, ...], h: Float) -> Float:
     """Proposal coordinates (..., k) of sampled ones; `names` are those of h: 'f', 's_out'."""

@@ -20,8 +20,6 @@ from bayesdist.infer.density.target import Target
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.stars.mixture import TAILS
 
-__all__ = ["build_proposal"]
-
 Line = dict[float, Conditional]  # nodes by their value on one axis
 
 N_NODES = 25

@@ -16,8 +16,6 @@ import numpy as np
 from bayesdist.arrays import Float
 from bayesdist.infer.convergence import importance_efficiency, pareto_k
 
-__all__ = ["Quality", "draws_per_effective", "quality_of", "rejection", "warmup_steps"]
-
 CLOSE = 0.02  # distance from the posterior (total variation) at which warm-up ends
 MOST_WARMUP = 10_000
 

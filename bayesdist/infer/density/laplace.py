@@ -17,8 +17,6 @@ from bayesdist.infer.density.target import Target
 from bayesdist.infer.equations.arrow import Arrow, ArrowFactor
 from bayesdist.infer.linear import LinearFit
 
-__all__ = ["Conditional", "Node", "conditional_mode", "expected_mode", "starting_point"]
-
 MAX_STEPS = 60
 UNSEEN = 1e-8  # decrement that rounding of the log density may hide: the step is taken unseen
 ON_A_RIDGE = 1e-2  # decrement at which a search stops where the curvature had to be made positive

@@ -12,8 +12,6 @@ from bayesdist.arrays import Bool, Float
 from bayesdist.infer.density.piecewise import PiecewiseExponential
 from bayesdist.infer.stars.mixture import TAILS
 
-__all__ = ["Marginal", "cardinal"]
-
 MESH = {1: 4001, 2: 401}  # points of each axis, by the number of axes
 
 

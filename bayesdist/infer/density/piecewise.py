@@ -6,8 +6,6 @@ import numpy as np
 
 from bayesdist.arrays import Float
 
-__all__ = ["PiecewiseExponential"]
-
 
 class PiecewiseExponential:
     """Density whose logarithm is linear between ascending mesh points (m,) and beyond them.

@@ -25,8 +25,6 @@ from bayesdist.infer.density.laplace import Node
 from bayesdist.infer.density.marginal import Marginal, cardinal
 from bayesdist.infer.equations.arrow import Arrow
 
-__all__ = ["GridProposal", "Proposal", "Random"]
-
 Random = np.random.Generator | np.random.RandomState
 
 WIDE, SHARE = 2.0, 0.1  # draws of an uncertain f are so much wider, so often

@@ -19,8 +19,6 @@ from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.model import DistortionModel
 
-__all__ = ["Density", "Target"]
-
 SCRATCH = 32_000_000  # bytes of effective coefficients in memory at a time
 
 

@@ -15,8 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, solve_triangular
 
-__all__ = ["Arrow", "ArrowFactor"]
-
 Float = NDArray[Any]  # numpy's stubs lose float64 in its linear algebra
 
 

@@ -12,8 +12,6 @@ from bayesdist.infer.equations.rank import require_full_rank
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import nearest_frame
 
-__all__ = ["gauss_newton", "refuse_absorbed_drift", "starting_point"]
-
 RELINEARISED = 1e-7  # pixels: where the Gauss-Newton iteration over the frames stops
 STALLED = 1e-4  # formal errors: steps below this that do not shrink are rounding
 TURNS = 50  # most iterations

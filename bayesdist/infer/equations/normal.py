@@ -21,8 +21,6 @@ from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.sums import Sums
 from bayesdist.model import DistortionModel, Groups
 
-__all__ = ["NormalEquations", "least_squares", "mixture"]
-
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations(Sums):

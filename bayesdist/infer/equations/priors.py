@@ -13,8 +13,6 @@ from bayesdist.errors import InputError
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.model import DistortionModel
 
-__all__ = ["GaussianPriors", "JointPrior", "Prior"]
-
 
 @dataclass(frozen=True, eq=False)
 class JointPrior:

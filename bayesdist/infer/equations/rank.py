@@ -16,8 +16,6 @@ from bayesdist.infer.stars.survey import Survey
 from bayesdist.model import DistortionModel, Groups
 from bayesdist.model.frames import DEVIATIONS, FRAME_KINDS, frame_names
 
-__all__ = ["NullSpace", "check_coverage", "null_space"]
-
 # Eigenvalues of the unit-diagonal normal matrix below this are zero: rounding alone leaves ~1e-15
 # and a fit that loses 11 of 16 digits is no longer a measurement.
 RANK_TOLERANCE = 1e-11

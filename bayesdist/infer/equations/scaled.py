@@ -18,18 +18,6 @@ from threadpoolctl import threadpool_limits
 from bayesdist.arrays import Bool, Float
 from bayesdist.distributions import chi2_sf
 
-__all__ = [
-    "FieldTest",
-    "chi_square",
-    "determined",
-    "known_terms",
-    "one_thread",
-    "recolouring",
-    "scaled_cholesky",
-    "scaled_inverse",
-    "unit_diagonal",
-]
-
 RANK = 1e-9  # eigenvalues of a correlation matrix below it are rounding
 
 F = TypeVar("F", bound=Callable[..., Any])

@@ -18,17 +18,6 @@ import numpy as np
 from bayesdist.arrays import Int
 from bayesdist.infer.kernel.lanes import FAST
 
-__all__ = [
-    "BLOCK",
-    "PASS",
-    "lay_out",
-    "pieces_of",
-    "scratch",
-    "set_threads",
-    "share_out",
-    "threads_for",
-]
-
 # how a pass is compiled: without a check for division by zero, which would exclude vectors
 PASS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": FAST, "error_model": "numpy"}
 

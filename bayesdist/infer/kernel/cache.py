@@ -18,8 +18,6 @@ from numba import config
 
 from bayesdist.reading.regular import read_bytes
 
-__all__ = ["kept_by_content"]
-
 log = logging.getLogger("bayesdist")
 
 _private: list[tempfile.TemporaryDirectory[str]] = []  # removed when the process ends

@@ -27,8 +27,6 @@ from bayesdist.arrays import Float, Int
 from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.infer.kernel.numeric import exp_negative
 
-__all__ = ["NODES", "inside", "log_circle", "nodes_for", "slopes"]
-
 SURE = 8.6**2  # squared errors from the edge within which the probability is 1 to the last digit
 # smallest resolved squared error over radius; steeper edges are blurred to it, which concerns stars
 # within a few such errors of their edge

@@ -19,26 +19,6 @@ from numba.core import cgutils, typing
 from numba.core.typing.templates import AbstractTemplate, infer_global
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
-__all__ = [
-    "AT_MOST",
-    "FAST",
-    "ROWS",
-    "WIDE",
-    "WIDTH",
-    "Lanes",
-    "choose",
-    "first_lanes",
-    "larger",
-    "load",
-    "load_wide",
-    "product",
-    "put",
-    "smaller",
-    "spread",
-    "tile",
-    "total",
-]
-
 # sums of products may be fused; nothing that would change NaN or infinity
 FAST = {"contract", "nsz", "arcp"}
 FLAGS = tuple(sorted(FAST))

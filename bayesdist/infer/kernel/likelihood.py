@@ -24,8 +24,6 @@ from bayesdist.infer.kernel.mixture import Constants, log_of_product, packed
 from bayesdist.infer.kernel.numeric import exp_negative, inverse_root
 from bayesdist.infer.kernel.polynomial import evaluate
 
-__all__ = ["log_likelihood"]
-
 SCRATCH = 16_000_000  # bytes of partial sums in memory at a time
 
 

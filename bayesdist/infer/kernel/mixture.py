@@ -17,15 +17,6 @@ from bayesdist.infer.kernel.blocks import BLOCK
 from bayesdist.infer.kernel.lanes import WIDTH, choose, load, product, spread, total
 from bayesdist.infer.kernel.numeric import bits_of, from_bits
 
-__all__ = [
-    "GAUSSIAN",
-    "NO_OUTLIERS",
-    "UNIFORM",
-    "Constants",
-    "log_of_product",
-    "packed",
-]
-
 NO_OUTLIERS, GAUSSIAN, UNIFORM = 0, 1, 2
 NEVER = 1e300  # chi-square of an outlier where there are none
 # A product of eight within these limits has lost no digits to underflow on the way, unless its

@@ -35,8 +35,6 @@ from bayesdist.infer.kernel.mixture import Constants, log_of_product, packed
 from bayesdist.infer.kernel.numeric import exp_negative, inverse_root
 from bayesdist.infer.kernel.polynomial import evaluate, legendre
 
-__all__ = ["PIECE", "Moments", "least_squares_moments", "mixture_moments"]
-
 PIECE = 4096
 EVALUATIONS = 10  # cost of the sums of one star, in likelihood evaluations
 

@@ -15,8 +15,6 @@ from numba.extending import intrinsic
 
 from bayesdist.infer.kernel.lanes import Lanes, larger
 
-__all__ = ["bits_of", "exp_negative", "from_bits", "inverse_root"]
-
 
 def _same_bits(element: Any) -> Any:
     """Intrinsic that reads the bits of a number, or of lanes, as another type."""

@@ -6,8 +6,6 @@ import numba as nb
 
 from bayesdist.infer.kernel.lanes import FAST, WIDE, load_wide, put, spread
 
-__all__ = ["evaluate", "legendre"]
-
 
 @nb.njit(cache=True, fastmath=FAST)
 def evaluate(coef, order, X, Y, n, out):

@@ -13,8 +13,6 @@ from bayesdist.arrays import Float, Int
 from bayesdist.infer.kernel.blocks import PASS, share_out
 from bayesdist.infer.kernel.lanes import FAST
 
-__all__ = ["legendre", "linearised", "positions", "powers"]
-
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def legendre(x, y, order, px, py, phi):

@@ -30,26 +30,6 @@ import numpy as np
 from bayesdist.infer.kernel.lanes import FAST, WIDTH
 from bayesdist.infer.kernel.numeric import exp_negative
 
-__all__ = [
-    "DOUBTFUL",
-    "FALSE",
-    "MEMBER",
-    "MOST_STAR",
-    "PLACE_U",
-    "PLACE_V",
-    "add_curvature",
-    "cholesky",
-    "design",
-    "far_odds",
-    "hessian",
-    "log_root",
-    "membership",
-    "own_rows",
-    "residual",
-    "summed_over_members",
-    "to_mode",
-]
-
 MOST_STAR = 5  # parameters of a star
 MOST_STEPS = 60
 CLOSE = 1e-8  # decrement at which one more Newton step is the last

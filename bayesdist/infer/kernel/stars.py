@@ -13,8 +13,6 @@ from bayesdist.infer.kernel.mixture import Constants, packed
 from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.polynomial import evaluate
 
-__all__ = ["memberships", "residuals"]
-
 
 @nb.njit(**PASS)
 def _residuals(first, end, blocks, columns, coef, order, out):

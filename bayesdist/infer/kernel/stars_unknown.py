@@ -36,8 +36,6 @@ from bayesdist.infer.kernel.star_modes import (
     to_mode,
 )
 
-__all__ = ["MOST_DOUBTFUL", "eliminate_stars", "log_marginals", "weighted_stars"]
-
 Flags = NDArray[np.int8]
 
 MOST_DOUBTFUL = 6  # most detections of a star over whose membership is summed

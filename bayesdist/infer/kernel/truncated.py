@@ -37,13 +37,6 @@ from bayesdist.infer.kernel.moments import (
 from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.polynomial import evaluate, legendre
 
-__all__ = [
-    "truncated_log_likelihood",
-    "truncated_memberships",
-    "truncated_moments",
-    "truncated_scores",
-]
-
 SCRATCH = 16_000_000  # bytes of partial sums in memory at a time
 INTEGRAL = 30  # cost of a star, in likelihood evaluations without a circle
 N_TERMS = COLUMNS + N_MIXTURE  # columns and scalars of one star

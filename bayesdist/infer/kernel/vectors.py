@@ -9,8 +9,6 @@ from __future__ import annotations
 from llvmlite import binding
 from numba import config
 
-__all__ = ["use_whole_vectors"]
-
 
 def use_whole_vectors() -> None:
     """Compile for the whole width, unless NUMBA_CPU_FEATURES or NUMBA_CPU_NAME say otherwise.

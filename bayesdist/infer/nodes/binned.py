@@ -23,8 +23,6 @@ from bayesdist.infer.nodes.grid import STEP, NodeGrid
 from bayesdist.model import Chip
 from bayesdist.model.lookup import LookupTable
 
-__all__ = ["binned_table", "quadratic_smoother"]
-
 PASSES = 20  # of the clipping, at most
 OWN_SCATTER = 5  # stars from which on a bin's error is from its own scatter
 HALF_WIDTH = 2  # nodes: the kernel is 5 x 5

@@ -22,8 +22,6 @@ from bayesdist.infer.nodes.posterior import TablePosterior, axis_posterior
 from bayesdist.infer.nodes.sums import BLOCK, NodeSums, node_sums
 from bayesdist.model import Chip
 
-__all__ = ["checked_stars", "field_table"]
-
 STEADY = 1e-5  # change of the stars' typical variance that is small against any error of the jitter
 MAX_ITERATIONS = 6
 

@@ -32,8 +32,6 @@ from bayesdist.infer.nodes.table_fit import Iteration, TableFit, table_of
 from bayesdist.model import DistortionModel
 from bayesdist.model.lookup import LookupTable
 
-__all__ = ["fit_with_tables"]
-
 LIKELY = 0.5  # stars that are less likely true matches are left out
 SEARCHED = 2  # iterations that optimise hyperparameters, which are fixed in later ones
 

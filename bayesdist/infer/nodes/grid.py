@@ -18,8 +18,6 @@ from bayesdist.errors import InputError
 from bayesdist.model import Chip, PolynomialBasis
 from bayesdist.model.lookup import LookupTable
 
-__all__ = ["STEP", "NodeGrid"]
-
 STEP = (64.0, 64.0)  # pixels: the grid of D2IMFILE and NPOLFILE
 
 

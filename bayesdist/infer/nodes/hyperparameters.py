@@ -20,8 +20,6 @@ from bayesdist.arrays import Float, Int
 from bayesdist.infer.nodes.grid import NodeGrid
 from bayesdist.infer.nodes.sums import NodeSums
 
-__all__ = ["SMOOTHNESS", "Evidence", "FittedField", "Matern", "fitted_field", "refined_field"]
-
 SMOOTHNESS = (0.5, 1.5, 2.5)
 
 # Fraction of the variance that each node has independently: a field that is very smooth on the grid

@@ -15,8 +15,6 @@ from bayesdist.arrays import Float
 from bayesdist.infer.stars.likelihood import good_probability
 from bayesdist.infer.stars.mixture import OUTLIER_MODE, OUTLIER_SHAPE, OutlierMixture
 
-__all__ = ["ResidualMixture", "fit_mixture", "jitter_variance"]
-
 SAMPLE = 200_000  # stars from which the mixture's three numbers are estimated
 STEPS = 200
 WIDER = 3.0  # smallest ratio of the standard deviations of false matches and true ones

@@ -15,14 +15,6 @@ from bayesdist.infer.stars.stars import errors_of, groups_of
 from bayesdist.model import DistortionModel
 from bayesdist.model.lookup import LookupTable, corrected
 
-__all__ = [
-    "PixelShifts",
-    "corrected_matches",
-    "inside_chips",
-    "on_the_chips",
-    "pixel_shifts",
-]
-
 FOLDED = 1e-6  # area of a pixel's image over the square of its sides
 
 

@@ -14,8 +14,6 @@ from bayesdist.infer.nodes.hyperparameters import FittedField, Matern
 from bayesdist.infer.nodes.sums import NodeSums
 from bayesdist.model.lookup import LookupTable
 
-__all__ = ["AxisField", "TablePosterior", "axis_posterior"]
-
 BLOCK = 2048  # pixels whose rows over all nodes are in memory at once
 
 

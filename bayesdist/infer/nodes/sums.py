@@ -19,8 +19,6 @@ from bayesdist.errors import DegenerateError
 from bayesdist.infer.nodes.grid import NodeGrid
 from bayesdist.infer.stars.sums import Sums
 
-__all__ = ["NodeSums", "node_sums"]
-
 BLOCK = 65_536  # stars at once: their polynomials take 11 MB at order 5
 
 

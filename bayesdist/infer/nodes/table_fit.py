@@ -17,8 +17,6 @@ from bayesdist.infer.nodes.pixels import corrected_matches, on_the_chips
 from bayesdist.infer.nodes.posterior import TablePosterior
 from bayesdist.model.lookup import LookupTable, corrected
 
-__all__ = ["Iteration", "TableFit", "held_sigma", "table_of"]
-
 BLOCK = 1024  # positions whose rows over all nodes are in memory at once
 
 

@@ -15,16 +15,6 @@ from bayesdist.infer.stars.mixture import Hyper
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
 
-__all__ = [
-    "Memberships",
-    "averaged_draws",
-    "count_outliers",
-    "memberships",
-    "memberships_of",
-    "some_draws",
-    "star_log_likelihood",
-]
-
 MOST_DRAWS, LEAST_DRAWS = 64, 8
 AT_A_TIME = 1_000_000  # log-likelihoods of a star that are in memory beside the result
 EVALUATIONS = 200_000_000  # largest number of evaluations of a star for the average

@@ -14,8 +14,6 @@ from bayesdist.infer.stars.likelihood import MixtureAt
 from bayesdist.infer.stars.mixture import Hyper, OutlierMixture
 from bayesdist.model import DistortionModel
 
-__all__ = ["Certificate", "Posterior", "SamplerInfo"]
-
 
 @dataclass(frozen=True)
 class SamplerInfo:

@@ -25,8 +25,6 @@ from bayesdist.infer.sampler.proposal_batch import ProposalBatch, pilot_batch
 from bayesdist.infer.sampler.surrogate import Surrogate, certify, draw_surrogate
 from bayesdist.infer.sampler.whitening import Whitening
 
-__all__ = ["PILOTS", "SECOND_STAGES", "SurrogateProposal", "has_second_stage", "run_certified"]
-
 SECOND_STAGES = ("auto", "always", "never")
 PILOTS = 400  # passes that the certificate costs
 AFFORDABLE = 1e11  # evaluations of a star that the second stage may cost, four minutes on two cores

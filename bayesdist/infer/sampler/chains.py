@@ -57,8 +57,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("bayesdist")
 
-__all__ = ["Chains", "Settings", "ensemble_seeds", "run_chains"]
-
 LEAST_ROWS = 10  # rows of a chain that diagnostics need at least
 
 

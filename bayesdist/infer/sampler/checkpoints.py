@@ -21,8 +21,6 @@ from bayesdist.files import atomic_path
 from bayesdist.reading.faults import restoring
 from bayesdist.reading.hdf5 import hdf5_arrays
 
-__all__ = ["Block", "Walkers", "block_path", "read_arrays", "write_arrays"]
-
 BLOCK_ARRAYS = ("coords", "log_prob", "accepted", "log_weights")
 END_ARRAYS = ("log_q", "random_keys", "random_state")
 

@@ -33,8 +33,6 @@ from bayesdist.infer.sampler.move_schedule import Plan, StepRange
 from bayesdist.infer.sampler.proposal_batch import ProposalBatch, draw_batch
 from bayesdist.infer.sampler.whitening import Whitening
 
-__all__ = ["Ensembles", "replay"]
-
 START_BATCHES = 20  # further batches of proposals that are searched for starts of walkers
 
 

@@ -15,24 +15,6 @@ from bayesdist.distributions import chi2_isf
 from bayesdist.infer.convergence import Convergence, Limits
 from bayesdist.limits import DRAWS_PER_WALKER, PARETO_K
 
-__all__ = [
-    "EFFICIENT",
-    "FIRST_CHECK",
-    "Plan",
-    "StepRange",
-    "block_schedule",
-    "doubling_schedule",
-    "expected_passes",
-    "first_check",
-    "has_mixed",
-    "is_hopeless",
-    "mixing_steps",
-    "next_check",
-    "pilot_steps",
-    "plan_moves",
-    "walkers_for",
-]
-
 FIRST_CHECK = 50  # steps after which state-dependent moves are first judged
 PILOT = 512  # smallest number of proposals that judge the proposal
 MOST_PILOT = 4096

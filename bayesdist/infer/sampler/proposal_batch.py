@@ -18,8 +18,6 @@ from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Density
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 
-__all__ = ["ProposalBatch", "draw_batch", "pilot_batch"]
-
 ROWS = 8192  # proposals evaluated at a time
 
 

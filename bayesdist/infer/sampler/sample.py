@@ -30,8 +30,6 @@ from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.memory import require_memory
 
-__all__ = ["sample"]
-
 STEPS_KEPT = 100  # at least, of each walker
 METHODS = ("exact", "certified")
 FORMAT = 3  # of the checkpoints

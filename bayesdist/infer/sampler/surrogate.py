@@ -44,8 +44,6 @@ from bayesdist.infer.posterior import Certificate
 from bayesdist.infer.sampler.move_schedule import EFFICIENT
 from bayesdist.limits import PARETO_K
 
-__all__ = ["Surrogate", "certify", "draw_surrogate"]
-
 DEGREE = 3  # of the polynomial in the hyperparameters
 LEAST_TRAINING = 20
 LEAST_HELD_OUT = 100  # fewer leave more than 3 % of the probability unseen

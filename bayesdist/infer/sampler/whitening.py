@@ -11,8 +11,6 @@ from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Density
 from bayesdist.infer.equations.arrow import ArrowFactor
 
-__all__ = ["Whitening"]
-
 
 @dataclass(frozen=True, eq=False)
 class Whitening:

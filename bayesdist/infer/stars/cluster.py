@@ -45,8 +45,6 @@ except ModuleNotFoundError as error:
         do="pip install 'bayesdist[dask]'",
     ) from error
 
-__all__ = ["ClusterPieces", "ClusterShards"]
-
 CONNECT = 10.0  # seconds to find the scheduler
 PATIENCE = 60.0  # seconds without any worker after which none is expected any more
 POLL = 1.0  # seconds between two checks for workers

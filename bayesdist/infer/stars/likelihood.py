@@ -14,17 +14,6 @@ from bayesdist.infer.kernel import GAUSSIAN, Constants
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
 from bayesdist.model import DistortionModel
 
-__all__ = [
-    "Clip",
-    "ClippedGaussian",
-    "Likelihood",
-    "MixtureAt",
-    "good_probability",
-    "log_densities",
-    "star_averages",
-    "star_log_likelihoods",
-]
-
 
 class Likelihood(Protocol):
     """Likelihood of a star by its position in the model, at one parameter vector."""

@@ -10,8 +10,6 @@ from bayesdist.errors import InputError
 from bayesdist.infer.stars.shards import Compute, LocalShards, Shards
 from bayesdist.model import DistortionModel
 
-__all__ = ["load", "opened"]
-
 
 @contextmanager
 def opened(

@@ -35,8 +35,6 @@ from bayesdist.errors import InputError, required
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel import Constants
 
-__all__ = ["HYPER_NAMES", "TAILS", "Hyper", "OutlierMixture"]
-
 HYPER_NAMES = {"j": "log j", "f": "logit f", "s_out": "log s_out"}
 KINDS = {"none": kernel.NO_OUTLIERS, "gaussian": kernel.GAUSSIAN, "uniform": kernel.UNIFORM}
 T_DOF = 4.0

@@ -14,8 +14,6 @@ import numpy as np
 from bayesdist.errors import InputError
 from bayesdist.infer.stars.stars import Stars
 
-__all__ = ["Store"]
-
 EMPTY = np.zeros(0)
 COLUMNS, OFFSETS = ("X", "Y", "u", "v", "var_u", "var_v"), ("off_u", "off_v")
 

@@ -19,8 +19,6 @@ from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.infer.stars.survey import Survey, survey
 from bayesdist.model import DistortionModel, Groups
 
-__all__ = ["Compute", "LocalShards", "Pieces", "Shards", "shard_of", "total"]
-
 Task = Callable[..., Any]
 
 SAMPLE = 1_000_000  # stars from whose errors the median error is computed

@@ -16,8 +16,6 @@ from bayesdist.infer import kernel
 from bayesdist.infer.kernel import Constants
 from bayesdist.model import DistortionModel, Groups
 
-__all__ = ["Stars", "errors_of", "groups_of", "in_table_order", "prepare"]
-
 NOBODY = np.zeros(0, np.int64)
 
 

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from bayesdist.arrays import Int
 from bayesdist.model import Groups, merge_groups
 
-__all__ = ["Sums"]
-
 Rows = tuple[Int, ...]
 
 

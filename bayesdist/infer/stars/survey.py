@@ -14,8 +14,6 @@ from bayesdist.errors import InputError
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.model import Groups, merge_groups
 
-__all__ = ["ChipSurvey", "Survey", "survey"]
-
 # relative distance by which a star at the edge of its circle may seem to lie outside
 ROUNDING = 1e-6
 

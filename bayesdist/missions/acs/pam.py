@@ -14,8 +14,6 @@ from bayesdist.calibration.subarray import FULL
 from bayesdist.errors import InputError
 from bayesdist.products.maps_file import write_pam
 
-__all__ = ["write_area_maps"]
-
 
 def write_area_maps(
     path: str | Path,

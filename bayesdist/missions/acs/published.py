@@ -10,8 +10,6 @@ from typing import Any
 
 from bayesdist.report.sections.campaign.published import Published, PublishedLine, publishes
 
-__all__ = ["LINES", "published_lines"]
-
 SOURCE = "ACS ISR 2015-06"
 
 # term: where it stands

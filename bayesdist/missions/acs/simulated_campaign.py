@@ -18,8 +18,6 @@ from bayesdist.missions.acs.simulate import AcsCampaign, acs_solution, simulate_
 from bayesdist.model import DistortionModel
 from bayesdist.products import IdcTab, idctab_from_solution, write_idctab
 
-__all__ = ["simulate_campaign"]
-
 START = "start_idc.fits"
 REFERENCE = "F606W"  # the filter of the detector's tables and of the drift
 SCALE_ARCSEC = 0.05

@@ -22,8 +22,6 @@ from bayesdist.infer import LinearFit, Posterior
 from bayesdist.missions.wise.simulate import simulate_wise
 from bayesdist.simulate import Truth
 
-__all__ = ["FILES", "SCALES", "demo", "write_simulation"]
-
 SEED = 20110201  # the date of the report that the coefficients come from
 N_STARS = 6000
 SCALES = {"jwst": 0.0656, "roman": 0.1075, "tpv": 2.75}  # arcsec in a pixel, as of a detector

@@ -4,19 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = [
-    "FORMAL_RADII",
-    "LARGEST_CORRECTIONS",
-    "LONGEST_VECTORS",
-    "RADIAL_RESIDUALS",
-    "RESIDUAL_SIGMAS",
-    "SAMPLE_SIZES",
-    "WISE_ARRAYS",
-    "WISE_BANDS",
-    "WISE_COEFFICIENTS",
-    "WiseArray",
-]
-
 WISE_BANDS = ("W1", "W2", "W3", "W4")
 
 # Appendix B.  band: (A, B), each in the order of polynomial_terms(4): 00, 10, 01, 20, 11, 02, 30,

@@ -18,8 +18,6 @@ from bayesdist.products import (
 )
 from bayesdist.products.registry import open_document
 
-__all__ = ["rotate"]
-
 
 def rotate(
     path: str | Path,

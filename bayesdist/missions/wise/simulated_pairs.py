@@ -15,8 +15,6 @@ from bayesdist.missions.wise.demo import write_simulation
 from bayesdist.missions.wise.simulate import WiseSet, simulate_wise, wise_set, write_wise_set
 from bayesdist.missions.wise.simulate.optical import DELIVERED_TURN, write_optical_model
 
-__all__ = ["simulate_sets", "simulate_table"]
-
 WISE_CONFIG = """\
 # Calibrates WISE {band} from simulated pairs: bayesdist run THIS -o {run}
 # {truth} holds what they were made from

@@ -34,8 +34,6 @@ from bayesdist.products.formats.common.document import (
 if TYPE_CHECKING:
     from astropy.table import Table  # slow to import, and needed for few files
 
-__all__ = ["FORMAT", "GbdesParameters"]
-
 _COLUMNS = ("mapName", "coordinate", "coefficientNumber", "parameter")
 _DEVICE = re.compile(r"(.+)/(\d+)/poly$")
 _NOT_EVEN = 1e-9  # by which a covariance matrix may differ from its transpose, of its size

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from bayesdist.products.formats.common.asdf.build import ChipTransform
     from bayesdist.products.formats.common.asdf.distortion import DistortionFile
 
-__all__ = ["FORMAT", "Settings"]
-
 
 class Settings(PlacedSettings):
     """Configuration of a JWST distortion reference file."""

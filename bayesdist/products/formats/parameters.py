@@ -7,8 +7,6 @@ from bayesdist.products.formats.common.content import Content, Hdu
 from bayesdist.products.formats.common.document import Choice, Format, finding_lines
 from bayesdist.products.formats.common.parameters import stored_calibration, stored_in
 
-__all__ = ["FORMAT"]
-
 
 def _parse(content: Content) -> tuple[str, Hdu] | None:
     """Name of a file that is such a table, and its extension."""

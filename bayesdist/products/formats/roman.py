@@ -25,9 +25,6 @@ if TYPE_CHECKING:
     from bayesdist.products.formats.common.asdf.build import ChipTransform
     from bayesdist.products.formats.common.asdf.distortion import DistortionFile
 
-__all__ = ["FORMAT", "Settings"]
-
-
 KEY = "coordinate_distortion_transform"
 
 

@@ -7,8 +7,6 @@ from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import Format
 from bayesdist.products.formats.sip.format import describe_wcs
 
-__all__ = ["FORMAT"]
-
 
 def _parse(content: Content) -> Content | None:
     return content if any(holds_wcs(hdu.header) for hdu in content.hdus) else None

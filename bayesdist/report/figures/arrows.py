@@ -20,17 +20,6 @@ if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
-__all__ = [
-    "CHANCE",
-    "Arrows",
-    "cross_map",
-    "magnification_of",
-    "significant_cells",
-    "spacing",
-    "square_cells",
-    "vector_map",
-]
-
 CHANCE = 0.0455  # probability that noise alone puts one axis beyond 2 sigma
 
 # -- grids ----------------------------------------------------------------------------------------

@@ -27,12 +27,6 @@ from bayesdist.report.figures.style import (
 if TYPE_CHECKING:
     from bayesdist.assess.comparison.compare import Comparison
 
-__all__ = [
-    "change_over_time",
-    "difference_vectors",
-    "gaussian_sigmas",
-]
-
 LEVELS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 # from white to a blue on which black arrows are still seen
 _SHADES = LinearSegmentedColormap.from_list("significance", ["#FFFFFF", PALETTE["sky"]])

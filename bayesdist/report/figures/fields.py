@@ -19,8 +19,6 @@ from bayesdist.arrays import Float
 from bayesdist.report.figures.panels import Panels
 from bayesdist.report.figures.style import COLORBAR, INK, SEQUENTIAL, figure_style
 
-__all__ = ["Grid", "contour_levels", "scalar_map"]
-
 EMPTY = "#D9DEE3"  # of a cell without a value
 FAR = 15.0  # factor between values, from which on even steps would show the largest alone
 

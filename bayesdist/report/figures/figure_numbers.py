@@ -17,8 +17,6 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle, StepPatch
 from matplotlib.quiver import Quiver
 
-__all__ = ["numbers_of"]
-
 HEADS = ("panel", "mark", "label", "x", "y", "value", "value_2")
 MOST_ROWS = 20_000  # beyond them a figure is a picture of a table of its own
 Row = tuple[Any, ...]

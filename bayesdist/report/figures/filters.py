@@ -18,8 +18,6 @@ from bayesdist.report.figures.style import (
     new_figure,
 )
 
-__all__ = ["FilterTerm", "filters_figure"]
-
 MARKERS = "os^Dvp"
 
 

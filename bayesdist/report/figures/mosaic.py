@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 from bayesdist.model import Chip
 
-__all__ = ["Mosaic"]
-
 Size = tuple[float, float]
 
 MAX_COLUMNS = 3  # of panels: more would be too narrow to be read

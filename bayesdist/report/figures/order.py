@@ -15,8 +15,6 @@ from bayesdist.report.figures.style import PALETTE, WIDTH, figure_style, new_fig
 if TYPE_CHECKING:
     from bayesdist.infer.compare.order_result import OrderSelection
 
-__all__ = ["order_comparison"]
-
 _NEAR = 10.0  # log density within which the right-hand axis is linear
 _APART = 0.12  # of an order, by which markers of one order are apart
 

@@ -18,8 +18,6 @@ from bayesdist.report.figures.style import (
     new_figure,
 )
 
-__all__ = ["ArrayPanels", "ChipPanels", "OneArray", "Panels", "chip_axes"]
-
 Size = tuple[float, float]
 
 TALLEST_PANEL = 8.0  # inches

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     from bayesdist.assess.planning.dithers import PlannedPattern
 
-__all__ = ["pattern_maps"]
-
 SHOWN = ("gauge-free", "shape")
 ROW = 2.3  # inches
 UNBOUNDED = "#E8ECF0"

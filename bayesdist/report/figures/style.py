@@ -20,27 +20,6 @@ from matplotlib.ticker import LogFormatterSciNotation, ScalarFormatter
 
 from bayesdist.report.figures.ticks import OneTickFigure
 
-__all__ = [
-    "COLORBAR",
-    "CYCLE",
-    "DIVERGING",
-    "GUIDE",
-    "HALF_WIDTH",
-    "INK",
-    "LEVEL_COLORS",
-    "OUTLINE",
-    "PALE",
-    "PALETTE",
-    "SEQUENTIAL",
-    "WIDTH",
-    "figure_style",
-    "guide_lines",
-    "legend_above",
-    "new_figure",
-    "nice_below",
-    "plain_ticks",
-]
-
 # Okabe and Ito's palette: eight colours that remain distinct in every common colour blindness
 PALETTE = {
     "black": "#000000",

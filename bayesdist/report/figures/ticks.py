@@ -15,8 +15,6 @@ from matplotlib.transforms import Bbox
 
 from bayesdist.arrays import Bool, Float
 
-__all__ = ["OneTickAxes", "OneTickFigure"]
-
 
 class _AllTicks:
     """Tick that stands for all of an axis: its lines have all marks, its labels are moved."""

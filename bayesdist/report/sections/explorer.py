@@ -18,8 +18,6 @@ from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.style import CYCLE, SEQUENTIAL
 
-__all__ = ["budget_data", "map_data"]
-
 MOMENT_DIGITS = 7  # quadratic forms of them cancel in part
 MAP_DIGITS = 5
 MOST_POINTS = 65  # of a map on the longer side: a pointer cannot separate more of them

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from bayesdist.report.context import ReportInput
 
-__all__ = ["gauge_mark", "gauge_note", "gauge_of_maps", "gauge_of_new_exposure"]
-
 
 def gauge_mark(r: ReportInput) -> str:
     """Words of a caption on the gauge; empty for a single system, where there is no choice."""

@@ -31,8 +31,6 @@ from bayesdist.calibration.inverse import fitted_inverse
 from bayesdist.errors import InputError
 from bayesdist.reading.tables import read_table
 
-__all__ = ["apply_to_table"]
-
 METHODS = ("newton", "polynomial", "table")
 
 

@@ -23,8 +23,6 @@ from bayesdist.products.formats.common.content import read_hdus
 from bayesdist.products.registry import read_calibration
 from bayesdist.reading.documents import read_json_as
 
-__all__ = ["calibration_at", "images_of", "notes_of", "on_the_sky", "pixel_of_run"]
-
 _SUMMARY = TypeAdapter(Summary)
 
 

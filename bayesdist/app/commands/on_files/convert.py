@@ -36,8 +36,6 @@ from bayesdist.products.formats.common.document import (
 from bayesdist.products.registry import build, format_of, open_document, product_settings
 from bayesdist.reading.documents import toml_of
 
-__all__ = ["convert"]
-
 _GRID = 65  # points of each axis over which the loss is measured
 _ROUNDING = 1e-6  # pixels: what is less is called none
 

@@ -22,8 +22,6 @@ from bayesdist.data.formats.layout import TableLayout, table_layout
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 
-__all__ = ["init"]
-
 log = logging.getLogger("bayesdist")
 
 SIGMA = 0.05  # for tables that say nothing about their errors

@@ -13,8 +13,6 @@ from bayesdist.data import Matches
 from bayesdist.data.formats.layout import TableLayout
 from bayesdist.model.basis import polynomial_terms
 
-__all__ = ["column_lines", "guessed_sigma"]
-
 # names under which SExtractor writes what the image's own WCS makes of the pixels
 _BY_THE_IMAGE = ("alpha_j2000", "alphawin_j2000", "alphapsf_j2000", "sky_centroid.ra")
 _TOLD = 3  # columns that may be chips

@@ -9,8 +9,6 @@ import numpy as np
 
 from bayesdist.errors import InputError
 
-__all__ = ["DetectorLines", "detector_lines", "quoted"]
-
 _DETECTOR = """\
 [detector]
 name = {name}

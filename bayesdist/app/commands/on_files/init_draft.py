@@ -12,8 +12,6 @@ from bayesdist.data.formats.files import input_files, kind_of
 from bayesdist.data.formats.hst1pass import read_hst1pass
 from bayesdist.data.formats.layout import TableLayout, table_layout
 
-__all__ = ["draft_of"]
-
 MAX_CANDIDATES = 40  # columns that are listed
 
 _HEAD = """\

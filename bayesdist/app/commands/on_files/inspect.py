@@ -10,8 +10,6 @@ from bayesdist.app.screen import number, table_text
 if TYPE_CHECKING:
     from bayesdist.infer.posterior import Posterior
 
-__all__ = ["inspect"]
-
 
 def inspect(path: str | Path) -> str:
     """Text on an IDCTAB, a D2IMFILE or NPOLFILE, a WCS in FITS, a posterior, or that of a run."""

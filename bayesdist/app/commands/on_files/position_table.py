@@ -16,17 +16,6 @@ from bayesdist.calibration.apply import Positions
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 
-__all__ = [
-    "OUT",
-    "add_positions",
-    "check_output",
-    "chip_numbers",
-    "position_column",
-    "refuse_columns",
-    "refuse_no_rows",
-    "write_positions",
-]
-
 log = logging.getLogger("bayesdist")
 
 

@@ -15,8 +15,6 @@ from bayesdist.assess.budget.budget import TOTAL, ErrorBudget, place_budget
 from bayesdist.assess.maps import circular_error, per_axis
 from bayesdist.assess.terms.forms import PRODUCT
 
-__all__ = ["budget_at"]
-
 
 def budget_at(
     run: str | Path,

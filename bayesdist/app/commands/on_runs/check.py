@@ -21,8 +21,6 @@ from bayesdist.infer import Limits
 from bayesdist.infer.sampler.certified import PILOTS, has_second_stage
 from bayesdist.infer.sampler.move_schedule import expected_passes
 
-__all__ = ["check"]
-
 # measured on two cores of a server at orders 4 and 5; other machines differ by factors
 STAR_S = 3e-9  # of the likelihood, for each star and pass
 EXPANSION_S = 1.5e-8  # of an expansion to second order, for each star

@@ -32,8 +32,6 @@ from bayesdist.products.formats.common.document import MissingSizeError
 from bayesdist.report.drawing import save_figures
 from bayesdist.report.figures.comparison import difference_vectors
 
-__all__ = ["compare_files", "joined"]
-
 
 def write_comparison(
     output: Path, found: Sequence[Comparison], gaps: Sequence[GapDifference], command: str

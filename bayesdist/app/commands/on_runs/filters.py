@@ -21,8 +21,6 @@ from bayesdist.infer.transforms import linear_terms, lines, reference_gauge, wit
 from bayesdist.limits import DIFFERENCE
 from bayesdist.model import TimeDependence
 
-__all__ = ["FilterComparison", "compare_filters", "comparison_table", "draw_filters"]
-
 Measured = tuple[float, float]  # value and standard deviation
 
 # places of the linear terms: power of x, power of y

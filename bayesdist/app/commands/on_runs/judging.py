@@ -15,8 +15,6 @@ from bayesdist.assess.requirements.margins import judge
 from bayesdist.assess.requirements.validity import ValidityPeriod
 from bayesdist.infer.solution import Solution
 
-__all__ = ["errors_of", "margins_of", "probability_met", "validity_periods_of"]
-
 
 def errors_of(results: Results) -> DrawnErrors:
     """Draws of all errors of a position, as budget and margins have them, and of files."""

@@ -33,8 +33,6 @@ from bayesdist.infer.posterior.memberships import count_outliers
 from bayesdist.report.drawing import save_figures
 from bayesdist.report.figures.comparison import change_over_time, difference_vectors
 
-__all__ = ["monitor"]
-
 CHANGE_MAPS = 1  # of the random streams that follow from the one seed
 
 

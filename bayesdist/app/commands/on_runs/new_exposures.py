@@ -19,8 +19,6 @@ from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.compare.monitoring import NewFit, fit_new, with_star_errors_of
 from bayesdist.infer.linear import Rejection
 
-__all__ = ["fit_exposures_of", "read_new_exposures"]
-
 
 @dataclass(frozen=True, eq=False)
 class NewExposures:

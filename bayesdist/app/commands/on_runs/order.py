@@ -30,8 +30,6 @@ from bayesdist.infer.linear import Rejection
 from bayesdist.model import DistortionModel
 from bayesdist.model.basis import MAX_ORDER
 
-__all__ = ["order"]
-
 
 def order(
     path: str | Path,

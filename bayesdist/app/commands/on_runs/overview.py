@@ -17,8 +17,6 @@ from bayesdist.app.store.summary import head_of
 from bayesdist.numbers import with_mas
 from bayesdist.report.overview import OverviewRow, write_overview
 
-__all__ = ["overview"]
-
 log = logging.getLogger("bayesdist")
 
 NO_VERDICT = "no verdict is recorded; 'bayesdist stage report' makes one"

@@ -19,8 +19,6 @@ from bayesdist.infer.compare.planning import ExposureContent, exposure_content, 
 from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.solution import Solution
 
-__all__ = ["plan"]
-
 DRAWS = 1000
 LATER = 4  # dates that stand for exposures spread evenly
 

@@ -28,8 +28,6 @@ from bayesdist.infer.exposures.shared_drift import with_drift_of
 from bayesdist.infer.solution import Solution
 from bayesdist.model import LookupTable
 
-__all__ = ["release_runs"]
-
 PRINTED = ("filter", "chip", "term", "at_edge", "sigma_at_edge")
 
 

@@ -16,8 +16,6 @@ from bayesdist.app.tables.margins import margin_rows, margins_text
 from bayesdist.assess import Margin, Requirement
 from bayesdist.errors import InputError
 
-__all__ = ["validate"]
-
 
 def validate(run: str | Path, requirements: str | Path) -> tuple[str, bool]:
     """Judge a run that has been sampled, and replace its margins and validity periods.

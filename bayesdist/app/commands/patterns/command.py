@@ -20,8 +20,6 @@ from bayesdist.assess.planning.dithers import (
     nearly_free,
 )
 
-__all__ = ["plan_patterns"]
-
 LEGEND = (
     "reach: largest distance of two pointings, pix; free: directions that detections leave free; "
     "the rest is errors of positions over the detector, per axis, 1 sigma, pix (CE68 is 1.51 and "

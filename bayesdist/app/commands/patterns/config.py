@@ -32,8 +32,6 @@ from bayesdist.simulate.patterns import (
     rolls_in_turn,
 )
 
-__all__ = ["PlanConfig", "load_plan"]
-
 Pair = tuple[PositiveFloat, PositiveFloat]
 MOST_EXPOSURES = 10_000  # of one pattern
 Count = Annotated[int, Field(ge=1, le=MOST_EXPOSURES)]  # of exposures, or of one side of their grid

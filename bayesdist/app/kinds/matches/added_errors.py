@@ -12,8 +12,6 @@ from bayesdist.errors import DegenerateError
 from bayesdist.infer import GaussianPriors, LinearFit
 from bayesdist.infer.catalogue.added_errors import ONE, GroupedErrors, grouped_errors
 
-__all__ = ["added_errors_rows", "compared_errors", "grouping_sentence", "knows_circle"]
-
 log = logging.getLogger("bayesdist")
 
 MOST_LISTED = 4  # groups that are listed one by one

@@ -12,8 +12,6 @@ from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel, TimeDependence
 
-__all__ = ["doubts_on_stars", "refuse_empty_segments"]
-
 OFF = 1e3  # factor on the scale by which u and v cannot be those of the detector
 ODD = 3.0  # factor that is worth a warning
 SMALLEST_ERROR = 1e-6  # pixels: no detector measures positions to that

@@ -16,18 +16,6 @@ from bayesdist.errors import InputError
 from bayesdist.mission import load_object, missions
 from bayesdist.model import Chip
 
-__all__ = [
-    "MatchSource",
-    "RunInput",
-    "check_chips",
-    "input_of_run",
-    "is_large",
-    "load_matches",
-    "mission_template",
-    "read_configured",
-]
-
-
 IN_MEMORY = 1_000_000  # rows of Parquet above which they stay on disk
 
 PathLike = str | os.PathLike[str]

@@ -45,17 +45,6 @@ from bayesdist.infer.linear import Rejection
 from bayesdist.model import DistortionModel
 from bayesdist.products.registry import read_calibration
 
-__all__ = [
-    "earlier_calibration",
-    "fit_stars",
-    "match_stars",
-    "model_of",
-    "read_stars",
-    "sample_stars",
-    "shards_of",
-]
-
-
 log = logging.getLogger("bayesdist")
 
 SAMPLING = 1  # of the random streams that follow from the one seed: that of the stage 'sample'

@@ -15,8 +15,6 @@ from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 
-__all__ = ["FunctionField", "Functions"]
-
 MANY = 64  # functions from which on their values are kept, not their coefficients alone
 
 

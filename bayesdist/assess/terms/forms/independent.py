@@ -12,8 +12,6 @@ from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms.rows import ErrorField, Image, Noise, Row, Scale
 
-__all__ = ["Independent", "Known", "KnownField", "NoiseField"]
-
 
 class SigmaAt(Protocol):
     """Standard deviations at the positions of a domain."""

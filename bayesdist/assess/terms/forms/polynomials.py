@@ -15,8 +15,6 @@ from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
 from bayesdist.calibration.chip_map import position_moments
 from bayesdist.model import DistortionModel
 
-__all__ = ["PolynomialField", "Polynomials", "polynomial_errors", "without_rigid"]
-
 
 def polynomial_errors(
     model: DistortionModel,

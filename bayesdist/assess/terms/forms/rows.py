@@ -17,22 +17,6 @@ import numpy as np
 from bayesdist.arrays import Float, Int
 from bayesdist.assess.domain import EvaluationDomain
 
-__all__ = [
-    "GIVEN",
-    "LOCAL",
-    "MEASURED",
-    "PRODUCT",
-    "PUBLISHED",
-    "DrawnField",
-    "ErrorDraws",
-    "ErrorField",
-    "ErrorTerm",
-    "Image",
-    "Noise",
-    "Row",
-    "Scale",
-]
-
 Scale = Mapping[str, float]
 
 LOCAL, PRODUCT = "local", "product"

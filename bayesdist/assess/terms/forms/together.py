@@ -13,8 +13,6 @@ from bayesdist.assess.terms.forms.functions import Functions
 from bayesdist.assess.terms.forms.polynomials import Polynomials
 from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
 
-__all__ = ["Together", "TogetherField"]
-
 
 @dataclass(frozen=True, eq=False)
 class Together:

@@ -21,8 +21,6 @@ from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
-__all__ = ["handbook"]
-
 
 def handbook(
     path: str | Path,

@@ -24,8 +24,6 @@ from bayesdist.report.figures.style import PALETTE, nice_below
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
-__all__ = ["area_figure", "non_linear_figure", "residual_figure"]
-
 # vectors, and points of contours, along the longer side of a chip
 _VECTORS, _POINTS = 21, 65
 

@@ -14,9 +14,6 @@ from bayesdist.errors import InputError
 from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 from bayesdist.model.grid import mesh
 
-__all__ = ["acs_detector", "detector_numbers", "handbook_rows"]
-
-
 # Points on each axis of a chip where extremes are looked for: they lie at edges and in corners.
 _GRID = 129
 

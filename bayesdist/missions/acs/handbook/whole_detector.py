@@ -21,8 +21,6 @@ from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import InputError
 from bayesdist.model.grid import mesh
 
-__all__ = ["WholeDetector"]
-
 
 @dataclass(frozen=True, eq=False)
 class ChipField:

@@ -14,8 +14,6 @@ from bayesdist.missions.acs.simulate.stars import FAINT, centroid_error
 from bayesdist.missions.acs.simulate.truth import AcsTruth, DetectionTruth
 from bayesdist.model import Chip
 
-__all__ = ["Detector", "cte_shift", "star_list"]
-
 BORDER = 5.0  # pixels: too close to an edge for a fit
 LIMIT, SOFT = -7.5, 0.3  # magnitude at which half of the stars are found, and width of the decline
 SATURATED = -14.0  # Figure 5

@@ -17,8 +17,6 @@ from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
-__all__ = ["ACS_FILTERS", "SM4", "acs_model", "acs_solution"]
-
 SM4 = 2009.4  # Servicing Mission 4, May 2009
 EPOCH0 = (2004.5, 2012.5)  # RDATE of Tables 1-3
 HALF = (2048.0, 1024.0)

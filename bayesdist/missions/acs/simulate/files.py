@@ -16,8 +16,6 @@ from bayesdist.files import atomic_path, made_folder
 from bayesdist.missions.acs.simulate.truth import AcsCampaign
 from bayesdist.missions.acs.simulate.truth_files import read_truth, write_truth
 
-__all__ = ["read_acs", "write_acs"]
-
 CATALOGS = {"catalog": "catalog", "catalog_early": "early", "catalog_late": "late"}
 CATALOG_UNITS = (
     dict.fromkeys(("u", "v", "sigma_u", "sigma_v"), "pix")

@@ -16,8 +16,6 @@ from bayesdist.missions.acs.simulate.stars import measured_catalogs, true_stars
 from bayesdist.missions.acs.simulate.tables import detector_tables, filter_tables
 from bayesdist.missions.acs.simulate.truth import AcsCampaign, AcsTruth
 
-__all__ = ["simulate_acs"]
-
 BASE = "F606W"
 FEWEST = 100  # stars
 SCATTER = 7e-6  # of the linear terms: 7e-6 / sqrt(60) is the sigma(alpha) of Table 1

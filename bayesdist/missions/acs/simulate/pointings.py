@@ -21,8 +21,6 @@ from bayesdist.data.sky.earth import velocity_aberration
 from bayesdist.missions.acs.simulate.distortion import SM4
 from bayesdist.missions.acs.simulate.stars import CENTRE
 
-__all__ = ["AcsFrames", "exposures_of", "frames_of"]
-
 # Of the catalogue's pixel (5000, 5000): 00h 22m 35.0s, -72d 04' 00"
 RA, DEC = 5.645833333333333, -72.06666666666666
 PIXEL = 0.05 / 3600.0  # degrees

@@ -14,8 +14,6 @@ from scipy.spatial import cKDTree
 from bayesdist.arrays import Float
 from bayesdist.data import ReferenceCatalog
 
-__all__ = ["CENTRE", "FAINT", "TrueStars", "centroid_error", "measured_catalogs", "true_stars"]
-
 HALF_SIZE = 4500.0  # pixels from the centre to each side
 CENTRE = (5000.0, 5000.0)
 CLUSTER = (CENTRE[0] - 6.7 * 60 / 0.05, CENTRE[1])  # its centre lies to the east

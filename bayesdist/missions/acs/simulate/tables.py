@@ -17,8 +17,6 @@ from bayesdist.missions.acs.simulate.distortion import CHIPS, EPOCH0, HALF, acs_
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.lookup import LookupTable
 
-__all__ = ["detector_tables", "filter_tables"]
-
 STEP = 64.0
 SHAPE = (32, 64)  # nodes along y and x
 ORDER = 5  # the tables are orthogonal to polynomials of this order

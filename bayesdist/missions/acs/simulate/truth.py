@@ -18,8 +18,6 @@ from bayesdist.missions.acs.simulate.stars import TrueStars
 from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.lookup import LookupTable, corrected
 
-__all__ = ["LINEAR_TERMS", "AcsCampaign", "AcsTruth", "DetectionTruth"]
-
 LINEAR_TERMS = ("A_1", "A_2", "A_3", "B_1", "B_2", "B_3")
 CLOSE = 1e-10  # pixels: largest error of an inverse
 EXACT = 1e-13  # step in scaled pixels at which Newton's method has converged

@@ -19,8 +19,6 @@ from bayesdist.model.lookup import LookupTable
 from bayesdist.reading.faults import naming_faults
 from bayesdist.reading.tables import read_table
 
-__all__ = ["read_truth", "write_truth"]
-
 STAR_UNITS = {"u": "pix", "v": "pix", "pm_u": "pix / yr", "pm_v": "pix / yr"}
 MATRIX = ("uu", "uv", "vu", "vv")
 

@@ -29,8 +29,6 @@ from bayesdist.missions.wise.assess.published import (
 from bayesdist.missions.wise.assess.residual_structure import ResidualPartition
 from bayesdist.missions.wise.published import SAMPLE_SIZES
 
-__all__ = ["LONGEST_DIFFERENCES", "PRINTED_BINS", "RowAccount", "accounts", "partition_parts"]
-
 PRINTED_BINS = 31
 # section 4: longest difference vectors, in pixels of W1, and from the Code V model, in the band's
 LONGEST_DIFFERENCES = {

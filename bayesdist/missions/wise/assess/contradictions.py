@@ -14,8 +14,6 @@ import numpy as np
 from bayesdist.missions.wise.assess.published import PrintedRow
 from bayesdist.missions.wise.assess.tables import WISE_ARCSEC
 
-__all__ = ["contradictions_across", "contradictions_within"]
-
 
 def contradictions_within(row: PrintedRow) -> list[str]:
     """Sentences on statistics of a row that no set of numbers can have.

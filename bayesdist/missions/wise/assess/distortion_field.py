@@ -19,8 +19,6 @@ from bayesdist.infer.solution import Solution
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.grid import grid_pixels
 
-__all__ = ["DistortionField", "field_of_solution"]
-
 
 @dataclass(frozen=True, eq=False)
 class DistortionField:

@@ -17,8 +17,6 @@ from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.missions.wise.assess.distortion_field import DistortionField
 
-__all__ = ["BandSums", "ResidualHistogram", "band_sums", "histogram"]
-
 CALIBRATED = "calibrated"
 HISTOGRAM_BINS = 401  # an odd number: one of them lies about zero
 _BLOCK = 2**16  # stars

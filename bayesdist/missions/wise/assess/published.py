@@ -12,18 +12,6 @@ from bayesdist.diagnose.residuals.rows import STATISTICS
 from bayesdist.errors import InputError
 from bayesdist.model.basis import polynomial_terms
 
-__all__ = [
-    "HEADS",
-    "TABLE_5_1",
-    "TABLE_5_2",
-    "TABLE_5_3",
-    "TABLE_C_1",
-    "PrintedRow",
-    "implied_sigma",
-    "noise_of_bins",
-    "printed_rows",
-]
-
 HEADS = dict(
     zip(STATISTICS, ("Mean", "Sigma", "Min", "Max", "Median", "1%-tile", "99%-tile"), strict=True)
 )

@@ -11,8 +11,6 @@ from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.residuals.binned import BinnedResiduals
 from bayesdist.missions.wise.assess.residual_field import ResidualField, residual_field
 
-__all__ = ["ResidualCorrelation", "residual_correlation"]
-
 DRAWS = 500  # noise fields that give mean and sigma, and half a thousand more for the ranks
 _AT_ONCE = 50
 _PAIRS = (("uu", 0, 0), ("vv", 1, 1), ("uv", 0, 1))

@@ -13,8 +13,6 @@ from bayesdist.diagnose.residuals.binned import BinnedResiduals
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.model.basis import polynomial_terms
 
-__all__ = ["ResidualField", "residual_field", "scaled"]
-
 _FEWEST_STARS = 5
 
 

@@ -21,8 +21,6 @@ from bayesdist.limits import STRUCTURE
 from bayesdist.missions.wise.assess.residual_field import ResidualField, residual_field, scaled
 from bayesdist.model.basis import polynomial_terms
 
-__all__ = ["ResidualPartition", "residual_partition"]
-
 Base = tuple[Float, Float]
 
 PARTITIONS = tuple(range(2, 13))

@@ -17,8 +17,6 @@ from bayesdist.diagnose.residuals import (
 )
 from bayesdist.missions.wise.published import WISE_ARRAYS
 
-__all__ = ["WISE_ARCSEC", "band_to_band_table", "fitting_table", "multiframe_table"]
-
 _AXES = BAND_AXES[:2]
 WISE_ARCSEC = {band: array.scale for band, array in WISE_ARRAYS.items()}  # per pixel
 

@@ -25,8 +25,6 @@ from bayesdist.products import sip_from_solution, write_wise_meta
 from bayesdist.report.drawing import draw_all, save_drawings
 from bayesdist.report.page import parts_of, template
 
-__all__ = ["bands_of_runs"]
-
 
 def write_bands(folder: Path, inputs: BandsInput) -> list[str]:
     """Names of bands.html and its figures, once they are written into a folder.

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from bayesdist.missions.wise.assess.residual_correlation import ResidualCorrelation
     from bayesdist.missions.wise.assess.residual_structure import ResidualPartition
 
-__all__ = ["BANDS", "BandResult", "BandsInput", "Printed"]
-
 BANDS = Registry(
     "bands",
     (

@@ -10,8 +10,6 @@ from bayesdist.numbers import probability
 from bayesdist.report.figures.style import INK, PALETTE, WIDTH, legend_above, new_figure
 from bayesdist.report.registry import Plot
 
-__all__ = ["CASES", "below_draws", "chance_of", "correlation", "histograms"]
-
 # colour, width and dashes by case, drawn in this order
 CASES = {
     "no correction": (PALETTE["blue"], 1.0, "-"),

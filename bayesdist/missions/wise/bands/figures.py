@@ -21,16 +21,6 @@ from bayesdist.report.registry import Plot
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap
 
-__all__ = [
-    "alignment",
-    "coverage",
-    "differences",
-    "formal_uncertainty",
-    "minus_optical",
-    "residuals",
-    "vectors",
-]
-
 Size = tuple[float, float]
 
 EVERY = 2  # every second vector of a map is drawn: more would hide each other in small panels

@@ -13,8 +13,6 @@ from bayesdist.numbers import MISSING, count, number, percent, probability, size
 from bayesdist.report.sections.run.status import Verdict
 from bayesdist.report.texttable import TextTable, listing
 
-__all__ = ["overview_table", "verdict"]
-
 SAME_VECTOR = 0.005  # of the printed maximum
 
 

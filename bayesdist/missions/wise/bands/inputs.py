@@ -13,8 +13,6 @@ from bayesdist.errors import InputError
 from bayesdist.missions.wise.published import WISE_BANDS
 from bayesdist.model import Chip
 
-__all__ = ["BandRun", "open_bands"]
-
 SAME_FIELD = 0.01  # by so much the fields of two bands may differ in size
 
 

@@ -30,8 +30,6 @@ from bayesdist.missions.wise.published import (
 )
 from bayesdist.model.basis import polynomial_terms
 
-__all__ = ["measure_bands"]
-
 GRID = (33, 33)
 SEED = 20110201
 

@@ -14,8 +14,6 @@ from bayesdist.model import Chip, PolynomialBasis
 from bayesdist.products import SipHeader, read_sip, read_wise_meta, rotated_sip
 from bayesdist.products.registry import open_document
 
-__all__ = ["OpticalModel", "optical_models"]
-
 OTHER_FIELD = 1.5  # by this factor in extent the header's image is of another instrument
 
 

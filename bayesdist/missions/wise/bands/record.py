@@ -16,8 +16,6 @@ from bayesdist.missions.wise.assess.published import HEADS
 from bayesdist.missions.wise.bands.context import BandResult, BandsInput
 from bayesdist.missions.wise.bands.findings import verdict
 
-__all__ = ["record_of", "write_tables"]
-
 
 def record_of(inputs: BandsInput) -> dict[str, Any]:
     """Content of bands.json beside command and versions."""

@@ -13,8 +13,6 @@ from bayesdist.missions.wise.bands.context import BANDS, BandsInput
 from bayesdist.numbers import MISSING, number, rounded
 from bayesdist.report.texttable import TextTable
 
-__all__ = ["as_printed"]
-
 TITLES = {
     "5-1": "Residuals of the fit in bins",
     "5-2": "Alignment of two bands observed together",

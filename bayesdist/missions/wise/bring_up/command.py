@@ -25,8 +25,6 @@ from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.reading.tables import read_table
 
-__all__ = ["bring_up_files"]
-
 _COLUMNS = {
     "x": ("x",),
     "y": ("y",),

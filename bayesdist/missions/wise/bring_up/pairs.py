@@ -15,8 +15,6 @@ from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.model import DistortionModel
 
-__all__ = ["Field"]
-
 RARE = 1e-3
 DISPLACED = 10.0  # in units of the radius in the corners
 GRID = 17  # points on each axis where models are compared

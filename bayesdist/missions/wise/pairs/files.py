@@ -19,16 +19,6 @@ from bayesdist.errors import InputError
 from bayesdist.missions.wise.published import WISE_BANDS
 from bayesdist.reading.tables import read_table
 
-__all__ = [
-    "IPAC",
-    "MAGNITUDES",
-    "RVB_ALIASES",
-    "ArrayCheck",
-    "RvbFile",
-    "band_name",
-    "open_rvb_files",
-]
-
 PathLike = str | os.PathLike[str]
 
 MAGNITUDES = tuple(f"mag_{band.lower()}" for band in WISE_BANDS)

@@ -16,8 +16,6 @@ from bayesdist.arrays import Bool, Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 
-__all__ = ["CHI2", "OFFSET", "RadialLimit", "radial_rows"]
-
 OFFSET = "offset beyond the radial limit"
 CHI2 = "chi-square beyond the radial limit"
 

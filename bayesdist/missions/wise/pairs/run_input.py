@@ -31,9 +31,6 @@ from bayesdist.missions.wise.pairs.selection import SelectedPairs
 from bayesdist.missions.wise.pairs.template import rvb_template
 from bayesdist.missions.wise.published import WISE_ARRAYS
 
-__all__ = ["open_rvb"]
-
-
 PathLike = str | os.PathLike[str]
 
 

@@ -23,8 +23,6 @@ from bayesdist.data.storage.write import Part, write_parts
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
 
-__all__ = ["RvbPairs", "bluest_rows", "colour_of", "colours_of", "write_rvb"]
-
 NO_COLOUR = "no colour"
 COLOUR = "colour"
 

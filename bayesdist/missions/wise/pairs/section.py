@@ -10,8 +10,6 @@ from bayesdist.app.config.data import Data
 from bayesdist.app.config.section import Section
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 
-__all__ = ["RvbBlock", "RvbData"]
-
 
 class RvbBlock(Section):
     """Limits that pairs have to meet, all of those that are given.

@@ -26,8 +26,6 @@ from bayesdist.missions.wise.pairs.rvb_pairs import (
 )
 from bayesdist.missions.wise.pairs.section import RvbBlock
 
-__all__ = ["SelectedPairs"]
-
 MOST_COLOURS = 100_000_000  # rows whose colours are compared with each other, 1.6 GB of them
 
 

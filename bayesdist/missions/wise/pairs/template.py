@@ -18,8 +18,6 @@ from bayesdist.missions.wise.pairs.read import rvb_bands, stream_rvb
 from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.reading.tables import read_table
 
-__all__ = ["rvb_template"]
-
 SIGMA = 0.1  # pixels, for pairs that say nothing about their errors
 
 _FORMAT = """\

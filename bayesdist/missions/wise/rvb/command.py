@@ -24,9 +24,6 @@ from bayesdist.missions.wise.rvb.linear import fit_transform, linear_moments
 from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform, rereference, transformed
 from bayesdist.reading.tables import read_table
 
-__all__ = ["read_solutions", "rereference_files", "transform_files"]
-
-
 SOLUTION_ALIASES: dict[str, tuple[str, ...]] = {
     "frame": RVB_ALIASES["exposure"],
     **{name: (name,) for name in PARAMETERS},

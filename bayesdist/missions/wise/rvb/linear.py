@@ -14,8 +14,6 @@ from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform
 
-__all__ = ["LinearMoments", "fit_transform", "linear_moments"]
-
 FREE = 5  # parameters that are fitted, the first of `PARAMETERS`
 
 _RANK = 1e-12  # eigenvalues of the unit-diagonal normal matrix below this are zero

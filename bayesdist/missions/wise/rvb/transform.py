@@ -17,8 +17,6 @@ from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 
-__all__ = ["PARAMETERS", "RvbTransform", "rereference", "transformed"]
-
 PARAMETERS = ("shift_u", "shift_v", "rotation", "scale_u", "scale_v", "skew")
 
 # Errors of u and v stay uncorrelated in a Matches.  A transformation that correlates them by

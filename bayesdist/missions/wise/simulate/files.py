@@ -18,8 +18,6 @@ from bayesdist.files import atomic_path, made_folder
 from bayesdist.missions.wise.simulate.pattern import PartitionPattern
 from bayesdist.missions.wise.simulate.sets import PairChunk, WiseSet
 
-__all__ = ["write_wise_set"]
-
 UNITS = dict.fromkeys(("x", "y", "u", "v", "sigma"), "pix") | {"epoch": "yr", "mag": "mag"}
 UNITS["colour"] = "mag"
 

@@ -14,8 +14,6 @@ from numpy.polynomial import legendre
 from bayesdist.arrays import Float
 from bayesdist.model import PolynomialBasis
 
-__all__ = ["BLOCKS", "PartitionPattern", "partition_pattern"]
-
 BLOCKS = {"W1": 5, "W2": 5, "W3": 2}  # on each axis
 
 

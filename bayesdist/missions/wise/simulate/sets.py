@@ -24,8 +24,6 @@ from bayesdist.missions.wise.simulate.stars import POPULATIONS
 from bayesdist.missions.wise.simulate.survey import FalseMatches, Survey, false_matches, survey
 from bayesdist.model import DistortionModel
 
-__all__ = ["PairChunk", "WiseSet", "wise_set"]
-
 CHUNK = 2**19  # pairs of a chunk at most
 _STEP = 8192  # positions at a time: they stay in the cache
 

@@ -14,8 +14,6 @@ from bayesdist.missions.wise.published import SAMPLE_SIZES, WISE_ARRAYS, WISE_CO
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate.matches import Truth, simulate_matches, simulate_partitioned
 
-__all__ = ["simulate_wise", "simulate_wise_partitioned", "wise_solution"]
-
 FAINT, BRIGHT = 14.5, 7.0
 
 

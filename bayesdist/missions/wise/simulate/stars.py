@@ -14,8 +14,6 @@ import numpy as np
 from bayesdist.arrays import Bool, Float
 from bayesdist.missions.wise.published import WISE_ARRAYS
 
-__all__ = ["POPULATIONS"]
-
 COUNTS = 0.3  # slope of the logarithm of star counts by magnitude
 REFERENCE_ARCSEC = 0.08  # 2MASS positions on each axis
 STAR_COLOUR = (0.0, 0.15)  # mean and standard deviation, magnitudes

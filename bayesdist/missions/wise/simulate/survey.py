@@ -14,8 +14,6 @@ from scipy.optimize import brentq
 from bayesdist.arrays import Float, Int
 from bayesdist.errors import InputError
 
-__all__ = ["FalseMatches", "Survey", "false_matches", "match_radius", "survey"]
-
 FRAMES = 5000  # framesets; one serves all bands
 CADENCE_S = 11.0
 PER_SCAN = 259  # half an orbit of 95 minutes

@@ -22,8 +22,6 @@ from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import MissingSizeError
 from bayesdist.products.formats.common.parameters import with_parameters
 
-__all__ = ["AstFile", "ast_calibration", "ast_of"]
-
 _REMARK = re.compile(r"#\s*bayesdist\s+(\w+)\s+(.*?)\s*$", re.MULTILINE)
 _BEGIN = re.compile(r"(#.*\n|\s*\n)*\s*Begin\s+\w+")
 

@@ -28,8 +28,6 @@ from bayesdist.products.formats.common.document import (
 from bayesdist.products.formats.common.parameters import parameters_content
 from bayesdist.products.formats.tpv.head import substitution
 
-__all__ = ["FORMAT", "Settings"]
-
 _SKEW = 0.5  # sine of the angle between the axes, and ratio of their scales: no camera is below
 
 

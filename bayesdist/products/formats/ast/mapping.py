@@ -17,8 +17,6 @@ from bayesdist.arrays import Float
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model.basis import MAX_ORDER
 
-__all__ = ["PolyMap", "Step", "parse_dump", "steps_of"]
-
 _BEGIN = re.compile(r"\s*Begin\s+(\w+)\s*(#.*)?$")
 _END = re.compile(r"\s*End\s+(\w+)\s*(#.*)?$")
 _VALUE = re.compile(r"\s*(\w+)\s*=\s*(\"(?:[^\"]|\"\")*\"|[^#\s]*)\s*(#.*)?$")

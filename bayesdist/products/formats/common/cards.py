@@ -12,19 +12,6 @@ from astropy.io import fits
 from bayesdist.errors import FormatError
 from bayesdist.infer.solution import Solution
 
-__all__ = [
-    "card_images",
-    "convergence_cards",
-    "header_of",
-    "holds_wcs",
-    "keyword_of",
-    "named_in",
-    "number_card",
-    "printable",
-    "text_card",
-    "wrapped_cards",
-]
-
 _UNPRINTABLE = re.compile(r"[^ -~]")  # a header has printable ASCII alone
 # Without one of these nothing ties pixels to a world.
 _NEEDED = re.compile(r"(CTYPE|CRVAL)\d+[A-Z]?$|A_ORDER$|(T?CTYP|TCTY|TCRVL|TCRV)\d+[A-Z]?$")

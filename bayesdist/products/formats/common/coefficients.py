@@ -27,18 +27,6 @@ from numpy.typing import ArrayLike
 from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError
 
-__all__ = [
-    "Coefficients",
-    "evaluate",
-    "idctab_column",
-    "idctab_powers",
-    "largest_magnitude",
-    "propagated_sigma",
-    "require_regular",
-    "sip_keyword",
-    "sip_powers",
-]
-
 Coefficients = Mapping[tuple[int, int], float]
 
 SINGULAR = 1e-12  # determinant over the largest coefficient squared

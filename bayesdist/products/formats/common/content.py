@@ -33,8 +33,6 @@ from bayesdist.reading.fits import HDU_STARTS, RECORD, data_size, open_fits, pad
 from bayesdist.reading.regular import read_bytes
 from bayesdist.reading.unpacked import unpacked
 
-__all__ = ["Content", "Hdu", "hdus_of", "read_content", "read_hdus", "readable", "write_hdus"]
-
 _CARD = re.compile(r"[A-Z0-9_-]{1,8} *=|(COMMENT|HISTORY| {8})")
 
 

@@ -22,23 +22,6 @@ from bayesdist.model.basis import MAX_ORDER
 from bayesdist.products.formats.common.content import Content, readable
 from bayesdist.products.formats.common.read_back import ReadBack
 
-__all__ = [
-    "PARAMETERS",
-    "BuildOptions",
-    "Builder",
-    "Built",
-    "Choice",
-    "Document",
-    "Finding",
-    "Format",
-    "FormatSettings",
-    "MissingSizeError",
-    "finding_lines",
-    "identity_lines",
-    "missing_identity",
-    "repeated_values",
-]
-
 LEVELS = ("error", "warning", "note")
 PARAMETERS = "parameters"  # kind of a file that stands beside another, with its covariance
 

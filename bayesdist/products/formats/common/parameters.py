@@ -29,14 +29,6 @@ from bayesdist.model import Chip, DistortionModel
 from bayesdist.products.formats.common.cards import named_in
 from bayesdist.products.formats.common.content import Content, Hdu, hdus_of
 
-__all__ = [
-    "parameters_content",
-    "parameters_hdu",
-    "stored_calibration",
-    "stored_in",
-    "with_parameters",
-]
-
 EXTENSION = "BDPARAM"
 AGREE = 1e-6  # pixels by which numbers that were printed may differ from the parameters
 _GRID = 33  # points of each axis over which two calibrations are compared

@@ -11,8 +11,6 @@ from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.model import TimeDependence
 
-__all__ = ["Positions", "ReadBack", "by_calibrations", "of_chips"]
-
 Positions = Callable[[Float, Float, int, float | None], Float]
 
 

@@ -22,8 +22,6 @@ from bayesdist.model import Chip, DistortionModel, LookupTable
 from bayesdist.reading.documents import model_of
 from bayesdist.version import __version__
 
-__all__ = ["at_date", "calibration_from", "record_of"]
-
 VERSION = 1
 Pair = tuple[float, float]
 

@@ -24,8 +24,6 @@ from bayesdist.products.formats.common.content import hdus_of
 from bayesdist.products.formats.common.parameters import parameters_hdu
 from bayesdist.products.formats.cpdis.file import ERRORS, TABLES
 
-__all__ = ["cpdis_content"]
-
 _CLOSE = 1e-4  # pixels: error between nodes that is aimed at where no step is asked for
 _STEPS = (64.0, 32.0, 16.0, 8.0, 4.0)  # pixels
 _MOST = 1025  # nodes of an axis

@@ -29,8 +29,6 @@ from bayesdist.products.formats.common.parameters import stored_calibration, sto
 from bayesdist.products.formats.lookup.plane import Plane as TablePlane
 from bayesdist.products.formats.sip.read import cd_matrix, image_size
 
-__all__ = ["ERRORS", "TABLES", "CpdisFile", "CpdisImage", "cpdis_calibration", "cpdis_of"]
-
 TABLES, ERRORS = "WCSDVARR", "WCSDVERR"
 _DEGREES = {"deg": 1.0, "arcsec": 1 / 3600, "mas": 1 / 3.6e6, "rad": 180 / np.pi, "": 1.0}
 _SLACK = 1e-9  # pixels: rounding of a check

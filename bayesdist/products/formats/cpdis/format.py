@@ -17,8 +17,6 @@ from bayesdist.products.formats.cpdis.file import CpdisFile, cpdis_calibration, 
 from bayesdist.products.formats.cpdis.lint import lint_cpdis
 from bayesdist.products.formats.sip.format import describe_wcs
 
-__all__ = ["FORMAT", "Settings"]
-
 
 class Settings(FormatSettings):
     """Configuration of a file with look-up tables."""

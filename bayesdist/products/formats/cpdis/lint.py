@@ -17,8 +17,6 @@ from bayesdist.products.formats.cpdis.file import (
 )
 from bayesdist.products.formats.lookup.plane import Plane
 
-__all__ = ["lint_cpdis"]
-
 _TINY = 1e-3  # pixels: tables all of which are below are in another unit
 _ASKEW = 0.75  # of a step by which the nodes lie nearer to one edge than to the other
 # sign of det(CD) by CTYPE1: with north up RA grows to the left, longitude on the Sun to the right

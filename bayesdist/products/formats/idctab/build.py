@@ -37,8 +37,6 @@ from bayesdist.products.formats.idctab.numbers import (
 )
 from bayesdist.products.formats.idctab.table import IdcTab
 
-__all__ = ["idctab_from_solution"]
-
 Filter = str | tuple[str, ...]
 Source = Solution | Calibration
 

@@ -27,8 +27,6 @@ from bayesdist.products.formats.idctab.hst import parity_of
 from bayesdist.products.formats.idctab.plausible import refuse_implausible
 from bayesdist.products.formats.idctab.table import FILTER_COLUMNS, IdcTab
 
-__all__ = ["idctab_calibration"]
-
 Filters = Sequence[str] | None
 
 

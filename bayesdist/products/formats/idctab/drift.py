@@ -24,8 +24,6 @@ from bayesdist.infer.solution import Solution, TransformedSolution
 from bayesdist.infer.transforms import segment as segment_of
 from bayesdist.model import TimeDependence
 
-__all__ = ["RATES", "Loss", "drift", "scheme_of", "storable"]
-
 Term = tuple[str, int, int]
 
 NEGLIGIBLE = 1e-3  # mas: a drift held at zero by a prior, or by the gauge, is not reported

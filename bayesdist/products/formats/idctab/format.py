@@ -23,9 +23,6 @@ from bayesdist.products.formats.idctab.lint import lint_idctab
 from bayesdist.products.formats.idctab.plausible import LIMITS
 from bayesdist.products.formats.idctab.table import FILTER_COLUMNS, HIGHEST, IdcTab
 
-__all__ = ["FORMAT", "Settings", "describe_idctab"]
-
-
 _SCHEMES = {
     "2015": "scheme of 2015: CX11 += CXB dt, CY11 += CTB dt, CY10 += CYB dt",
     "2014": "scheme of 2014 (TDD_CXB, TDD_CYB)",

@@ -26,16 +26,6 @@ from bayesdist.calibration.plane import Orientation
 from bayesdist.products.formats.common.cards import number_card, text_card, wrapped_cards
 from bayesdist.products.formats.idctab.numbers import ChipInverse, ChipNumbers
 
-__all__ = [
-    "Piece",
-    "closure_cards",
-    "coefficient_hdu",
-    "covariance_hdu",
-    "provenance_cards",
-    "sigma_hdu",
-    "tdd_cards",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class Piece:

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from bayesdist.errors import InputError
 
-__all__ = ["combination_of", "parity_of", "serves"]
-
 _PARITY = {
     ("ACS", "WFC"): (1, -1),
     ("ACS", "HRC"): (-1, 1),

@@ -14,8 +14,6 @@ from bayesdist.products.formats.idctab.hst import parity_of
 from bayesdist.products.formats.idctab.plausible import implausible, rows_text
 from bayesdist.products.formats.idctab.table import FILTER_COLUMNS, IdcTab
 
-__all__ = ["lint_idctab"]
-
 _SCALE_RATIO = 1.25
 
 

@@ -26,15 +26,6 @@ from bayesdist.products.formats.common.coefficients import (
 )
 from bayesdist.products.formats.idctab.drift import RATES
 
-__all__ = [
-    "ChipInverse",
-    "ChipNumbers",
-    "check_time",
-    "chip_inverse",
-    "chip_numbers",
-    "joint_covariance",
-]
-
 INVERSE_NODES = 33  # points of each axis of the fit
 
 

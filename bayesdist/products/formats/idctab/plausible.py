@@ -10,8 +10,6 @@ from bayesdist.errors import FormatError
 from bayesdist.products.formats.common.document import Finding
 from bayesdist.products.formats.idctab.table import IdcTab
 
-__all__ = ["implausible", "refuse_implausible", "rows_text"]
-
 # least and most that a column may have, and what it is then
 LIMITS = {
     "XSIZE": (1.0, 1e6, "pixels"),

@@ -37,8 +37,6 @@ from bayesdist.products.formats.common.content import Hdu, read_hdus, write_hdus
 from bayesdist.products.formats.idctab.drift import drift, scheme_of
 from bayesdist.products.formats.idctab.hst import serves
 
-__all__ = ["FILTER_COLUMNS", "HIGHEST", "IdcTab", "read_idctab", "write_idctab"]
-
 FILTER_COLUMNS = ("FILTER1", "FILTER2", "FILTER", "OPT_ELEM")
 HIGHEST = 9  # order: CX and CY have one digit for each power
 # The chip to whose zero point stwcs refers both chips of ACS/WFC and of WFC3/UVIS.

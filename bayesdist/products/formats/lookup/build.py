@@ -24,8 +24,6 @@ from bayesdist.products.formats.common.cards import number_card, text_card, wrap
 from bayesdist.products.formats.common.content import hdus_of
 from bayesdist.products.formats.lookup.file import AXES, LookupFile
 
-__all__ = ["Part", "identity_cards", "lookup_file", "one_per_chip", "optional_cards"]
-
 # A maximum below this fraction of the largest absolute value may turn negative on the way.
 _CLEARLY = 0.01
 

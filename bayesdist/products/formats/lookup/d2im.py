@@ -21,8 +21,6 @@ from bayesdist.products.formats.lookup.file import (
     write_lookup_file,
 )
 
-__all__ = ["read_d2im", "write_d2im"]
-
 
 def write_d2im(
     tables: Sequence[LookupTable],

@@ -29,8 +29,6 @@ from bayesdist.products.formats.common.cards import named_in
 from bayesdist.products.formats.common.content import Hdu, read_hdus, write_hdus
 from bayesdist.products.formats.lookup.plane import Plane
 
-__all__ = ["AXES", "LookupFile", "check_kind", "read_lookup_file", "write_lookup_file"]
-
 AXES = ("DX", "DY")
 _SIGMA = "SIGMA_"
 _FILTERS = ("FILTER1", "FILTER2", "FILTER")

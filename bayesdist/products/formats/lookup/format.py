@@ -9,8 +9,6 @@ from bayesdist.products.formats.common.document import Format, finding_lines, id
 from bayesdist.products.formats.lookup.file import AXES, LookupFile
 from bayesdist.products.formats.lookup.lint import lint_lookup_file
 
-__all__ = ["FORMAT"]
-
 
 def _parse(content: Content) -> LookupFile | None:
     hdus = content.tables

@@ -12,8 +12,6 @@ from bayesdist.products.formats.common.document import Finding, missing_identity
 from bayesdist.products.formats.lookup.file import AXES, LookupFile
 from bayesdist.products.formats.lookup.plane import Plane
 
-__all__ = ["lint_lookup_file"]
-
 _PLACE = ("CRPIX1", "CRPIX2", "CRVAL1", "CRVAL2")
 
 

@@ -36,8 +36,6 @@ from bayesdist.products.formats.lookup.file import (
     write_lookup_file,
 )
 
-__all__ = ["read_npol", "write_npol"]
-
 
 def write_npol(
     tables: Sequence[LookupTable],

@@ -12,8 +12,6 @@ from bayesdist.arrays import Float
 from bayesdist.errors import FormatError
 from bayesdist.products.formats.common.content import Hdu
 
-__all__ = ["Plane"]
-
 
 @dataclass(frozen=True, eq=False)
 class Plane:

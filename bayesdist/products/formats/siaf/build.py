@@ -30,8 +30,6 @@ from bayesdist.products.formats.siaf.table import (
     table_of,
 )
 
-__all__ = ["siaf_files"]
-
 
 @dataclass(frozen=True, eq=False)
 class SiafFiles:

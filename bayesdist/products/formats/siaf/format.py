@@ -34,8 +34,6 @@ from bayesdist.products.formats.siaf.table import (
     table_of,
 )
 
-__all__ = ["FORMAT", "Settings", "describe_siaf"]
-
 
 def describe_siaf(table: SiafTable) -> list[str]:
     """Lines of text on a table or a side file, its findings at the end."""

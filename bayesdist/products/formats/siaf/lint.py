@@ -20,8 +20,6 @@ from bayesdist.products.formats.siaf.table import (
     side_name,
 )
 
-__all__ = ["lint_siaf"]
-
 # Closure that a good inverse reaches, and one that only a wrong coefficient leaves; pixels.
 _CLOSURE_GOOD, _CLOSURE_BAD = 0.05, 1.0
 # Pixels of imagers are 0.03 to 0.2 arcsec wide: what is far below is in degrees or radians.

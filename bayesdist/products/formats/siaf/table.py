@@ -32,23 +32,6 @@ from bayesdist.products.formats.common.record import calibration_from
 from bayesdist.reading.documents import json_of
 from bayesdist.reading.faults import reason_of
 
-__all__ = [
-    "AGREEMENT",
-    "COLUMNS",
-    "COVARIANCE",
-    "HIGHEST",
-    "KEYWORDS",
-    "NAMES",
-    "SIDE",
-    "Row",
-    "SiafTable",
-    "departure",
-    "holds_table",
-    "siaf_calibration",
-    "side_name",
-    "table_of",
-]
-
 NAMES = ("Sci2IdlX", "Sci2IdlY", "Idl2SciX", "Idl2SciY")
 COLUMNS = ("AperName", "siaf_index", "exponent_x", "exponent_y", *NAMES)
 KEYWORDS = ("XSciSize", "YSciSize", "XSciRef", "YSciRef")

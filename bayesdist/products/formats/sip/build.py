@@ -30,8 +30,6 @@ from bayesdist.products.formats.common.coefficients import (
 from bayesdist.products.formats.sip.families import offset_ranges
 from bayesdist.products.formats.sip.header import LINEAR_AXES, SIP_ORDERS, SipHeader, worst_closure
 
-__all__ = ["sip_from_solution"]
-
 # How far from the identity the linear part may be when it is to be a correction of pixels.
 _NEAR_IDENTITY = 0.5
 

@@ -23,8 +23,6 @@ from bayesdist.products.formats.common.parameters import (
 )
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
 
-__all__ = ["side_file", "sip_calibration", "with_covariance", "with_side_file"]
-
 
 def sip_calibration(
     sip: SipHeader,

@@ -10,19 +10,6 @@ from bayesdist.products.formats.common.coefficients import sip_keyword
 from bayesdist.products.formats.common.document import repeated_values
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
 
-__all__ = [
-    "EDGE",
-    "families",
-    "forward_is_used",
-    "half_unit",
-    "inverse_is_used",
-    "offset_ranges",
-    "powers_of",
-    "repeated_names",
-    "values_by_keyword",
-    "with_coefficient",
-]
-
 # How far the edge of a pixel lies from its centre: some take the maximum to there.
 EDGE = 0.5
 

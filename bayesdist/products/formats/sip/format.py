@@ -31,8 +31,6 @@ from bayesdist.products.formats.sip.lint import lint_sip
 from bayesdist.products.formats.sip.read import holds_sip, sip_of
 from bayesdist.products.formats.sip.write import sip_text
 
-__all__ = ["FORMAT", "describe_wcs"]
-
 
 class Settings(FormatSettings):
     """Configuration of a SIP header."""

@@ -20,8 +20,6 @@ from bayesdist.calibration.inverse import detector_grid
 from bayesdist.errors import InputError
 from bayesdist.products.formats.common.coefficients import evaluate
 
-__all__ = ["LINEAR_AXES", "SIP_ORDERS", "SipHeader", "worst_closure"]
-
 Terms = Mapping[tuple[int, int], float]
 
 # Programs ignore lower orders, and a keyword has room for one digit.

@@ -25,8 +25,6 @@ from bayesdist.products.formats.sip.families import (
 )
 from bayesdist.products.formats.sip.header import SipHeader
 
-__all__ = ["Implied", "StatedMaxima", "implied_values", "with_error"]
-
 Frozen = Any  # a distribution of scipy.stats with its parameters
 
 # Odds of a further, independent fault, for values that a suspect leaves unexplained.

@@ -24,9 +24,6 @@ from bayesdist.products.formats.sip.families import (
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader, worst_closure
 from bayesdist.products.formats.sip.implied import implied_values, with_error
 
-__all__ = ["lint_sip"]
-
-
 # Closure that a good inverse reaches, and one that only a wrong coefficient leaves; pixels.
 _CLOSURE_GOOD, _CLOSURE_BAD = 0.01, 0.5
 # How much a stated value may differ from the measured one: headers print three decimals.

@@ -19,8 +19,6 @@ from bayesdist.products.formats.sip.header import SipHeader
 from bayesdist.products.formats.sip.read import sip_of
 from bayesdist.products.formats.sip.write import sip_header
 
-__all__ = ["headers_read_back", "sip_positions", "sip_read_back", "sky_of_header"]
-
 
 def sip_positions(
     sip: SipHeader,

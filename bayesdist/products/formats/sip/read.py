@@ -14,17 +14,6 @@ from bayesdist.products.formats.common.coefficients import sip_powers
 from bayesdist.products.formats.common.content import Content, read_content, readable
 from bayesdist.products.formats.sip.header import SipHeader
 
-__all__ = [
-    "CD_KEYWORDS",
-    "LINEAR_KEYWORDS",
-    "cd_matrix",
-    "holds_sip",
-    "image_size",
-    "parsed",
-    "read_sip",
-    "sip_of",
-]
-
 CD_KEYWORDS = ("CD1_1", "CD1_2", "CD2_1", "CD2_2")
 # Keywords in place of a CD matrix in other headers.
 LINEAR_KEYWORDS = (

@@ -13,8 +13,6 @@ from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.formats.common.cards import header_of, keyword_of
 from bayesdist.products.formats.sip.header import SipHeader
 
-__all__ = ["rotated_sip"]
-
 Terms = Mapping[tuple[int, int], float]
 
 # Cards that describe the shape of an image, which after a rotation by any angle is no rectangle.

@@ -10,8 +10,6 @@ from bayesdist.products.formats.common.coefficients import sip_keyword
 from bayesdist.products.formats.sip.families import forward_is_used, inverse_is_used
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader, worst_closure
 
-__all__ = ["coefficient_lines", "sip_lines"]
-
 
 def sip_lines(sip: SipHeader, name: str) -> list[str]:
     """Lines of text on a header, but for its coefficients."""

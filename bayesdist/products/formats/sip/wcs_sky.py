@@ -16,8 +16,6 @@ from bayesdist.data.sky.tangent import tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.products.formats.common.document import Finding
 
-__all__ = ["HeaderText", "add_sky_lines", "first_line", "pv_keywords"]
-
 _NODES = 9  # points of each axis that are projected to the sky and back
 _PV_OF_TAN = 5  # more than the standard gives a TAN: SCAMP's older headers, which are TPV
 _BACK = 1e-3  # of a pixel: largest closure error of points that count as recovered

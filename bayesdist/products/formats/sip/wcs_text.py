@@ -26,9 +26,6 @@ from bayesdist.products.formats.sip.wcs_sky import (
 )
 from bayesdist.reading.fits import RECORD
 
-__all__ = ["coefficient_lines", "describe_wcs"]
-
-
 _WCS = re.compile(
     r"(CTYPE|CRVAL|CRPIX|CDELT|CUNIT|CROTA|LTV)\d+[A-Z]?$|(CD|PC|PV|PS|LTM)\d+_\d+[A-Z]?$|"
     r"(A|B|AP|BP)_(ORDER|\d_\d)$|(CPDIS|CPERR|D2IMDIS|D2IMERR)\d$|(DP|DQ|D2IM)\d$|(LON|LAT)POLE"

@@ -19,8 +19,6 @@ from bayesdist.products.formats.common.coefficients import sip_keyword, sip_powe
 from bayesdist.products.formats.sip.header import SipHeader
 from bayesdist.products.formats.sip.read import CD_KEYWORDS, LINEAR_KEYWORDS, cd_matrix, image_size
 
-__all__ = ["sip_header", "sip_text", "write_sip"]
-
 _FITS_SUFFIXES = (".fits", ".fit", ".fts", ".fits.gz")
 _STRUCTURE = (
     *("SIMPLE", "XTENSION", "BITPIX", "NAXIS", "NAXIS1", "NAXIS2"),

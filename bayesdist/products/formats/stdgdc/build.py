@@ -23,8 +23,6 @@ from bayesdist.products.formats.common.content import hdus_of
 from bayesdist.products.formats.common.parameters import parameters_hdu
 from bayesdist.products.formats.stdgdc.file import EXTENSIONS, SIGMAS, CorrectedFrame, frame_of
 
-__all__ = ["stdgdc_content"]
-
 _BETWEEN = 997  # points along each axis, between pixels, at which the tables are checked
 _LARGEST = 2**26  # pixels: beyond it a detector is a misprint
 

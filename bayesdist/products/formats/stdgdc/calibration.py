@@ -17,8 +17,6 @@ from bayesdist.products.formats.common.cards import named_in
 from bayesdist.products.formats.common.parameters import stored_calibration, stored_in
 from bayesdist.products.formats.stdgdc.file import CorrectedFrame, StdGdc
 
-__all__ = ["stdgdc_calibration"]
-
 _SLACK = 1e-9  # pixels: rounding of the check itself
 _GRID = 129
 

@@ -31,8 +31,6 @@ from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import FormatError
 from bayesdist.products.formats.common.content import Content, Hdu
 
-__all__ = ["EXTENSIONS", "SIGMAS", "CorrectedFrame", "StdGdc", "frame_of", "stdgdc_of"]
-
 _S = ("BDS1_1", "BDS1_2", "BDS2_1", "BDS2_2")
 
 

@@ -19,8 +19,6 @@ from bayesdist.products.formats.stdgdc.calibration import stdgdc_calibration
 from bayesdist.products.formats.stdgdc.file import SIGMAS, StdGdc, stdgdc_of
 from bayesdist.products.formats.stdgdc.lint import lint_stdgdc
 
-__all__ = ["FORMAT", "Settings"]
-
 
 class Settings(FormatSettings):
     """Configuration of an STDGDC file."""

@@ -14,8 +14,6 @@ from bayesdist.products.formats.common.document import Finding
 from bayesdist.products.formats.stdgdc.calibration import stdgdc_calibration
 from bayesdist.products.formats.stdgdc.file import EXTENSIONS, SIGMAS, StdGdc
 
-__all__ = ["lint_stdgdc"]
-
 _CLOSE = 0.3  # pixels: an inverse that closes worse is counted from another pixel
 _TOO_FAR = 0.5  # of the detector: no camera moves pixels so far
 _AREA = 0.02  # magnitudes by which MGC may differ from the area of the pixels

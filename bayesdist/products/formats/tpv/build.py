@@ -27,8 +27,6 @@ from bayesdist.products.formats.tpv.head import (
     substitution,
 )
 
-__all__ = ["tpv_cards", "tpv_heads"]
-
 _GRID = 33  # points of each axis over which CRDER is the rms error
 
 

@@ -14,8 +14,6 @@ from bayesdist.products.formats.common.document import MissingSizeError
 from bayesdist.products.formats.common.parameters import with_parameters
 from bayesdist.products.formats.tpv.head import TpvFile, TpvHead
 
-__all__ = ["tpv_calibration"]
-
 _RADIAL_ORDER = 9  # of the polynomial that stands for odd powers of r
 _EXACT = 1e-9  # pixels: below it a map is the polynomial that it was taken for
 

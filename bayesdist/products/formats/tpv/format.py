@@ -20,8 +20,6 @@ from bayesdist.products.formats.tpv.calibration import tpv_calibration
 from bayesdist.products.formats.tpv.head import HIGHEST, TpvFile, tpv_of
 from bayesdist.products.formats.tpv.lint import lint_tpv
 
-__all__ = ["FORMAT", "Settings"]
-
 NAME, SIDE = "tpv.head", "tpv_parameters.fits"
 
 

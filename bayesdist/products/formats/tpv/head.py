@@ -24,18 +24,6 @@ from bayesdist.model import polynomial_terms
 from bayesdist.products.formats.common.content import Content, readable
 from bayesdist.products.formats.sip.read import cd_matrix, image_size
 
-__all__ = [
-    "HIGHEST",
-    "POWERS",
-    "SIDE_FILE",
-    "TpvFile",
-    "TpvHead",
-    "pv_value",
-    "pv_values_of",
-    "substitution",
-    "tpv_of",
-]
-
 Powers = tuple[int, int]
 
 HIGHEST = 7  # order of a TPV

@@ -10,8 +10,6 @@ from bayesdist.calibration.inverse import detector_grid
 from bayesdist.products.formats.common.document import Finding, repeated_values
 from bayesdist.products.formats.tpv.head import POWERS, TpvFile, TpvHead, pv_value
 
-__all__ = ["lint_tpv"]
-
 _LARGE = 0.3  # of the distance from CRPIX: no camera is distorted so much
 _WIDE = 180.0  # degrees: what a CD in arcseconds makes of a detector
 _ROUGH = 4096  # pixels, for a header without a size

@@ -21,8 +21,6 @@ from bayesdist.products.formats.sip.families import EDGE, families, offset_range
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader, worst_closure
 from bayesdist.products.formats.wise.meta import ARRAYS, monomial
 
-__all__ = ["wise_text", "write_wise_meta"]
-
 # How far A_DMAX and B_DMAX look beyond the centres of the outermost pixels: the printed ones do so
 # in W4 alone.
 _MARGIN = {1: 0.0, 2: 0.0, 3: 0.0, 4: EDGE}

@@ -31,8 +31,6 @@ from bayesdist.products.formats.wise.meta import (
     wise_calibration,
 )
 
-__all__ = ["FORMAT", "Settings"]
-
 Bands = tuple[WiseBand, ...]
 
 

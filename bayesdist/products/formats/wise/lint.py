@@ -25,8 +25,6 @@ from bayesdist.products.formats.sip.implied import StatedMaxima, implied_values
 from bayesdist.products.formats.sip.lint import lint_sip
 from bayesdist.products.formats.wise.meta import WiseBand, monomial
 
-__all__ = ["lint_wise_band"]
-
 _NUMBER = re.compile(r"([+-]?)([0-9]+)\.([0-9]+)([EeDd][+-]?[0-9]+)")
 _MONOMIAL = re.compile(r"coefficient of (\S+)")
 # Farther from the implied value a number counts as excluded.

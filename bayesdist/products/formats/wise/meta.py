@@ -16,16 +16,6 @@ from bayesdist.products.formats.sip.calibration import sip_calibration
 from bayesdist.products.formats.sip.header import SipHeader
 from bayesdist.products.formats.sip.read import parsed
 
-__all__ = [
-    "ARRAYS",
-    "WiseBand",
-    "bands_of",
-    "holds_wise_meta",
-    "monomial",
-    "read_wise_meta",
-    "wise_calibration",
-]
-
 _ENTRY = re.compile(r"\S*distort_(?:skew|(?:a|b|ap|bp)_)\S*")
 _ENTRY_LINE = re.compile(r"\S*distort_(\S+)\s+(\d+)\s+(\S+)\s+([ir])\s+(\S+)\s*(.*)")
 _KEYWORD = re.compile(r"SKEW|[AB]P?_(?:ORDER|\d_\d)|[AB]_DMAX")

@@ -14,10 +14,6 @@ from bayesdist.report.sections.campaign.published import Published, PublishedLin
 from bayesdist.report.sections.campaign.terms import name_of_scatter, name_of_term
 from bayesdist.report.texttable import TextTable, listing
 
-__all__ = [
-    "time_tables",
-]
-
 Row = tuple[str, ...]
 
 TERMS = ("A_2", "B_3", "B_2", "B_1", "A_3")  # in the order of their tables

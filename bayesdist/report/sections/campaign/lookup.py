@@ -26,17 +26,6 @@ from bayesdist.report.texttable import TextTable, listing
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
-__all__ = [
-    "binned_of",
-    "largest_cell",
-    "lookup_table",
-    "residual_map",
-    "rms_of_cells",
-    "table_errors",
-    "table_nodes",
-    "table_residuals",
-]
-
 WITHOUT, WITH = PALETTE["vermilion"], PALETTE["blue"]
 _REACH = 4.5  # times the robust width of the residuals without tables: where axes end
 

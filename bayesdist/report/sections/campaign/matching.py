@@ -28,14 +28,6 @@ from bayesdist.report.texttable import TextTable, listing
 if TYPE_CHECKING:
     from bayesdist.report.campaign import CatalogStars
 
-__all__ = [
-    "catalogue_errors",
-    "fit_quality",
-    "footprints",
-    "matching",
-    "matching_table",
-]
-
 _DOT = "#8FA3B5"
 _LEFT_OUT = PALETTE["vermilion"]
 

@@ -6,8 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["Published", "PublishedLine", "published_terms", "publishes"]
-
 
 @dataclass(frozen=True)
 class PublishedLine:

@@ -14,11 +14,6 @@ from bayesdist.report.figures.style import WIDTH, new_figure, nice_below
 from bayesdist.report.registry import Plot
 from bayesdist.report.texttable import TextTable
 
-__all__ = [
-    "overlap",
-    "released_files",
-]
-
 MIN_STARS_PER_CELL = 5  # for a cell that is drawn and counted
 
 _KINDS = {

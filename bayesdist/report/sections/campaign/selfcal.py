@@ -20,11 +20,6 @@ from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing
 if TYPE_CHECKING:
     from astropy.table import Table
 
-__all__ = [
-    "selfcal",
-    "selfcal_tables",
-]
-
 MAX_STARS_DRAWN = 20_000  # more only hide each other
 ONE_AXIS = 0.5**0.5  # of a radius hypot(sigma_u, sigma_v)
 

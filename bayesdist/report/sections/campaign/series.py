@@ -28,10 +28,6 @@ from bayesdist.report.sections.campaign.terms import (
 if TYPE_CHECKING:
     from bayesdist.report.campaign import LinearSeries
 
-__all__ = [
-    "series",
-]
-
 ABREAST = 2  # chips in a figure
 FALLS = 1.2  # scatter before VAFACTOR over that after it, above which the aberration is seen
 

@@ -13,15 +13,6 @@ from bayesdist.arrays import Bool, Float
 if TYPE_CHECKING:
     from bayesdist.report.campaign import LinearSeries
 
-__all__ = [
-    "TermCourse",
-    "course_of",
-    "line_error",
-    "name_of_scatter",
-    "name_of_term",
-    "terms_of",
-]
-
 TERM_ORDER = ("A_2", "B_3", "B_2", "A_3", "B_1", "A_1")  # as in the published report
 _FEWEST = 3  # dates in a segment that fix a parabola
 

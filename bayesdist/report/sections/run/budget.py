@@ -38,13 +38,6 @@ from bayesdist.report.registry import Plot
 from bayesdist.report.sections.gauge import gauge_of_new_exposure
 from bayesdist.report.texttable import TextTable
 
-__all__ = [
-    "budget_dominating",
-    "budget_table",
-    "budget_terms",
-    "is_total",
-]
-
 AS_ABOVE = "as above"  # of the rows of single chips
 _LETTERS = 31  # of a label beside another one, over a narrow figure
 _MOST_PANELS = 3  # chips whose bars are shown with those of the detector

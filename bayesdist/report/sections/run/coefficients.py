@@ -13,10 +13,6 @@ from bayesdist.report.context import ReportInput
 from bayesdist.report.sections.gauge import gauge_mark, gauge_note
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further
 
-__all__ = [
-    "coefficient_tables",
-]
-
 _ON_SCREEN = ("68 %", "95 %", "R-hat", "ESS")
 _SMALL = 1e-3  # below it a number without a unit is shown in 10^-6
 

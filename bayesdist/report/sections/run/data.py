@@ -21,12 +21,6 @@ from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing, sh
 if TYPE_CHECKING:
     from bayesdist.data import MagnitudeErrors
 
-__all__ = [
-    "coverage",
-    "data_tables",
-    "residuals_by_magnitude",
-]
-
 
 @REPORT.table("data")
 def data_tables(r: ReportInput) -> tuple[TextTable, ...]:

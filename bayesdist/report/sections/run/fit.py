@@ -14,11 +14,6 @@ from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.texttable import TextTable, listing
 
-__all__ = [
-    "fit_tables",
-    "score_test_table",
-]
-
 
 @REPORT.table("fit")
 def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:

@@ -23,12 +23,6 @@ from bayesdist.report.texttable import TextTable
 if TYPE_CHECKING:
     from bayesdist.diagnose.holdout.tests import HeldTest
 
-__all__ = [
-    "holdout",
-    "holdout_coverage",
-    "holdout_table",
-]
-
 _WHAT = ("u", "v, given u", "distance")
 _LEAST_RANGE = 0.3  # of the factor on the errors, above 1: chance alone must not look dramatic
 _FEWEST = 20  # stars of a region that is coloured

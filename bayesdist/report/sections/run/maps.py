@@ -29,16 +29,6 @@ from bayesdist.report.texttable import TextTable
 if TYPE_CHECKING:
     from bayesdist.assess import VectorMap
 
-__all__ = [
-    "distortion",
-    "distortion_non_linear",
-    "formal_uncertainty",
-    "map_table",
-    "pixel_area",
-    "pixel_scale",
-    "uncertainty_radius",
-]
-
 
 @REPORT.table("maps")
 def map_table(r: ReportInput) -> TextTable:

@@ -27,14 +27,6 @@ from bayesdist.report.texttable import TextTable
 if TYPE_CHECKING:
     from bayesdist.assess import Margin
 
-__all__ = [
-    "VERDICT_LEVELS",
-    "margin_table",
-    "margins",
-    "rests_on_table",
-    "validity_period",
-]
-
 VERDICT_LEVELS = {"met": "pass", "undecided": "warn", "missed": "fail"}
 _SHOWN = (0.001, 0.999)  # quantiles of the draws that a histogram runs between
 _MARKERS = {"met": "o", "undecided": "D", "missed": "X"}  # shape as well as colour

@@ -29,11 +29,6 @@ if TYPE_CHECKING:
     from bayesdist.diagnose.residuals import StatisticsTable
     from bayesdist.model import Chip
 
-__all__ = [
-    "period_differences",
-    "period_tables",
-]
-
 GRID = 17  # vectors along the longer side
 _CLEAR = 3.0  # sigmas beyond which a coefficient counts
 

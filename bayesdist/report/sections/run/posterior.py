@@ -38,17 +38,6 @@ from bayesdist.report.texttable import TextTable
 if TYPE_CHECKING:
     from bayesdist.infer import Posterior
 
-__all__ = [
-    "added_errors_table",
-    "correlation_matrix",
-    "correlations",
-    "outlier_table",
-    "outliers_corner",
-    "rank_counts",
-    "ranks",
-    "slowest_parameters",
-]
-
 _MIXTURE_LABELS = {"f": "f", "j": "j", "s_out": r"$s_\mathrm{out}$"}
 _MAX_POINTS = 20_000  # draws that enter a corner plot
 N_SLOWEST = 4  # parameters whose ranks are shown

@@ -12,12 +12,6 @@ from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.texttable import Level, TextTable, check_cells, listing, moment, short_paths
 
-__all__ = [
-    "config_table",
-    "product_table",
-    "provenance_tables",
-]
-
 _DETAILS = ("stages", "timings", "versions")  # the margin of each page names our version
 _PRINTED = {"inputs": 4}  # rows on paper
 

@@ -31,13 +31,6 @@ from bayesdist.report.registry import Plot
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
-__all__ = [
-    "MixtureCurve",
-    "residual_histogram",
-    "residual_panels",
-    "residual_vectors",
-]
-
 _SIGMA_BINS = 200
 
 

@@ -25,13 +25,6 @@ from bayesdist.report.texttable import TextTable, check_cells
 if TYPE_CHECKING:
     from bayesdist.assess import Margin
 
-__all__ = [
-    "Verdict",
-    "status_checks",
-    "status_table",
-    "verdict",
-]
-
 _OWN_CLAUSE = ("Requirements", "Validity")  # of the headline
 _UNSAMPLED = "least squares only, no posterior was sampled"
 _NAMED = 2  # rows of the status table that the headline names

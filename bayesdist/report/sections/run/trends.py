@@ -25,15 +25,6 @@ from bayesdist.report.figures.style import (
 )
 from bayesdist.report.registry import Plot
 
-__all__ = [
-    "Means",
-    "chi_square_by_exposure",
-    "means_in_bins",
-    "residuals_by_column_and_row",
-    "residuals_by_position",
-    "residuals_by_property",
-]
-
 _POINTS = 1200  # single stars in a panel: more hide each other
 _MIN_STARS = 25  # in a bin on average
 _BINS, _FINE_BINS = 20, 100  # most bins along an axis

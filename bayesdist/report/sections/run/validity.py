@@ -9,8 +9,6 @@ from bayesdist.assess.requirements.validity import ValidityPeriod
 from bayesdist.checks import Check
 from bayesdist.report.context import ReportInput
 
-__all__ = ["epoch_clause", "validity_checks", "validity_clause"]
-
 
 def validity_checks(r: ReportInput) -> tuple[Check, ...]:
     """Check of each validity period: that it has not ended before the run began."""

@@ -25,8 +25,6 @@ from bayesdist.products.formats.common.coefficients import require_regular
 from bayesdist.products.formats.common.document import BuildOptions
 from bayesdist.products.formats.common.record import at_date, record_of
 
-__all__ = ["ChipTransform", "chip_transforms", "refuse_larger"]
-
 
 @dataclass(frozen=True, eq=False)
 class ChipTransform:

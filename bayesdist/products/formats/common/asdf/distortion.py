@@ -23,17 +23,6 @@ from bayesdist.products.formats.common.document import Choice, MissingSizeError
 from bayesdist.products.formats.common.read_back import ReadBack, of_chips
 from bayesdist.products.formats.common.record import calibration_from
 
-__all__ = [
-    "AGREEMENT",
-    "DistortionFile",
-    "closure_of",
-    "departure",
-    "distortion_calibration",
-    "recorded",
-    "transform_in",
-    "transforms_read_back",
-]
-
 ARCSEC = {"arcsec": 1.0, "deg": 3600.0, "mas": 1e-3, "rad": 180 / np.pi * 3600, "arcmin": 60.0}
 AGREEMENT = 1e-6  # pixels: as far as record and transform of one file may differ
 GRID = 65  # nodes of each axis, over the pixel centres from corner to corner

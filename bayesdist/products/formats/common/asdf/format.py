@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from bayesdist.products.formats.common.asdf.build import ChipTransform
     from bayesdist.products.formats.common.asdf.distortion import DistortionFile
 
-__all__ = ["Observatory"]
-
-
 Settings = TypeVar("Settings", bound=PlacedSettings)
 
 

@@ -19,8 +19,6 @@ from bayesdist.products.formats.common.asdf.distortion import (
 from bayesdist.products.formats.common.asdf.transforms import exchanged, leaves, order_of, tables_of
 from bayesdist.products.formats.common.document import Finding, finding_lines, repeated_values
 
-__all__ = ["describe_distortion", "lint_distortion"]
-
 PIXEL, SKY = ("pix", "pixel"), ("arcsec",)
 # Closure that a good inverse reaches, and one that only a wrong coefficient leaves; pixels.
 _CLOSURE_GOOD, _CLOSURE_BAD = 0.01, 0.5

@@ -20,16 +20,6 @@ from bayesdist.calibration.inverse import ExplicitInverse
 from bayesdist.model import LookupTable
 from bayesdist.products.formats.common.coefficients import Coefficients
 
-__all__ = [
-    "evaluated",
-    "exchanged",
-    "forward_transform",
-    "inverse_transform",
-    "leaves",
-    "order_of",
-    "tables_of",
-]
-
 # Fixed-point steps that invert tables: each leaves the table's largest slope times what was left.
 _LEFT, _MOST_STEPS = 1e-10, 12
 _SPLIT = models.Mapping((0, 1, 0, 1))

@@ -15,9 +15,6 @@ from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import FormatSettings
 from bayesdist.reading.asdf import asdf_tree, asdf_with_transforms
 
-__all__ = ["Detector", "PlacedSettings", "is_asdf", "packed", "plain", "tagged", "tree_of"]
-
-
 DESCRIPTION = "Geometric distortion with its uncertainty, by bayesdist"
 
 
