@@ -1,4 +1,12 @@
-"""A calibration oriented by another one, with the error of that."""
+"""A calibration oriented by another one, with the error of that, or by a position on the sky.
+
+Shift, turn, scale and parity between two maps are found by least squares over the area of a chip.
+With w = u + i v as Legendre coefficients, mean over the chip,
+
+    w_A = shift + turn w_B + d        (or the conjugate of w_B, where one of them is mirrored)
+
+Products of two polynomials have their means from the coefficients alone, without any grid.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +16,8 @@ import numpy as np
 
 from bayesdist.arrays import Complex, Float
 from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.further import scaled
 from bayesdist.calibration.plane import ARCSEC, Agreement, Orientation, Plane
-from bayesdist.calibration.similarity import correlations
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.solution import DerivedSolution, Solution
 from bayesdist.model import DistortionModel, PolynomialBasis
@@ -227,3 +235,108 @@ def _cov_about(arm: complex, variance: float, log_scale: float, angular: float) 
     to_origin[:2, 2] = -arm.real, -arm.imag
     to_origin[:2, 3] = arm.imag, -arm.real
     return to_origin @ np.diag([variance, variance, log_scale, angular]) @ to_origin.T
+
+
+def placed_at(
+    calibration: Calibration,
+    crval: tuple[float, float] | None,
+    scale_arcsec: float | None,
+    *,
+    where: str,
+) -> Calibration:
+    """Calibration with (u, v) = (0, 0) at CRVAL (degrees), u to the east and v to the north.
+
+    Pixels become arcseconds by their size.  Without a CRVAL the calibration stays as it is.
+    InputError, that names the configuration `where`, for a plane that lies on the sky already, a
+    CRVAL that is no position, and pixels of unknown size.
+    """
+    if crval is None:
+        return calibration
+    if calibration.plane.point is not None:
+        raise InputError(
+            "a crval is given for a plane that lies on the sky already",
+            where=f"{where}.crval",
+            do="leave it out",
+        )
+    if not (np.isfinite(crval).all() and -90 <= crval[1] <= 90):
+        raise InputError(
+            f"crval is {crval}, no right ascension and declination in degrees",
+            where=f"{where}.crval",
+            do="correct it, or leave it out",
+        )
+    if calibration.unit == "pix":
+        if scale_arcsec is None:
+            raise InputError(
+                "a crval is given, and u and v are in pixels of unknown size",
+                where="detector.scale_mas",
+                do="give the pixel scale (of convert: --scale)",
+            )
+        calibration = _in_arcsec(calibration, scale_arcsec)
+    plane = Plane("sky", point=(float(crval[0]), float(crval[1])), note=calibration.plane.note)
+    return replace(calibration, plane=plane, with_plane=None)
+
+
+def _in_arcsec(calibration: Calibration, pixel: float) -> Calibration:
+    """Calibration in arcseconds; `pixel` is the size of one."""
+    solution, model = calibration.solution, calibration.model
+    return replace(
+        calibration,
+        solution=solution.transformed(
+            replace(model, unit="arcsec"),
+            lambda theta: pixel * theta[..., : model.n_params],
+            pixel * np.eye(model.n_params),
+        ),
+        after=tuple(
+            replace(
+                table,
+                values=pixel * table.values,
+                sigma=None if table.sigma is None else pixel * table.sigma,
+            )
+            for table in calibration.after
+        ),
+        inverses={},
+        scale=None if calibration.scale is None else pixel * calibration.scale,
+        further=scaled(calibration.further, pixel),
+    )
+
+
+def correlations(
+    za: Complex, zb: Complex, basis: PolynomialBasis
+) -> tuple[complex, complex, float]:
+    """Mean products, about mean positions, of A with B, of A with B mirrored, and of B with itself.
+
+    `za` and `zb` (K,) are coefficients of u + i v.
+    """
+    weight = basis.mean_squares
+    weight[0] = 0.0  # the shift takes the mean
+    straight = complex(np.sum(weight * za * zb.conj()))
+    flipped = complex(np.sum(weight * za * zb))
+    return straight, flipped, float(weight @ np.abs(zb) ** 2)
+
+
+def turn_between(
+    za: Complex, zb: Complex, basis: PolynomialBasis, name: str
+) -> tuple[complex, bool]:
+    """Scale and rotation that bring B nearest to A, as one complex number; True if mirrored first.
+
+    InputError, with B's `name`, when B maps the chip to one point.
+    """
+    straight, flipped, norm = correlations(za, zb, basis)
+    if norm == 0.0:
+        raise InputError("has no linear part", where=name, do="check its coefficients")
+    mirrored = bool(abs(flipped) > abs(straight))
+    return complex((flipped if mirrored else straight) / norm), mirrored
+
+
+def as_real(z: Complex) -> Float:
+    """Coefficients (2 K,), u before v, of u + i v."""
+    return np.concatenate([z.real, z.imag])
+
+
+def similarity_fields(z: Complex) -> Float:
+    """Derivatives (2 K, 4) of positions by shift along u and v, scale and rotation."""
+    one = np.zeros_like(z)
+    one[0] = 1.0
+    offsets = z.copy()
+    offsets[0] = 0.0  # about the mean position, so that a rotation is no shift
+    return np.stack([as_real(f) for f in (one, 1j * one, offsets, 1j * offsets)], axis=1)

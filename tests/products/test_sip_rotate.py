@@ -13,11 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from bayesdist.calibration.rotation import coefficient_map, pixel_matrix
 from bayesdist.errors import InputError
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products import lint_sip, read_sip, sip_from_solution, sip_header, write_sip
-from bayesdist.products.formats.sip.rotate import rotated_sip
+from bayesdist.products.formats.sip.rotate import coefficient_map, pixel_matrix, rotated_sip
 
 from .support import astropy_wcs, random_pixels, some_solution
 

@@ -11,7 +11,6 @@ from numpy.testing import assert_allclose
 from scipy import stats
 
 from bayesdist.calibration.inverse import detector_grid, fit_inverse
-from bayesdist.calibration.rotation import pixel_matrix
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.products import (
     read_sip,
@@ -20,7 +19,7 @@ from bayesdist.products import (
     worst_closure,
     write_sip,
 )
-from bayesdist.products.formats.sip.rotate import rotated_sip
+from bayesdist.products.formats.sip.rotate import pixel_matrix, rotated_sip
 
 from ..products.support import StandIn, astropy_wcs, random_pixels
 from ..products.test_sip_rotate import moved_pixels

@@ -19,7 +19,7 @@ import numpy as np
 from bayesdist.arrays import Complex, Float
 from bayesdist.assess.units import convert
 from bayesdist.calibration.chip_map import ChipMap
-from bayesdist.calibration.similarity import as_real, similarity_fields, turn_between
+from bayesdist.calibration.orientation import as_real, similarity_fields, turn_between
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.frame_fields import term_squares
 from bayesdist.model import PolynomialBasis

@@ -26,7 +26,7 @@ from bayesdist.assess.comparison.frame import (
 )
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
-from bayesdist.calibration.similarity import as_real, similarity_fields, turn_between
+from bayesdist.calibration.orientation import as_real, similarity_fields, turn_between
 from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.model import PolynomialBasis
 

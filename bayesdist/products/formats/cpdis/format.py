@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import PositiveFloat
 
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.calibration.placed import placed_at
+from bayesdist.calibration.orientation import placed_at
 from bayesdist.products.formats.common.document import (
     BuildOptions,
     Built,

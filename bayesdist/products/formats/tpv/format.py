@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.calibration.placed import placed_at
+from bayesdist.calibration.orientation import placed_at
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import (
     PARAMETERS,
