@@ -230,7 +230,7 @@ class Record:
         """Note that the stage under way writes files; False where that is known of all."""
         if self.under_way is None or names <= set(self.under_way["files"]):
             return False
-        self.under_way["files"] = sorted(names.union(self.under_way["files"]))
+        self.under_way["files"] = sorted({*names, *self.under_way["files"]})
         return True
 
     def write(self, path: Path) -> None:
