@@ -323,7 +323,7 @@ class ParameterLayout:
         return slice(start, start + self.n_frame)
 
     def frame_columns(self, exposure: int | Int) -> Int:
-        """Entries (..., q) of theta of exposures (by codes), which are all the first or all later."""
+        """Entries (..., q) of theta of exposures (codes), which are all the first or all later."""
         codes = np.asarray(exposure)
         first = int(codes.flat[0])
         block = self.frame_slice(first)
