@@ -47,6 +47,7 @@ def field_table(
     smoothness: Sequence[float] = SMOOTHNESS,
     earlier: TablePosterior | None = None,
     hold: bool = False,
+    thorough: bool = True,
 ) -> TablePosterior:
     """Posterior of a table from the residuals of one chip.
 
@@ -81,6 +82,9 @@ def field_table(
         Table of nearly the same stars from an earlier iteration, at which the search starts.
     hold : bool
         True to take the hyperparameters of the earlier table unchanged.
+    thorough : bool
+        False to take those that are most probable for independent tiles of the chip: near those of
+        the whole chip, and found in a fifth of the time.
 
     Returns
     -------
@@ -120,7 +124,9 @@ def field_table(
         n = sum(at_once(_n_rough, rough))
         j2, _ = jitter_at([e.sums for e in rough], [e.rough for e in rough], n)
         sums = sums_at(j2)
-        fields = at_once(lambda s: fitted_field(Evidence(grid, s), smoothness, thorough=True), sums)
+        fields = at_once(
+            lambda s: fitted_field(Evidence(grid, s), smoothness, thorough=thorough), sums
+        )
     else:
         j2, fields = earlier.jitter**2, [axis.field for axis in earlier.axes]
         sums = sums_at(j2)
