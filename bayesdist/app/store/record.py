@@ -23,7 +23,7 @@ from bayesdist.version import __version__
 __all__ = ["SCHEMA", "Artefact", "FileMark", "Record", "versions", "write_json"]
 
 SCHEMA = 2
-PACKAGES = ("arviz-stats", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
+PACKAGES = ("arviz-stats", "astropy", "emcee", "h5py", "numba", "numpy", "scipy")
 
 
 def write_json(path: Path, value: Any) -> None:
