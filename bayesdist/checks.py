@@ -44,34 +44,18 @@ GROUPS = (
 
 @dataclass(frozen=True)
 class Check:
-    """One criterion.
+    """One criterion."""
 
-    Parameters
-    ----------
-    group : str
-        What it concerns: one of `GROUPS`.
-    name : str
-        What was checked, with its unit.
-    value : float or str
-        What was found; empty where the sentence says it.
-    limit : str
-        What is asked, in words; empty where nothing is.
-    level : str
-        'pass', 'warn', 'fail', or 'note' where nothing is asked.
-    sentence : str
-        What a reader of the numbers has to know, as a clause; empty where that is nothing.
-    doubt : str
-        What the sentence does to verdicts: `LARGER` where errors can only be larger for it, so that
-        nothing is met, and what is missed is missed all the same; `EITHER` where errors may be
-        smaller too, so that nothing is decided; empty where verdicts stand.
-    """
-
-    group: str
-    name: str
-    value: float | str = ""
-    limit: str = ""
-    level: str = "note"
+    group: str  # what it concerns: one of `GROUPS`
+    name: str  # what was checked, with its unit
+    value: float | str = ""  # what was found; empty where the sentence says it
+    limit: str = ""  # what is asked, in words; empty where nothing is
+    level: str = "note"  # 'pass', 'warn', 'fail', or 'note' where nothing is asked
+    # what a reader of the numbers has to know, as a clause; empty where that is nothing
     sentence: str = ""
+    # what the sentence does to verdicts: `LARGER` where errors can only be larger for it, so that
+    # nothing is met, and what is missed is missed all the same; `EITHER` where errors may be
+    # smaller too, so that nothing is decided; empty where verdicts stand
     doubt: str = ""
 
     @property

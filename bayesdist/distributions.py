@@ -8,8 +8,10 @@ distribution without degrees of freedom has NaN.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import special
+
+from bayesdist.arrays import Float, Int
 
 __all__ = [
     "beta_ppf",
@@ -29,8 +31,6 @@ __all__ = [
     "t_ppf",
     "t_sf",
 ]
-
-Float = NDArray[np.float64]
 
 
 def _where(known: ArrayLike, values: ArrayLike) -> Float:
@@ -115,6 +115,6 @@ def beta_std(a: float, b: float) -> float:
     return float(np.sqrt(a * b / (a + b + 1)) / (a + b))
 
 
-def binom_ppf(p: ArrayLike, n: int, each: float) -> NDArray[np.int64]:
+def binom_ppf(p: ArrayLike, n: int, each: float) -> Int:
     """Smallest numbers of n successes, each of probability `each`, of which there are at most p."""
     return np.searchsorted(special.bdtr(np.arange(n + 1.0), n, each), p)

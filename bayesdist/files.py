@@ -31,10 +31,7 @@ _watchers: list[Callable[[Sequence[Path]], None]] = []
 def watched_writes(note: Callable[[Sequence[Path]], None]) -> Iterator[None]:
     """Call a function with the paths that `atomic_path` writes, before a file takes its name.
 
-    Parameters
-    ----------
-    note : callable
-        Where it raises, the file does not appear.
+    `note`: where it raises, the file does not appear.
     """
     _watchers.append(note)
     try:
@@ -62,20 +59,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     writers which go by the extension do the same.  When the block raises, it is removed and
     whatever stood at `path` before is left as it was.
 
-    Parameters
-    ----------
-    path : path-like
-        File to write.
-
-    Yields
-    ------
-    pathlib.Path
-        Where to write; no file is there yet.
-
-    Raises
-    ------
-    InputError
-        When the system refuses to write, naming the path and the reason (full disk, no permission).
+    `path`: file to write. Result: where to write; no file is there yet. InputError when the system
+    refuses to write, naming the path and the reason (full disk, no permission).
     """
     target = Path(path)
     temporary = target.with_name(f"{_MARK}{secrets.token_hex(4)}-{target.name}")
@@ -114,18 +99,7 @@ def _concerns(error: OSError, temporary: Path, target: Path) -> bool:
 def made_folder(path: str | os.PathLike[str]) -> Path:
     """A folder that is there from now on, with those above it.
 
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    pathlib.Path
-
-    Raises
-    ------
-    InputError
-        When the system refuses to make it, naming the path and the reason.
+    InputError when the system refuses to make it, naming the path and the reason.
     """
     folder = Path(path)
     try:
@@ -146,23 +120,8 @@ def path_within(
 
     Names that stand in files which others may have written are not to lead anywhere else.
 
-    Parameters
-    ----------
-    folder : path-like
-    name : str
-    where : str
-        The file that has the name, for the error.
-    links : bool
-        Follow symbolic links in the folders of the path, too.
-
-    Returns
-    -------
-    pathlib.Path
-
-    Raises
-    ------
-    InputError
-        For a name that leads out of the folder.
+    `where`: the file that has the name, for the error. `links`: follow symbolic links in the
+    folders of the path, too. InputError for a name that leads out of the folder.
     """
     folder = Path(folder)
     path = folder / name
@@ -192,19 +151,7 @@ def remove_leftovers(folder: str | os.PathLike[str]) -> None:
 def sha256_of(path: str | os.PathLike[str]) -> str:
     """SHA-256 of a file's content.
 
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    str
-        64 hexadecimal digits.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read.
+    Result: 64 hexadecimal digits. InputError when the file cannot be read.
     """
     with opened(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -12,22 +12,8 @@ __all__ = ["lazy_name"]
 def lazy_name(package: str, homes: Mapping[str, Sequence[str]], name: str) -> Any:
     """Object that a package gives under a name, from the module where it is at home.
 
-    Parameters
-    ----------
-    package : str
-        Dotted name of the package, whose `__getattr__` this is.
-    homes : mapping of str to sequence of str
-        Dotted name of each module, and the names that are taken from it.
-    name : str
-
-    Returns
-    -------
-    object
-
-    Raises
-    ------
-    AttributeError
-        When the package has no such name.
+    `package`: dotted name of the package, whose `__getattr__` this is. `homes`: dotted name of each
+    module, and the names that are taken from it. AttributeError when the package has no such name.
     """
     for home, names in homes.items():
         if name in names:

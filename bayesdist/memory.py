@@ -29,18 +29,8 @@ def memory_limit() -> int:
 def require_memory(n_bytes: float, what: str, *, where: str = "", do: str) -> None:
     """Refuse a computation before it takes more memory than it may.
 
-    Parameters
-    ----------
-    n_bytes : float
-        That it needs, at least.
-    what : str
-        As in "the grid of 100000 x 100000 positions".
-    where, do : str
-        As of `BayesdistError`.
-
-    Raises
-    ------
-    MemoryLimitError
+    `n_bytes`: that it needs, at least. `what`: as in "the grid of 100000 x 100000 positions".
+    `where`, `do`: as of `BayesdistError`.
     """
     most = memory_limit()
     if n_bytes > most:

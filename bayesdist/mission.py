@@ -24,41 +24,26 @@ GROUP = "bayesdist.missions"
 
 @dataclass(frozen=True)
 class Mission:
-    """What belongs to one mission, as "module:object" that is loaded when it is used.
+    """What belongs to one mission, as "module:object" that is loaded when it is used."""
 
-    Parameters
-    ----------
-    title : str
-        One line for `bayesdist --help`.
-    commands : mapping of str to str
-        Of the group that has the mission's name.
-    simulate : mapping of str to str
-        Of `bayesdist simulate`.
-    beside_core : mapping of str to str
-        Commands that stand beside those of the core.
-    match_formats : mapping of str to str
-        Formats of files of matches, by name: each a `bayesdist.data.MatchFormat`.
-    data_sections : mapping of str to str
-        Sections `[data]` of formats that have keys of their own, by the name of the format: each a
-        subclass of `bayesdist.app.config.Data`.
-    match_sources : mapping of str to str
-        How the matches of these formats are read: each a
-        `bayesdist.app.kinds.matches.sources.MatchSource`.
-    error_terms : mapping of str to str
-        Kinds of `[[budget]]` rows with one sigma: each makes an error term of name, kind, sigma,
-        solution and source, as `bayesdist.assess.terms.parameters.ScaleError`.
-    report : str
-        Module that registers figures and tables with `bayesdist.report.contents.REPORT`.
-    """
-
-    title: str
+    title: str  # one line for `bayesdist --help`
+    # of the group that has the mission's name
     commands: Mapping[str, str] = field(default_factory=dict)
-    simulate: Mapping[str, str] = field(default_factory=dict)
+    simulate: Mapping[str, str] = field(default_factory=dict)  # of `bayesdist simulate`
+    # commands that stand beside those of the core
     beside_core: Mapping[str, str] = field(default_factory=dict)
+    # formats of files of matches, by name: each a `bayesdist.data.MatchFormat`
     match_formats: Mapping[str, str] = field(default_factory=dict)
+    # sections `[data]` of formats that have keys of their own, by the name of the format: each a
+    # subclass of `bayesdist.app.config.Data`
     data_sections: Mapping[str, str] = field(default_factory=dict)
+    # how the matches of these formats are read: each a
+    # `bayesdist.app.kinds.matches.sources.MatchSource`
     match_sources: Mapping[str, str] = field(default_factory=dict)
+    # kinds of `[[budget]]` rows with one sigma: each makes an error term of name, kind, sigma,
+    # solution and source, as `bayesdist.assess.terms.parameters.ScaleError`
     error_terms: Mapping[str, str] = field(default_factory=dict)
+    # module that registers figures and tables with `bayesdist.report.contents.REPORT`
     report: str = ""
 
 
@@ -75,10 +60,7 @@ def mission_names() -> list[str]:
 def load_mission(name: str) -> Mission:
     """Mission of this name.
 
-    Raises
-    ------
-    InputError
-        When its package cannot be loaded.
+    InputError when its package cannot be loaded.
     """
     entry = _entries()[name]
     try:

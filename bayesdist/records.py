@@ -55,16 +55,8 @@ def record_to_arrays(record: Any) -> dict[str, NDArray[Any]]:
 def record_from_arrays(arrays: Mapping[str, NDArray[Any]], kind: type = object) -> Any:
     """The record that `record_to_arrays` described.
 
-    Parameters
-    ----------
-    arrays : mapping of str to ndarray
-    kind : type
-        Which it has to be.
-
-    Raises
-    ------
-    TypeError, KeyError, AttributeError
-        For arrays that are no such record.
+    `kind`: which it has to be. TypeError, KeyError, AttributeError for arrays that are no such
+    record.
     """
     tree = json_of(np.asarray(arrays[TREE], np.uint8).tobytes().decode(), "record")
     found = _Reader(arrays).of(tree)

@@ -105,17 +105,9 @@ bayesdist = click.version_option(__version__, message="bayesdist %(version)s")(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command.
 
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        In place of those of the process.
-
-    Returns
-    -------
-    int
-        0 good; 1 bad input; 2 usage; 3 not converged under --strict; 4 requirement missed; 65
-        nested too deep; 70 a defect; 71 too little memory; 74 refused by the system; 130
-        interrupted.
+    `arguments`: in place of those of the process. Result: 0 good; 1 bad input; 2 usage; 3 not
+    converged under --strict; 4 requirement missed; 65 nested too deep; 70 a defect; 71 too little
+    memory; 74 refused by the system; 130 interrupted.
     """
     open_streams()
     gc.set_threshold(*SELDOM)

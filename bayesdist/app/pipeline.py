@@ -56,16 +56,8 @@ __all__ = [
 def read(config: Config, base: Path) -> Any:
     """All that a run begins with: matched stars, or star lists with what goes with them.
 
-    Parameters
-    ----------
-    config : Config
-    base : Path
-        Folder that its files are relative to.
-
-    Raises
-    ------
-    BayesdistError
-        For files that cannot be read or do not go together.
+    `base`: folder that its files are relative to. BayesdistError for files that cannot be read or
+    do not go together.
     """
     kind = kind_of(config)
     inputs = kind.read(config, base)
@@ -81,18 +73,8 @@ def match(inputs: Any, config: Config) -> Matched:
 def fit(matched: Matched, config: Config, base: Path, reader: StarReader | None = None) -> FitData:
     """The least-squares solution with its stars.
 
-    Parameters
-    ----------
-    matched : Matched
-    config, base
-        As of `read`.
-    reader : StarReader, optional
-        That has read the stars before.
-
-    Raises
-    ------
-    BayesdistError
-        For parameters that the stars do not determine.
+    `config`, `base`: as of `read`. `reader`: that has read the stars before. BayesdistError for
+    parameters that the stars do not determine.
     """
     reader = reader or StarReader(config.resources())
     return FitData(matched, kind_of(config).fit(matched, config, base, reader), reader)
@@ -174,20 +156,9 @@ def export(
 ) -> list[dict[str, Any]]:
     """Write the files that a configuration asks for, and list what is known of each.
 
-    Parameters
-    ----------
-    evaluation : Evaluation or None
-        With whose budget the errors of the files are compared.
-    posterior : Posterior
-    found : Diagnostics or None
-        Whose errors of the parameters the files have, too.
-    data : FitData
-    config, base
-        As of `read`.
-    folder : Path
-        Where the files are written.
-    source : str
-        As of `evaluate`.
+    `evaluation`: with whose budget the errors of the files are compared. `found`: whose errors of
+    the parameters the files have, too. `config`, `base`: as of `read`. `folder`: where the files
+    are written. `source`: as of `evaluate`.
     """
     product = product_of(posterior, found, data, config, source)
     stars = None

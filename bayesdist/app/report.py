@@ -39,11 +39,7 @@ VECTOR_GRID = 17  # vectors along the longer side of a diagram: more would hide 
 def report(results: Results, *, pdf: bool = False) -> list[str]:
     """Names of the figures of a report, which is written into the folder of the run.
 
-    Parameters
-    ----------
-    results : Results
-    pdf : bool
-        Whether figures are drawn as PDF, too.
+    `pdf`: whether figures are drawn as PDF, too.
     """
     # figures take seconds to import
     from bayesdist.report.drawing import save_drawings
@@ -193,15 +189,8 @@ def selfcal_results(
 ) -> SelfcalResults:
     """Content that a self-calibration adds to the report of its run.
 
-    Parameters
-    ----------
-    run : RunDirectory
-        That has been assessed.
-    fitted : Fitted
-    posterior : Posterior
-        As it was sampled.
-    epoch : float or None
-        Of the assessment, decimal years.
+    `run`: that has been assessed. `posterior`: as it was sampled. `epoch`: of the assessment,
+    decimal years.
     """
     model, theta = fitted.linear.model, posterior.mean
     solved = required(fitted.solved, "solution of detections")

@@ -49,22 +49,13 @@ ARTEFACTS = (
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """The artefacts of a run, and what follows from them.
-
-    Parameters
-    ----------
-    run : RunDirectory
-    reader : StarReader
-        Reads the stars once for all stages.
-    made : mapping
-        Artefacts of this process, in place of those in the folder.
-    source : RunInput, optional
-        Pairs in RvB files, which may have to be selected before they are read.
-    """
+    """The artefacts of a run, and what follows from them."""
 
     run: RunDirectory
-    reader: StarReader
+    reader: StarReader  # reads the stars once for all stages
+    # artefacts of this process, in place of those in the folder
     made: Mapping[str, Any] = field(default_factory=dict)
+    # pairs in RvB files, which may have to be selected before they are read
     source: RunInput | None = None
 
     def having(self, **artefacts: Any) -> Results:
@@ -234,27 +225,13 @@ class Results:
 
 
 def results_of(run: RunDirectory) -> Results:
-    """The results of a run, which whoever asks for them closes.
-
-    Parameters
-    ----------
-    run : RunDirectory
-    """
+    """The results of a run, which whoever asks for them closes."""
     return Results(run, StarReader(run.config.resources()), source=input_of_run(run))
 
 
 @contextmanager
 def open_results(run: RunDirectory) -> Iterator[Results]:
-    """The results of a run, whose stars are let go of in the end.
-
-    Parameters
-    ----------
-    run : RunDirectory
-
-    Yields
-    ------
-    Results
-    """
+    """The results of a run, whose stars are let go of in the end."""
     results = results_of(run)
     try:
         yield results

@@ -210,16 +210,7 @@ def continue_stage(
 
 @contextmanager
 def initialized(directory: RunDirectory) -> Iterator[Results]:
-    """Results of a run whose folder is there, once it is known that it can be carried out.
-
-    Parameters
-    ----------
-    directory : RunDirectory
-
-    Yields
-    ------
-    Results
-    """
+    """Results of a run whose folder is there, once it is known that it can be carried out."""
     with open_results(directory) as results:
         begins = directory.is_planned
         if begins:

@@ -184,13 +184,7 @@ def save_figures(results: Results) -> None:
 def fit_sections(fitted: Fitted, stars: Matches, *, skew: bool = False) -> dict[str, Any]:
     """Sections of summary.json: 'data', 'fit', and those that only the making of the fit knows.
 
-    Parameters
-    ----------
-    fitted : Fitted
-    stars : Matches
-        As `Fitted.placed` gives them.
-    skew : bool
-        The skew of the axes is asked for.
+    `stars`: as `Fitted.placed` gives them. `skew`: the skew of the axes is asked for.
     """
     fit, errors = fitted.linear, fitted.errors
     optional: dict[str, Any] = {}
@@ -260,11 +254,7 @@ def _skew_row(skew: Skew) -> dict[str, float]:
 def sample_sections(posterior: Posterior, *, in_circle: bool) -> dict[str, Any]:
     """Sections 'outliers' and 'sampler' of summary.json.
 
-    Parameters
-    ----------
-    posterior : Posterior
-    in_circle : bool
-        Stars were matched in circles about nominal positions.
+    `in_circle`: stars were matched in circles about nominal positions.
     """
     return {
         "outliers": _outliers(posterior, in_circle),

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.area import determinant
 from bayesdist.calibration.calibration import calibration_of
 from bayesdist.errors import InputError, required
@@ -15,8 +15,6 @@ from bayesdist.model.basis import point_blocks
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 
 __all__ = ["AreaMap", "area_map"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

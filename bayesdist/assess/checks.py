@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.checks import EITHER, LARGER, Check
 from bayesdist.limits import MATCH_RADIUS
 from bayesdist.model.timedep import TimeDependence
 
 __all__ = ["catalogue_checks", "matching_checks", "time_checks", "visits_of"]
-
-Float = NDArray[np.float64]
 
 GROUP = "Assumptions"
 

@@ -6,16 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy.table import MaskedColumn, Table
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.model import AXES
 
 if TYPE_CHECKING:
     from bayesdist.infer import LinearFit, Posterior
 
 __all__ = ["coefficient_table"]
-
-Float = NDArray[np.float64]
 
 
 def coefficient_table(fit: LinearFit, posterior: Posterior | None = None) -> Table:

@@ -9,8 +9,9 @@ from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.assess.solution import place_of
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
@@ -27,8 +28,6 @@ __all__ = [
     "region_words",
 ]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 MIN_POSITIONS = 4  # of a region
 Region: TypeAlias = "str | tuple[tuple[float, float], ...]"
 WHOLE = "whole"
@@ -310,7 +309,7 @@ def check_region(region: Region | Sequence[Sequence[float]], where: str) -> Regi
     return tuple((x, y) for x, y in corners)
 
 
-def in_region(region: Region, size: tuple[float, float], x: Float, y: Float) -> NDArray[np.bool_]:
+def in_region(region: Region, size: tuple[float, float], x: Float, y: Float) -> Bool:
     """Boolean mask of the pixels in a region; its edge belongs to rectangles.
 
     `region`: as `check_region` gives it. `size`: columns and rows of the chip. `x`, `y`: (N,), FITS
@@ -328,7 +327,7 @@ def in_region(region: Region, size: tuple[float, float], x: Float, y: Float) -> 
     return np.asarray(np.maximum(np.abs(X), np.abs(Y)) <= half + 1e-12)
 
 
-def _in_polygon(corners: Float, x: Float, y: Float) -> NDArray[np.bool_]:
+def _in_polygon(corners: Float, x: Float, y: Float) -> Bool:
     """Pixels from which a ray to the right crosses an odd number of sides."""
     inside = np.zeros(np.shape(x), bool)
     for (x1, y1), (x2, y2) in zip(corners, np.roll(corners, -1, axis=0), strict=True):

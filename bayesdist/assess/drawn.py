@@ -14,8 +14,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain, WorstPosition
 from bayesdist.assess.statistics import ErrorsOf, drawn_statistics
 from bayesdist.assess.terms.forms import (
@@ -30,8 +30,6 @@ from bayesdist.assess.terms.forms import (
 from bayesdist.infer.solution import Solution
 
 __all__ = ["DrawnErrors", "generators"]
-
-Float = NDArray[np.float64]
 
 BLOCK = 200_000  # positions times draws whose errors a thread holds at once
 MOST_PAIRS = 5000  # pairs of positions that stand for all: percentiles over them to about 1 %

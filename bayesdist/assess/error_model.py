@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.budget.budget import ErrorBudget, budget_of
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors, generators
@@ -40,8 +40,6 @@ __all__ = [
     "with_diagnosed_errors",
     "with_shared_stars",
 ]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

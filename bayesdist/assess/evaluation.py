@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.area import AreaMap, area_map
 from bayesdist.assess.budget.budget import ErrorBudget, budget_of
 from bayesdist.assess.budget.surface import BudgetSurface, budget_surface
@@ -43,8 +43,6 @@ __all__ = [
     "judged",
     "validity_of",
 ]
-
-Float = NDArray[np.float64]
 
 VALIDITY_DRAWS = 1000  # for each of its epochs
 VALIDITY_EPOCHS = 40  # of a curve

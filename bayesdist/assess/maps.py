@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
+from bayesdist.arrays import Float
 from bayesdist.assess.solution import place_of
 from bayesdist.calibration.chip_map import position_moments
 from bayesdist.infer.solution import Solution
@@ -25,7 +26,6 @@ __all__ = [
     "with_local",
 ]
 
-Float = NDArray[np.float64]
 RELATIVE = "relative positions"
 NODES = 33  # ratios of the axes between which radii are interpolated: to 1e-4
 ANGLES = 256
@@ -200,10 +200,7 @@ def uncertainty_map(
 def per_axis(sigma_u: ArrayLike, sigma_v: ArrayLike) -> Float:
     """Rms of the standard deviations of both axes: 1 sigma of one axis, whatever its direction.
 
-    Parameters
-    ----------
-    sigma_u, sigma_v : array_like
-        In one unit, which is that of the result.
+    `sigma_u`, `sigma_v`: in one unit, which is that of the result.
     """
     return np.asarray(np.hypot(sigma_u, sigma_v) / np.sqrt(2.0))
 

@@ -10,15 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, DistortionModel, Groups, PolynomialBasis
 
 __all__ = ["Place", "chip_places", "place_of"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

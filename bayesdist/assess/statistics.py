@@ -9,14 +9,11 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.errors import require_known
 
 __all__ = ["STATISTICS", "ErrorsOf", "drawn_statistics", "extent", "field_statistic"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 _PERCENTILES = {"p50": 50.0, "p68": 68.0, "p90": 90.0, "p95": 95.0, "p99": 99.0}
 _DIRECTIONS = 64  # over half a turn

@@ -6,16 +6,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.solution import Place, Solution, place_of
 from bayesdist.errors import InputError, require_known
 from bayesdist.model.basis import point_blocks
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
 
 __all__ = ["PARTS", "VectorMap", "distortion_vectors"]
-
-Float = NDArray[np.float64]
 
 PARTS = ("no_constant", "non_linear")
 

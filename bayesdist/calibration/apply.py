@@ -16,16 +16,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.subarray import FULL, Subarray
 from bayesdist.errors import InputError
 
 __all__ = ["Application", "OutputFrame", "Positions", "frame_that_holds"]
-
-Float = NDArray[np.float64]
 
 # Points along each edge of a chip, whose image bulges.
 _EDGE = 257
@@ -63,7 +62,7 @@ class Positions:
     x: Float  # NaN where there is none
     y: Float
     cov: Float | None  # (N, 2, 2); None where the calibration has no errors
-    chip: NDArray[np.int64]  # 0 where a position lies on no chip
+    chip: Int  # 0 where a position lies on no chip
 
     @property
     def sigma_x(self) -> Float:
@@ -196,7 +195,7 @@ def frame_that_holds(
     return frame, (int(size[0]), int(size[1]))
 
 
-def on_chip(chip: ChipMap, x: Float, y: Float) -> NDArray[np.bool_]:
+def on_chip(chip: ChipMap, x: Float, y: Float) -> Bool:
     """Boolean mask of pixels on a chip, edges included; False for NaN."""
     nx, ny = chip.basis.size
     return (x >= 0.5) & (x <= nx + 0.5) & (y >= 0.5) & (y <= ny + 0.5)

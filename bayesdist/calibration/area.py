@@ -12,16 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.subarray import FULL, Subarray
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
 
 __all__ = ["PixelAreaMap", "determinant", "pixel_area_map", "pixel_areas"]
-
-Float = NDArray[np.float64]
 
 _MAGNITUDES = 2.5 / np.log(10.0)
 

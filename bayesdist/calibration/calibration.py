@@ -12,8 +12,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.chip_map import ChipMap, sampling_of
 from bayesdist.calibration.further import FurtherError
 from bayesdist.calibration.inverse import ExplicitInverse
@@ -30,8 +31,6 @@ __all__ = [
     "calibration_of",
     "calibration_of_maps",
 ]
-
-Float = NDArray[np.float64]
 
 ORIGINS = ("stated", "reference", "chip")
 FOLLOWING_ORDER = 9  # of the polynomial that stands for look-up tables where two are compared

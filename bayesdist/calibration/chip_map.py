@@ -11,16 +11,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, LookupTable, PolynomialBasis
 from bayesdist.model.basis import point_blocks
 
 __all__ = ["ChipMap", "Monomials", "fitted_map", "position_moments", "sampling_of"]
-
-Float = NDArray[np.float64]
 
 # Newton's method has converged when a step is this short in pixels, which rounding allows.
 STEP, MAX_STEPS = 1e-9, 30

@@ -14,8 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import polynomial
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
@@ -23,7 +24,6 @@ from bayesdist.model.basis import MAX_ORDER
 
 __all__ = ["ExplicitInverse", "detector_grid", "fit_inverse", "fitted_inverse"]
 
-Float = NDArray[np.float64]
 Terms = Mapping[tuple[int, int], float]
 Forward = Callable[[Float, Float], tuple[Float, Float]]
 

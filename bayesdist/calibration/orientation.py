@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Complex, Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC, Agreement, Orientation, Plane
 from bayesdist.calibration.similarity import correlations
@@ -17,9 +17,6 @@ from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.model.similarity import turned, turned_model
 
 __all__ = ["lay_on", "oriented"]
-
-Float = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 
 def lay_on(

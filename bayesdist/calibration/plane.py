@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.infer.solution import Solution
 
 __all__ = ["ARCSEC", "Agreement", "Orientation", "Plane"]
-
-Float = NDArray[np.float64]
 
 ARCSEC = {"arcsec": 1.0, "mas": 1e-3, "deg": 3600.0}
 

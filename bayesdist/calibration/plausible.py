@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import FormatError, InputError
@@ -19,16 +19,7 @@ OFF = 1e3  # factor between a stated scale and the size of a pixel
 
 
 def refuse_senseless(found: Calibration) -> None:
-    """Refuse sizes, scales and coefficients that no detector can have.
-
-    Parameters
-    ----------
-    found : Calibration
-
-    Raises
-    ------
-    FormatError
-    """
+    """Refuse sizes, scales and coefficients that no detector can have."""
     do = "correct the file, or fetch it again"
     for cause in _faults(found):
         raise FormatError(cause, where=found.name, do=do)
@@ -65,7 +56,7 @@ def _faults(found: Calibration) -> list[str]:
     return []
 
 
-def _is_covariance(cov: NDArray[np.float64]) -> bool:
+def _is_covariance(cov: Float) -> bool:
     """Whether variances are positive or zero, and correlations lie between -1 and 1."""
     variance = np.diag(cov)
     if variance.min(initial=0.0) < 0:

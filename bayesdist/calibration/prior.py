@@ -16,8 +16,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import sampling_of
 from bayesdist.calibration.plane import ARCSEC
@@ -28,9 +28,6 @@ from bayesdist.model.frames import LINEAR_MATRICES, frame_names
 
 __all__ = ["CalibrationPrior", "prior_of_calibration"]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-
 FEWEST_DRAWS = 4.0  # effective draws for each parameter, whose covariance is inverted
 SINGULAR = 1e-12  # of the largest eigenvalue in units of the standard deviations
 SCALED = "shift_rotation_scale"  # frames that are flat whatever the turn
@@ -38,30 +35,15 @@ SCALED = "shift_rotation_scale"  # frames that are flat whatever the turn
 
 @dataclass(frozen=True, eq=False)
 class CalibrationPrior:
-    """Prior of a model's polynomials, and of their drift, by an earlier calibration.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    name : str
-        Of the earlier calibration, for messages.
-    index : ndarray, shape (r,)
-        Entries of theta that it knows, the polynomials before the drift.
-    mean : ndarray, shape (r,)
-    cov : ndarray, shape (r, r)
-    frame : str
-        Kind of the frame along which the prior is flat, as of `model.frames`.
-    draws : float
-        Effective number behind the covariance; infinite if computed.
-    """
+    """Prior of a model's polynomials, and of their drift, by an earlier calibration."""
 
     model: DistortionModel
-    name: str
-    index: Int
-    mean: Float
-    cov: Float
-    frame: str
-    draws: float = np.inf
+    name: str  # of the earlier calibration, for messages
+    index: Int  # (r,), entries of theta that it knows, the polynomials before the drift
+    mean: Float  # (r,)
+    cov: Float  # (r, r)
+    frame: str  # kind of the frame along which the prior is flat, as of `model.frames`
+    draws: float = np.inf  # effective number behind the covariance; infinite if computed
 
     @property
     def turns(self) -> bool:

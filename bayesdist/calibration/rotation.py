@@ -16,13 +16,12 @@ from collections.abc import Sequence
 from math import comb
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 
 __all__ = ["coefficient_map", "is_exact", "pixel_matrix"]
-
-Float = NDArray[np.float64]
 
 # Exact, as cosines and sines are not.
 _QUARTERS = {0.0: (1.0, 0.0), 90.0: (0.0, 1.0), 180.0: (-1.0, 0.0), 270.0: (0.0, -1.0)}

@@ -10,15 +10,12 @@ Products of two polynomials have their means from the coefficients alone, withou
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Complex, Float
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
 
 __all__ = ["as_real", "correlations", "similarity_fields", "turn_between"]
-
-Float = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 
 def correlations(

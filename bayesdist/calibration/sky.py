@@ -14,8 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.chip_map import ChipMap, Monomials
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.data.sky.tangent import ARCSEC, plane_axes, sky_of_plane, tangent_plane
@@ -24,8 +24,6 @@ from bayesdist.model import PolynomialBasis
 from bayesdist.model.basis import MAX_ORDER
 
 __all__ = ["Reprojected", "reprojected"]
-
-Float = NDArray[np.float64]
 
 LEFT = 1e-5  # of a pixel: a thousandth of the best centroids' errors
 _NODES = 33

@@ -14,8 +14,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float, Int
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.plane import ARCSEC
@@ -23,9 +24,6 @@ from bayesdist.data.sky.tangent import sky_of_plane, tangent_jacobian
 from bayesdist.errors import InputError
 
 __all__ = ["SkyPositions", "sky_positions"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

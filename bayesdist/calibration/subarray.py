@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.errors import FormatError, InputError
 
 __all__ = [
@@ -26,8 +27,6 @@ __all__ = [
     "subarray_of_header",
     "subarrays_of_image",
 ]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

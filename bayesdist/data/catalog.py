@@ -11,6 +11,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.reading.columns import is_on_sky, plane_unit, position_unit
 from bayesdist.data.reading.table import with_sky_columns
 from bayesdist.data.sky.earth import parallax_factors
@@ -30,9 +31,6 @@ from bayesdist.errors import InputError
 from bayesdist.reading.tables import read_table
 
 __all__ = ["ReferenceCatalog", "catalog_from_table", "read_catalog"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 _PAIRS = (("sigma_u", "sigma_v"), ("pm_u", "pm_v"), ("sigma_pm_u", "sigma_pm_v"))
 _PARALLAX = ("parallax", "sigma_parallax")

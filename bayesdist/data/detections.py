@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.tables.checks import COMPLETED, check_columns, columns_of
 from bayesdist.errors import InputError
 
 __all__ = ["NO_STAR", "Detections", "detections_of"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 NO_STAR = -1
 

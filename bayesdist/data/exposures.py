@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 from astropy.table import Column, MaskedColumn, Table
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data.sky.earth import velocity_aberration
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import find_columns
@@ -214,7 +214,7 @@ class ExposureLog:
                         )
                     raise InputError(f"exposure {one.name} has no {key}", where=self.source, do=do)
 
-    def values(self, quantity: str) -> NDArray[np.float64]:
+    def values(self, quantity: str) -> Float:
         """A number of each exposure, NaN where it is not known.
 
         Parameters

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.streams import mixed
@@ -39,7 +40,7 @@ class HoldoutSpec:
     exposures: tuple[str, ...] = ()
     seed: int = 1
 
-    def which(self, table: Matches) -> NDArray[np.bool_]:
+    def which(self, table: Matches) -> Bool:
         """Boolean mask (N,) of the matches that are set aside; those of a star go together."""
         if table.star is not None:
             keys = [table.star.view(np.uint64)]

@@ -6,16 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import isotonic_regression
 
+from bayesdist.arrays import Float, Int
 from bayesdist.errors import InputError
 
 __all__ = ["AddedErrors", "MagnitudeErrors", "estimate", "no_magnitudes"]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 _MIN_STARS_IN_BIN = 40
 _MAX_BINS = 25
 _MIN_STARS = 10  # stars in all, below which the scatter is unknown

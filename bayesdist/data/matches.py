@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data.batches import batch_edges, every_kth
 from bayesdist.data.columns.checked import SIGMAS, MatchColumns, refuse_repeated
 from bayesdist.data.columns.joining import joined_arguments, joined_columns
@@ -20,7 +21,6 @@ from bayesdist.errors import InputError
 
 __all__ = ["BatchReader", "Matches"]
 
-Float = NDArray[np.float64]
 Errors = MagnitudeErrors | AddedErrors | float | tuple[ArrayLike, ArrayLike]
 
 

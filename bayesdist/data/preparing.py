@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.exposures import ExposureLog
 from bayesdist.data.magnitude_errors import MAD_TO_SIGMA, MagnitudeErrors
@@ -22,8 +23,6 @@ __all__ = [
     "select_motions",
 ]
 
-Float = NDArray[np.float64]
-
 _STARS_IN_BIN = 200  # stars of a bin in magnitude
 _MAX_BINS = 40
 # above the median, in the logarithm: 0.6 % of a log-normal distribution
@@ -33,14 +32,9 @@ _MIN_SCATTER = 0.05  # of ln(sigma): among errors all alike a slightly larger on
 
 @dataclass(frozen=True, eq=False)
 class MotionErrorLine:
-    """Largest error of a proper motion that counts as well measured, by magnitude.
+    """Largest error of a proper motion that counts as well measured, by magnitude."""
 
-    Parameters
-    ----------
-    mag, sigma : ndarray, shape (B,)
-        Knots in rising magnitude; linear in the logarithm between, constant beyond.
-    """
-
+    # mag, sigma (B,): knots in rising magnitude; linear in the logarithm between, constant beyond
     mag: Float
     sigma: Float
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from astropy.table import Table
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.data.detections import Detections
 from bayesdist.data.formats.files import exposure_names, input_files, kind_of
 from bayesdist.data.formats.hst1pass import read_hst1pass
@@ -24,7 +24,6 @@ __all__ = ["StarCuts", "read_star_lists"]
 
 log = logging.getLogger("bayesdist")
 
-Bool = NDArray[np.bool_]
 
 _LIST_ALIASES = {key: BASIC[key] for key in ("exposure", "chip", "epoch")} | {
     "x": ALIASES["x"],
@@ -187,7 +186,7 @@ def _of_table(
         return SourceColumn(table[found[key]], source, found[key])
 
     keys = [key for key in ("x", "y", "mag", "q") if key in found]
-    values: dict[str, NDArray[np.float64]] = {key: column(key).numbers() for key in keys}
+    values: dict[str, Float] = {key: column(key).numbers() for key in keys}
     if "mag" not in values and "flux" in found:
         mag = column("flux").magnitudes_of_fluxes()
         if mag is not None:
@@ -223,7 +222,7 @@ def _of_table(
     ]
 
 
-def _variance(column: SourceColumn) -> NDArray[np.float64]:
+def _variance(column: SourceColumn) -> Float:
     """Variance of pixels (N,), which SExtractor writes itself."""
     values = column.numbers()
     bad = values <= 0

@@ -9,13 +9,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-__all__ = ["add_over", "joint_clusters", "products_over", "squares_over", "sums_over"]
+from bayesdist.arrays import Float, Int
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+__all__ = ["add_over", "joint_clusters", "products_over", "squares_over", "sums_over"]
 
 
 def sums_over(cluster: Int, values: Float, n: int = 0) -> Float:

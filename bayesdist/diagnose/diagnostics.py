@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.checks import EITHER, Check
 from bayesdist.data import MagnitudeErrors, Matches
 from bayesdist.diagnose.checks import (
@@ -67,7 +67,6 @@ __all__ = [
     "residual_sums",
 ]
 
-Int = NDArray[np.int64]
 Bins = tuple[int, int]
 
 SHOWN = "shown"  # the partition that diagrams of mean residuals show
@@ -77,55 +76,31 @@ log = logging.getLogger("bayesdist")
 
 @dataclass(frozen=True, eq=False)
 class Diagnostics:
-    """Misfit, score tests, correlated errors and further results by the residuals of a solution.
+    """Misfit, score tests, correlated errors and further results by the residuals of a solution."""
 
-    Parameters
-    ----------
-    sums : StarSums
-        Of residuals over all stars.
-    partitions : mapping of int to mapping of str to tuple of int
-        Bins of each chip, by its number and the name of the partition.
-    misfits : tuple of Misfit
-        Structure that the solution leaves, of each chip or, where these share stars, of all.
-    coverage : tuple of Coverage
-        The area of each chip that its stars cover.
-    sample : StarSample
-        Some stars, or all of them, and what residuals and probabilities of each.
-    majority : str
-        What it means that most pairs are false; empty where they are not.
-    epoch_shift : EpochShift or None
-        Error of the epochs; None without proper motions.
-    centroid : MagnitudeErrors or None
-        Scatter of residuals by magnitude, where stars have magnitudes.
-    flagged : ndarray of int, shape (E,), or None
-        Stars of each exposure that are more likely false than not; None for one exposure.
-    score_tests : tuple of ScoreTest
-    correlated : Discrepancy or None
-        Correlated errors; None where they have not been estimated.
-    catalogue : StarCovariance or None
-        Covariance of the parameters by errors of the catalogue, where these are known by star.
-    periods : TimeVariation or None
-        Models of several periods compared, where that was asked for.
-    holdout : HoldoutValidation or None
-        Results of stars that were set aside before the fit, where there are any.
-    overlap : OverlapTest or None
-        Two exposures far apart in time laid on each other, of a campaign.
-    """
-
-    sums: StarSums
+    sums: StarSums  # of residuals over all stars
+    # bins of each chip, by its number and the name of the partition
     partitions: Mapping[int, Mapping[str, Bins]]
+    # structure that the solution leaves, of each chip or, where these share stars, of all
     misfits: tuple[Misfit, ...]
-    coverage: tuple[Coverage, ...]
-    sample: StarSample
-    majority: str = ""
-    epoch_shift: EpochShift | None = None
+    coverage: tuple[Coverage, ...]  # the area of each chip that its stars cover
+    sample: StarSample  # some stars, or all of them, and what residuals and probabilities of each
+    majority: str = ""  # what it means that most pairs are false; empty where they are not
+    epoch_shift: EpochShift | None = None  # error of the epochs; None without proper motions
+    # scatter of residuals by magnitude, where stars have magnitudes
     centroid: MagnitudeErrors | None = None
+    # (E,), stars of each exposure that are more likely false than not; None for one exposure
     flagged: Int | None = None
     score_tests: tuple[ScoreTest, ...] = ()
+    # correlated errors; None where they have not been estimated
     correlated: Discrepancy | None = None
+    # covariance of the parameters by errors of the catalogue, where these are known by star
     catalogue: StarCovariance | None = None
+    # models of several periods compared, where that was asked for
     periods: TimeVariation | None = None
+    # results of stars that were set aside before the fit, where there are any
     holdout: HoldoutValidation | None = None
+    # two exposures far apart in time laid on each other, of a campaign
     overlap: OverlapTest | None = None
 
     @property
@@ -269,7 +244,7 @@ def misfits_of(
     return tuple(out)
 
 
-def _taken(eliminated: SelfCalibrationMode, rows: Int) -> NDArray[np.float64]:
+def _taken(eliminated: SelfCalibrationMode, rows: Int) -> Float:
     """Fraction (N,) of the variance that places of stars take out of detections."""
     own = eliminated.problem.rows
     taken = np.zeros(max(int(own.max(initial=-1)), int(rows.max(initial=-1))) + 1)
@@ -409,23 +384,8 @@ def hold_out(
 ) -> Diagnostics:
     """Diagnostics with what stars say that were set aside.
 
-    Parameters
-    ----------
-    diagnostics : Diagnostics
-    predictive : Predictive
-        The solution with its correlated errors, as it predicts.
-    held : Matches
-        Stars that were set aside, with errors.
-    whole : tuple of str
-        Exposures all of whose stars were.
-
-    Returns
-    -------
-    Diagnostics
-
-    Raises
-    ------
-    InputError
-        For too few stars.
+    `predictive`: the solution with its correlated errors, as it predicts. `held`: stars that were
+    set aside, with errors. `whole`: exposures all of whose stars were. InputError for too few
+    stars.
     """
     return replace(diagnostics, holdout=holdout_validation(predictive, held, whole=whole))

@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from bayesdist.arrays import Float, Int
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.data import Matches
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
@@ -22,9 +22,6 @@ from bayesdist.model import LookupTable, corrected
 
 __all__ = ["Alignment", "OverlapTest", "align", "chosen_exposures", "overlap_test"]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-
 MIN_OVERLAP = 0.5  # of the stars of the exposure that has fewer: what "overlap well" means
 MIN_SHARED_STARS = 100  # shared stars below which there is no map to be drawn
 STARS_PER_CELL = 12  # stars in a cell, on average
@@ -33,26 +30,13 @@ MAX_CELLS = 24  # along an axis
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """The similarity a = shift + scale R(rotation) b between two exposures, and what it leaves.
+    """The similarity a = shift + scale R(rotation) b between two exposures, and what it leaves."""
 
-    Parameters
-    ----------
-    shift : ndarray, shape (2,)
-        Pixels.
-    rotation : float
-        Radians, from xi to eta.
-    scale : float
-    position : ndarray, shape (N, 2)
-        (xi, eta) of the stars in exposure a, pixels.
-    residual : ndarray, shape (N, 2)
-        a minus the transformed b, pixels.
-    """
-
-    shift: Float
-    rotation: float
+    shift: Float  # (2,), pixels
+    rotation: float  # radians, from xi to eta
     scale: float
-    position: Float
-    residual: Float
+    position: Float  # (N, 2), (xi, eta) of the stars in exposure a, pixels
+    residual: Float  # (N, 2), a minus the transformed b, pixels
 
     @property
     def rms(self) -> Float:

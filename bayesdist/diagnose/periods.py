@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Int
 from bayesdist.data import Matches
 from bayesdist.diagnose.residuals import (
     BinnedSums,
@@ -48,7 +48,6 @@ __all__ = [
     "time_variation",
 ]
 
-Int = NDArray[np.int64]
 MAX_BINS = 45  # along each side, as in Appendix C
 COMBINED = "combined"
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.distributions import beta_ppf, beta_sf, chi2_isf
 
 __all__ = ["chi_square_of", "clopper_pearson", "holm", "hotelling_p"]
-
-Float = NDArray[np.float64]
 
 MIN_P = 1e-300  # tails underflow: no probability is zero
 

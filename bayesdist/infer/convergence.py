@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from bayesdist.arrays import Float
 from bayesdist.limits import DRAWS_PER_WALKER
 from bayesdist.numbers import count
 
@@ -26,8 +26,6 @@ __all__ = [
     "pareto_k",
     "smoothed_weights",
 ]
-
-Float = NDArray[np.float64]
 
 AXES = {"chain_axis": 0, "draw_axis": 1}
 TAIL = (0.05, 0.95)  # quantiles whose effective sample sizes are those of the tails

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.gauss_newton import (
@@ -32,8 +32,6 @@ from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
 __all__ = ["LinearFit", "Rejection", "build_model", "fit_linear", "residuals"]
-
-Float = NDArray[np.float64]
 
 MEDIAN_STARS = 1_000_000  # largest number of stars whose median is taken
 MEDIAN_CHI2_2 = 2 * np.log(2)  # median of chi-square with two degrees of freedom
@@ -139,7 +137,7 @@ class LinearFit(Solution):
         """Number of stars left out of the second pass."""
         return self.n_rows - self.n_used
 
-    def uses(self, matches: Matches) -> NDArray[np.bool_]:
+    def uses(self, matches: Matches) -> Bool:
         """Boolean mask (N,) of a table's stars that the second pass uses.
 
         Parameters

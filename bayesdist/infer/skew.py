@@ -15,14 +15,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["Skew", "skew_of"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

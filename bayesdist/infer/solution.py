@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 
@@ -28,8 +28,6 @@ __all__ = [
     "likelihood_of",
     "root_of_diagonal",
 ]
-
-Float = NDArray[np.float64]
 
 
 def root_of_diagonal(cov: Float) -> Float:
@@ -112,7 +110,7 @@ class Solution(ABC):
         """Likelihood of a star by its position, at the mean; None for a transformed solution."""
         return None
 
-    def uses(self, matches: Matches) -> NDArray[np.bool_]:
+    def uses(self, matches: Matches) -> Bool:
         """Boolean mask (N,) of a table's stars that were not left out; all by default."""
         return np.ones(len(matches), bool)
 
@@ -228,12 +226,6 @@ class TransformedSolution(DerivedSolution):
 
 @dataclass(frozen=True, eq=False)
 class GaugedSolution(TransformedSolution):
-    """A solution rotated and shifted to the reference gauge.
+    """A solution rotated and shifted to the reference gauge."""
 
-    Parameters
-    ----------
-    gauge : ReferenceGauge
-        Rotation and shift that were applied.
-    """
-
-    gauge: ReferenceGauge
+    gauge: ReferenceGauge  # rotation and shift that were applied

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Complex, Float
 from bayesdist.errors import InputError, required
 from bayesdist.infer.solution import (
     GaugedSolution,
@@ -32,8 +32,6 @@ __all__ = [
     "segment",
     "without_frames",
 ]
-
-Float = NDArray[np.float64]
 
 # constant, x and y of both axes as ACS ISR 2015-06 numbers them (Equations 1-2)
 LINEAR_TERMS = ("A_1", "A_2", "A_3", "B_1", "B_2", "B_3")
@@ -191,7 +189,7 @@ def reference_gauge(
     basis = model.basis(chip)
     n = model.n_params
 
-    def pose(theta: Float) -> tuple[Float, NDArray[np.complex128]]:
+    def pose(theta: Float) -> tuple[Float, Complex]:
         """Rotation (...) and shift (...) that bring the polynomials to the gauge."""
         at = basis.to_monomials(model.effective(theta, group)[..., 0, :, :])
         return np.arctan2(at[..., 0, 2], at[..., 1, 2]), at[..., 0, 0] + 1j * at[..., 1, 0]

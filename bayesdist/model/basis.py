@@ -15,8 +15,9 @@ from typing import overload
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 
 __all__ = ["MAX_ORDER", "PolynomialBasis", "as_pair", "point_blocks", "polynomial_terms"]
@@ -24,8 +25,6 @@ __all__ = ["MAX_ORDER", "PolynomialBasis", "as_pair", "point_blocks", "polynomia
 MAX_ORDER = 12
 # Points whose basis values are held at once: 91 terms (order 12) of them are 24 MB.
 BLOCK = 32768
-
-Float = NDArray[np.float64]
 
 
 @lru_cache

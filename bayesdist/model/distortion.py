@@ -21,14 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.errors import InputError
 from bayesdist.model.effective import EffectiveCoefficients
 from bayesdist.model.grouping import Groups, group_by
 
 __all__ = ["DistortionModel"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 NO_EXPOSURE = -1  # code of the polynomial itself where it is no exposure's
 

@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float, Int
 from bayesdist.model.frames import (
     CHIP_DEVIATIONS,
     RIGID,
@@ -27,9 +28,6 @@ from bayesdist.model.timedep import TimeDependence
 
 __all__ = ["EffectiveCoefficients"]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-
 
 @dataclass(frozen=True)
 class EffectiveCoefficients(ParameterLayout):
@@ -38,16 +36,7 @@ class EffectiveCoefficients(ParameterLayout):
     def polynomials(self, theta: ArrayLike, chip: Int, epoch: Float) -> Float:
         """Legendre coefficients of w, before the exposure frame.
 
-        Parameters
-        ----------
-        theta : array_like, shape (..., n_params)
-        chip : ndarray of int, shape (G,)
-            Chip codes.
-        epoch : ndarray, shape (G,)
-
-        Returns
-        -------
-        ndarray, shape (..., G, 2, K)
+        `theta`: (..., n_params). `chip` (G,): chip codes. `epoch`: (G,). Result: (..., G, 2, K).
         """
         theta = np.asarray(theta, float)
         K = self.n_terms
@@ -103,14 +92,7 @@ class EffectiveCoefficients(ParameterLayout):
     def effective(self, theta: ArrayLike, groups: Groups) -> Float:
         """Effective Legendre coefficients of each group: the whole model as polynomials.
 
-        Parameters
-        ----------
-        theta : array_like, shape (..., n_params)
-        groups : Groups
-
-        Returns
-        -------
-        ndarray, shape (..., G, 2, K)
+        `theta`: (..., n_params). Result: (..., G, 2, K).
         """
         theta = np.asarray(theta, float)
         out = self.polynomials(theta, groups.chip, groups.epoch)
@@ -145,17 +127,9 @@ class EffectiveCoefficients(ParameterLayout):
     def effective_jacobian(self, theta: ArrayLike, groups: Groups) -> list[tuple[Int, Float]]:
         """Derivatives of the effective coefficients.
 
-        Parameters
-        ----------
-        theta : array_like, shape (n_params,)
-            The point at which the frames are linearised.
-        groups : Groups
-
-        Returns
-        -------
-        list of (columns, derivative), one for each group
-            `columns` (m,) are the entries of theta that the group depends on (global ones first),
-            `derivative` (2, K, m).
+        `theta` (n_params,): the point at which the frames are linearised. Result: `columns` (m,)
+        are the entries of theta that the group depends on (global ones first), `derivative` (2, K,
+        m).
         """
         out = [(np.zeros(0, np.int64), np.zeros(0))] * len(groups)
         for rows, columns, derivative in self.jacobian_blocks(theta, groups):

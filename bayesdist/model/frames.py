@@ -20,7 +20,9 @@ These are small, and taken as linear.  Scale and shear of the frame then act abo
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from bayesdist.arrays import Float
 
 __all__ = [
     "CHIP_DEVIATIONS",
@@ -35,8 +37,6 @@ __all__ = [
     "nearest_frame",
     "rigid_part",
 ]
-
-Float = NDArray[np.float64]
 
 _NAMES: dict[str, tuple[str, ...]] = {
     "none": (),

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.errors import InputError
 from bayesdist.memory import require_memory
 
@@ -16,8 +16,6 @@ __all__ = [
     "outline_pixels",
     "position_of_largest",
 ]
-
-Float = NDArray[np.float64]
 
 DEFAULT_GRID = (33, 17)
 BYTES_OF_POINT = 500  # at least: its position, the polynomial there, and some draws
@@ -50,7 +48,7 @@ def mesh(x: Float, y: Float) -> tuple[Float, Float]:
     return X.ravel(), Y.ravel()
 
 
-def cell_index(X: Float, Y: Float, bins: tuple[int, int]) -> NDArray[np.int64]:
+def cell_index(X: Float, Y: Float, bins: tuple[int, int]) -> Int:
     """Cell of each position (N,), counted along x first; X and Y run from -1 to 1 over the chip.
 
     Positions beyond are in the outermost cells.

@@ -9,17 +9,14 @@ from itertools import product
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.errors import InputError
 from bayesdist.model.basis import PolynomialBasis
 from bayesdist.model.frames import CHIP_DEVIATIONS, FRAME_KINDS, RIGID, frame_names
 from bayesdist.model.timedep import AXES, TimeDependence
 
 __all__ = ["GAUGES", "Chip", "Parameter", "ParameterLayout"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 GAUGES = ("first", "held")
 
@@ -278,10 +275,7 @@ class ParameterLayout:
     def chip_code(self, number: int) -> int:
         """Index of a chip by its number.
 
-        Raises
-        ------
-        InputError
-            When no chip has that number.
+        InputError when no chip has that number.
         """
         for code, chip in enumerate(self.chips):
             if chip.number == number:

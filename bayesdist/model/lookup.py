@@ -15,15 +15,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.errors import InputError
 from bayesdist.model.basis import as_pair
 
 __all__ = ["LookupTable", "corrected"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +197,7 @@ class LookupTable:
             out[:, a, a] += 1.0
         return out
 
-    def _cell(self, pixel: ArrayLike, axis: int) -> tuple[Int, Float, NDArray[np.bool_]]:
+    def _cell(self, pixel: ArrayLike, axis: int) -> tuple[Int, Float, Bool]:
         """Lower node, fraction of the step above it, and a mask of the pixels on the grid."""
         pixel = np.atleast_1d(np.asarray(pixel, float))
         if not np.isfinite(pixel).all():
@@ -273,7 +271,7 @@ def corrected(
     return x, y
 
 
-def _refuse(bad: NDArray[np.bool_], array: Float, what: str, where: str, do: str) -> None:
+def _refuse(bad: Bool, array: Float, what: str, where: str, do: str) -> None:
     """Refuse a table with a bad node, naming the first."""
     if bad.any():
         axis, row, column = np.argwhere(bad)[0]

@@ -12,14 +12,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.model.distortion import DistortionModel
 from bayesdist.model.timedep import TimeDependence
 
 __all__ = ["turned", "turned_model"]
-
-Float = NDArray[np.float64]
 
 
 def turned_model(model: DistortionModel) -> DistortionModel:

@@ -11,8 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 
 __all__ = ["AXES", "TimeDependence"]
@@ -95,7 +96,7 @@ class TimeDependence:
             names += [f"step_{s + 1}", f"rate_{s + 1}"]
         return tuple(names)
 
-    def weights(self, epoch: ArrayLike) -> NDArray[np.float64]:
+    def weights(self, epoch: ArrayLike) -> Float:
         """Derivatives of a coefficient by each parameter of a drifting term, at an epoch.
 
         Parameters

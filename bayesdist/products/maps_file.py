@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess import AreaMap, UncertaintyMap
 from bayesdist.assess.maps import RELATIVE
 from bayesdist.calibration.area import PixelAreaMap
@@ -22,7 +22,6 @@ from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 
 __all__ = ["write_maps", "write_pam"]
-
 
 PREFIX = {"least squares": "LSQ", "posterior": "MIX", RELATIVE: "REL"}
 
@@ -76,9 +75,9 @@ def write_maps(
 
 def _image(
     name: str,
-    values: NDArray[np.float64],
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
+    values: Float,
+    x: Float,
+    y: Float,
     unit: str,
 ) -> fits.ImageHDU:
     hdu = fits.ImageHDU(np.ascontiguousarray(values), name=name)

@@ -21,12 +21,7 @@ DEEPEST = 64  # brackets within each other; our own files have fewer than ten
 
 
 def json_of(text: str, where: str, *, do: str = "restore it, or write it again") -> Any:
-    """Tree of a JSON text.
-
-    Raises
-    ------
-    FormatError
-    """
+    """Tree of a JSON text."""
     try:
         return _not_too_deep(json.loads(text), where, do)
     except (ValueError, RecursionError) as error:
@@ -36,12 +31,7 @@ def json_of(text: str, where: str, *, do: str = "restore it, or write it again")
 
 
 def toml_of(text: str, where: str) -> dict[str, Any]:
-    """Tree of a TOML text.
-
-    Raises
-    ------
-    FormatError
-    """
+    """Tree of a TOML text."""
     do = "correct it there"
     try:
         return _not_too_deep(tomllib.loads(text), where, do)
@@ -62,10 +52,7 @@ def read_json_as(kind: TypeAdapter[T], path: Path, *, do: str) -> T:
 def model_of(kind: TypeAdapter[T], tree: Any, where: str, *, do: str) -> T:
     """A tree as a type.
 
-    Raises
-    ------
-    FormatError
-        With the key that does not fit.
+    FormatError with the key that does not fit.
     """
     try:
         return kind.validate_python(tree)

@@ -46,13 +46,7 @@ def restoring(path: Path, what: str, *, do: str) -> Iterator[None]:
     A file of a run's folder may have been changed by anybody: what is missing in it, or of another
     shape, shows where objects are made from it.
 
-    Parameters
-    ----------
-    path : Path
-    what : str
-        With its article, as in 'a posterior'.
-    do : str
-        By which the file is made again.
+    `what`: with its article, as in 'a posterior'. `do`: by which the file is made again.
     """
     try:
         with warnings.catch_warnings():

@@ -19,10 +19,7 @@ RECORD = 2880  # bytes
 def open_fits(raw: bytes, where: str) -> fits.HDUList:
     """HDUs by astropy, with their data in memory.
 
-    Raises
-    ------
-    FormatError
-        For a file that is truncated, or whose headers cannot be followed.
+    FormatError for a file that is truncated, or whose headers cannot be followed.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of other programs' cards

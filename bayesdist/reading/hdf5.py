@@ -27,20 +27,9 @@ def hdf5_arrays(
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Arrays by name, and attributes, of an HDF5 file.
 
-    Parameters
-    ----------
-    path : Path
-    names : sequence of str, optional
-        Arrays that are wanted; by default all at the top of the file.
-
-    Raises
-    ------
-    InputError
-        For a path that is no regular file.
-    FormatError
-        For arrays that the file cannot hold.
-    OSError, KeyError
-        As h5py raises them for a damaged file.
+    `names`: arrays that are wanted; by default all at the top of the file. InputError for a path
+    that is no regular file. FormatError for arrays that the file cannot hold. OSError, KeyError as
+    h5py raises them for a damaged file.
     """
     with _checked(path) as file:
         arrays = {name: file[name][...] for name in names or file}

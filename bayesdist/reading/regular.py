@@ -33,10 +33,8 @@ _KINDS = {
 def opened(path: PathLike) -> Iterator[io.BufferedReader]:
     """Context with a regular file, open for reading bytes.
 
-    Raises
-    ------
-    InputError
-        For a path where there is none, none that the system lets us read, and a file of holes.
+    InputError for a path where there is none, none that the system lets us read, and a file of
+    holes.
     """
     try:
         stream = open(path, "rb", opener=_without_waiting)  # noqa: SIM115  in a context below
@@ -85,15 +83,7 @@ def _irregular(path: PathLike, kind: int) -> InputError:
 def read_bytes(path: PathLike, *, most: int | None = None) -> bytes:
     """Content of a file.
 
-    Parameters
-    ----------
-    path : path-like
-    most : int, optional
-        Bytes that are plausible; by default what fits in memory.
-
-    Raises
-    ------
-    InputError
+    `most`: bytes that are plausible; by default what fits in memory.
     """
     most = memory_limit() if most is None else most
     with opened(path) as stream:

@@ -25,17 +25,7 @@ def most_unpacked(size: int) -> int:
 def refuse_inflated(announced: float, size: int, where: str) -> None:
     """Refuse a file that announces more content than its size allows.
 
-    Parameters
-    ----------
-    announced : float
-        Bytes.
-    size : int
-        Of the file.
-    where : str
-
-    Raises
-    ------
-    FormatError
+    `announced`: bytes. `size`: of the file.
     """
     if not announced <= most_unpacked(size):
         raise FormatError(
@@ -48,10 +38,7 @@ def refuse_inflated(announced: float, size: int, where: str) -> None:
 def unpacked(raw: bytes, where: str) -> bytes:
     """Content of a file, decompressed where gzip has compressed it.
 
-    Raises
-    ------
-    FormatError
-        For a broken gzip file, or one that holds more than is plausible.
+    FormatError for a broken gzip file, or one that holds more than is plausible.
     """
     if raw[:2] != GZIP:
         return raw

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.model import Chip, LookupTable
 
 if TYPE_CHECKING:
@@ -26,8 +26,6 @@ __all__ = [
     "Footprints",
     "LinearSeries",
 ]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +46,7 @@ class Detections:
 
     mag: Float  # (N,), of those that are drawn
     q: Float  # (N,)
-    kept: NDArray[np.bool_]  # (N,), True where they pass the cuts
+    kept: Bool  # (N,), True where they pass the cuts
     n_total: int  # of all
     n_kept: int  # of all
     mag_cuts: tuple[float, ...]  # magnitudes beyond which detections are left out
@@ -104,12 +102,12 @@ class LinearSeries:
         return tuple(n for n in names if f"sigma_{n}" in names)
 
     @property
-    def segment(self) -> NDArray[np.int64]:
+    def segment(self) -> Int:
         """Segment of each exposure, from 0."""
         return np.searchsorted(np.asarray(self.breaks, float), self.epoch, side="right")
 
     @property
-    def outlying(self) -> NDArray[np.bool_]:
+    def outlying(self) -> Bool:
         """Mask of the exposures that are more likely off the line than not."""
         return np.asarray(self.exposures["outlier_probability"], float) > 0.5
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.checks import Check, warnings_of
 from bayesdist.numbers import MISSING, count, with_mas
 from bayesdist.report.figures.mosaic import Mosaic
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 __all__ = ["ChipResults", "Product", "ReportInput", "SelfcalResults", "needed"]
 
-Float = NDArray[np.float64]
 T = TypeVar("T")
 
 
@@ -147,7 +146,7 @@ class ReportInput:
     score_tests: tuple[ScoreTest, ...] = ()  # of the residuals
     magnitude_errors: MagnitudeErrors | None = None  # where the stars had no errors
     added_errors: GroupedErrors | None = None  # beyond the quoted ones, by groups
-    flagged: NDArray[np.int64] | None = None  # (E,), stars more likely false than not
+    flagged: Int | None = None  # (E,), stars more likely false than not
     provenance: Mapping[str, Any] = field(default_factory=dict)  # nested
     campaign: CampaignResults | None = None  # of a run on star lists
     periods: TimeVariation | None = None  # models of several periods compared

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = [
@@ -16,10 +16,6 @@ __all__ = [
     "sky_seen",
     "stars_on_detector",
 ]
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-Int = NDArray[np.int64]
 
 MOST_STEPS = 30
 CLOSE = 1e-9  # pixels

@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.batches import even_edges
 from bayesdist.data.matches import Matches
 from bayesdist.data.storage.write import write_partitioned
@@ -16,8 +17,6 @@ from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 
 __all__ = ["Truth", "simulate_matches", "simulate_partitioned"]
-
-Float = NDArray[np.float64]
 
 _AT_ONCE, _STEP = 65_536, 8192
 CHUNK = 1_000_000  # matches in memory at a time
@@ -46,7 +45,7 @@ class Truth:
     fraction: float
     jitter: float
     outlier_scale: float
-    false: NDArray[np.bool_]
+    false: Bool
 
 
 def simulate_matches(
@@ -196,8 +195,8 @@ def _positions(
     x: Float,
     y: Float,
     epoch: Float | None,
-    exposure: NDArray[np.int64],
-    chip: NDArray[np.int64],
+    exposure: Int,
+    chip: Int,
 ) -> Float:
     """Positions (N, 2) at which stars (N,) are seen."""
     n = len(x)

@@ -8,14 +8,12 @@ from functools import cached_property
 from math import lcm
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
+from bayesdist.arrays import Float
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["DitherPattern", "flat_coefficients", "grid_offsets", "rolls_in_turn"]
-
-Float = NDArray[np.float64]
 
 GAP = 50.0  # pixels between chips without a given position
 ONE_LINE = 0.02  # of the spread along the offsets, below which that across them counts as none

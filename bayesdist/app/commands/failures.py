@@ -20,17 +20,8 @@ DEFECT, NO_MEMORY, NO_SYSTEM, TOO_DEEP = 70, 71, 74, 65
 def failure(error: Exception, command: str) -> tuple[int, str]:
     """Exit code and sentence for an exception that nobody below could say more about.
 
-    Parameters
-    ----------
-    error : Exception
-    command : str
-        The command line.
-
-    Returns
-    -------
-    code : int
-    sentence : str
-        Of a defect it names the file with the traceback, which is written here.
+    `command`: the command line. Result: `code`; `sentence`: of a defect it names the file with the
+    traceback, which is written here.
     """
     if isinstance(error, MemoryError):
         return NO_MEMORY, (

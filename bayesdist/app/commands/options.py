@@ -28,14 +28,7 @@ __all__ = [
 
 
 class LazyGroup(click.Group):
-    """A group whose commands are named as "module:object".
-
-    Parameters
-    ----------
-    name : str
-    help : str
-    lazy : mapping of str to str
-    """
+    """A group whose commands are named as "module:object"."""
 
     def __init__(self, name: str, *, help: str, lazy: Mapping[str, str], **options: Any) -> None:
         super().__init__(name, help=help, **options)
@@ -61,10 +54,7 @@ class LazyGroup(click.Group):
 class CommaList(click.ParamType):
     """Values that are separated by commas.
 
-    Parameters
-    ----------
-    kind : type
-        Of each value.
+    `kind`: of each value.
     """
 
     name = "list"
@@ -142,10 +132,7 @@ image_size = click.option(
 def chip_of(numbers: Sequence[int], chip: int | None, where: str) -> int:
     """Number of the chip that --chip names, which may be left out where there is one.
 
-    Raises
-    ------
-    InputError
-        For none, or one that is not there, among several.
+    InputError for none, or one that is not there, among several.
     """
     listed = ", ".join(map(str, numbers))
     if chip is None and len(numbers) == 1:

@@ -42,10 +42,7 @@ MEASURED_TERMS = (
 def require_own_names(block: str, names: Sequence[str]) -> None:
     """Refuse blocks of one name.
 
-    Raises
-    ------
-    ValueError
-        As validators raise it.
+    ValueError as validators raise it.
     """
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:

@@ -257,10 +257,7 @@ class MatchesConfig(RunConfig):
     def refuse_circle(self) -> None:
         """Refuse what cannot go with matches in a circle about their nominal positions.
 
-        Raises
-        ------
-        ValueError
-            As validators raise it.
+        ValueError as validators raise it.
         """
         if self.outliers.match_radius is None:
             return

@@ -63,13 +63,8 @@ def as_config_error(
 ) -> ConfigError:
     """The first thing that is wrong, with its key.
 
-    Parameters
-    ----------
-    kinds : type of pydantic.BaseModel or mapping of str to such types
-        What the file was validated against: by the section that says which one of several.
-    error : pydantic.ValidationError
-    where : str
-        The file.
+    `kinds`: what the file was validated against: by the section that says which one of several.
+    `where`: the file.
     """
     # an unknown key is usually the cause of a missing one
     details = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")

@@ -15,10 +15,7 @@ TABLES, POSTERIOR = "tables.h5", "posterior.nc"
 def tables_file(path: Path) -> Path:
     """File of a detector's tables: a D2IMFILE as it is named, or that of a run.
 
-    Raises
-    ------
-    InputError
-        For a folder that is no finished run.
+    InputError for a folder that is no finished run.
     """
     return path if path.is_file() else _file_of_run(path, TABLES, "tables.detector")
 
@@ -26,10 +23,7 @@ def tables_file(path: Path) -> Path:
 def rates_file(folder: Path) -> Path:
     """File of the posterior of a run whose drift is taken over.
 
-    Raises
-    ------
-    InputError
-        For a folder that is no finished run.
+    InputError for a folder that is no finished run.
     """
     return _file_of_run(folder, POSTERIOR, "model.tdd.rates")
 
@@ -37,10 +31,7 @@ def rates_file(folder: Path) -> Path:
 def calibration_file(path: Path) -> Path:
     """File of an earlier calibration: one of any format as it is named, or a run's posterior.
 
-    Raises
-    ------
-    InputError
-        For a folder that is no finished run.
+    InputError for a folder that is no finished run.
     """
     return path if path.is_file() else _file_of_run(path, POSTERIOR, "prior_calibration.source")
 

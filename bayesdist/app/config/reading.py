@@ -78,17 +78,8 @@ class _RequirementFile(Section):
 def load_config(path: str | Path) -> tuple[Config, str]:
     """Read a configuration file.
 
-    Returns
-    -------
-    config : Config
-    text : str
-        The file as it stands.
-
-    Raises
-    ------
-    ConfigError
-        With file, key and reason; an unknown key names the nearest known one, or the kind of run
-        that has it.
+    Result: `config`; `text`: the file as it stands. ConfigError with file, key and reason; an
+    unknown key names the nearest known one, or the kind of run that has it.
     """
     text = load_text(path)
     return parse_config(text, str(path)), text
@@ -112,10 +103,7 @@ def parse_config(text: str, where: str) -> Config:
 def config_of_record(settings: Mapping[str, Any], where: str) -> Config:
     """A configuration as the record of a run holds it.
 
-    Raises
-    ------
-    ConfigError
-        For settings that another version allowed.
+    ConfigError for settings that another version allowed.
     """
     try:
         return CONFIG.validate_python(settings)
@@ -144,14 +132,7 @@ def load_text(path: str | Path) -> str:
 def validated(kind: type[Section], text: str, where: str, *, begin: str) -> Any:
     """A file of sections from its text.
 
-    Parameters
-    ----------
-    kind : type of Section
-    text : str
-    where : str
-        The file, for errors.
-    begin : str
-        What to do about an empty one.
+    `where`: the file, for errors. `begin`: what to do about an empty one.
     """
     return _validated(TypeAdapter(kind), kind, _settings(text, where, begin=begin), where)
 

@@ -67,10 +67,7 @@ def require_detector(
 ) -> None:
     """Refuse chips that contradict each other, or no detector at all.
 
-    Raises
-    ------
-    ValueError
-        As validators raise it.
+    ValueError as validators raise it.
     """
     if sum(c.reference for c in chips) > 1:
         raise ValueError("reference = true stands in several [[chip]] blocks; keep it in one")
@@ -102,10 +99,7 @@ def chips_of(chips: Sequence[ChipBlock]) -> tuple[Chip, ...]:
 def one_chip(detector: Detector, reference_pixel: Pair | None, number: int, name: str) -> Chip:
     """The chip of a detector that has one; its middle where no pixel is named.
 
-    Raises
-    ------
-    ValueError
-        For a detector without a size.
+    ValueError for a detector without a size.
     """
     if detector.size is None:
         raise ValueError("detector.size is missing; give columns and rows")

@@ -26,10 +26,7 @@ MinDetections = Annotated[int, Field(ge=2)]
 def require_scales(sigma: float | None, frames: Frames) -> None:
     """Refuse a scatter of the scales of exposures that have none.
 
-    Raises
-    ------
-    ValueError
-        As validators raise it.
+    ValueError as validators raise it.
     """
     if sigma is not None and "scale" not in frames:
         raise ValueError(

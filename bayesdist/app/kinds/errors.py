@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data.magnitude_errors import AddedErrors, MagnitudeErrors
 from bayesdist.data.matches import Matches
 from bayesdist.infer import Posterior
@@ -17,23 +17,13 @@ __all__ = ["QUOTED", "ErrorLaw", "ExposureScatter"]
 
 @dataclass(frozen=True, eq=False)
 class ErrorLaw:
-    """Law by which errors of stars, fitted or held out, follow from those that their table quotes.
+    """Law by which errors of stars, fitted or held out, follow from the quoted ones."""
 
-    Parameters
-    ----------
-    factor : float
-        On all quoted errors; 1 where they will do.
-    by_magnitude : MagnitudeErrors or None
-        Errors of the centroids, in place of the quoted ones.
-    added : AddedErrors or None
-        Beyond these, by groups of stars.
-    with_catalogue : bool
-        Errors by magnitude are added in quadrature to the quoted ones, which are the catalogue's.
-    """
-
-    factor: float = 1.0
+    factor: float = 1.0  # on all quoted errors; 1 where they will do
+    # errors of the centroids, in place of the quoted ones
     by_magnitude: MagnitudeErrors | None = None
-    added: AddedErrors | None = None
+    added: AddedErrors | None = None  # beyond these, by groups of stars
+    # errors by magnitude are added in quadrature to the quoted ones, which are the catalogue's
     with_catalogue: bool = False
 
     def applied(self, matches: Matches) -> Matches:
@@ -52,21 +42,11 @@ QUOTED = ErrorLaw()
 
 @dataclass(frozen=True, eq=False)
 class ExposureScatter:
-    """Scatter of the linear terms of exposures about those of the model.
+    """Scatter of the linear terms of exposures about those of the model."""
 
-    Parameters
-    ----------
-    kinds : tuple of str
-        Kinds of deviation.
-    tau : ndarray, shape (n, k)
-        Draws of the scatter of each kind.
-    offsets : Settling
-        How the constant terms of chips follow from the shifts of single chips.
-    """
-
-    kinds: tuple[str, ...]
-    tau: NDArray[np.float64]
-    offsets: Settling
+    kinds: tuple[str, ...]  # kinds of deviation
+    tau: Float  # (n, k), draws of the scatter of each kind
+    offsets: Settling  # how the constant terms of chips follow from the shifts of single chips
 
     def averaged(self, posterior: Posterior, rng: np.random.Generator) -> Posterior:
         """The posterior with the chips where the exposures have them on average."""

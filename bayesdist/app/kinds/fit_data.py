@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.matched import Matched
+from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.residuals.quoted import error_scale_sentence
 from bayesdist.diagnose.residuals.sample import SAMPLE
@@ -25,10 +25,7 @@ __all__ = ["FitData", "StarReader"]
 class StarReader:
     """Reads stars, and remembers those that it was asked for last.
 
-    Parameters
-    ----------
-    compute : Compute, optional
-        Where the work is done.
+    `compute`: where the work is done.
     """
 
     def __init__(self, compute: Compute | None = None) -> None:
@@ -85,23 +82,13 @@ class StarReader:
             self._shards = None
 
 
-Float = NDArray[np.float64]
-
-
 @dataclass(frozen=True, eq=False)
 class FitData:
-    """A fit and its stars: where its tables move them, with its errors.
-
-    Parameters
-    ----------
-    matched : Matched
-    fitted : Fitted
-    reader : StarReader
-        Reads the stars once for all passes over them.
-    """
+    """A fit and its stars: where its tables move them, with its errors."""
 
     matched: Matched
     fitted: Fitted
+    # reads the stars once for all passes over them
     reader: StarReader = field(default_factory=StarReader)
 
     @property

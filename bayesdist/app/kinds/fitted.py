@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from bayesdist.app.kinds.errors import ErrorLaw, ExposureScatter
 from bayesdist.app.store.output import write_table
+from bayesdist.arrays import Bool, Float
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
@@ -39,44 +40,23 @@ __all__ = [
     "write_tables",
 ]
 
-
 SOLUTION, GAUGE = "solution.h5", "gauge.ecsv"
 
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibrated:
-    """The mode of a self-calibration, with its gauge and matches.
-
-    Parameters
-    ----------
-    mode : SelfCalibrationMode
-    gauge : Gauge
-        Degeneracies of the detections, and the constraints that remove them.
-    fixed : mapping of str to str
-        What fixes each property of the solution.
-    gauge_words : str
-        In which gauge the solution stands, as a sentence.
-    gauge_table : astropy.table.Table
-        One row for each property of the solution.
-    matches : Matches
-        Detections beside their stars.
-    arrays : mapping
-        From which the solution is made again.
-    contradictions : tuple of str
-        Where what is known beside the detections does not go with them, as sentences.
-    references : ReferenceCatalog or None
-        Stars that a catalogue has, too.
-    """
+    """The mode of a self-calibration, with its gauge and matches."""
 
     mode: SelfCalibrationMode
-    gauge: Gauge
-    fixed: Mapping[str, str]
-    gauge_words: str
-    gauge_table: Table
-    matches: Matches
-    arrays: Mapping[str, NDArray[Any]]
+    gauge: Gauge  # degeneracies of the detections, and the constraints that remove them
+    fixed: Mapping[str, str]  # what fixes each property of the solution
+    gauge_words: str  # in which gauge the solution stands, as a sentence
+    gauge_table: Table  # one row for each property of the solution
+    matches: Matches  # detections beside their stars
+    arrays: Mapping[str, NDArray[Any]]  # from which the solution is made again
+    # where what is known beside the detections does not go with them, as sentences
     contradictions: tuple[str, ...] = ()
-    references: ReferenceCatalog | None = None
+    references: ReferenceCatalog | None = None  # stars that a catalogue has, too
 
     def save(self, folder: Path) -> None:
         """Write the files of a run's folder that belong to it."""
@@ -84,7 +64,6 @@ class SelfCalibrated:
         write_table(self.gauge_table, folder / GAUGE)
 
 
-Float = NDArray[np.float64]
 T = TypeVar("T")
 
 FIT, PARTS, TABLES, MAGNITUDE_ERRORS = "fit.nc", "fit.h5", "tables.h5", "magnitude_errors.ecsv"
@@ -94,20 +73,12 @@ FIT_AGAIN = "run the stage 'fit' again"
 
 @dataclass(frozen=True, eq=False)
 class StoredLookupTables:
-    """Look-up tables of a run, with their errors.
+    """Look-up tables of a run, with their errors."""
 
-    Parameters
-    ----------
-    tables : tuple of LookupTable
-        The detector's first.
-    position_sigma : mapping of int to ndarray, shape (ny, nx, 2)
-        By chip: errors of positions by those of all tables, in the unit of u, v.
-    between : mapping of int to BetweenNodes
-        By chip, where it has been measured: what all tables leave between their nodes.
-    """
-
-    tables: tuple[LookupTable, ...] = ()
+    tables: tuple[LookupTable, ...] = ()  # the detector's first
+    # (ny, nx, 2), by chip: errors of positions by those of all tables, in the unit of u, v
     position_sigma: Mapping[int, Float] = field(default_factory=dict)
+    # by chip, where it has been measured: what all tables leave between their nodes
     between: Mapping[int, BetweenNodes] = field(default_factory=dict)
 
 
@@ -122,10 +93,7 @@ def write_tables(path: Path, stored: StoredLookupTables) -> None:
 def read_tables(path: Path, *, do: str) -> StoredLookupTables:
     """Read what `write_tables` wrote; nothing where there is no file.
 
-    Raises
-    ------
-    InputError
-        For a damaged file, with `do` as the advice.
+    InputError for a damaged file, with `do` as the advice.
     """
     if not path.exists():
         return StoredLookupTables()
@@ -137,36 +105,20 @@ def read_tables(path: Path, *, do: str) -> StoredLookupTables:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A least-squares solution with all that it rests on; what a kind of run lacks is None.
-
-    Parameters
-    ----------
-    linear : LinearFit
-    errors : ErrorLaw
-        Of fitted and held-out stars.
-    priors : GaussianPriors
-    grouped : GroupedErrors or None
-        Errors beyond the quoted ones, where groups of stars were compared.
-    tables : StoredLookupTables
-        Empty where there are none.
-    scatter : ExposureScatter or None
-        How exposures deviate, where they were fitted jointly.
-    alone : Series or None
-        Linear terms of exposures that were each fitted alone.
-    solved : SelfCalibrated or None
-        Solution and gauge of detections whose stars are not known otherwise.
-    facts : mapping
-        Sections of summary.json that only the making of the fit knows.
-    """
+    """A least-squares solution with all that it rests on; what a kind of run lacks is None."""
 
     linear: LinearFit
-    errors: ErrorLaw
+    errors: ErrorLaw  # of fitted and held-out stars
     priors: GaussianPriors
+    # errors beyond the quoted ones, where groups of stars were compared
     grouped: GroupedErrors | None = None
+    # empty where there are none
     tables: StoredLookupTables = field(default_factory=StoredLookupTables)
-    scatter: ExposureScatter | None = None
-    alone: Series | None = None
+    scatter: ExposureScatter | None = None  # how exposures deviate, where they were fitted jointly
+    alone: Series | None = None  # linear terms of exposures that were each fitted alone
+    # solution and gauge of detections whose stars are not known otherwise
     solved: SelfCalibrated | None = None
+    # sections of summary.json that only the making of the fit knows
     facts: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -185,7 +137,7 @@ class Fitted:
             return stars
         return on_the_chips(corrected_matches(self.tables.tables, stars), self.linear.model)
 
-    def inside(self, stars: Matches) -> NDArray[np.bool_]:
+    def inside(self, stars: Matches) -> Bool:
         """Boolean mask (N,) of the stars that the tables do not move off their chip."""
         if not self.tables.tables:
             return np.ones(len(stars), bool)
@@ -206,15 +158,7 @@ class Fitted:
 def load_fitted(folder: Path) -> Fitted:
     """The fit of an earlier stage, but for the solution of detections.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the run.
-
-    Raises
-    ------
-    InputError
-        For missing or damaged files.
+    `folder`: of the run. InputError for missing or damaged files.
     """
     tables = read_tables(folder / TABLES, do=FIT_AGAIN)
     return Fitted(load_fit(folder / FIT), tables=tables, **_read_parts(folder))

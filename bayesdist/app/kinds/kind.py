@@ -50,47 +50,29 @@ class Kind:
     """Matched stars, a campaign, or a self-calibration.
 
     Each takes configurations, inputs and matches of its own types.
-
-    Parameters
-    ----------
-    read : callable
-        Of (config, base): all that a run begins with, its inputs; paths are relative to `base`.
-    match : callable
-        Of (inputs, config): stars that are fitted, and those that are held out.
-    fit : callable
-        Of (matched, config, base, reader): the least-squares solution.
-    sample : callable
-        The posterior of the fit.
-    load_matched : callable, optional
-        Of (folder, inputs, summary): the matches of an earlier stage, from a run's folder and its
-        summary.json; without it they are matched again.
-    load_fitted : callable
-        Of (folder, matched): the fit of an earlier stage; `matched` is called where that needs the
-        matches.
-    refuse : callable
-        Of inputs: refuses what does not go together; what is wrong with matched stars shows in
-        their fit.
-    lines : callable
-        Of inputs: what `check` says of them; None where the fit says more.
-    begins_with : str
-        Its first stage: 'match', or 'fit' where stars are matched already.
-    rows : str
-        What a row of the data is, in words.
-    chooser : str
-        What leaves out rows that are far off, in words.
     """
 
+    # of (config, base): all that a run begins with, its inputs; paths are relative to `base`
     read: Callable[[Any, Path], Any]
+    # of (inputs, config): stars that are fitted, and those that are held out
     match: Callable[[Any, Any], Matched]
+    # of (matched, config, base, reader): the least-squares solution
     fit: Callable[[Any, Any, Path, StarReader], Fitted]
-    sample: Sampler = sample_stars
+    sample: Sampler = sample_stars  # the posterior of the fit
+    # of (folder, inputs, summary): the matches of an earlier stage, from a run's folder and its
+    # summary.json; without it they are matched again
     load_matched: Callable[[Path, Any, Mapping[str, Any]], Matched] | None = None
+    # of (folder, matched): the fit of an earlier stage; `matched` is called where that needs the
+    # matches
     load_fitted: Callable[[Path, Callable[[], Any]], Fitted] = lambda folder, _: load_fitted(folder)
+    # of inputs: refuses what does not go together; what is wrong with matched stars shows in their
+    # fit
     refuse: Callable[[Any], None] = lambda inputs: None
+    # of inputs: what `check` says of them; None where the fit says more
     lines: Callable[[Any], Iterator[str] | None] = lambda inputs: None
-    begins_with: str = "match"
-    rows: str = "stars"
-    chooser: str = "least-squares fit"
+    begins_with: str = "match"  # its first stage: 'match', or 'fit' where stars are matched already
+    rows: str = "stars"  # what a row of the data is, in words
+    chooser: str = "least-squares fit"  # what leaves out rows that are far off, in words
 
 
 MATCHES = Kind(read=read_stars, match=match_stars, fit=fit_stars, begins_with="fit")

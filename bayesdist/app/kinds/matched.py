@@ -9,12 +9,12 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from astropy.table import Table
-from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
 from bayesdist.app.config.fit import HoldoutBlock
 from bayesdist.app.kinds.errors import ExposureScatter
 from bayesdist.app.store.output import write_table
+from bayesdist.arrays import Float
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.holdout import HoldoutSpec, exposures_drawn, split_matches
@@ -28,7 +28,6 @@ from bayesdist.limits import HELD_OUT
 from bayesdist.model import LookupTable
 
 __all__ = ["Matched", "columns_by_code", "set_aside"]
-
 
 MATCHING = "matching.ecsv"
 
@@ -138,7 +137,7 @@ class Matched:
             write_table(self.table, folder / MATCHING)
 
 
-def columns_by_code(catalog: ReferenceCatalog, *names: str) -> NDArray[np.float64] | None:
+def columns_by_code(catalog: ReferenceCatalog, *names: str) -> Float | None:
     """Columns of a catalogue by code of the star (codes, n); None where it lacks one of them."""
     out = np.zeros((int(catalog.star.max()) + 1, len(names)))
     for k, name in enumerate(names):
@@ -154,25 +153,9 @@ def set_aside(
 ) -> tuple[Matches, Matches | None, tuple[str, ...]]:
     """Matches that are fitted, those that are held out, and exposures that are so as a whole.
 
-    Parameters
-    ----------
-    config : Config
-    matches : Matches
-    needed : int
-        So many of the first exposures define the gauge and cannot be held out.
-
-    Returns
-    -------
-    fitted : Matches
-    held : Matches or None
-        None where the configuration holds nothing out.
-    whole : tuple of str
-
-    Raises
-    ------
-    InputError
-        For an unknown exposure or one that is needed, and when nothing would be left, or too
-        little set aside.
+    `needed`: so many of the first exposures define the gauge and cannot be held out. Result:
+    `fitted`; `held`: none where the configuration holds nothing out; `whole`. InputError for an
+    unknown exposure or one that is needed, and when nothing would be left, or too little set aside.
     """
     block = config.holdout
     if block is None:

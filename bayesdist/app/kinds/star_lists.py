@@ -8,9 +8,9 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.config.campaign import StarListsBlock
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.data import Detections, StarCuts, read_star_lists
 from bayesdist.errors import InputError
@@ -28,21 +28,13 @@ __all__ = [
     "start_of",
 ]
 
-Float = NDArray[np.float64]
-
 OFF_CHIP = 0.02  # of a list's detections beyond the edge of a chip: more are no stray ones
 EDGE = 1.0  # pixels: half of one to the edge, and half of one for lists that count from 0
 
 
 @dataclass(frozen=True, eq=False)
 class StarLists:
-    """Star lists, and which of their detections pass the cuts.
-
-    Parameters
-    ----------
-    lists : tuple of Detections
-    cuts : StarCuts
-    """
+    """Star lists, and which of their detections pass the cuts."""
 
     lists: tuple[Detections, ...]
     cuts: StarCuts
@@ -61,11 +53,11 @@ class StarLists:
         return replace(self, lists=tuple(one for one in self.lists if one.name in names))
 
     @cached_property
-    def _tested(self) -> list[tuple[NDArray[np.bool_], dict[str, int]]]:
+    def _tested(self) -> list[tuple[Bool, dict[str, int]]]:
         return [self.cuts.passed(one) for one in self.lists]
 
     @property
-    def passed(self) -> list[NDArray[np.bool_]]:
+    def passed(self) -> list[Bool]:
         """Boolean mask of the detections that pass, by list."""
         return [good for good, _ in self._tested]
 
@@ -102,10 +94,7 @@ def refuse_other_chips(lists: Sequence[Detections], chips: Sequence[Chip], key: 
     Nothing is checked without [[chip]] blocks.  `key` is the one of the configuration that names
     the lists.
 
-    Raises
-    ------
-    InputError
-        Naming the list.
+    InputError naming the list.
     """
     known = {chip.number: chip for chip in chips}
     if not known:
@@ -158,7 +147,7 @@ def start_of(tab: IdcTab | Path, unit_arcsec: float, filter: str | None = None) 
     return lambda x, y, chip: known.forward(x, y, chip=chip) / unit_arcsec
 
 
-def positions_by_chip(start: Start, x: Float, y: Float, chip: NDArray[np.int64]) -> Float:
+def positions_by_chip(start: Start, x: Float, y: Float, chip: Int) -> Float:
     """Positions (N, 2) of pixels on chips with numbers (N,)."""
     out = np.empty((len(x), 2))
     for number in np.unique(chip):

@@ -53,44 +53,24 @@ IN_COVARIANCE = (
 
 @dataclass(frozen=True, eq=False)
 class ProductInput:
-    """Ingredients of the files of a run.
-
-    Parameters
-    ----------
-    solution : Solution
-    source : str
-        Where it is from: the folder of a run.
-    detector : str
-    epoch : float or None
-        Of the assessment, decimal years.
-    scale_arcsec : float or None
-        Size of a pixel, where the configuration gives it.
-    tangent_point : tuple of float or None
-        Sky position of (u, v) = (0, 0), degrees; None where u, v are not along the sky.
-    exposure : str
-        Of several with frames of their own the one for which a file is right on the sky.
-    gauge : str
-        In which gauge the solution stands, as a sentence; empty where that is no question.
-    tables : tuple of LookupTable
-        By which pixels are corrected before the polynomials, of the detector and of the filter.
-    filter : str
-    aligned : bool
-        The user of a file fits shift and rotation of an exposure.
-    further : tuple of FurtherError
-        Errors of positions that the covariance does not hold; once the budget is known.
-    """
+    """Ingredients of the files of a run."""
 
     solution: Solution
-    source: str
+    source: str  # where it is from: the folder of a run
     detector: str = ""
-    epoch: float | None = None
-    scale_arcsec: float | None = None
+    epoch: float | None = None  # of the assessment, decimal years
+    scale_arcsec: float | None = None  # size of a pixel, where the configuration gives it
+    # sky position of (u, v) = (0, 0), degrees; None where u, v are not along the sky
     tangent_point: tuple[float, float] | None = None
+    # of several with frames of their own the one for which a file is right on the sky
     exposure: str = ""
+    # in which gauge the solution stands, as a sentence; empty where that is no question
     gauge: str = ""
+    # by which pixels are corrected before the polynomials, of the detector and of the filter
     tables: tuple[LookupTable, ...] = ()
     filter: str = ""
-    aligned: bool = False
+    aligned: bool = False  # the user of a file fits shift and rotation of an exposure
+    # errors of positions that the covariance does not hold; once the budget is known
     further: tuple[FurtherError, ...] = ()
 
 
@@ -184,26 +164,11 @@ def write_files(
 ) -> list[dict[str, Any]]:
     """Write the files of one filter or several, as the configuration of one run says.
 
-    Parameters
-    ----------
-    block : ReleaseBlock
-        Its section [products.release].
-    chip : int
-        Number of the chip whose axes and zero point define the gauge.
-    base : Path
-        Folder that its files are relative to.
-    folder : Path
-    solutions : mapping of filter to Solution
-        The configuration's own first: V2 and V3 lie as the reference says of it.
-    tables : sequence of LookupTable
-        The detector's, and those of filters.
-    history : sequence of str
-        Lines for HISTORY of all files.
-
-    Returns
-    -------
-    list of dict
-        One entry for each file: path, kind, findings, and of an IDCTAB period and lost.
+    `block`: its section [products.release]. `chip`: number of the chip whose axes and zero point
+    define the gauge. `base`: folder that its files are relative to. `solutions`: the
+    configuration's own first: V2 and V3 lie as the reference says of it. `tables`: the detector's,
+    and those of filters. `history`: lines for HISTORY of all files. Result: one entry for each
+    file: path, kind, findings, and of an IDCTAB period and lost.
     """
     calibrations = {
         filter: calibration_of(

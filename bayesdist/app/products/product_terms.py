@@ -16,11 +16,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
 from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.products.made_files import ProductInput, ingredients, made_files, write_files
+from bayesdist.arrays import Float
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import MEASURED, PRODUCT, Known, Row
 from bayesdist.calibration.calibration import Calibration
@@ -36,7 +36,6 @@ __all__ = ["file_errors", "product_terms"]
 
 log = logging.getLogger("bayesdist")
 
-Float = NDArray[np.float64]
 
 FORWARD, INVERSE = "forward", "inverse"
 GRID = (33, 33)  # points over which files are laid on the solution
@@ -158,13 +157,8 @@ def _in_unit(product: ProductInput, missed: Positions) -> Positions:
 class _Laid:
     """Positions by a file, laid on those of the solution over all chips at once, less these.
 
-    Parameters
-    ----------
-    product : ProductInput
-    place : callable
-        Positions by the file, in a unit of its own where `scaled`.
-    scaled : bool
-        Whether the file's scale is a convention of its own, found at the date of the assessment.
+    `place`: positions by the file, in a unit of its own where `scaled`. `scaled`: whether the
+    file's scale is a convention of its own, found at the date of the assessment.
     """
 
     def __init__(self, product: ProductInput, place: Positions, *, scaled: bool) -> None:

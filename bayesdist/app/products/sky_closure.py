@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.products.made_files import ProductInput
 from bayesdist.calibration.plane import ARCSEC
@@ -19,35 +18,20 @@ from bayesdist.products.formats.sip.positions import sky_of_header
 
 __all__ = ["sky_closure"]
 
-Float = NDArray[np.float64]
-
 FALSE = 0.5  # probability above which a match is taken for a false one
 
 
 @dataclass(frozen=True)
 class SkyClosure:
-    """Distances on the sky of the positions that a header gives to the pixels of stars.
+    """Distances on the sky of the positions that a header gives to the pixels of stars."""
 
-    Parameters
-    ----------
-    n : int
-        Stars, without those that are probably false matches.
-    rms : float
-        From their RA and Dec, arcsec.
-    east, north : float
-        Mean of header minus star, arcsec.
-    solution : float
-        Largest distance from the positions of the solution, arcsec.
-    pixel : float
-        Side of a pixel, arcsec.
-    """
-
-    n: int
-    rms: float
+    n: int  # stars, without those that are probably false matches
+    rms: float  # from their RA and Dec, arcsec
+    # east, north: mean of header minus star, arcsec
     east: float
     north: float
-    solution: float
-    pixel: float
+    solution: float  # largest distance from the positions of the solution, arcsec
+    pixel: float  # side of a pixel, arcsec
 
     @property
     def summary(self) -> dict[str, Any]:

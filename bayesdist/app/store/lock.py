@@ -34,11 +34,8 @@ def locked(folder: Path) -> Iterator[None]:
     The lock is that of a file, not the file itself: one that a killed process has left holds
     nobody up.
 
-    Raises
-    ------
-    InputError
-        While another process holds the lock, with what that process is; where the folder is
-        read-only.
+    InputError while another process holds the lock, with what that process is; where the folder is
+    read-only.
     """
     made_folder(folder)
     if fcntl is None:

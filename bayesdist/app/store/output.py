@@ -21,12 +21,7 @@ __all__ = ["provenance_notes", "record_folder", "refuse_existing", "write_table"
 
 
 def refuse_existing(path: Path, force: bool) -> None:
-    """Refuse a file that is there already, unless it may be replaced.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a file that is there already, unless it may be replaced."""
     if path.exists() and not force:
         raise InputError("this file exists", where=str(path), do="replace it by --force")
 
@@ -66,20 +61,8 @@ def record_folder(path: Path, name: str, command: str) -> Iterator[tuple[Path, d
 def atomic_directory(path: Path) -> Iterator[Path]:
     """A folder that takes its name when the block succeeds, and else is removed.
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        New, or empty.
-
-    Yields
-    ------
-    pathlib.Path
-        Where to write.
-
-    Raises
-    ------
-    InputError
-        For a folder that holds something, or that cannot be made.
+    `path`: new, or empty. Result: where to write. InputError for a folder that holds something, or
+    that cannot be made.
     """
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise InputError(

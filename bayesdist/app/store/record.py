@@ -123,24 +123,13 @@ class FileMark:
 
 @dataclass(frozen=True)
 class Artefact:
-    """Ingredients of a stage, and the files that it wrote.
+    """Ingredients of a stage, and the files that it wrote."""
 
-    Parameters
-    ----------
-    key : str
-        Hash of `parts`.
-    parts : mapping
-        Revision of the stage, settings, and digests of the artefacts before it.
-    files : mapping of str to FileMark
-        By their path in the folder.
-    sections : mapping
-        Of summary.json.
-    """
-
-    key: str
+    key: str  # hash of `parts`
+    # revision of the stage, settings, and digests of the artefacts before it
     parts: Mapping[str, Any]
-    files: Mapping[str, FileMark] = field(default_factory=dict)
-    sections: Mapping[str, Any] = field(default_factory=dict)
+    files: Mapping[str, FileMark] = field(default_factory=dict)  # by their path in the folder
+    sections: Mapping[str, Any] = field(default_factory=dict)  # of summary.json
 
     @property
     def digest(self) -> str:
@@ -157,26 +146,15 @@ class Artefact:
 
 @dataclass
 class Record:
-    """Content of run.json.
+    """Content of run.json."""
 
-    Parameters
-    ----------
-    facts : dict
-        What the run is made from: configuration, inputs, versions.
-    artefacts : dict of str to Artefact
-        Of the stages that have ended.
-    stages : dict of str to dict
-        When each of them ended, and how long it took.
-    under_way : dict, optional
-        Of the stage that has begun and not ended: its name, and the files that it may have written.
-    checkpoints : dict of str to str
-        Of stages with checkpoints: the hash of what these were made from.
-    """
-
-    facts: dict[str, Any]
-    artefacts: dict[str, Artefact] = field(default_factory=dict)
+    facts: dict[str, Any]  # what the run is made from: configuration, inputs, versions
+    artefacts: dict[str, Artefact] = field(default_factory=dict)  # of the stages that have ended
+    # when each of them ended, and how long it took
     stages: dict[str, dict[str, Any]] = field(default_factory=dict)
+    # of the stage that has begun and not ended: its name, and the files that it may have written
     under_way: dict[str, Any] | None = None
+    # of stages with checkpoints: the hash of what these were made from
     checkpoints: dict[str, str] = field(default_factory=dict)
 
     @classmethod

@@ -48,12 +48,7 @@ def part_files(folder: Path) -> list[Path]:
 
 
 class RunDirectory(ArtefactStore):
-    """The folder of a run: its configuration and inputs, and the artefacts of its stages.
-
-    Parameters
-    ----------
-    path : path
-    """
+    """The folder of a run: its configuration and inputs, and the artefacts of its stages."""
 
     def __init__(self, path: str | Path) -> None:
         super().__init__(Path(path), STAGES, head_of)
@@ -80,26 +75,10 @@ class RunDirectory(ArtefactStore):
     ) -> RunDirectory:
         """A run that may be resumed in a folder, or may begin there; nothing is written yet.
 
-        Parameters
-        ----------
-        path : path
-        config : Config
-        text : str
-            The configuration as written by the user.
-        base : Path
-            Folder that relative inputs are relative to.
-        resume, force : bool
-            Resume the run that is there, or replace it.
-        seed : int, optional
-            In place of the configured one.
-        command : str
-            For the record.
-
-        Raises
-        ------
-        InputError
-            When the folder holds another run or foreign files, or a resumed run was made from other
-            inputs or settings.
+        `text`: the configuration as written by the user. `base`: folder that relative inputs are
+        relative to. `resume`, `force`: resume the run that is there, or replace it. `seed`: in
+        place of the configured one. `command`: for the record. InputError when the folder holds
+        another run or foreign files, or a resumed run was made from other inputs or settings.
         """
         run = cls(path)
         if run.path.exists() and not run.path.is_dir():
@@ -183,12 +162,7 @@ class RunDirectory(ArtefactStore):
 
     @classmethod
     def open(cls, path: str | Path) -> RunDirectory:
-        """A run that exists, or a folder with a config.toml that becomes one.
-
-        Raises
-        ------
-        InputError
-        """
+        """A run that exists, or a folder with a config.toml that becomes one."""
         run = cls(path)
         if run.is_initialized:
             refuse_edited(run.path, run.config)

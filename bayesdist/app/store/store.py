@@ -36,36 +36,20 @@ log = logging.getLogger("bayesdist")
 
 @dataclass(frozen=True)
 class Stage:
-    """Revision and checkpoints of a stage.
+    """Revision and checkpoints of a stage."""
 
-    Parameters
-    ----------
-    revision : int
-        Raised when the numbers of the stage change.
-    checkpoints : tuple of str
-        Patterns of the files by which it goes on where it was interrupted.
-    """
-
-    revision: int = 1
+    revision: int = 1  # raised when the numbers of the stage change
+    # patterns of the files by which it goes on where it was interrupted
     checkpoints: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Made(Generic[T]):
-    """An artefact that stands.
+    """An artefact that stands."""
 
-    Parameters
-    ----------
-    name : str
-        Of its stage.
-    digest : str
-        Hash of what was written: what is made from the artefact has it in its key.
-    value : object
-        What the stage has given; None where it was not run now, as the artefact stood before.
-    """
-
-    name: str
-    digest: str
+    name: str  # of its stage
+    digest: str  # hash of what was written: what is made from the artefact has it in its key
+    # what the stage has given; None where it was not run now, as the artefact stood before
     value: T | None = None
 
 
@@ -76,14 +60,8 @@ class ArtefactStore:
     were.  What a stage writes is noted in run.json before it takes its name, so that all of it is
     known at whatever moment a process is killed.
 
-    Parameters
-    ----------
-    path : Path
-        A folder with a run.json, or one that will have it.
-    stages : mapping of str to Stage
-        By name, in order.
-    head : callable, optional
-        What summary.json says of the run as a whole, from the facts of run.json.
+    `path`: a folder with a run.json, or one that will have it. `stages`: by name, in order. `head`:
+    what summary.json says of the run as a whole, from the facts of run.json.
     """
 
     def __init__(

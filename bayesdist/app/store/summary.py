@@ -385,10 +385,7 @@ class Summary(Sections):
 def head_of(facts: Mapping[str, Any]) -> dict[str, Any]:
     """What summary.json says of the run as a whole.
 
-    Parameters
-    ----------
-    facts : mapping
-        Of run.json.
+    `facts`: of run.json.
     """
     config = facts["config"]
     kind = next(one for one in ("data", "campaign", "selfcal") if one in config)

@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.terms.forms import PRODUCT
 
 __all__ = ["TOTAL", "BudgetTerm", "ErrorBudget", "budget_of", "place_budget", "with_product"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 TOTAL = "total"
 TOGETHER = "all terms but products, combined by draws"

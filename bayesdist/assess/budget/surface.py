@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.terms.forms import (
@@ -32,8 +32,6 @@ from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 
 __all__ = ["JOINT", "BudgetSpan", "BudgetSurface", "GridRow", "budget_surface"]
-
-Float = NDArray[np.float64]
 
 JOINT = "model"  # all errors of parameters together
 CONSTANT = 1e-9  # moments that change less, relative to the largest, do not depend on time

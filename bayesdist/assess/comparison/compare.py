@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from astropy.table import Table
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.comparison.frame import (
     CommonFrame,
     Similarity,
@@ -39,8 +39,6 @@ __all__ = [
     "gap_table",
     "term_sigmas",
 ]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Complex, Float
 from bayesdist.assess.units import convert
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.similarity import as_real, similarity_fields, turn_between
@@ -34,9 +34,6 @@ __all__ = [
     "turn_matrix",
     "with_errors",
 ]
-
-Float = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 NEAR = 0.1  # radians, or of the scale: axes that lie alike
 

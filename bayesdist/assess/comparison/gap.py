@@ -15,8 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.comparison.frame import (
     draws_of_sum,
     least_squares,
@@ -31,8 +31,6 @@ from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.model import PolynomialBasis
 
 __all__ = ["ChipPair", "GapDifference", "gap_difference", "pair_of_chips"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

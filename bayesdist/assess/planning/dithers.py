@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from bayesdist.arrays import Float, Int
 from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
 from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
@@ -42,8 +42,6 @@ __all__ = [
     "nearly_free",
 ]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 KINDS = ("gauge-free", "shape", "absolute")
 LEAST_SHARED = 3  # stars that two exposures share at least, if they overlap at all
 MOST_STARS = 2_000_000  # of the sky that all patterns see together

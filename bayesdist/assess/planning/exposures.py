@@ -5,15 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from bayesdist.arrays import Float
 from bayesdist.infer.compare.planning import with_information
 from bayesdist.infer.solution import Solution
 
 __all__ = ["Need", "Schedule", "exposures_needed"]
-
-Float = NDArray[np.float64]
 
 MOST = 4096  # exposures beyond which more are no plan
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain, WorstPosition
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.error_model import error_model
@@ -25,8 +25,6 @@ from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import DEFAULT_GRID
 
 __all__ = ["Margin", "Requirement", "check_requirements", "domains_of", "judge"]
-
-Float = NDArray[np.float64]
 
 EPOCHS = 9  # of a range that are judged, its ends and what lies evenly between
 

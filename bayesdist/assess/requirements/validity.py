@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.requirements.margins import domains_of
 from bayesdist.assess.requirements.requirement import Requirement
@@ -15,8 +16,6 @@ from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.model.grid import DEFAULT_GRID
 
 __all__ = ["ValidityPeriod", "validity_period"]
-
-Float = NDArray[np.float64]
 
 BAND = 0.95
 

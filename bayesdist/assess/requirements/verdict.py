@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.checks import visits_of
 from bayesdist.checks import LARGER, Check, doubts_of
 from bayesdist.diagnose.correlated import Discrepancy
@@ -18,8 +18,6 @@ from bayesdist.model import DistortionModel
 from bayesdist.numbers import count
 
 __all__ = ["counting_error", "rests_on", "verdict_of"]
-
-Float = NDArray[np.float64]
 
 
 def counting_error(fraction: float, n: float) -> float:

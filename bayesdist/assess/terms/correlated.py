@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms import (
     LOCAL,
@@ -24,8 +25,6 @@ from bayesdist.diagnose.correlated.deviations import LinearDeviations
 from bayesdist.errors import required
 
 __all__ = ["DEVIATIONS", "STRUCTURE", "STRUCTURE_IN_FIT", "Deviations", "StructureErrors"]
-
-Float = NDArray[np.float64]
 
 STRUCTURE = "unmodelled structure"
 STRUCTURE_IN_FIT = "unmodelled structure in coefficients"
@@ -113,7 +112,7 @@ class _Bending:
 
     linear: LinearDeviations
     mean: Float
-    rows: NDArray[np.int64]
+    rows: Int
     seed: int | None
 
     def polynomials(self, epoch: float | None, chip: int) -> Float:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms import (
     GIVEN,
@@ -26,8 +26,6 @@ from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 
 __all__ = ["CENTROID", "TERM_KINDS", "Centroids", "SmoothTerm", "UserTerm", "said_by_user"]
-
-Float = NDArray[np.float64]
 
 TERM_KINDS = ("random", "systematic")
 CENTROID = "centroid"

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import LOCAL, MEASURED, Independent, Row
@@ -19,7 +19,6 @@ from bayesdist.model.grid import grid_pixels, mesh
 
 __all__ = ["INTERPOLATION", "LocalErrors", "interpolation_term", "table_of"]
 
-Float = NDArray[np.float64]
 INTERPOLATION = "look-up tables, between nodes"
 SOURCE = f"{MEASURED}: neighbours in different exposures"
 
@@ -111,16 +110,8 @@ def interpolation_term(
 ) -> tuple[LocalErrors, ...]:
     """The term of the budget; nothing where a chip has not been measured.
 
-    Parameters
-    ----------
-    between : mapping of int to BetweenNodes
-        By chip number.
-    solution : Solution
-        Its derivatives bring pixels to u and v, along the axes of the polynomials.
-    grid : tuple of int
-        Points on x and y of each chip.
-    epoch : float or None
-        Decimal years.
+    `between`: by chip number. `solution`: its derivatives bring pixels to u and v, along the axes
+    of the polynomials. `grid`: points on x and y of each chip. `epoch`: decimal years.
     """
     chips = solution.model.chips
     if not between or any(chip.number not in between for chip in chips):

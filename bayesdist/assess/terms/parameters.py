@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import (
     GIVEN,
@@ -36,8 +36,6 @@ __all__ = [
     "one_size_kinds",
     "one_size_term",
 ]
-
-Float = NDArray[np.float64]
 
 CATALOGUE = "reference catalogue (shared stars)"
 MOTIONS = "proper motions (shared stars)"

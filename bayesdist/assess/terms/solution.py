@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import (
@@ -24,8 +24,6 @@ from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["COEFFICIENTS", "EXPOSURE_FRAME", "TIME_DEPENDENCE", "SolutionErrors"]
-
-Float = NDArray[np.float64]
 
 COEFFICIENTS = "coefficients"
 TIME_DEPENDENCE = "time dependence"
@@ -103,7 +101,7 @@ class SolutionDraws:
 
 
 def _parts(
-    solution: Solution, theta: Float, epoch: float | None, exposure: NDArray[np.int64] | None
+    solution: Solution, theta: Float, epoch: float | None, exposure: Int | None
 ) -> dict[str, Callable[[int], Float]]:
     """By name of the part, its Legendre coefficients (n, 2, K) by chip number."""
     model, mean = solution.model, np.asarray(solution.mean, float)
@@ -115,7 +113,7 @@ def _parts(
         gauge = place_of(model, epoch=epoch, chip=chip)
         return gauge.polynomial(theta) - gauge.polynomial(mean) - static(chip)
 
-    def frame(exposure: NDArray[np.int64], chip: int) -> Float:
+    def frame(exposure: Int, chip: int) -> Float:
         out = np.zeros((len(theta), 2, model.n_terms))
         for e in np.unique(exposure):
             rows = np.flatnonzero(exposure == e)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.columns.labels import LABELS_OF_CODES, Labels, merged_counts
 from bayesdist.data.tables.checks import (
     COMPLETED,
@@ -24,9 +25,6 @@ from bayesdist.data.tables.units import check_unit, conversion, unit_of, without
 from bayesdist.errors import InputError
 
 __all__ = ["COLUMNS", "OPTIONAL", "POSITIONS", "SIGMAS", "MatchColumns", "refuse_repeated"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 POSITIONS = ("x", "y", "u", "v")
 SIGMAS = ("sigma_u", "sigma_v")
@@ -113,32 +111,15 @@ class MatchColumns:
     def grouped(self, by: str) -> tuple[tuple[str, ...], Int]:
         """Labels of groups of stars, and the code (N,) of each star's group among them.
 
-        Parameters
-        ----------
-        by : str
-            'chip', 'exposure' or 'filter'; empty for one group of all stars, whose label is empty.
-
-        Returns
-        -------
-        labels : tuple of str
-        codes : ndarray of int, shape (N,)
+        `by`: 'chip', 'exposure' or 'filter'; empty for one group of all stars, whose label is
+        empty. Result: `labels`; `codes` (N,).
         """
         if not by:
             return ("",), np.zeros(len(self.x), np.int64)
         return tuple(map(str, getattr(self, LABELS_OF_CODES[by]))), getattr(self, by)
 
     def place(self, row: int, column: str = "") -> str:
-        """Name of a star for a message: file, row (from 1) and column.
-
-        Parameters
-        ----------
-        row : int
-        column : str, optional
-
-        Returns
-        -------
-        str
-        """
+        """Name of a star for a message: file, row (from 1) and column."""
         head = f"{self.sources[self.source[row]]}, row {self.row[row] + 1}"
         return f"{head}, column {column!r}" if column else head
 

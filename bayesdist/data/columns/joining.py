@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.columns.checked import OPTIONAL, POSITIONS, SIGMAS, MatchColumns
 from bayesdist.data.columns.labels import LABELS_OF_CODES, merged_counts
 from bayesdist.errors import InputError
 
 __all__ = ["joined_arguments", "joined_columns", "merged_codes"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 def joined_arguments(tables: Sequence[MatchColumns]) -> dict[str, Any]:

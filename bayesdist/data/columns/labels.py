@@ -8,13 +8,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Int
 from bayesdist.errors import InputError
 
 __all__ = ["DEFAULT_LABELS", "LABELS_OF_CODES", "Labels", "merged_counts", "recoded"]
-
-Int = NDArray[np.int64]
 
 LABELS_OF_CODES = {
     "exposure": "exposure_names",

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
@@ -22,8 +22,6 @@ from bayesdist.errors import FormatError
 from bayesdist.reading.regular import read_lines
 
 __all__ = ["Hst1passList", "is_hst1pass", "is_matchup", "read_hst1pass", "read_matchup"]
-
-Float = NDArray[np.float64]
 
 _COLUMN = re.compile(r"#\s*\((\d+)\)\s+(\S+)\s+--\s")
 _KEYWORD = re.compile(r"#\s*(\w+)\s*:\s*(.*?)\s*$")
@@ -137,7 +135,7 @@ class Hst1passList:
             source=self.source,
         )
 
-    def _on_chips(self, y: Float) -> tuple[NDArray[np.int64], Float]:
+    def _on_chips(self, y: Float) -> tuple[Int, Float]:
         """Chip of each star, (N,), and its row on that chip.
 
         hst1pass lays the two chips of ACS/WFC and WFC3/UVIS into one frame, k = 1 below k = 2; of

@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky.positions import SKY_QUANTITIES, reference_sky
 from bayesdist.data.sky.tangent import onto_plane
@@ -33,9 +33,6 @@ __all__ = [
     "present_columns",
     "text_labels",
 ]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 def position_unit(pair: tuple[SourceColumn, SourceColumn], unit: str | None) -> str:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from astropy.table import Column, Table
 from astropy.time import Time
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.data.reading.columns import columns_read, is_on_sky, match_columns
 from bayesdist.data.reading.options import ReadOptions
@@ -21,8 +21,6 @@ from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns
 from bayesdist.errors import InputError
 
 __all__ = ["matches_from_table", "own_epoch", "sky_positions", "with_sky_columns"]
-
-Float = NDArray[np.float64]
 
 _MOTION = "mas / yr"
 _SPARED = frozenset((*SPARED, "colour", "flux"))  # optional: a star may lack them

@@ -12,16 +12,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 
 if TYPE_CHECKING:
     from astropy.time import Time
 
 __all__ = ["parallax_factors", "velocity_aberration"]
-
-Float = NDArray[np.float64]
 
 _LIGHT = 299_792.458  # km/s
 

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.data.sky.tangent import mean_direction
 from bayesdist.data.tables.column import Quantities, SourceColumn
 from bayesdist.errors import InputError
 
 __all__ = ["MOTIONS", "SKY_QUANTITIES", "SPARED", "ReferenceSky", "reference_sky", "sky_columns"]
-
-Float = NDArray[np.float64]
 
 MOTIONS = ("pm_ra", "pm_dec", "sigma_pm_ra", "sigma_pm_dec")
 # that a star may lack: it then has none that counts

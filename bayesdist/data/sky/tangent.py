@@ -12,8 +12,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.data.tables.column import Place, row_number
 from bayesdist.errors import InputError
 
@@ -28,8 +29,6 @@ __all__ = [
     "tangent_jacobian",
     "tangent_plane",
 ]
-
-Float = NDArray[np.float64]
 
 ARCSEC = np.degrees(1.0) * 3600.0  # seconds of arc in a radian
 

@@ -29,8 +29,6 @@ from bayesdist.errors import InputError
 
 __all__ = ["StoredFile", "scan", "stored_file", "tangent_point_of"]
 
-Int = NDArray[np.int64]
-
 _BLOCK = 2**18  # rows scanned together
 
 

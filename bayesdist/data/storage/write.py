@@ -7,9 +7,9 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Int
 from bayesdist.data.batches import BATCH
 from bayesdist.data.columns.labels import DEFAULT_LABELS, LABELS_OF_CODES
 from bayesdist.data.matches import Matches
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["write_columns", "write_partitioned", "write_parts"]
 
-Labelled = tuple[NDArray[np.int64], tuple[str, ...]]
+Labelled = tuple[Int, tuple[str, ...]]
 Part = tuple[Mapping[str, NDArray[Any] | Labelled], Mapping[str, str]]
 
 _NUMBERS = (
@@ -169,7 +169,7 @@ def write_columns(
     pyarrow.default_memory_pool().release_unused()
 
 
-def _labelled(codes: NDArray[np.int64], labels: Sequence[str | int]) -> pyarrow.DictionaryArray:
+def _labelled(codes: Int, labels: Sequence[str | int]) -> pyarrow.DictionaryArray:
     """A column of labels, by codes into them."""
     import pyarrow
 

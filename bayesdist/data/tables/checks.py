@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool
 from bayesdist.errors import InputError
 
 __all__ = [
@@ -23,8 +24,6 @@ __all__ = [
     "refuse_half",
     "without_missing",
 ]
-
-Bool = NDArray[np.bool_]
 
 NOT_FINITE = ("refuse", "reject")
 # of a value, and of an error: the square of one over that of the other is still a number

@@ -13,6 +13,7 @@ from astropy.table import Column
 from astropy.time import Time
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.tables.checks import absent
 from bayesdist.data.tables.names import known_unit
 from bayesdist.data.tables.units import conversion, unit_of
@@ -31,8 +32,6 @@ __all__ = [
 
 log = logging.getLogger("bayesdist")
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 Place = Callable[[int], str]  # name of a row in an error, by its index in the arrays
 Array = TypeVar("Array", Float, Int)
 _YEARS = (1800.0, 2200.0)  # epochs outside are a wrong unit, not a date

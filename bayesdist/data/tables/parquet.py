@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Int
 from bayesdist.data.tables.column import EncodedColumn, Place
 from bayesdist.errors import InputError
 from bayesdist.reading.faults import naming_faults
@@ -73,7 +73,7 @@ class ParquetPart:
         return int(self._edges[-1])
 
     @cached_property
-    def _edges(self) -> NDArray[np.int64]:
+    def _edges(self) -> Int:
         return np.cumsum([0, *self.group_rows])
 
     def _group_of(self, row: int) -> int:

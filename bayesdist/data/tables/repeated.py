@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Int
 from bayesdist.errors import InputError
 
 __all__ = ["HELD", "buckets_for", "first_duplicate", "first_repetition"]
@@ -89,7 +90,7 @@ def _bucketed(batches: Batches, buckets: int) -> Iterator[UInt]:
         found = [_hashed(keys) for keys in batches()]
         yield np.concatenate(found) if found else np.zeros(0, np.uint64)
         return
-    edges: list[NDArray[np.int64]] = []  # of the buckets of each batch, in the file
+    edges: list[Int] = []  # of the buckets of each batch, in the file
     with tempfile.TemporaryFile(prefix="bayesdist-") as file:
         try:
             for hashed in _joined(_hashed(keys) for keys in batches()):

@@ -13,14 +13,12 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions
 from bayesdist.diagnose.correlated.priors import AmplitudeGrid, log_half_cauchy, log_widths
 
 __all__ = ["StructurePosterior", "structure_posterior"]
-
-Float = NDArray[np.float64]
 
 # of the field, in longer half sides; all equally probable beforehand
 LENGTHS = np.geomspace(0.08, 0.6, 5)

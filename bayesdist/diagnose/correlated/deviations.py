@@ -16,6 +16,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.correlated.information import GroupCells, Information
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_cauchy, log_widths
 from bayesdist.model import DistortionModel, Groups
@@ -28,9 +29,6 @@ __all__ = [
     "deviation_draws",
     "linear_deviations",
 ]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 # deviations of an exposure that scatter together, and the frames that fit them already
 KINDS = {

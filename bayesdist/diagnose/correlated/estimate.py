@@ -8,8 +8,8 @@ from functools import reduce
 from operator import add
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.correlated.deviations import MAX_EXPOSURES, linear_deviations
 from bayesdist.diagnose.correlated.functions import StructureFunctions
@@ -37,8 +37,6 @@ from bayesdist.model import DistortionModel
 from bayesdist.model.grid import cell_index
 
 __all__ = ["estimate_discrepancy"]
-
-Float = NDArray[np.float64]
 
 DRAWS = 2000
 

@@ -13,14 +13,11 @@ from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.model.basis import polynomial_terms
 
 __all__ = ["StructureFunctions", "legendre_products"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 ORDERS = 3  # Legendre orders above the model's
 FALL = 0.5  # rms of an order relative to the one below it

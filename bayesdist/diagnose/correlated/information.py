@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.infer.equations.normal import NormalEquations
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import scaled_inverse
@@ -25,8 +25,6 @@ from bayesdist.model.grid import cell_index
 
 __all__ = ["CellSums", "GroupCells", "Information", "cell_sums", "cells_per_side"]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 # A star that alone determines a parameter has no residual: its squared score is uninformative.
 MIN_FREE = 0.1
 # cells along each side of a chip, by largest number of groups: limits memory and time

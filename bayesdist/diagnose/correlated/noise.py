@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.correlated.information import Information
 from bayesdist.infer.equations.scaled import scaled_inverse
 from bayesdist.model.grid import cell_index
 
 __all__ = ["block_ratios", "not_narrower", "score_excess"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 STARS_PER_BLOCK = 60
 MAX_BLOCKS = 8  # along each side of a chip

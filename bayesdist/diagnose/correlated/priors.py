@@ -12,13 +12,11 @@ import math
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 
 __all__ = ["AmplitudeGrid", "DiscrepancyPriors", "log_half_cauchy", "log_widths"]
-
-Float = NDArray[np.float64]
 
 TERM_STEPS = 24  # of the amplitude of the higher orders
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.diagnose.correlated.deviations import KINDS, LinearDeviations
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.model import Chip, DistortionModel
@@ -22,7 +23,6 @@ __all__ = [
     "discrepancy_to_arrays",
 ]
 
-Float = NDArray[np.float64]
 POINTS = 12  # on each axis of a chip, over which sizes are averaged
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.correlated.priors import log_half_cauchy
 from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
@@ -15,9 +15,6 @@ from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import DistortionModel
 
 __all__ = ["SharedStars", "shared_stars"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 STEPS = 60
 RANGE = 300.0

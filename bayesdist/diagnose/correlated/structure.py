@@ -19,15 +19,13 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions
 from bayesdist.diagnose.correlated.neighbours import SharedVariance
 from bayesdist.diagnose.correlated.priors import AmplitudeGrid, log_half_cauchy, log_widths
 
 __all__ = ["Structure", "chip_structure"]
-
-Float = NDArray[np.float64]
 
 # of the field, in longer half sides; all equally probable beforehand
 LENGTHS = np.geomspace(0.02, 0.6, 7)

@@ -13,15 +13,12 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["ALL", "Bin", "Partition", "partitions_of"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 ALL = "all"
 STARS_PER_BIN = 60

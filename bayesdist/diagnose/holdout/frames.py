@@ -13,8 +13,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.predictive import (
     Prediction,
@@ -28,9 +28,6 @@ from bayesdist.model import DistortionModel
 from bayesdist.model.frames import RIGID, frame_names, nearest_frame
 
 __all__ = ["Frame", "framed", "frames_for"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 SOFT, EXACT = 10, 6  # steps with weights that reach far, and with those of the mixture
 REACH = 4.0  # chi-square at which the former are one half

@@ -11,18 +11,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
+from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.holdout.frames import Frame
 from bayesdist.diagnose.holdout.predictive import SCALES, Predictive
 from bayesdist.diagnose.holdout.rows import HeldRows
 from bayesdist.diagnose.holdout.spread import scale_of, sum_tails
 
 __all__ = ["GroupedScores", "ScaleSums", "StarScores", "membership"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.infer.catalogue.star_errors import StarInfluence
 from bayesdist.infer.posterior import Posterior
@@ -35,9 +35,6 @@ __all__ = [
     "scores_of",
     "uniforms_of",
 ]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 NEVER = 1e-300
 AT_ONCE = 2**14  # stars

@@ -14,8 +14,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.frames import Frame, framed
 from bayesdist.diagnose.holdout.predictive import (
@@ -25,9 +25,6 @@ from bayesdist.diagnose.holdout.predictive import (
 )
 
 __all__ = ["HeldRows", "predicted_rows"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.diagnose.holdout.predictive import SCALES, Predictive
 from bayesdist.distributions import gamma_cdf, gamma_sf, norm_sf
 
 __all__ = ["SpreadMoments", "scale_of", "sum_tails"]
-
-Float = NDArray[np.float64]
 
 KNOTS, POINTS, LAST = 48, 2000, 60.0
 MIN_SKEW = 1e-4

@@ -6,11 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.sparse import csr_matrix
 from scipy.special import erf
 
+from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.bins import ALL, Partition
 from bayesdist.diagnose.holdout.frames import Frame
@@ -26,9 +26,6 @@ from bayesdist.diagnose.holdout.shared import SharedErrors
 from bayesdist.diagnose.holdout.spread import SpreadMoments
 
 __all__ = ["LEVELS", "PIT_BINS", "TAILS", "BinSums", "HeldSums", "held_sums"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 PIT_BINS = 20
 TAILS = (3.0, 4.0, 5.0)  # sigma

@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import betainc, erf
 
+from bayesdist.arrays import Float
 from bayesdist.diagnose.holdout.bins import ALL, Partition
 from bayesdist.diagnose.holdout.frames import Frame
 from bayesdist.diagnose.holdout.grouped import ScaleSums
@@ -24,8 +24,6 @@ from bayesdist.distributions import chi2_sf, norm_sf
 from bayesdist.limits import HELD_OUT_DISTRIBUTION, HELD_OUT_RATIO, HELD_OUT_TAILS
 
 __all__ = ["AXIS", "AxisCoverage", "HeldTest", "all_tests", "axis_coverage", "deviation_tests"]
-
-Float = NDArray[np.float64]
 
 AXIS = "axis"  # a part: the stars along one axis
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.bins import Bin, partitions_of
 from bayesdist.diagnose.holdout.frames import frames_for
@@ -26,8 +26,6 @@ from bayesdist.limits import HELD_OUT, HELD_OUT_DOUBTFUL, HELD_OUT_UNUSUAL
 from bayesdist.numbers import p_words
 
 __all__ = ["HoldoutValidation", "holdout_validation"]
-
-Float = NDArray[np.float64]
 
 SAMPLE = 200_000  # stars that say where bins end
 ORDER = ("offset", "deviation", "spread", "tails", "distribution")  # of what tells most

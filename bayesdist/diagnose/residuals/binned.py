@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.errors import InputError, require_known
 
 __all__ = [
@@ -22,9 +23,6 @@ __all__ = [
     "residual_statistics",
 ]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-
 BAND_AXES = ("X", "Y", "radial")
 
 _BLOCK = 2**16  # stars
@@ -32,30 +30,19 @@ _BLOCK = 2**16  # stars
 
 @dataclass(frozen=True, eq=False)
 class BinnedResiduals:
-    """Mean residuals on a grid of equal bins that cover the detector.
+    """Mean residuals on a grid of equal bins that cover the detector."""
 
-    Parameters
-    ----------
-    x : ndarray, shape (nx,)
-    y : ndarray, shape (ny,)
-        Centres of the bins, FITS 1-based pixels.
-    mean_u, mean_v : ndarray, shape (ny, nx)
-        Weighted means; NaN in an empty bin.
-    count : ndarray of int, shape (ny, nx)
-        Stars of positive weight.
-    sem_u, sem_v : ndarray, shape (ny, nx)
-        Standard errors of the means from the scatter inside the bin; NaN below two stars.
-    n_outside : int
-        Stars of positive weight that lie on no pixel of the detector and went into no bin.
-    """
-
-    x: Float
-    y: Float
+    x: Float  # (nx,)
+    y: Float  # (ny,), centres of the bins, FITS 1-based pixels
+    # mean_u, mean_v (ny, nx): weighted means; NaN in an empty bin
     mean_u: Float
     mean_v: Float
-    count: Int
+    count: Int  # (ny, nx), stars of positive weight
+    # sem_u, sem_v (ny, nx): standard errors of the means from the scatter inside the bin; NaN below
+    # two stars
     sem_u: Float
     sem_v: Float
+    # stars of positive weight that lie on no pixel of the detector and went into no bin
     n_outside: int = 0
 
 
@@ -69,7 +56,7 @@ class BinValues:
     dof: Float  # (ny, nx) degrees of freedom of the standard errors: stars less one
 
     @property
-    def good(self) -> NDArray[np.bool_]:
+    def good(self) -> Bool:
         """Bins whose mean has a standard error."""
         return np.isfinite(self.mean) & np.isfinite(self.sem)
 
@@ -89,30 +76,20 @@ class BinValues:
 
 @dataclass(frozen=True, eq=False)
 class BinnedSums:
-    """Sums of residuals in equal bins that cover the detector; sums of pieces of the data add.
+    """Sums of residuals in equal bins that cover the detector; sums of pieces of the data add."""
 
-    Parameters
-    ----------
-    size : tuple of float
-        Columns and rows of the detector.
-    count : ndarray of int, shape (ny, nx)
-        Stars of positive weight.
-    weight, weight_2 : ndarray, shape (ny, nx)
-        Sums of the weights and of their squares.
-    first, first_2, second_2 : ndarray, shape (q, ny, nx)
-        Of u, of v and of further quantities: sums of the residual times its weight and times its
-        squared weight, and of the squared residual times the squared weight.
-    n_outside : int
-        Stars of positive weight that lie on no pixel of the detector and went into no bin.
-    """
-
-    size: tuple[float, float]
-    count: Int
+    size: tuple[float, float]  # columns and rows of the detector
+    count: Int  # (ny, nx), stars of positive weight
+    # weight, weight_2 (ny, nx): sums of the weights and of their squares
     weight: Float
     weight_2: Float
+    # first, first_2, second_2 (q, ny, nx): of u, of v and of further quantities: sums of the
+    # residual times its weight and times its squared weight, and of the squared residual times the
+    # squared weight
     first: Float
     first_2: Float
     second_2: Float
+    # stars of positive weight that lie on no pixel of the detector and went into no bin
     n_outside: int = 0
 
     def __add__(self, other: BinnedSums) -> BinnedSums:
@@ -177,19 +154,7 @@ def binned_residuals(
 ) -> BinnedResiduals:
     """Residuals averaged in bins of the detector.
 
-    Parameters
-    ----------
-    x, y, ru, rv, bins, size, weights
-        As `binned_sums`.
-
-    Returns
-    -------
-    BinnedResiduals
-
-    Raises
-    ------
-    InputError
-        As `binned_sums`.
+    `x`, `y`, `ru`, `rv`, `bins`, `size`, `weights`: as `binned_sums`. InputError as `binned_sums`.
     """
     return binned_sums(x, y, ru, rv, bins=bins, size=size, weights=weights).residuals()
 
@@ -335,21 +300,9 @@ def _ratio(a: Float, b: Float) -> Float:
 def residual_statistics(values: ArrayLike) -> dict[str, float]:
     """Statistics of residuals: the columns of Table 5-1 of WSDC D-T033.
 
-    Parameters
-    ----------
-    values : array_like
-        Residuals of stars or means of bins, any shape; NaN (empty bins) is left out.
-
-    Returns
-    -------
-    dict
-        mean, sigma (about the mean, over n), min, max, median, p01, p99 (percentiles), and n, the
-        number of values.
-
-    Raises
-    ------
-    InputError
-        When there is no value or one is infinite.
+    `values`: residuals of stars or means of bins, any shape; NaN (empty bins) is left out. Result:
+    mean, sigma (about the mean, over n), min, max, median, p01, p99 (percentiles), and n, the
+    number of values. InputError when there is no value or one is infinite.
     """
     r = np.asarray(values, float).ravel()
     r = r[~np.isnan(r)]

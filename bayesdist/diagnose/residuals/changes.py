@@ -6,15 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.diagnose.residuals.binned import BAND_AXES, BinnedSums, BinValues
 from bayesdist.distributions import chi2_isf, chi2_sf, f_sf
 from bayesdist.errors import DegenerateError
 
 __all__ = ["PatternChange", "pattern_changes"]
-
-Float = NDArray[np.float64]
 
 _FEWEST_STARS = 5
 

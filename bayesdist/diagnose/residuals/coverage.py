@@ -8,18 +8,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
 
+from bayesdist.arrays import Float
 from bayesdist.diagnose.residuals.binned import BinnedSums
 from bayesdist.limits import UNCOVERED, UNCOVERED_BY_CHANCE
 from bayesdist.model import Chip
 from bayesdist.model.grid import mesh
 
 __all__ = ["Coverage", "coverage_of"]
-
-Float = NDArray[np.float64]
 
 SPARSE = 0.02  # of the density where stars usually are: strays, not coverage
 _FINE = (65, 65)

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.magnitude_errors import MAD_TO_SIGMA
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.clusters import squares_over
@@ -29,9 +29,6 @@ from bayesdist.limits import EPOCH_SHIFT
 from bayesdist.model.basis import polynomial_terms
 
 __all__ = ["EpochShift", "epoch_shift"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 SAMPLE = 20_000  # detections that are looked at
 MIN_STARS = 30  # stars with motions

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, BinnedSums
 from bayesdist.distributions import chi2_sf
 from bayesdist.limits import STRUCTURE, STRUCTURE_SEEN
@@ -30,40 +30,26 @@ __all__ = [
     "worst_misfit",
 ]
 
-Float = NDArray[np.float64]
-
 STARS_PER_BIN = 25
 MAX_BINS = 32  # along each side
 
 
 @dataclass(frozen=True)
 class Misfit:
-    """Structure in binned residuals.
+    """Structure in binned residuals."""
 
-    Parameters
-    ----------
-    p_value : float
-        Probability of as much structure by chance, of the most telling of three partitions: cells,
-        columns, rows; multiplied by three, and by the number of chips where the worst of several is
-        named.
-    partition : str
-        Which one that is.
-    structure : float
-        Rms over that partition of the mean residual, its noise subtracted (both axes together);
-        weighted by precision where the noisiest cells would hide what is significant.
-    unit : str
-    chip : Chip or None
-        The chip, where the detector has several.
-    power : float
-        Share of the patterns over the partitions that would have been seen: below 1 where fitted
-        stars hide some.
-    """
-
+    # probability of as much structure by chance, of the most telling of three partitions: cells,
+    # columns, rows; multiplied by three, and by the number of chips where the worst of several is
+    # named
     p_value: float
-    partition: str
+    partition: str  # which one that is
+    # rms over that partition of the mean residual, its noise subtracted (both axes together);
+    # weighted by precision where the noisiest cells would hide what is significant
     structure: float
     unit: str
-    chip: Chip | None = None
+    chip: Chip | None = None  # the chip, where the detector has several
+    # share of the patterns over the partitions that would have been seen: below 1 where fitted
+    # stars hide some
     power: float = 1.0
 
     @property
@@ -95,15 +81,7 @@ class Misfit:
 def partitions_for(n: int) -> dict[str, tuple[int, int]]:
     """The partitions of the detector that `misfit_of` looks at.
 
-    Parameters
-    ----------
-    n : int
-        Stars.
-
-    Returns
-    -------
-    dict of str to tuple of int
-        Bins on x and on y, by name.
+    `n`: stars. Result: bins on x and on y, by name.
     """
     side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 3, MAX_BINS))
     strips = int(np.clip(n / STARS_PER_BIN, 3, 2 * MAX_BINS))
@@ -113,18 +91,9 @@ def partitions_for(n: int) -> dict[str, tuple[int, int]]:
 def misfit_of(sums: Mapping[str, BinnedSums], *, order: int | None = None, unit: str) -> Misfit:
     """Test residuals for structure over the detector.
 
-    Parameters
-    ----------
-    sums : mapping of str to BinnedSums
-        Of the residuals of the stars that were not rejected, in each of `partitions_for` so many.
-    order : int, optional
-        Of the polynomial that the fit has taken out of the residuals of both axes.
-    unit : str
-        Of the residuals.
-
-    Returns
-    -------
-    Misfit
+    `sums`: of the residuals of the stars that were not rejected, in each of `partitions_for` so
+    many. `order`: of the polynomial that the fit has taken out of the residuals of both axes.
+    `unit`: of the residuals.
     """
     found = []
     for name, one in sums.items():
@@ -136,14 +105,7 @@ def misfit_of(sums: Mapping[str, BinnedSums], *, order: int | None = None, unit:
 def worst_misfit(found: Sequence[Misfit]) -> Misfit:
     """The most telling of several chips or partitions, its probability corrected for their number.
 
-    Parameters
-    ----------
-    found : sequence of Misfit
-        One for each.
-
-    Returns
-    -------
-    Misfit
+    `found`: one for each.
     """
     # many p-values are zero in double precision: then the larger structure is the worse
     worst = min(found, key=lambda m: (m.p_value, -m.structure))

@@ -15,14 +15,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.diagnose.residuals.binned import BinValues
 from bayesdist.errors import DegenerateError
 
 __all__ = ["STATISTICS", "StatisticsRow", "bin_row", "pair_row", "pair_statistics"]
 
-Float = NDArray[np.float64]
 STATISTICS = ("mean", "sigma", "min", "max", "median", "p01", "p99")
 DRAWS = 300  # of bins with fresh noise: errors to 4 %
 _FEWEST_BINS = 3
@@ -158,7 +157,7 @@ def _row(
     calm: Mapping[str, Float | float],
     variance: float,
     variance_error: float,
-    good: NDArray[np.bool_],
+    good: Bool,
 ) -> StatisticsRow:
     error = {name: float(drawn[name].std()) for name in STATISTICS}
     added = {name: float(drawn[name].mean() - calm[name]) for name in STATISTICS}

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
 from bayesdist.data.matches import Matches
 from bayesdist.infer.linear import LinearFit
@@ -25,8 +25,6 @@ __all__ = [
     "star_sample",
 ]
 
-Float = NDArray[np.float64]
-
 SAMPLE = 200_000  # stars that show what all of them look like
 MIN_STARS = 50  # stars whose scatter says anything by magnitude
 CERTAIN = 0.5  # probability of a false match from which on a star is left out
@@ -41,7 +39,7 @@ class ExposureScatter:
     """
 
     names: tuple[str, ...]  # of the E exposures that have stars
-    n: NDArray[np.int64]  # (E,), probably true stars
+    n: Int  # (E,), probably true stars
     ratio: Float  # (E,)
 
     @property
@@ -60,7 +58,7 @@ class ExposureScatter:
         return np.asarray(1.0 / np.sqrt(self.n))
 
     @property
-    def deviating(self) -> NDArray[np.bool_]:
+    def deviating(self) -> Bool:
         """Boolean mask (E,) of exposures with other errors than all, by more than chance."""
         factor = np.maximum(self.relative, 1.0 / self.relative)
         by_chance = np.abs(self.relative - 1.0) <= 3.0 * self.chance
@@ -69,42 +67,26 @@ class ExposureScatter:
 
 @dataclass(frozen=True, eq=False)
 class StarSample:
-    """Evenly spread stars of the data, or all of them.
+    """Evenly spread stars of the data, or all of them."""
 
-    Parameters
-    ----------
-    table : Matches
-        N stars.
-    fit_residual : ndarray, shape (N, 2)
-        Data minus the least-squares fit, in the unit of u and v.
-    used : ndarray of bool, shape (N,)
-        Whether the fit used the star.
-    n_total : int
-        Stars that there are in all.
-    variance : ndarray, shape (N, 2)
-        Of true matches along u and v: errors as quoted, with the jitter of the posterior.
-    posterior_residual : ndarray, shape (N, 2), or None
-        Data minus the model at the posterior mean; None where nothing was sampled.
-    outlier_probability : ndarray, shape (N,), or None
-    taken : ndarray, shape (N,), or None
-        Share of the variance that fitted places of the stars take out of the residuals; None where
-        places are known.
-    """
-
-    table: Matches
-    fit_residual: Float
-    used: NDArray[np.bool_]
-    n_total: int
+    table: Matches  # n stars
+    fit_residual: Float  # (N, 2), data minus the least-squares fit, in the unit of u and v
+    used: Bool  # (N,), whether the fit used the star
+    n_total: int  # stars that there are in all
+    # (N, 2), of true matches along u and v: errors as quoted, with the jitter of the posterior
     variance: Float
+    # (N, 2), data minus the model at the posterior mean; None where nothing was sampled
     posterior_residual: Float | None = None
-    outlier_probability: Float | None = None
+    outlier_probability: Float | None = None  # (N,)
+    # (N,), share of the variance that fitted places of the stars take out of the residuals; None
+    # where places are known
     taken: Float | None = None
 
     def __len__(self) -> int:
         return len(self.table)
 
     @property
-    def probably_true(self) -> NDArray[np.bool_]:
+    def probably_true(self) -> Bool:
         """Boolean mask (N,) of the stars that are no likely false match, else that were used."""
         p = self.outlier_probability
         return self.used if p is None else p < CERTAIN
@@ -143,18 +125,7 @@ def star_sample(
 ) -> StarSample:
     """Residuals and probabilities of some stars, by a fit and a posterior.
 
-    Parameters
-    ----------
-    table : Matches
-        With errors: as of ``matches.sample(SAMPLE)``.
-    n_total : int
-        Stars that there are in all.
-    fit : LinearFit
-    posterior : Posterior, optional
-
-    Returns
-    -------
-    StarSample
+    `table`: with errors: as of ``matches.sample(SAMPLE)``. `n_total`: stars that there are in all.
     """
     stars, order = prepare(fit.model, table)
     solution = likelihood_shown(fit, posterior)

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.diagnose.residuals.binned import BinnedSums, binned_sums
 from bayesdist.infer.kernel import Constants
 from bayesdist.infer.posterior import Posterior
@@ -23,25 +23,17 @@ from bayesdist.infer.stars.sums import Sums
 
 __all__ = ["ExposureSums", "StarSums", "flagged_by_exposure", "star_sums"]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 Bins = tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
 class ExposureSums(Sums):
-    """Counts and residuals of each exposure.
+    """Counts and residuals of each exposure."""
 
-    Parameters
-    ----------
-    n, n_used : ndarray of int, shape (E,)
-        Stars, and those that the least-squares fit used.
-    uu, vv : ndarray, shape (E,)
-        Sums of the squared residuals of the stars used.
-    """
-
+    # n, n_used (E,): stars, and those that the least-squares fit used
     n: Int
     n_used: Int
+    # uu, vv (E,): sums of the squared residuals of the stars used
     uu: Float
     vv: Float
 
@@ -54,20 +46,13 @@ class ExposureSums(Sums):
 
 @dataclass(frozen=True, eq=False)
 class StarSums(Sums):
-    """Sums over stars at a solution.
+    """Sums over stars at a solution."""
 
-    Parameters
-    ----------
-    binned : mapping of (int, (int, int)) to BinnedSums
-        Residuals at the solution of its probably true stars, by the chip's number and the numbers
-        of bins on x and y.  Where exposures have frames that turn, they are along the axes of the
-        polynomials: what belongs to the detector would cancel along those of the sky.
-    exposures : ExposureSums
-        At the least-squares fit.
-    """
-
+    # residuals at the solution of its probably true stars, by the chip's number and the numbers of
+    # bins on x and y. Where exposures have frames that turn, they are along the axes of the
+    # polynomials: what belongs to the detector would cancel along those of the sky
     binned: Mapping[tuple[int, Bins], BinnedSums]
-    exposures: ExposureSums
+    exposures: ExposureSums  # at the least-squares fit
 
 
 def star_sums(
@@ -78,20 +63,9 @@ def star_sums(
 ) -> StarSums:
     """Sums over some stars: a task for `Shards.sum`.
 
-    Parameters
-    ----------
-    stars : Stars
-    fit : Likelihood
-        Of the least-squares fit.
-    solution : Likelihood
-        Of the posterior, or the fit again where nothing was sampled: the clip of a fit lets false
-        matches in that hide what residuals of the true ones show.
-    partitions : mapping of int to tuple of (int, int)
-        Bins on x and on y, by the number of the chip.
-
-    Returns
-    -------
-    StarSums
+    `fit`: of the least-squares fit. `solution`: of the posterior, or the fit again where nothing
+    was sampled: the clip of a fit lets false matches in that hide what residuals of the true ones
+    show. `partitions`: bins on x and on y, by the number of the chip.
     """
     used, residual = fit.inliers(stars) > 0.5, stars.residuals(fit.theta)
     exposures = _exposure_sums(stars, used, residual)
@@ -125,11 +99,7 @@ def _along_gauge(stars: Stars, theta: Float, residual: Float) -> Float:
 def flagged_by_exposure(shards: Shards, posterior: Posterior) -> Int:
     """Stars (E,) of each exposure that are more likely false matches than not.
 
-    Parameters
-    ----------
-    shards : Shards
-        Of all stars; one pass over them is made.
-    posterior : Posterior
+    `shards`: of all stars; one pass over them is made.
     """
     return shards.sum(_flagged, *averaged_draws(posterior))
 
@@ -145,7 +115,7 @@ def _of_groups(stars: Stars, codes: Int) -> Int:
     return np.repeat(codes, np.diff(stars.starts))
 
 
-def _exposure_sums(stars: Stars, used: NDArray[np.bool_], residual: Float) -> ExposureSums:
+def _exposure_sums(stars: Stars, used: Bool, residual: Float) -> ExposureSums:
     exposure, n = _of_groups(stars, stars.groups.exposure), len(stars.model.exposures)
     of_used = exposure[used]
     u, v = residual[used].T

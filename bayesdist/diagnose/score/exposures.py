@@ -14,9 +14,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve
 
+from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.clusters import add_over, sums_over
 from bayesdist.diagnose.score.projection import (
     Projection,
@@ -31,9 +31,6 @@ from bayesdist.distributions import chi2_sf
 from bayesdist.model.frames import LINEAR_MATRICES, frame_names
 
 __all__ = ["EXPOSURES", "exposure_test"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 EXPOSURES = Family(
     "exposures",

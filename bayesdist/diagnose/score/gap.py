@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.projection import Projection
 from bayesdist.diagnose.score.result import Family, Outcome, outcome, smallest_pattern
@@ -31,9 +31,6 @@ from bayesdist.distributions import f_sf
 from bayesdist.model.frames import DEVIATIONS, LINEAR_MATRICES, RIGID, frame_names
 
 __all__ = ["gap_test", "visit_codes"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 GAP = Family("gap", "", "", "no drift of the gap between the chips is left in the residuals")
 MIN_FREE = 3  # visits beyond those that the line takes

@@ -17,17 +17,14 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.score.result import Family, Outcome, noncentrality, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.distributions import t_sf
 
 __all__ = ["MOTIONS", "StarResiduals", "motion_outcome", "motion_test"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 MOTIONS = Family(
     "motions",

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.result import Family, Outcome, outcome, smallest_pattern
 from bayesdist.diagnose.score.sample import ScoredSample
@@ -22,9 +22,6 @@ from bayesdist.distributions import chi2_sf
 from bayesdist.model.grid import cell_index
 
 __all__ = ["noise_tests"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 BY_POSITION = Family(
     "noise by position",

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import i0e, i1e
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.model.grid import cell_index
 
 __all__ = ["pattern_test"]
-
-Float = NDArray[np.float64]
 
 REPEATING = Family(
     "repeating pattern",
@@ -86,7 +84,7 @@ def pattern_test(sample: ScoredSample) -> Outcome | None:
     )
 
 
-def _frequencies(order: int) -> NDArray[np.bool_]:
+def _frequencies(order: int) -> Bool:
     """Boolean mask of the frequencies of `rfft2` that the polynomial does not take up."""
     n = PADDED * BINS
     j, i = np.fft.fftfreq(n, 1 / n)[:, None], np.arange(n // 2 + 1)[None]
@@ -96,7 +94,7 @@ def _frequencies(order: int) -> NDArray[np.bool_]:
 
 def _binned(sample: ScoredSample) -> dict[int, tuple[list[Float], Float]]:
     """Scores (N,) along each axis of the polynomials on each chip, and binned (2, BINS, BINS)."""
-    found = dict[int, list[tuple[NDArray[np.int64], Float]]]()
+    found = dict[int, list[tuple[Int, Float]]]()
     code = cell_index(sample.X, sample.Y, (BINS, BINS))
     for block in sample.blocks:
         scores = block.frame.T @ sample.whole_score[:, block.rows]

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.diagnose.score.regressors import Functions
 from bayesdist.diagnose.score.sample import Block, ScoredSample
 from bayesdist.infer.equations.priors import GaussianPriors
@@ -31,8 +31,6 @@ __all__ = [
     "weighted",
 ]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 RIDGE = 1e-12  # of a scaled information matrix: what the sample does not determine stays finite
 LARGEST_LEVERAGE = 0.95  # of one detection; it has next to no residual of its own there
 
@@ -306,7 +304,7 @@ def _inverse(matrix: Float) -> Float:
     return np.asarray(cho_solve((root, True), np.eye(len(matrix))))
 
 
-def beside_others(information: Float, own: NDArray[np.bool_], directions: Float) -> Float:
+def beside_others(information: Float, own: Bool, directions: Float) -> Float:
     """Directions (n, q) of the `own` regressors (n,), without what the others say of them.
 
     `information` (n, n) is that of all, the parameters projected out; `directions` are combinations

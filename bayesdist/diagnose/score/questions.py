@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.diagnose.score.result import Family
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.model.basis import MAX_ORDER, polynomial_terms
@@ -20,7 +20,6 @@ from bayesdist.model.timedep import TimeDependence
 
 __all__ = ["CONSTANT", "LINEAR", "Products", "Question", "questions"]
 
-Float = NDArray[np.float64]
 Terms = tuple[tuple[int, int], ...]
 
 CONSTANT, LINEAR = polynomial_terms(0), polynomial_terms(1)

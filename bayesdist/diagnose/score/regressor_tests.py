@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.clusters import add_over
 from bayesdist.diagnose.score.projection import (
     LARGEST_LEVERAGE,
@@ -35,9 +35,6 @@ from bayesdist.diagnose.significance import chi_square_of
 from bayesdist.distributions import chi2_sf, f_sf
 
 __all__ = ["regressor_tests"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 MAX_TAKEN = 0.5  # of the noise, by fit and step: what is left then says nothing of it
 # power of what is left of a star's noise: 1/2 is exact where quoted errors are right (HC2), and 1,

@@ -8,18 +8,15 @@ from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.diagnose.score.questions import Products, Question, questions
 from bayesdist.diagnose.score.result import Family, Outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.model.basis import polynomial_terms
 
 __all__ = ["Functions", "Regressors", "functions_for", "one_of_each"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 CONSTANT = 1e-9  # scatter of values, in magnitudes or of the time from -1 to 1
 SAYS_NOTHING = 0.2  # probability by chance above which an adjusted test has seen nothing
@@ -42,7 +39,7 @@ class Regressors:
         """Indices of all of these functions, the tested ones first."""
         return np.concatenate([self.functions, self.adjusted_for])
 
-    def own(self, n_chips: int) -> NDArray[np.bool_]:
+    def own(self, n_chips: int) -> Bool:
         """Boolean mask of what is tested, along both axes of every function on some chips."""
         mask = np.arange(len(self.every)) < len(self.functions)
         return np.tile(np.repeat(mask, 2), n_chips)

@@ -6,17 +6,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.infer.solution import Solution, likelihood_of
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import DistortionModel
 
 __all__ = ["SAMPLE", "Block", "ScoredSample", "scored_sample"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 SAMPLE = 200_000  # detections that are looked at
 LARGEST_BLOCK = 4096  # detections, whose functions stay in the cache
@@ -83,7 +80,7 @@ class ScoredSample:
         return len(self.X)
 
     @property
-    def used(self) -> NDArray[np.bool_]:
+    def used(self) -> Bool:
         """Boolean mask (N,) of the detections that count: all but those that a fit rejects."""
         return np.any(self.curvature != 0, axis=0)
 

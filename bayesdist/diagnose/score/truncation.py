@@ -13,17 +13,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize, special
 
+from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.score.result import Family, Outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.significance import chi_square_of
 
 __all__ = ["truncation_test"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 TRUNCATION = Family(
     "truncation", "match again with a wider radius", "", "the residuals do not end abruptly"

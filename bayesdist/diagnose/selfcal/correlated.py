@@ -8,8 +8,8 @@ posterior, with amplitudes and a correlation length in common.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.diagnose.correlated.coupled_structure import structure_posterior
 from bayesdist.diagnose.correlated.deviations import deviation_columns, deviation_draws
 from bayesdist.diagnose.correlated.functions import MIN_SIDE, StructureFunctions
@@ -29,9 +29,6 @@ from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 
 __all__ = ["MAX_EXPOSURES", "selfcal_discrepancy"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 DRAWS = 2000
 MAX_DETECTIONS = 60_000  # from which structure is estimated, at most

@@ -18,9 +18,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.correlated.deviations import DeviationColumns
 from bayesdist.diagnose.correlated.functions import StructureFunctions
@@ -41,9 +41,6 @@ __all__ = [
     "pieces",
     "without_parameters",
 ]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 DETECTIONS = 8192  # in memory at a time
 UNKNOWN = 1e-10  # relative curvature below which a combination of numbers is undetermined

@@ -17,9 +17,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.residuals.misfit import Misfit, bin_means, partitions_for, worst_misfit
 from bayesdist.diagnose.selfcal.scores import StarBlock, star_blocks
 from bayesdist.distributions import f_sf
@@ -29,9 +29,6 @@ from bayesdist.model.basis import polynomial_terms
 from bayesdist.model.grid import cell_index
 
 __all__ = ["dithered_misfit"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 MAX_SIDE = 16  # cells along each side of a chip
 MAX_CELLS = 512  # of all chips: the matrix of all shifts is decomposed

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.diagnose.selfcal.eliminated import Columns, Piece, absorbed_by_stars, pieces
 from bayesdist.diagnose.selfcal.scores import DetectionScores
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 
 __all__ = ["sandwich", "star_scores"]
-
-Float = NDArray[np.float64]
 
 # A star that alone determines a parameter has no residual: its squared score is uninformative.
 MIN_FREE = 0.1

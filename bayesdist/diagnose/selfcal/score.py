@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.diagnose.correlated.deviations import deviation_columns
 from bayesdist.diagnose.score.exposures import EXPOSURES
 from bayesdist.diagnose.score.motions import MOTIONS, SHORTEST, StarResiduals, motion_outcome
@@ -48,9 +48,6 @@ from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 
 __all__ = ["selfcal_score_tests"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 MAX_DETECTIONS = 60_000  # that are looked at
 STARS_PER_DIRECTION = 2  # below, a covariance of the scores says nothing
@@ -143,7 +140,7 @@ def selfcal_score_tests(
 
 
 def _summed(
-    solution: SelfCalibrationMode, columns: _AddedColumns, rows: NDArray[np.bool_], stars: Float
+    solution: SelfCalibrationMode, columns: _AddedColumns, rows: Bool, stars: Float
 ) -> _Sums:
     """Sums over some of the detections of a solution."""
     p, scores = columns.problem, scores_of_detections(solution).at(rows)
@@ -240,7 +237,7 @@ def _motions(solution: SelfCalibrationMode, epoch: Float) -> Outcome | None:
 def _sample(
     solution: SelfCalibrationMode,
     some: Int,
-    rows: NDArray[np.bool_],
+    rows: Bool,
     **known: Float | None,
 ) -> ScoredSample:
     """Sample of detections along the axes of the detector, in the unit of u and v.

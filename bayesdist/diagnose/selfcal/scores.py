@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.correlated.noise import MAX_BLOCKS, STARS_PER_BLOCK, block_ratios
 from bayesdist.infer.selfcal.calibrate import MOST_TAKEN
@@ -26,9 +26,6 @@ __all__ = [
     "taken_by_stars",
 ]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-
 LOOSE = 1e-9  # relative curvature below which a combination of a star's parameters is undetermined
 
 
@@ -41,7 +38,7 @@ class DetectionScores:
     # star, so that every sum is that of a possible likelihood
     curvature: Float
 
-    def at(self, rows: slice | NDArray[np.bool_]) -> DetectionScores:
+    def at(self, rows: slice | Bool) -> DetectionScores:
         """Scores of some detections."""
         return DetectionScores(self.gradient[rows], self.curvature[rows])
 

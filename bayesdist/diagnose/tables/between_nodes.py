@@ -19,17 +19,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.diagnose.clusters import squares_over, sums_over
 from bayesdist.errors import DegenerateError
 from bayesdist.model import Chip
 
 __all__ = ["BetweenNodes", "MeanSquare", "between_nodes"]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 FINE, COARSE = 8, 4  # cells along a side of the squares between nodes
 AREA_RATIO = (FINE / COARSE) ** 2  # areas of the cells
 MIN_PAIRS = 30  # pairs of stars
@@ -151,7 +149,7 @@ class _Pairs:
     spread: Float
     number: Float  # (squares,)
 
-    def axis(self, a: int, seen: NDArray[np.bool_]) -> _Axis:
+    def axis(self, a: int, seen: Bool) -> _Axis:
         """Sums along one axis, in some of the squares; noise goes with one over the weight."""
         scatter = self.spread[:, a].sum() / self.weight[:, a].sum()
         return _Axis(self.product[seen, a], self.weight[seen, a], float(scatter))
@@ -160,7 +158,7 @@ class _Pairs:
         self,
         function: Callable[[Float, Float], Float],
         a: int,
-        seen: NDArray[np.bool_],
+        seen: Bool,
         weight: Float,
     ) -> float:
         """Mean of a function of the place (n, 2) along one axis, squares having weights."""

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes, between_nodes
 from bayesdist.errors import DegenerateError
@@ -24,8 +24,6 @@ from bayesdist.infer.nodes import (
 from bayesdist.model import Chip, LookupTable
 
 __all__ = ["measured_between"]
-
-Float = NDArray[np.float64]
 
 FAR = 6.0  # standard deviations
 
@@ -44,21 +42,10 @@ def measured_between(
 ) -> tuple[BetweenNodes, ...]:
     """Distortion that tables leave between their nodes, for each chip where it can be measured.
 
-    Parameters
-    ----------
-    pairs : Matches
-        At raw pixels, with errors.
-    fit : LinearFit
-        The polynomial that goes with the tables.
-    tables : sequence of LookupTable
-    filter : str
-        Of the pairs.
-    posteriors : sequence of TablePosterior
-        Of the tables that were fitted to these pairs.
-    mixture : ResidualMixture, optional
-        Of the pairs; by default that of their residuals.
-    fitted : bool
-        Whether the tables were fitted to these pairs.  Those that were not err by themselves.
+    `pairs`: at raw pixels, with errors. `fit`: the polynomial that goes with the tables. `filter`:
+    of the pairs. `posteriors`: of the tables that were fitted to these pairs. `mixture`: of the
+    pairs; by default that of their residuals. `fitted`: whether the tables were fitted to these
+    pairs. Those that were not err by themselves.
     """
     if pairs.star is None:
         return ()

@@ -28,8 +28,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.magnitude_errors import AddedErrors
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
@@ -46,9 +46,6 @@ from bayesdist.infer.stars.likelihood import good_probability, log_densities
 from bayesdist.model import DistortionModel
 
 __all__ = ["ONE", "GroupedErrors", "grouped_errors"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 ONE, AXIS = "one", "axis"
 STARS = 50_000  # from which the errors are estimated: they are then known to half a percent
@@ -232,7 +229,7 @@ def _maxima(quoted: Float, square: Float, good: Float, code: Int, n_groups: int)
     flat, weight = code.ravel(), np.concatenate([good, good])
     s2, e2 = quoted.ravel(), square.ravel()
 
-    def rising(a: Float) -> NDArray[np.bool_]:
+    def rising(a: Float) -> Bool:
         var = s2 + a[flat]
         return np.bincount(flat, weight * (e2 - var) / var**2, n_groups) > 0
 

@@ -11,8 +11,8 @@ swing.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
@@ -32,8 +32,6 @@ __all__ = [
     "residuals_of",
     "variances_of",
 ]
-
-Float = NDArray[np.float64]
 
 STARS = 200_000  # from which the law is estimated: it is then known to a part in a thousand
 PER_EXPOSURE = 100  # mean number of stars of each exposure among these, at least

@@ -10,15 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 
 __all__ = ["MagnitudeLaw"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 CELLS = 1000  # cells of magnitude, within which the law hardly changes
 LOG_VARIANCE = 1.36  # variance of ln(scatter) times n, for the median absolute deviation

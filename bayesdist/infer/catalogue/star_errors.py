@@ -20,8 +20,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
@@ -31,9 +31,6 @@ from bayesdist.infer.solution import Solution
 from bayesdist.infer.stars.stars import prepare
 
 __all__ = ["StarCovariance", "StarErrors", "StarInfluence", "star_covariance", "star_influence"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,15 +14,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.model import DistortionModel, Groups
 
 __all__ = ["StarSums", "influence_by_group"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 SCRATCH = 64_000_000  # bytes of the stars' sums in memory at a time
 

@@ -14,9 +14,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import null_space
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.distributions import chi2_sf
 from bayesdist.infer.compare.frame_fields import mean_squares, without
@@ -29,8 +29,6 @@ from bayesdist.model import DistortionModel
 from bayesdist.model.frames import nearest_frame
 
 __all__ = ["ChangeDate", "PeriodScore", "period_scores", "scan_dates"]
-
-Float = NDArray[np.float64]
 
 MOST_PERIODS = 24
 CREDIBLE = 0.95
@@ -155,7 +153,7 @@ def _score(new: NewFit, change: Change, equations: NormalEquations) -> tuple[Flo
     return (normal + normal.T) / 2, score
 
 
-def _of_exposures(model: DistortionModel, codes: NDArray[np.int64]) -> DistortionModel:
+def _of_exposures(model: DistortionModel, codes: Int) -> DistortionModel:
     """Model of some exposures, after one without matches in the frame of the release."""
     names = tuple(model.exposures[int(code)] for code in codes)
     return replace(model, exposures=("(release)", *names))

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.frames import frame_matrix, frame_names, nearest_frame
 
 __all__ = ["frame_between", "frame_fields", "mean_squares", "term_squares", "without"]
-
-Float = NDArray[np.float64]
 
 
 def term_squares(basis: PolynomialBasis) -> Float:

@@ -14,8 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance, star_influence
@@ -35,8 +35,6 @@ from bayesdist.infer.transforms import without_frames
 from bayesdist.model import DistortionModel
 
 __all__ = ["Change", "NewFit", "change_of", "fit_new", "new_model", "with_star_errors_of"]
-
-Float = NDArray[np.float64]
 
 SAMPLE = 1_000_000  # matches from which the mean date is computed
 HELD = 1e-4  # sigma of a fixed rate, in units of its released sigma

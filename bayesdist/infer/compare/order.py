@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.compare.order_result import HeldOutOrders, OrderSelection, OrderSurfaces
@@ -35,7 +35,6 @@ from bayesdist.model.basis import MAX_ORDER
 
 __all__ = ["in_one_frame", "select_order"]
 
-Float = NDArray[np.float64]
 DEFAULT_ORDERS = tuple(range(3, 10))
 
 
@@ -165,25 +164,10 @@ def _lost(
 def in_one_frame(solution: Solution, matches: Matches, chip: int) -> Matches:
     """Matches of one chip with the frames and the drift of a solution taken out.
 
-    Parameters
-    ----------
-    solution : Solution
-    matches : Matches
-        With errors, of the exposures of the solution's model.
-    chip : int
-        Number of the chip.
-
-    Returns
-    -------
-    Matches
-        In memory, of one exposure and without dates.  They lie as far from the polynomials alone,
-        at their first reference date, as they lay from the solution; residuals and errors are along
-        the axes of these polynomials.
-
-    Raises
-    ------
-    InputError
-        For matches without errors.
+    `matches`: with errors, of the exposures of the solution's model. `chip`: number of the chip.
+    Result: in memory, of one exposure and without dates. They lie as far from the polynomials
+    alone, at their first reference date, as they lay from the solution; residuals and errors are
+    along the axes of these polynomials. InputError for matches without errors.
     """
     matches = matches.load()
     if len(solution.model.chips) > 1:

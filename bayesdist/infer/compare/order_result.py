@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.distributions import chi2_sf, f_sf, norm_sf
 from bayesdist.numbers import p_words
 
 __all__ = ["HeldOutOrders", "OrderSelection", "OrderSurfaces"]
-
-Float = NDArray[np.float64]
 
 CLEAR = 3.0  # standard errors from which on a higher order counts as better
 CLEAR_P = float(norm_sf(CLEAR))
@@ -31,7 +29,7 @@ class OrderSurfaces:
     orders: tuple[int, ...]
     n_bins: int  # bins that have stars
     chi2: Float  # remaining in u and v (orders, 2), relative to the noise of the bins' means
-    dof: NDArray[np.int64]  # of one axis (orders,)
+    dof: Int  # of one axis (orders,)
     # remaining in the bins of u and v (orders, 2), in the unit of u, v; bins weigh as their stars
     # do
     rms: Float

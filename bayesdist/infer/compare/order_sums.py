@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.infer import kernel
 from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.stars import Stars
@@ -22,9 +23,6 @@ from bayesdist.model.grid import cell_index
 from bayesdist.streams import mixed
 
 __all__ = ["FoldStatistics", "bin_sums", "departures", "fold_sums", "held_out_gain", "truncated"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from bayesdist.arrays import Float
 from bayesdist.distributions import norm_sf
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.compare.positions import (
@@ -43,8 +43,6 @@ __all__ = [
     "compare_periods",
     "sums_of_stars",
 ]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

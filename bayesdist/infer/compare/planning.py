@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import recolouring, scaled_cholesky, scaled_inverse
@@ -14,8 +15,6 @@ from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["ExposureContent", "exposure_content", "exposure_information", "with_information"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.distributions import chi2_sf
 from bayesdist.infer.equations.scaled import chi_square, scaled_cholesky
 from bayesdist.model import Chip, DistortionModel
@@ -18,8 +18,6 @@ __all__ = [
     "difference_field",
     "largest_difference",
 ]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

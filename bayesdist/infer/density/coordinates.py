@@ -12,11 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from bayesdist.arrays import Bool, Float
 
 __all__ = ["Split", "from_cube_root", "inside", "to_cube_root"]
-
-Float = NDArray[np.float64]
 
 
 def to_cube_root(names: tuple[str, ...], h: Float) -> Float:
@@ -28,7 +27,7 @@ def to_cube_root(names: tuple[str, ...], h: Float) -> Float:
     return out
 
 
-def inside(names: tuple[str, ...], z: Float) -> NDArray[np.bool_]:
+def inside(names: tuple[str, ...], z: Float) -> Bool:
     """Boolean mask (...) of points (..., k) in the support."""
     ok = np.all(z > 0, axis=-1)
     if "f" in names:
@@ -82,7 +81,7 @@ class Split:
         held = [self.hyper.index(name) for name in self.held]
         return held, [self.hyper.index(name) for name in self.rest]
 
-    def contains(self, y: Float) -> NDArray[np.bool_]:
+    def contains(self, y: Float) -> Bool:
         """Boolean mask (...) of points (..., D') in the support."""
         return np.isfinite(y).all(axis=-1) & inside(self.rest, y[..., self.n_theta :])
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.density.coordinates import Split
 from bayesdist.infer.density.importance import quality_of
@@ -22,7 +22,6 @@ from bayesdist.infer.stars.mixture import TAILS
 
 __all__ = ["build_proposal"]
 
-Float = NDArray[np.float64]
 Line = dict[float, Conditional]  # nodes by their value on one axis
 
 N_NODES = 25

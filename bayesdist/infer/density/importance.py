@@ -12,13 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.infer.convergence import importance_efficiency, pareto_k
 
 __all__ = ["Quality", "draws_per_effective", "quality_of", "rejection", "warmup_steps"]
-
-Float = NDArray[np.float64]
 
 CLOSE = 0.02  # distance from the posterior (total variation) at which warm-up ends
 MOST_WARMUP = 10_000

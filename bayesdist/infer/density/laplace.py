@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.density.coordinates import Split, from_cube_root
 from bayesdist.infer.density.target import Target
@@ -18,8 +18,6 @@ from bayesdist.infer.equations.arrow import Arrow, ArrowFactor
 from bayesdist.infer.linear import LinearFit
 
 __all__ = ["Conditional", "Node", "conditional_mode", "expected_mode", "starting_point"]
-
-Float = NDArray[np.float64]
 
 MAX_STEPS = 60
 UNSEEN = 1e-8  # decrement that rounding of the log density may hide: the step is taken unseen

@@ -6,15 +6,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, CubicSpline, PchipInterpolator
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.infer.density.piecewise import PiecewiseExponential
 from bayesdist.infer.stars.mixture import TAILS
 
 __all__ = ["Marginal", "cardinal"]
-
-Float = NDArray[np.float64]
 
 MESH = {1: 4001, 2: 401}  # points of each axis, by the number of axes
 
@@ -76,7 +74,7 @@ class Marginal:
             out[rows] += density.log_density(at[rows, 1])
         return out
 
-    def _conditionals(self, at: Float) -> Iterator[tuple[NDArray[np.bool_], PiecewiseExponential]]:
+    def _conditionals(self, at: Float) -> Iterator[tuple[Bool, PiecewiseExponential]]:
         """Masks (n,) of points, with the density of their second coordinate."""
         if self.first is None or not self.second:
             return

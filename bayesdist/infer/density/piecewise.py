@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from bayesdist.arrays import Float
 
 __all__ = ["PiecewiseExponential"]
-
-Float = NDArray[np.float64]
 
 
 class PiecewiseExponential:

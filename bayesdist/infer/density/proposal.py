@@ -18,8 +18,8 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.infer.density.coordinates import Split
 from bayesdist.infer.density.laplace import Node
 from bayesdist.infer.density.marginal import Marginal, cardinal
@@ -27,8 +27,6 @@ from bayesdist.infer.equations.arrow import Arrow
 
 __all__ = ["GridProposal", "Proposal", "Random"]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 Random = np.random.Generator | np.random.RandomState
 
 WIDE, SHARE = 2.0, 0.1  # draws of an uncertain f are so much wider, so often

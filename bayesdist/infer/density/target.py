@@ -7,8 +7,8 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.infer import kernel
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.equations.normal import mixture
@@ -20,8 +20,6 @@ from bayesdist.infer.stars.stars import Stars
 from bayesdist.model import DistortionModel
 
 __all__ = ["Density", "Target"]
-
-Float = NDArray[np.float64]
 
 SCRATCH = 32_000_000  # bytes of effective coefficients in memory at a time
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.equations.normal import NormalEquations
 from bayesdist.infer.equations.priors import GaussianPriors
@@ -13,8 +13,6 @@ from bayesdist.model import DistortionModel
 from bayesdist.model.frames import nearest_frame
 
 __all__ = ["gauss_newton", "refuse_absorbed_drift", "starting_point"]
-
-Float = NDArray[np.float64]
 
 RELINEARISED = 1e-7  # pixels: where the Gauss-Newton iteration over the frames stops
 STALLED = 1e-4  # formal errors: steps below this that do not shrink are rounding

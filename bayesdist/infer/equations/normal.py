@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.infer import kernel
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.kernel import Constants
@@ -22,8 +22,6 @@ from bayesdist.infer.stars.sums import Sums
 from bayesdist.model import DistortionModel, Groups
 
 __all__ = ["NormalEquations", "least_squares", "mixture"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,33 +7,22 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.model import DistortionModel
 
 __all__ = ["GaussianPriors", "JointPrior", "Prior"]
 
-Float = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class JointPrior:
-    """Gaussian prior of the first entries of theta with their correlations.
+    """Gaussian prior of the first entries of theta with their correlations."""
 
-    Parameters
-    ----------
-    centre : ndarray, shape (G,)
-    precision : ndarray, shape (G, G)
-        Inverse covariance; it may leave directions flat.
-    rank : int
-        Number of directions that are not flat.
-    """
-
-    centre: Float
-    precision: Float
-    rank: int
+    centre: Float  # (G,)
+    precision: Float  # (G, G), inverse covariance; it may leave directions flat
+    rank: int  # number of directions that are not flat
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,20 +120,11 @@ class Prior:
     """Correlated Gaussian prior of the parameters, linearised at some.
 
     log p = -d^T P d / 2 + r^T d with d = theta - reference.
-
-    Parameters
-    ----------
-    reference : ndarray, shape (D,)
-        Near the solution, so that no digits are lost.
-    precision : ndarray, shape (D, D)
-        P.
-    right : ndarray, shape (D,)
-        r.
     """
 
-    reference: Float
-    precision: Float
-    right: Float
+    reference: Float  # (D,), near the solution, so that no digits are lost
+    precision: Float  # (D, D), P
+    right: Float  # (D,), r
 
     @classmethod
     def none(cls, reference: Float) -> Prior:

@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from bayesdist.errors import DegenerateError
@@ -18,8 +17,6 @@ from bayesdist.model import DistortionModel, Groups
 from bayesdist.model.frames import DEVIATIONS, FRAME_KINDS, frame_names
 
 __all__ = ["NullSpace", "check_coverage", "null_space"]
-
-Float = NDArray[np.float64]
 
 # Eigenvalues of the unit-diagonal normal matrix below this are zero: rounding alone leaves ~1e-15
 # and a fit that loses 11 of 16 digits is no longer a measurement.

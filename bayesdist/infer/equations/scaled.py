@@ -13,9 +13,9 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.distributions import chi2_sf
 
 __all__ = [
@@ -29,8 +29,6 @@ __all__ = [
     "scaled_inverse",
     "unit_diagonal",
 ]
-
-Float = NDArray[np.float64]
 
 RANK = 1e-9  # eigenvalues of a correlation matrix below it are rounding
 
@@ -131,7 +129,7 @@ def chi_square(
     return FieldTest.of(white, shrink=shrink)
 
 
-def known_terms(cov: Float) -> NDArray[np.bool_]:
+def known_terms(cov: Float) -> Bool:
     """Boolean mask (n,) of the parameters with variance."""
     variance = np.diag(cov)
     return np.asarray(variance > 1e-20 * variance.max(initial=0.0))

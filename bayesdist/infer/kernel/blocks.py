@@ -14,8 +14,8 @@ from typing import Any
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Int
 from bayesdist.infer.kernel.lanes import FAST
 
 __all__ = [
@@ -29,8 +29,6 @@ __all__ = [
     "share_out",
     "threads_for",
 ]
-
-Int = NDArray[np.int64]
 
 # how a pass is compiled: without a check for division by zero, which would exclude vectors
 PASS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": FAST, "error_model": "numpy"}

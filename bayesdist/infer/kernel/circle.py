@@ -22,14 +22,12 @@ import math
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.infer.kernel.numeric import exp_negative
 
 __all__ = ["NODES", "inside", "log_circle", "nodes_for", "slopes"]
-
-Float = NDArray[np.float64]
 
 SURE = 8.6**2  # squared errors from the edge within which the probability is 1 to the last digit
 # smallest resolved squared error over radius; steeper edges are blurred to it, which concerns stars
@@ -45,7 +43,7 @@ COUNTS = (
 MOST = COUNTS[-1]
 
 
-def _table() -> tuple[NDArray[np.int64], NDArray[np.int64], Float, Float]:
+def _table() -> tuple[Int, Int, Float, Float]:
     """Numbers of nodes, the first of each set of them, and their cosines and sines."""
     angles = np.concatenate([2 * np.pi * np.arange(n) / n for n in COUNTS])
     begin = np.concatenate([[0], np.cumsum(COUNTS)[:-1]]).astype(np.int64)

@@ -6,8 +6,8 @@ import math
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.infer.kernel.blocks import PASS, lay_out, scratch, share_out, threads_for
 from bayesdist.infer.kernel.lanes import (
     WIDTH,
@@ -25,9 +25,6 @@ from bayesdist.infer.kernel.numeric import exp_negative, inverse_root
 from bayesdist.infer.kernel.polynomial import evaluate
 
 __all__ = ["log_likelihood"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 SCRATCH = 16_000_000  # bytes of partial sums in memory at a time
 

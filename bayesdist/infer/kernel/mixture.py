@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.infer.kernel.blocks import BLOCK
 from bayesdist.infer.kernel.lanes import WIDTH, choose, load, product, spread, total
 from bayesdist.infer.kernel.numeric import bits_of, from_bits
@@ -25,8 +25,6 @@ __all__ = [
     "log_of_product",
     "packed",
 ]
-
-Float = NDArray[np.float64]
 
 NO_OUTLIERS, GAUSSIAN, UNIFORM = 0, 1, 2
 NEVER = 1e300  # chi-square of an outlier where there are none

@@ -14,8 +14,8 @@ from functools import cache
 import numba as nb
 import numpy as np
 from numpy.polynomial import legendre as series
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.infer.kernel.blocks import BLOCK, PASS, lay_out, scratch, share_out, threads_for
 from bayesdist.infer.kernel.lanes import (
     AT_MOST,
@@ -36,9 +36,6 @@ from bayesdist.infer.kernel.numeric import exp_negative, inverse_root
 from bayesdist.infer.kernel.polynomial import evaluate, legendre
 
 __all__ = ["PIECE", "Moments", "least_squares_moments", "mixture_moments"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 PIECE = 4096
 EVALUATIONS = 10  # cost of the sums of one star, in likelihood evaluations

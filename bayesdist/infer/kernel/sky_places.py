@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.infer.kernel.blocks import PASS, share_out
 from bayesdist.infer.kernel.lanes import FAST
 
 __all__ = ["legendre", "linearised", "positions", "powers"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)

@@ -6,17 +6,14 @@ import math
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.infer.kernel.blocks import PASS, lay_out, scratch, share_out, threads_for
 from bayesdist.infer.kernel.mixture import Constants, packed
 from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.polynomial import evaluate
 
 __all__ = ["memberships", "residuals"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 @nb.njit(**PASS)

@@ -14,6 +14,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.infer.kernel.blocks import PASS, share_out
 from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.infer.kernel.sky_places import legendre
@@ -37,8 +38,6 @@ from bayesdist.infer.kernel.star_modes import (
 
 __all__ = ["MOST_DOUBTFUL", "eliminate_stars", "log_marginals", "weighted_stars"]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 Flags = NDArray[np.int8]
 
 MOST_DOUBTFUL = 6  # most detections of a star over whose membership is summed

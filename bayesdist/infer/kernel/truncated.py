@@ -17,8 +17,8 @@ from typing import Any
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.infer.kernel.blocks import BLOCK, PASS, lay_out, scratch, share_out, threads_for
 from bayesdist.infer.kernel.circle import MOST, NODES, log_circle, slopes
 from bayesdist.infer.kernel.lanes import FAST
@@ -43,9 +43,6 @@ __all__ = [
     "truncated_moments",
     "truncated_scores",
 ]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 SCRATCH = 16_000_000  # bytes of partial sums in memory at a time
 INTEGRAL = 30  # cost of a star, in likelihood evaluations without a circle

@@ -13,9 +13,10 @@ from functools import lru_cache
 
 import numpy as np
 import scipy.sparse
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.nodes.field import checked_stars
 from bayesdist.infer.nodes.grid import STEP, NodeGrid
@@ -23,9 +24,6 @@ from bayesdist.model import Chip
 from bayesdist.model.lookup import LookupTable
 
 __all__ = ["binned_table", "quadratic_smoother"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 PASSES = 20  # of the clipping, at most
 OWN_SCATTER = 5  # stars from which on a bin's error is from its own scatter
@@ -116,10 +114,10 @@ def binned_table(
     return grid.table(mean.T, sigma.T, filter=filter)
 
 
-def _clipped(bins: Int, r: Float, n: int, clip: float) -> NDArray[np.bool_]:
+def _clipped(bins: Int, r: Float, n: int, clip: float) -> Bool:
     """Boolean mask (N,) of the stars left when clipping changes nothing any more."""
     centre, scale = _robust(bins, r, n)
-    inlier: NDArray[np.bool_] = np.ones(len(r), bool)
+    inlier: Bool = np.ones(len(r), bool)
     for _ in range(PASSES):
         within = np.asarray((np.abs(r - centre[bins]) <= clip * scale[bins]).all(axis=1))
         if np.array_equal(within, inlier):
@@ -150,7 +148,7 @@ def _moments(bins: Int, r: Float, n: int) -> tuple[Int, Float, Float]:
     return count, mean, np.sqrt(square / np.maximum(count - 1, 1)[:, None])
 
 
-def quadratic_smoother(filled: NDArray[np.bool_]) -> scipy.sparse.csr_array:
+def quadratic_smoother(filled: Bool) -> scipy.sparse.csr_array:
     """Sparse linear map (n_nodes, n_nodes) from node values to smooth ones.
 
     `filled` (ny, nx) marks nodes with a value; columns of empty nodes are zero.  A node whose

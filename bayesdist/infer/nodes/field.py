@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.kernel.blocks import at_once
@@ -24,8 +25,6 @@ from bayesdist.infer.nodes.sums import BLOCK, NodeSums, node_sums
 from bayesdist.model import Chip
 
 __all__ = ["checked_stars", "field_table"]
-
-Float = NDArray[np.float64]
 
 STEADY = 1e-5  # change of the stars' typical variance that is small against any error of the jitter
 MAX_ITERATIONS = 6

@@ -15,8 +15,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import one_thread
@@ -33,8 +33,6 @@ from bayesdist.model import DistortionModel
 from bayesdist.model.lookup import LookupTable
 
 __all__ = ["fit_with_tables"]
-
-Float = NDArray[np.float64]
 
 LIKELY = 0.5  # stars that are less likely true matches are left out
 SEARCHED = 2  # iterations that optimise hyperparameters, which are fixed in later ones
@@ -125,7 +123,7 @@ def fit_with_tables(
         moved = _with_memberships(moved, mixture, jitter * pixel)
         return fit_linear(on_the_chips(moved, model), model)
 
-    def new_table(chip: int, rows: NDArray[np.bool_], shift: Float, variance: Float) -> LookupTable:
+    def new_table(chip: int, rows: Bool, shift: Float, variance: Float) -> LookupTable:
         where = model.chips[model.chip_code(chip)]
         if method == "binned":
             return binned_table(

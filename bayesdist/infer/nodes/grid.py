@@ -13,16 +13,13 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg
 import scipy.sparse
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, PolynomialBasis
 from bayesdist.model.lookup import LookupTable
 
 __all__ = ["STEP", "NodeGrid"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 STEP = (64.0, 64.0)  # pixels: the grid of D2IMFILE and NPOLFILE
 

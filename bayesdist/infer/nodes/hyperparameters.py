@@ -14,9 +14,9 @@ from functools import cached_property
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from bayesdist.arrays import Float, Int
 from bayesdist.infer.nodes.grid import NodeGrid
 from bayesdist.infer.nodes.sums import NodeSums
 
@@ -29,9 +29,6 @@ __all__ = [
     "fitted_field",
     "refined_field",
 ]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 SMOOTHNESS = (0.5, 1.5, 2.5)
 

@@ -9,15 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from bayesdist.arrays import Float
 from bayesdist.infer.stars.likelihood import good_probability
 from bayesdist.infer.stars.mixture import OUTLIER_MODE, OUTLIER_SHAPE, OutlierMixture
 
 __all__ = ["ResidualMixture", "fit_mixture", "jitter_variance"]
-
-Float = NDArray[np.float64]
 
 SAMPLE = 200_000  # stars from which the mixture's three numbers are estimated
 STEPS = 200

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.solution import Solution
@@ -23,49 +23,26 @@ __all__ = [
     "pixel_shifts",
 ]
 
-Float = NDArray[np.float64]
-
 FOLDED = 1e-6  # area of a pixel's image over the square of its sides
 
 
 @dataclass(frozen=True, eq=False)
 class PixelShifts:
-    """Residuals of matched stars in pixels of the detector.
+    """Residuals of matched stars in pixels of the detector."""
 
-    Parameters
-    ----------
-    shift : ndarray, shape (N, 2)
-        To be added to x and y, pixels.
-    variance : ndarray, shape (N, 2)
-        Square of the quoted error of each, square pixels.  The correlation that a skewed polynomial
-        makes between the two (some per cent) is left out.
-    """
-
-    shift: Float
+    shift: Float  # (N, 2), to be added to x and y, pixels
+    # (N, 2), square of the quoted error of each, square pixels. The correlation that a skewed
+    # polynomial makes between the two (some per cent) is left out
     variance: Float
 
 
 def pixel_shifts(solution: Solution, matches: Matches) -> PixelShifts:
     """Residuals of matches, mapped to the detector by the inverse of the local Jacobian.
 
-    Parameters
-    ----------
-    solution : Solution
-    matches : Matches
-        With errors, in the solution's unit.
-
-    Returns
-    -------
-    PixelShifts
-        To first order in the residual: at 0.2 pixels and the curvature of ACS/WFC the second one is
-        below 1e-5 pixels.
-
-    Raises
-    ------
-    InputError
-        For matches without errors or in another unit.
-    DegenerateError
-        Where the polynomial folds over: its Jacobian is singular at a star.
+    `matches`: with errors, in the solution's unit. Result: to first order in the residual: at 0.2
+    pixels and the curvature of ACS/WFC the second one is below 1e-5 pixels. InputError for matches
+    without errors or in another unit. DegenerateError where the polynomial folds over: its Jacobian
+    is singular at a star.
     """
     sigma_u, sigma_v = errors_of(matches)
     model, groups = solution.model, groups_of(solution.model, matches)
@@ -106,7 +83,7 @@ def on_the_chips(matches: Matches, model: DistortionModel) -> Matches:
     return matches if inside.all() else matches.select(inside, reason="moved off the chip")
 
 
-def inside_chips(matches: Matches, model: DistortionModel) -> NDArray[np.bool_]:
+def inside_chips(matches: Matches, model: DistortionModel) -> Bool:
     """Boolean mask (N,) of the matches whose pixels lie on their chip."""
     size = np.array([model.chips[model.chip_code(c)].size for c in matches.chip_numbers])
     nx, ny = size[matches.chip].T

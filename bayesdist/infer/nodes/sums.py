@@ -13,15 +13,13 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg
 import scipy.sparse
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.nodes.grid import NodeGrid
 from bayesdist.infer.stars.sums import Sums
 
 __all__ = ["NodeSums", "node_sums"]
-
-Float = NDArray[np.float64]
 
 BLOCK = 65_536  # stars at once: their polynomials take 11 MB at order 5
 

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.linear import LinearFit
@@ -18,32 +19,19 @@ from bayesdist.model.lookup import LookupTable, corrected
 
 __all__ = ["Iteration", "TableFit", "held_sigma", "table_of"]
 
-Float = NDArray[np.float64]
-
 BLOCK = 1024  # positions whose rows over all nodes are in memory at once
 
 
 @dataclass(frozen=True)
 class Iteration:
-    """Statistics of one iteration.
+    """Statistics of one iteration."""
 
-    Parameters
-    ----------
-    number : int
-        From 1.
-    moved : float
-        Largest change of a node, pixels.
-    rms : float
-        Rms residual of an axis before the new tables, stars weighted by their probability of being
-        true matches, pixels.
-    false_fraction : float
-        Of the matches.
-    """
-
-    number: int
-    moved: float
+    number: int  # from 1
+    moved: float  # largest change of a node, pixels
+    # rms residual of an axis before the new tables, stars weighted by their probability of being
+    # true matches, pixels
     rms: float
-    false_fraction: float
+    false_fraction: float  # of the matches
 
 
 def table_of(table: LookupTable | TablePosterior) -> LookupTable:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.infer.kernel import Constants
 from bayesdist.infer.posterior.posterior import Posterior
@@ -24,9 +24,6 @@ __all__ = [
     "some_draws",
     "star_log_likelihood",
 ]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 MOST_DRAWS, LEAST_DRAWS = 64, 8
 AT_A_TIME = 1_000_000  # log-likelihoods of a star that are in memory beside the result

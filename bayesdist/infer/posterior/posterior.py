@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.infer.convergence import Convergence
 from bayesdist.infer.solution import Solution
 from bayesdist.infer.stars.likelihood import MixtureAt
@@ -15,8 +15,6 @@ from bayesdist.infer.stars.mixture import Hyper, OutlierMixture
 from bayesdist.model import DistortionModel
 
 __all__ = ["Certificate", "Posterior", "SamplerInfo"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

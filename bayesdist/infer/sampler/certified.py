@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.infer.convergence import diagnose
 from bayesdist.infer.density.laplace import Node
@@ -26,8 +26,6 @@ from bayesdist.infer.sampler.surrogate import Surrogate, certify, draw_surrogate
 from bayesdist.infer.sampler.whitening import Whitening
 
 __all__ = ["PILOTS", "SECOND_STAGES", "SurrogateProposal", "has_second_stage", "run_certified"]
-
-Float = NDArray[np.float64]
 
 SECOND_STAGES = ("auto", "always", "never")
 PILOTS = 400  # passes that the certificate costs

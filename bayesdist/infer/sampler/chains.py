@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.convergence import (
     Convergence,
@@ -58,8 +58,6 @@ if TYPE_CHECKING:
 log = logging.getLogger("bayesdist")
 
 __all__ = ["Chains", "Settings", "ensemble_seeds", "run_chains"]
-
-Float = NDArray[np.float64]
 
 LEAST_ROWS = 10  # rows of a chain that diagnostics need at least
 

@@ -15,14 +15,13 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 from bayesdist.reading.faults import restoring
 from bayesdist.reading.hdf5 import hdf5_arrays
 
 __all__ = ["Block", "Walkers", "block_path", "read_arrays", "write_arrays"]
-
-Float = NDArray[np.float64]
 
 BLOCK_ARRAYS = ("coords", "log_prob", "accepted", "log_weights")
 END_ARRAYS = ("log_q", "random_keys", "random_state")

@@ -23,8 +23,8 @@ from pathlib import Path
 import emcee
 import numpy as np
 from emcee.moves import DEMove, MHMove
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.errors import InputError
 from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Density
@@ -34,9 +34,6 @@ from bayesdist.infer.sampler.proposal_batch import ProposalBatch, draw_batch
 from bayesdist.infer.sampler.whitening import Whitening
 
 __all__ = ["Ensembles", "replay"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 START_BATCHES = 20  # further batches of proposals that are searched for starts of walkers
 
@@ -127,7 +124,7 @@ class Ensembles:
 
     # -- where the walkers start ------------------------------------------------------------------
 
-    def starts(self) -> tuple[list[Walkers], NDArray[np.bool_], int]:
+    def starts(self) -> tuple[list[Walkers], Bool, int]:
         """First states from the pilot, mask (ensembles, n) of used proposals, number of new ones.
 
         Where the pilot is too short for so many walkers, further proposals are evaluated.

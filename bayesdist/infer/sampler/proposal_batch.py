@@ -12,15 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Density
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 
 __all__ = ["ProposalBatch", "draw_batch", "pilot_batch"]
-
-Float = NDArray[np.float64]
 
 ROWS = 8192  # proposals evaluated at a time
 
@@ -48,7 +46,7 @@ class ProposalBatch:
         """Batch with some of the proposals of each ensemble."""
         return ProposalBatch(self.psi[:, rows], self.log_prob[:, rows], self.log_q[:, rows])
 
-    def without(self, taken: NDArray[np.bool_], n: int) -> ProposalBatch:
+    def without(self, taken: Bool, n: int) -> ProposalBatch:
         """Batch of the first n proposals of each ensemble that are not among those taken."""
         rows = np.array([np.flatnonzero(~t)[:n] for t in taken])
         each = np.arange(len(rows))[:, None]

@@ -35,8 +35,8 @@ from math import factorial
 
 import numpy as np
 from numpy.polynomial import hermite_e
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError, NotConvergedError
 from bayesdist.infer.convergence import importance_efficiency, pareto_k
 from bayesdist.infer.density.proposal import Random
@@ -45,8 +45,6 @@ from bayesdist.infer.sampler.move_schedule import EFFICIENT
 from bayesdist.limits import PARETO_K
 
 __all__ = ["Surrogate", "certify", "draw_surrogate"]
-
-Float = NDArray[np.float64]
 
 DEGREE = 3  # of the polynomial in the hyperparameters
 LEAST_TRAINING = 20

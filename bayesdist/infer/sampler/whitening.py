@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Density
 from bayesdist.infer.equations.arrow import ArrowFactor
 
 __all__ = ["Whitening"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.data.matches import Matches
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel import GAUSSIAN, Constants
@@ -24,8 +24,6 @@ __all__ = [
     "star_averages",
     "star_log_likelihoods",
 ]
-
-Float = NDArray[np.float64]
 
 
 class Likelihood(Protocol):
@@ -53,12 +51,12 @@ class Clip:
     chi2_limit: float
     abs_limit: float  # in the unit of u, v
 
-    def keeps(self, model: DistortionModel, matches: Matches) -> NDArray[np.bool_]:
+    def keeps(self, model: DistortionModel, matches: Matches) -> Bool:
         """Boolean mask (N,) of a table's stars within both limits."""
         stars, order = prepare(model, matches)
         return in_table_order(self.keeps_of(stars), order).astype(bool)
 
-    def keeps_of(self, stars: Stars) -> NDArray[np.bool_]:
+    def keeps_of(self, stars: Stars) -> Bool:
         """Boolean mask (N,) of prepared stars within both limits, in their own order."""
         residual = stars.residuals(self.theta)
         chi2 = residual[:, 0] ** 2 / stars.var_u + residual[:, 1] ** 2 / stars.var_v

@@ -27,16 +27,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import expit, gammaln, log_expit, logit
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError, required
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel import Constants
 
 __all__ = ["HYPER_NAMES", "TAILS", "Hyper", "OutlierMixture"]
-
-Float = NDArray[np.float64]
 
 HYPER_NAMES = {"j": "log j", "f": "logit f", "s_out": "log s_out"}
 KINDS = {"none": kernel.NO_OUTLIERS, "gaussian": kernel.GAUSSIAN, "uniform": kernel.UNIFORM}

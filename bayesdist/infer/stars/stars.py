@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import kernel
@@ -16,9 +17,6 @@ from bayesdist.infer.kernel import Constants
 from bayesdist.model import DistortionModel, Groups
 
 __all__ = ["Stars", "errors_of", "groups_of", "in_table_order", "prepare"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 NOBODY = np.zeros(0, np.int64)
 

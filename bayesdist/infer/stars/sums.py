@@ -9,11 +9,12 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Int
 from bayesdist.model import Groups, merge_groups
 
 __all__ = ["Sums"]
 
-Rows = tuple[NDArray[np.int64], ...]
+Rows = tuple[Int, ...]
 
 
 class Sums:

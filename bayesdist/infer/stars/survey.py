@@ -6,18 +6,15 @@ from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.model import Groups, merge_groups
 
 __all__ = ["ChipSurvey", "Survey", "survey"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 # relative distance by which a star at the edge of its circle may seem to lie outside
 ROUNDING = 1e-6

@@ -8,9 +8,9 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.screen import progress_bar, table_text
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 from bayesdist.infer.solution import Solution
@@ -19,8 +19,6 @@ from bayesdist.model import DistortionModel
 from bayesdist.products import IdcTab, idctab_from_solution, write_idctab
 
 __all__ = ["simulate_campaign"]
-
-Float = NDArray[np.float64]
 
 START = "start_idc.fits"
 REFERENCE = "F606W"  # the filter of the detector's tables and of the drift

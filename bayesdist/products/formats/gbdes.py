@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.errors import FormatError, InputError
@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
 __all__ = ["FORMAT", "GbdesParameters"]
 
-Float = NDArray[np.float64]
-
 _COLUMNS = ("mapName", "coordinate", "coefficientNumber", "parameter")
 _DEVICE = re.compile(r"(.+)/(\d+)/poly$")
 _NOT_EVEN = 1e-9  # by which a covariance matrix may differ from its transpose, of its size
@@ -51,12 +49,12 @@ class GbdesParameters:
     table: Table
 
     @property
-    def maps(self) -> dict[str, NDArray[np.int64]]:
+    def maps(self) -> dict[str, Int]:
         """Rows of each map, x before y, by its name."""
         names = np.asarray(self.table["mapName"]).astype(str)
         return {str(n): np.flatnonzero(names == n) for n in dict.fromkeys(names)}
 
-    def order(self, rows: NDArray[np.int64]) -> int:
+    def order(self, rows: Int) -> int:
         """Order of a map; FormatError where its coefficients are those of no order."""
         half = len(rows) // 2
         for order in range(MAX_ORDER + 1):
@@ -77,7 +75,7 @@ class GbdesParameters:
                 columns.append(np.asarray(self.table[column], float))
         return np.stack(columns)
 
-    def devices(self, band: str | None) -> dict[int, NDArray[np.int64]]:
+    def devices(self, band: str | None) -> dict[int, Int]:
         """Rows of the maps of detectors, by number, of one band."""
         found = {n: m for n in self.maps if (m := _DEVICE.match(n)) is not None}
         bands = list(dict.fromkeys(match[1] for match in found.values()))

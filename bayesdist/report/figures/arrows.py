@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.distributions import f_isf
 from bayesdist.numbers import size_of
 from bayesdist.report.figures.panels import Panels
@@ -30,9 +30,6 @@ __all__ = [
     "square_cells",
     "vector_map",
 ]
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 CHANCE = 0.0455  # probability that noise alone puts one axis beyond 2 sigma
 

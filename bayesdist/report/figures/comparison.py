@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.distributions import chi2_ppf, chi2_sf, norm_isf
 from bayesdist.numbers import size_of
 from bayesdist.report.figures.arrows import Arrows, vector_map
@@ -32,8 +32,6 @@ __all__ = [
     "difference_vectors",
     "gaussian_sigmas",
 ]
-
-Float = NDArray[np.float64]
 
 LEVELS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 # from white to a blue on which black arrows are still seen

@@ -10,8 +10,8 @@ from unittest.mock import patch
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.numbers import display_scale
 from bayesdist.report.figures.style import PALETTE, WIDTH, figure_style, new_figure
 
@@ -19,8 +19,6 @@ __all__ = [
     "Column",
     "corner_figure",
 ]
-
-Float = NDArray[np.float64]
 
 _LEVELS = tuple(1.0 - np.exp(-0.5 * np.array([1.0, 2.0]) ** 2))  # content of 1 and 2 sigma in 2-D
 

@@ -12,15 +12,14 @@ from matplotlib.colors import BoundaryNorm, Colormap, Normalize
 from matplotlib.contour import QuadContourSet
 from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import RectBivariateSpline
 
+from bayesdist.arrays import Float
 from bayesdist.report.figures.panels import Panels
 from bayesdist.report.figures.style import COLORBAR, INK, SEQUENTIAL, figure_style
 
 __all__ = ["Grid", "contour_levels", "scalar_map"]
-
-Float = NDArray[np.float64]
 
 EMPTY = "#D9DEE3"  # of a cell without a value
 FAR = 15.0  # factor between values, from which on even steps would show the largest alone

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.report.figures.style import (
     CYCLE,
     INK,
@@ -20,8 +19,6 @@ from bayesdist.report.figures.style import (
 )
 
 __all__ = ["FilterTerm", "filters_figure"]
-
-Float = NDArray[np.float64]
 
 MARKERS = "os^Dvp"
 

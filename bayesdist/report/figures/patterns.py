@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.model.grid import mesh, outline_pixels
 from bayesdist.report.figures.style import (
     COLORBAR,
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from bayesdist.assess.planning.dithers import PlannedPattern
 
 __all__ = ["pattern_maps"]
-
-Float = NDArray[np.float64]
 
 SHOWN = ("gauge-free", "shape")
 ROW = 2.3  # inches

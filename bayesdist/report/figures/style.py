@@ -12,13 +12,11 @@ from contextlib import contextmanager
 from typing import Any, Literal
 
 import matplotlib
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
 from matplotlib.ticker import LogFormatterSciNotation, ScalarFormatter
-from numpy.typing import NDArray
 
 from bayesdist.report.figures.ticks import OneTickFigure
 
@@ -42,8 +40,6 @@ __all__ = [
     "nice_below",
     "plain_ticks",
 ]
-
-Float = NDArray[np.float64]
 
 # Okabe and Ito's palette: eight colours that remain distinct in every common colour blindness
 PALETTE = {

@@ -12,11 +12,10 @@ from matplotlib.axis import XAxis, XTick, YAxis, YTick
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
-from numpy.typing import NDArray
+
+from bayesdist.arrays import Bool, Float
 
 __all__ = ["OneTickAxes", "OneTickFigure"]
-
-Float = NDArray[np.float64]
 
 
 class _AllTicks:
@@ -119,7 +118,7 @@ class _OneTickAxis:
             self._placed = state, found
         return list(self._placed[1])
 
-    def _within(self: Any, locs: Any) -> NDArray[np.bool_]:
+    def _within(self: Any, locs: Any) -> Bool:
         """Boolean mask of the positions between the limits of the axis."""
         transform = self.get_transform()
         low, high = np.sort(transform.transform(np.asarray(self.get_view_interval(), float)))

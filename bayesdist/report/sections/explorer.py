@@ -7,9 +7,9 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.colors import to_hex
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
+from bayesdist.arrays import Float
 from bayesdist.assess.budget.surface import JOINT, BudgetSurface, GridRow
 from bayesdist.assess.terms.forms import MEASURED, Row
 from bayesdist.assess.terms.given import CENTROID
@@ -19,8 +19,6 @@ from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.style import CYCLE, SEQUENTIAL
 
 __all__ = ["budget_data", "map_data"]
-
-Float = NDArray[np.float64]
 
 MOMENT_DIGITS = 7  # quadratic forms of them cancel in part
 MAP_DIGITS = 5

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.commands.on_files.calibrations import calibration_at, images_of, notes_of
 from bayesdist.app.commands.on_files.position_table import (
@@ -19,6 +18,7 @@ from bayesdist.app.commands.on_files.position_table import (
     write_positions,
 )
 from bayesdist.app.screen import number
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.calibration.apply import (
     Application,
     OutputFrame,
@@ -32,8 +32,6 @@ from bayesdist.errors import InputError
 from bayesdist.reading.tables import read_table
 
 __all__ = ["apply_to_table"]
-
-Float = NDArray[np.float64]
 
 METHODS = ("newton", "polynomial", "table")
 
@@ -97,7 +95,7 @@ def apply_to_table(
     return "\n".join([_head(output, at, found, epoch), *lines, *_losses(a, at, x, y, inverse)])
 
 
-def _forth(a: Application, x: Float, y: Float, chips: NDArray[np.int64]) -> Positions:
+def _forth(a: Application, x: Float, y: Float, chips: Int) -> Positions:
     return _gathered(
         {n: (chips == n, a.forward(x[chips == n], y[chips == n], chip=n)) for n in a.chips}, x.size
     )
@@ -108,7 +106,7 @@ def _back(
     found: Calibration,
     X: Float,
     Y: Float,
-    chips: NDArray[np.int64] | None,
+    chips: Int | None,
     method: str,
     order: int | None,
     epoch: float | None,
@@ -148,7 +146,7 @@ def _back(
     return Positions(x, y, at.cov, at.chip), lines
 
 
-def _gathered(parts: dict[int, tuple[NDArray[np.bool_], Positions]], n: int) -> Positions:
+def _gathered(parts: dict[int, tuple[Bool, Positions]], n: int) -> Positions:
     """Positions of several chips in the order of the rows."""
     at = np.full((2, n), np.nan)
     number = np.zeros(n, np.int64)

@@ -37,26 +37,11 @@ def calibration_at(
 ) -> Calibration:
     """The calibration of a file or a run.
 
-    Parameters
-    ----------
-    path : path
-        A file of any format, a run directory, posterior.nc or fit.nc.
-    filter : str, optional
-        Of an IDCTAB; names of both wheels may be joined by a comma.  The band of WISE meta-data.
-    scale : float, optional
-        Size of a corrected pixel, in the unit of the calibration.
-    size : tuple of float, optional
-        Columns and rows, for a SIP header that does not say.
-
-    Returns
-    -------
-    Calibration
-
-    Raises
-    ------
-    InputError
-        For a file that holds no calibration, a filter that is missing or not there, or a scale that
-        is not positive.
+    `path`: a file of any format, a run directory, posterior.nc or fit.nc. `filter`: of an IDCTAB;
+    names of both wheels may be joined by a comma. The band of WISE meta-data. `scale`: size of a
+    corrected pixel, in the unit of the calibration. `size`: columns and rows, for a SIP header that
+    does not say. InputError for a file that holds no calibration, a filter that is missing or not
+    there, or a scale that is not positive.
     """
     path = Path(path)
     if not path.exists():
@@ -183,20 +168,8 @@ def images_of(
 ) -> dict[int, Subarray]:
     """Where pixels lie on their chips, as one of three options says; empty for whole chips.
 
-    Parameters
-    ----------
-    found : Calibration
-    image : path, optional
-        A calibrated image.
-    ltv : tuple of float, optional
-        LTV1, LTV2.
-    corner : tuple of float, optional
-        The pixel of the chip that is the subarray's first.
-
-    Raises
-    ------
-    InputError
-        For more than one of them, or as `subarrays_of_image`.
+    `image`: a calibrated image. `ltv`: LTV1, LTV2. `corner`: the pixel of the chip that is the
+    subarray's first. InputError for more than one of them, or as `subarrays_of_image`.
     """
     given = [("--image", image), ("--ltv", ltv), ("--corner", corner)]
     named = [name for name, value in given if value is not None]

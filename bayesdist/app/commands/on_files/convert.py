@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from bayesdist.app.commands.on_files.calibrations import (
@@ -19,6 +18,7 @@ from bayesdist.app.commands.on_files.calibrations import (
 )
 from bayesdist.app.screen import number as digits
 from bayesdist.app.store.output import refuse_existing
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC
@@ -37,8 +37,6 @@ from bayesdist.products.registry import build, format_of, open_document, product
 from bayesdist.reading.documents import toml_of
 
 __all__ = ["convert"]
-
-Float = NDArray[np.float64]
 
 _GRID = 65  # points of each axis over which the loss is measured
 _ROUNDING = 1e-6  # pixels: what is less is called none

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
 from bayesdist.app.commands.on_files.init_detector import quoted
+from bayesdist.arrays import Float
 from bayesdist.data import Matches
 from bayesdist.data.formats.layout import TableLayout
 from bayesdist.model.basis import polynomial_terms
@@ -27,12 +27,8 @@ _NONE = """\
 def column_lines(layout: TableLayout | None, columns: Mapping[str, str] | None) -> str:
     """Lines of [data] that name the columns taken, the pixel origin and the epochs.
 
-    Parameters
-    ----------
-    layout : TableLayout or None
-        None of a format that fixes its columns.
-    columns : mapping of str to str, or None
-        As the user names them; empty names stay.
+    `layout`: none of a format that fixes its columns. `columns`: as the user names them; empty
+    names stay.
     """
     if layout is None:
         return _NONE + "# pixel_origin = 1              # of x, y: 1 as in FITS, or 0\n"
@@ -88,7 +84,7 @@ def guessed_sigma(table: Matches) -> float | None:
     """
     i, j = np.array(polynomial_terms(ORDER)).T
     groups = table.exposure * len(table.chip_numbers) + table.chip
-    residuals: list[NDArray[np.float64]] = []
+    residuals: list[Float] = []
     for group in np.unique(groups):
         rows = groups == group
         if rows.sum() < EACH * len(i):

@@ -32,20 +32,11 @@ reference_pixel = [{cx}, {cy}]  # zero point of the polynomial
 
 @dataclass(frozen=True)
 class DetectorLines:
-    """Lines of a configuration on the detector, or on its chips.
-
-    Parameters
-    ----------
-    text : str
-    size : tuple of int
-        Columns and rows of the first chip.
-    several : bool
-        True of several chips.
-    """
+    """Lines of a configuration on the detector, or on its chips."""
 
     text: str
-    size: tuple[int, int]
-    several: bool
+    size: tuple[int, int]  # columns and rows of the first chip
+    several: bool  # true of several chips
 
     @property
     def middle(self) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.store.output import refuse_existing
+from bayesdist.arrays import Float, Int
 from bayesdist.calibration.apply import Positions
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
@@ -28,7 +29,6 @@ __all__ = [
 
 log = logging.getLogger("bayesdist")
 
-Float = NDArray[np.float64]
 
 OUT = ("x_out", "y_out")
 _FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits"}
@@ -72,7 +72,7 @@ def position_column(table: Table, name: str, where: str) -> Float:
 
 def chip_numbers(
     table: Table, chip: int | None, known: Sequence[int], name: str, where: str
-) -> NDArray[np.int64]:
+) -> Int:
     """Chip (N,) of each row, by an option or a column.
 
     `known` are the chips of the calibration; `name` and `where` are what to call it and the table.

@@ -10,7 +10,6 @@ import numpy as np
 from astropy import units
 from astropy.io import fits
 from astropy.table import QTable, Table
-from numpy.typing import NDArray
 
 from bayesdist.app.commands.on_files.calibrations import calibration_at, notes_of, on_the_sky
 from bayesdist.app.commands.on_files.position_table import (
@@ -22,6 +21,7 @@ from bayesdist.app.commands.on_files.position_table import (
     write_positions,
 )
 from bayesdist.app.screen import number
+from bayesdist.arrays import Float
 from bayesdist.calibration.apply import on_chip
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.sky_positions import SkyPositions, sky_positions
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     import pandas
 
 __all__ = ["apply_to_sky", "sky_to_table"]
-
-Float = NDArray[np.float64]
 
 COLUMNS = ("ra", "dec", "sigma_ra", "sigma_dec", "corr_ra_dec")
 COVARIANCE = "covariance"

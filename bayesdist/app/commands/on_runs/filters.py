@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 from astropy.table import Table
-from numpy.typing import NDArray
 
 from bayesdist.app.kinds.fitted import Fitted, required
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.infer.series import FilterDependence, Series, TrendModel, filter_dependence
 from bayesdist.infer.solution import Solution
@@ -23,8 +23,6 @@ from bayesdist.model import TimeDependence
 
 __all__ = ["FilterComparison", "compare_filters", "comparison_table", "draw_filters"]
 
-
-Float = NDArray[np.float64]
 Measured = tuple[float, float]  # value and standard deviation
 
 # places of the linear terms: power of x, power of y
@@ -33,27 +31,17 @@ POWERS = {"2": (1, 0), "3": (0, 1)}
 
 @dataclass(frozen=True, eq=False)
 class FilterComparison:
-    """Differences between filters, as exposures that were each fitted alone show them.
+    """Differences between filters, as exposures that were each fitted alone show them."""
 
-    Parameters
-    ----------
-    reference : str
-        The filter that the others are compared with.
-    offsets : dict of (filter, term) to (value, sigma)
-        What a filter adds to a drifting term, as 'WFC2.A_2', where all filters drift alike.
-    rates : dict of (filter, term) to (value, sigma)
-        What it adds to the term's rate, per year, where it has rates of its own.
-    p_value : float
-        Probability of such differences of rates where there are none: the least of all chips,
-        multiplied by their number.
-    depends : bool
-        Whether on some chip rates of each filter's own predict exposures better that were not used.
-    """
-
-    reference: str
+    reference: str  # the filter that the others are compared with
+    # what a filter adds to a drifting term, as 'WFC2.A_2', where all filters drift alike
     offsets: Mapping[tuple[str, str], Measured]
+    # what it adds to the term's rate, per year, where it has rates of its own
     rates: Mapping[tuple[str, str], Measured]
+    # probability of such differences of rates where there are none: the least of all chips,
+    # multiplied by their number
     p_value: float
+    # whether on some chip rates of each filter's own predict exposures better that were not used
     depends: bool
 
     @property
@@ -79,20 +67,9 @@ def compare_filters(
 ) -> FilterComparison:
     """Compare the drifting terms of exposures in several filters, chip by chip.
 
-    Parameters
-    ----------
-    series : mapping of filter to Series
-        The reference filter first.
-    time : TimeDependence or None
-        What drifts.
-    seed : int
-
-    Raises
-    ------
-    InputError
-        For one filter only, and where nothing drifts or no term is known in all filters.
-    DegenerateError
-        For a filter whose exposures do not determine rates of its own.
+    `series`: the reference filter first. `time`: what drifts. InputError for one filter only, and
+    where nothing drifts or no term is known in all filters. DegenerateError for a filter whose
+    exposures do not determine rates of its own.
     """
     if time is None:
         raise InputError("nothing drifts", where="model.tdd", do="give the terms that do")
@@ -244,13 +221,7 @@ def draw_filters(
 ) -> tuple[str, ...]:
     """Write filters_A_2.png and the like, and return their names.
 
-    Parameters
-    ----------
-    folder : Path
-    fits : mapping of filter to Fitted
-        The reference filter first.
-    solutions : mapping of filter to Solution
-        As they are released.
+    `fits`: the reference filter first. `solutions`: as they are released.
     """
     # figures take seconds to import
     from bayesdist.report.drawing import save_figures

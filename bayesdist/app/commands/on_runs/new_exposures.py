@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
@@ -22,32 +21,17 @@ from bayesdist.infer.linear import Rejection
 
 __all__ = ["fit_exposures_of", "read_new_exposures"]
 
-Float = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class NewExposures:
-    """Pairs of exposures that a release has not seen, and what is known of them.
+    """Pairs of exposures that a release has not seen, and what is known of them."""
 
-    Parameters
-    ----------
-    released : Posterior
-        With the errors of the catalogue, and those that its stars share.
-    matches : Matches
-        At the pixels that the release's tables have corrected, with errors.
-    errors : StarErrors or None
-        Of the catalogue; None where stars have no codes, or pairs no errors of it.
-    same_catalogue : bool
-        Whether it is that of the release, with the same codes of stars.
-    left_out : tuple of str
-        Exposures that the release has been made from.
-    """
-
-    released: Posterior
-    matches: Matches
+    released: Posterior  # with the errors of the catalogue, and those that its stars share
+    matches: Matches  # at the pixels that the release's tables have corrected, with errors
+    # of the catalogue; None where stars have no codes, or pairs no errors of it
     errors: StarErrors | None
-    same_catalogue: bool
-    left_out: tuple[str, ...]
+    same_catalogue: bool  # whether it is that of the release, with the same codes of stars
+    left_out: tuple[str, ...]  # exposures that the release has been made from
 
 
 def read_new_exposures(
@@ -55,23 +39,11 @@ def read_new_exposures(
 ) -> NewExposures:
     """Matched pairs of new exposures: those of another run, or a table.
 
-    Parameters
-    ----------
-    release : RunDirectory
-        Of a campaign.
-    released : Posterior
-        Its solution, with all errors.
-    fitted : Fitted
-        Its fit.
-    new : Path
-        Run directory of a campaign whose stage 'match' has been run, or pairs in a file or folder
-        as a run keeps them.
-
-    Raises
-    ------
-    InputError
-        For star lists, which have to be matched first; pairs in another unit or filter, without
-        epochs, or without a way to errors; when all exposures are those of the release.
+    `release`: of a campaign. `released`: its solution, with all errors. `fitted`: its fit. `new`:
+    run directory of a campaign whose stage 'match' has been run, or pairs in a file or folder as a
+    run keeps them. InputError for star lists, which have to be matched first; pairs in another unit
+    or filter, without epochs, or without a way to errors; when all exposures are those of the
+    release.
     """
     run = RunDirectory(new) if (new / "run.json").exists() else None
     pairs = _pairs(run, new, released.model.unit)

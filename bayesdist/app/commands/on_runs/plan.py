@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.commands.on_runs.judging import probability_met
 from bayesdist.app.results import Results, open_results
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.margins import judged_requirements
+from bayesdist.arrays import Float
 from bayesdist.assess.planning.exposures import Schedule, exposures_needed
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.errors import InputError
@@ -96,7 +96,7 @@ def _schedules(
     """Single exposures at dates that matter to a requirement, or at any."""
     solution, epoch = results.solution, results.epoch
 
-    def worth(date: float | None) -> NDArray[np.float64]:
+    def worth(date: float | None) -> Float:
         return exposure_information(solution, content, date)
 
     if solution.model.time is None or epoch is None:

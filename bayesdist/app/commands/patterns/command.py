@@ -34,26 +34,9 @@ LEGEND = (
 def plan_patterns(path: str | Path, output: str | Path | None = None, command: str = "") -> str:
     """Compare the dither patterns of a file by the covariance to be expected.
 
-    Parameters
-    ----------
-    path : path
-        TOML with ``[[pattern]]`` blocks.
-    output : path, optional
-        New or empty folder for table, record and figure.
-    command : str
-        For the record.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    ConfigError
-        For a file that is not sound.
-    InputError
-        For a pattern whose exposures do not overlap, and a folder that is in use.
+    `path`: TOML with ``[[pattern]]`` blocks. `output`: new or empty folder for table, record and
+    figure. `command`: for the record. Result: what to print. ConfigError for a file that is not
+    sound. InputError for a pattern whose exposures do not overlap, and a folder that is in use.
     """
     config = load_plan(path)
     camera = config.camera()

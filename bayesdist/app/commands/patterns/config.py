@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, model_validator
 
 from bayesdist.app.config.assess import require_own_names
@@ -22,6 +21,7 @@ from bayesdist.app.config.section import (
     require_detector,
 )
 from bayesdist.app.config.selfcal import Frames, MinDetections, require_scales
+from bayesdist.arrays import Float
 from bayesdist.assess.planning.dithers import Camera, PlannedStars, PriorInformation
 from bayesdist.model import Chip
 from bayesdist.simulate.dithers import dither_pattern
@@ -232,9 +232,7 @@ def _pattern(block: PatternBlock, side: float, seed: int) -> DitherPattern:
     return _against_first(block.name, round_, rolls_in_turn(n, len(round_), own))
 
 
-def _against_first(
-    name: str, round_: NDArray[np.float64], rolls_deg: NDArray[np.float64]
-) -> DitherPattern:
+def _against_first(name: str, round_: Float, rolls_deg: Float) -> DitherPattern:
     offsets = round_[np.arange(len(rolls_deg)) % len(round_)]
     return DitherPattern(name, offsets - offsets[0], np.radians(rolls_deg - rolls_deg[0]))
 
@@ -242,10 +240,7 @@ def _against_first(
 def load_plan(path: str | Path) -> PlanConfig:
     """Read a file of patterns.
 
-    Raises
-    ------
-    ConfigError
-        With file, key and reason; an unknown key names the nearest known one.
+    ConfigError with file, key and reason; an unknown key names the nearest known one.
     """
     config: PlanConfig = validated(
         PlanConfig, load_text(path), str(path), begin="give it [[pattern]] blocks"

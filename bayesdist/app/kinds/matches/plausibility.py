@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
+from bayesdist.arrays import Float
 from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel, TimeDependence
 
 __all__ = ["doubts_on_stars", "refuse_empty_segments"]
-
-Float = NDArray[np.float64]
 
 OFF = 1e3  # factor on the scale by which u and v cannot be those of the detector
 ODD = 3.0  # factor that is worth a warning
@@ -28,10 +26,7 @@ YEARS = (1950.0, 2100.0)
 def doubts_on_stars(stars: Matches, model: DistortionModel, config: Config) -> list[str]:
     """Sentences on what is odd about matched stars, by all of them or a sample, in memory.
 
-    Raises
-    ------
-    InputError
-        For a scale of u and v, quoted errors or epochs that cannot be meant.
+    InputError for a scale of u and v, quoted errors or epochs that cannot be meant.
     """
     return list(_doubts(stars, model.unit, config.detector.scale_mas))
 

@@ -116,22 +116,14 @@ class RunInput(Protocol):
 
 @dataclass(frozen=True)
 class MatchSource:
-    """Reader of the matches of one format.
+    """Reader of the matches of one format."""
 
-    Parameters
-    ----------
-    read : callable
-        Of paths, the section [data] as the mission has it, and columns and rows of the detector:
-        the matches in memory.
-    input_of : callable
-        Of the folder of a run: its `RunInput`.
-    template : callable
-        Of a path that `bayesdist init` is given: the number of matches and what they put into the
-        template of a configuration; None where the files are of another format.
-    """
-
+    # of paths, the section [data] as the mission has it, and columns and rows of the detector: the
+    # matches in memory
     read: Callable[[Paths, Any, tuple[float, float]], Matches]
-    input_of: Callable[[RunDirectory], RunInput]
+    input_of: Callable[[RunDirectory], RunInput]  # of the folder of a run: its `RunInput`
+    # of a path that `bayesdist init` is given: the number of matches and what they put into the
+    # template of a configuration; None where the files are of another format
     template: Callable[[str | Path], Template | None]
 
 

@@ -64,12 +64,8 @@ SAMPLING = 1  # of the random streams that follow from the one seed: that of the
 def match_stars(stars: Matches, config: MatchesConfig) -> Matched:
     """Matched stars of a configuration, those that are fitted and those that are held out.
 
-    Raises
-    ------
-    InputError
-        For files that cannot be read, and as `set_aside`.
-    ConfigError
-        For settings that do not go with nominal positions.
+    InputError for files that cannot be read, and as `set_aside`. ConfigError for settings that do
+    not go with nominal positions.
     """
     if stars.has_nominal:
         try:  # columns may be found by their names
@@ -83,10 +79,7 @@ def match_stars(stars: Matches, config: MatchesConfig) -> Matched:
 def read_stars(config: MatchesConfig, base: Path) -> Matches:
     """The matched stars that a configuration names.
 
-    Raises
-    ------
-    InputError
-        For a configuration that names none, and for files that cannot be read.
+    InputError for a configuration that names none, and for files that cannot be read.
     """
     data = config.data
     return read_configured(data.paths(base), data, size=config.detector.size, chips=config.chip)
@@ -95,10 +88,7 @@ def read_stars(config: MatchesConfig, base: Path) -> Matches:
 def model_of(stars: Matches, config: Config) -> DistortionModel:
     """The model that a configuration asks for, for these stars.
 
-    Raises
-    ------
-    InputError
-        For chips that only one side knows, and as `build_model`.
+    InputError for chips that only one side knows, and as `build_model`.
     """
     check_chips(config.chips(), stars.chip_numbers)
     return build_model(
@@ -121,19 +111,9 @@ def fit_stars(
 ) -> Fitted:
     """The linear fit of matched stars, with the errors that its residuals ask for.
 
-    Parameters
-    ----------
-    matched : Matched
-    config : Config
-    base : Path
-        That the file of an earlier calibration is relative to.
-    reader : StarReader, optional
-        Has the stars in the end, for the passes that follow.
-
-    Raises
-    ------
-    InputError
-        Where it cannot be made; with the frames of the exposures that would help.
+    `base`: that the file of an earlier calibration is relative to. `reader`: has the stars in the
+    end, for the passes that follow. InputError where it cannot be made; with the frames of the
+    exposures that would help.
     """
     if reader is None:
         with closing(StarReader(config.resources())) as reader:
@@ -214,10 +194,7 @@ def shards_of(
 ) -> Shards:
     """Stars as passes go over them, none of them outside the circle in which it was matched.
 
-    Raises
-    ------
-    InputError
-        Naming a star that is.
+    InputError naming a star that is.
     """
     shards = reader.shards(model, stars, errors)
     if knows_circle(config) and stars.has_nominal:
@@ -228,10 +205,7 @@ def shards_of(
 def priors_of(model: DistortionModel, config: Config) -> GaussianPriors:
     """Priors of the parameters, as the configuration gives them.
 
-    Raises
-    ------
-    InputError
-        For a parameter that the model does not have.
+    InputError for a parameter that the model does not have.
     """
     return GaussianPriors.of(model, {p.parameter: (p.mean, p.sigma) for p in config.prior})
 
@@ -265,11 +239,8 @@ def earlier_calibration(
 ) -> CalibrationPrior | None:
     """Prior of a model by the calibration that a configuration names; None where it names none.
 
-    Raises
-    ------
-    InputError
-        For a file that is no calibration, a run that has not converged, and as
-        `prior_of_calibration`.
+    InputError for a file that is no calibration, a run that has not converged, and as
+    `prior_of_calibration`.
     """
     block = config.prior_calibration
     if block is None:

@@ -10,13 +10,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 
 __all__ = ["FunctionField", "Functions"]
-
-Float = NDArray[np.float64]
 
 MANY = 64  # functions from which on their values are kept, not their coefficients alone
 
@@ -31,28 +30,17 @@ class OfPosition(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Functions:
-    """Errors that are sums of functions of the position: draw k is row k mod n' of coefficients.
-
-    Parameters
-    ----------
-    row : Row
-    coefficients : mapping of int to ndarray, shape (n', 2, m)
-        By chip number; a chip that is not there has no such error.  Under None, those of all chips.
-    functions : callable
-        Of chip number, x and y.
-    n_draws : int
-    uniform : bool
-        Whether the error is the same at all positions.
-    covariance : mapping of int to ndarray, shape (2, m, m), optional
-        Of the coefficients, where it is stated: mean squares are exact then, and it is not known
-        how well their size is.
-    """
+    """Errors that are sums of functions of the position: draw k is row k mod n' of coefficients."""
 
     row: Row
+    # (n', 2, m), by chip number; a chip that is not there has no such error. Under None, those of
+    # all chips
     coefficients: Mapping[int | None, NDArray[np.floating]]
-    functions: OfPosition
+    functions: OfPosition  # of chip number, x and y
     n_draws: int
-    uniform: bool = False
+    uniform: bool = False  # whether the error is the same at all positions
+    # (2, m, m), of the coefficients, where it is stated: mean squares are exact then, and it is not
+    # known how well their size is
     covariance: Mapping[int | None, Float] | None = None
     _cache: dict[EvaluationDomain, FunctionField] = field(default_factory=dict, repr=False)
 

@@ -7,14 +7,12 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms.rows import ErrorField, Image, Noise, Row, Scale
 
 __all__ = ["Independent", "Known", "KnownField", "NoiseField"]
-
-Float = NDArray[np.float64]
 
 
 class SigmaAt(Protocol):
@@ -27,22 +25,12 @@ class SigmaAt(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Independent:
-    """Errors that are independent from position to position.
-
-    Parameters
-    ----------
-    row : Row
-    sigma : callable
-        Of a domain.
-    sizes : mapping of int to ndarray, shape (n, 2)
-        As of `Noise`.
-    known : mapping of int to float
-        By chip number: how well the size is known, relative to it.
-    """
+    """Errors that are independent from position to position."""
 
     row: Row
-    sigma: SigmaAt
-    sizes: Mapping[int, Float] = field(default_factory=dict)
+    sigma: SigmaAt  # of a domain
+    sizes: Mapping[int, Float] = field(default_factory=dict)  # (n, 2), as of `Noise`
+    # by chip number: how well the size is known, relative to it
     known: Mapping[int, float | None] = field(default_factory=dict)
 
     def on(self, domain: EvaluationDomain, image: Image) -> NoiseField:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
@@ -16,9 +16,6 @@ from bayesdist.calibration.chip_map import position_moments
 from bayesdist.model import DistortionModel
 
 __all__ = ["PolynomialField", "Polynomials", "polynomial_errors", "without_rigid"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 def polynomial_errors(
@@ -94,30 +91,16 @@ class AddedPolynomials(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Polynomials:
-    """Errors of parameters: on any chip at any epoch a polynomial.
-
-    Parameters
-    ----------
-    row : Row
-    model : DistortionModel
-    mean : ndarray, shape (D,)
-        Where there is no error.
-    theta : ndarray, shape (n, D)
-    exposure : int or None
-        Code of an exposure whose frame errs, and takes the place of any new one.
-    frames : bool
-        Whether the frame of the exposure of each draw's star errs.
-    more : tuple
-        What is added to these polynomials.
-    """
+    """Errors of parameters: on any chip at any epoch a polynomial."""
 
     row: Row
     model: DistortionModel
-    mean: Float
-    theta: Float
+    mean: Float  # (D,), where there is no error
+    theta: Float  # (n, D)
+    # code of an exposure whose frame errs, and takes the place of any new one
     exposure: int | None = None
-    frames: bool = False
-    more: tuple[AddedPolynomials, ...] = ()
+    frames: bool = False  # whether the frame of the exposure of each draw's star errs
+    more: tuple[AddedPolynomials, ...] = ()  # what is added to these polynomials
 
     def on(self, domain: EvaluationDomain, image: Image) -> PolynomialField:
         """The errors at the positions of a domain, less what an alignment takes up."""

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.assess.domain import EvaluationDomain
 
 __all__ = [
@@ -33,8 +33,6 @@ __all__ = [
     "Scale",
 ]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 Scale = Mapping[str, float]
 
 LOCAL, PRODUCT = "local", "product"
@@ -45,41 +43,26 @@ BLOCK = 200_000  # positions times draws that are evaluated at once
 
 @dataclass(frozen=True)
 class Row:
-    """One row of a budget.
-
-    Parameters
-    ----------
-    name : str
-    kind : str
-        'systematic' (shared by all stars of an image), 'random' (of each star), 'local' (shared by
-        the stars near a position) or 'product' (of a file: known, and no error).
-    source : str
-        Begins with 'measured in this run', 'given by the user' or 'published'.
-    in_total : bool
-        False for a row that is shown beside the others, as these hold it already.
-    """
+    """One row of a budget."""
 
     name: str
+    # 'systematic' (shared by all stars of an image), 'random' (of each star), 'local' (shared by
+    # the stars near a position) or 'product' (of a file: known, and no error)
     kind: str = "systematic"
-    source: str = MEASURED
+    source: str = MEASURED  # begins with 'measured in this run', 'given by the user' or 'published'
+    # false for a row that is shown beside the others, as these hold it already
     in_total: bool = True
 
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """In which image a position is asked for.
+    """In which image a position is asked for."""
 
-    Parameters
-    ----------
-    exposure : ndarray of int, shape (n,), or None
-        Code of the exposure in which the star of each draw lies; None for a new exposure, or one of
-        a model without frames.
-    aligned_by : ndarray, shape (D,), or None
-        Parameters of the positions to which the observer has fitted shift and rotation of the whole
-        detector; None where nobody has.
-    """
-
+    # (n,), code of the exposure in which the star of each draw lies; None for a new exposure, or
+    # one of a model without frames
     exposure: Int | None = None
+    # (D,), parameters of the positions to which the observer has fitted shift and rotation of the
+    # whole detector; None where nobody has
     aligned_by: Float | None = None
 
 
@@ -106,19 +89,12 @@ class ErrorDraws(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Errors that are independent from position to position.
+    """Errors that are independent from position to position."""
 
-    Parameters
-    ----------
-    name : str
-        Of the row.
-    sigma : ndarray, shape (N, 2)
-    sizes : mapping of int to ndarray, shape (n, 2)
-        By chip number, what the variances of each draw are multiplied by; 1 where it is not there.
-    """
-
-    name: str
-    sigma: Float
+    name: str  # of the row
+    sigma: Float  # (N, 2)
+    # (n, 2), by chip number, what the variances of each draw are multiplied by; 1 where it is not
+    # there
     sizes: Mapping[int, Float] = field(default_factory=dict)
 
 

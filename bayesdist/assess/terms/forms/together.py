@@ -6,16 +6,14 @@ from dataclasses import dataclass
 from functools import cached_property, reduce
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms.functions import Functions
 from bayesdist.assess.terms.forms.polynomials import Polynomials
 from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
 
 __all__ = ["Together", "TogetherField"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,16 +23,10 @@ class Together:
     The joint error is the sum of the rows that are in the total.  Rows that are not are held by it:
     where one of them shrinks, the joint error does so at each position as the row's fraction of its
     variance says.
-
-    Parameters
-    ----------
-    draws : tuple
-        One for each row.
-    remainder : bool
-        Whether the last row counts as much as the joint error has beyond the other rows.
     """
 
-    draws: tuple[Polynomials | Functions, ...]
+    draws: tuple[Polynomials | Functions, ...]  # one for each row
+    # whether the last row counts as much as the joint error has beyond the other rows
     remainder: bool = False
 
     def on(self, domain: EvaluationDomain, image: Image) -> TogetherField:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.missions.acs.handbook.numbers import detector_numbers
 from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 from bayesdist.numbers import size_of
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
 __all__ = ["area_figure", "non_linear_figure", "residual_figure"]
-
-Float = NDArray[np.float64]
 
 # vectors, and points of contours, along the longer side of a chip
 _VECTORS, _POINTS = 21, 65

@@ -13,16 +13,15 @@ from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.area import pixel_areas
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import InputError
 from bayesdist.model.grid import mesh
 
 __all__ = ["WholeDetector"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.data.detections import Detections
 from bayesdist.missions.acs.simulate.stars import FAINT, centroid_error
 from bayesdist.missions.acs.simulate.truth import AcsTruth, DetectionTruth
 from bayesdist.model import Chip
 
 __all__ = ["Detector", "cte_shift", "star_list"]
-
-Float = NDArray[np.float64]
 
 BORDER = 5.0  # pixels: too close to an edge for a fit
 LIMIT, SOFT = -7.5, 0.3  # magnitude at which half of the stars are found, and width of the decline
@@ -75,11 +74,9 @@ def star_list(
     return Detections(exposure_names=(exposure,), **columns), DetectionTruth(star, blended)
 
 
-def _inside(x: Float, y: Float, chip: Chip) -> NDArray[np.bool_]:
+def _inside(x: Float, y: Float, chip: Chip) -> Bool:
     nx, ny = chip.size
-    out: NDArray[np.bool_] = (
-        (x >= BORDER) & (x <= nx + 1 - BORDER) & (y >= BORDER) & (y <= ny + 1 - BORDER)
-    )
+    out: Bool = (x >= BORDER) & (x <= nx + 1 - BORDER) & (y >= BORDER) & (y <= ny + 1 - BORDER)
     return out  # NaN is not inside
 
 

@@ -12,14 +12,12 @@ from __future__ import annotations
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
 __all__ = ["ACS_FILTERS", "SM4", "acs_model", "acs_solution"]
-
-Float = NDArray[np.float64]
 
 SM4 = 2009.4  # Servicing Mission 4, May 2009
 EPOCH0 = (2004.5, 2012.5)  # RDATE of Tables 1-3

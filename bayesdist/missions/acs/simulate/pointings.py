@@ -14,16 +14,14 @@ import astropy.units as apu
 import numpy as np
 from astropy.coordinates import get_body_barycentric
 from astropy.time import Time
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.data.exposures import Exposure, ExposureLog
 from bayesdist.data.sky.earth import velocity_aberration
 from bayesdist.missions.acs.simulate.distortion import SM4
 from bayesdist.missions.acs.simulate.stars import CENTRE
 
 __all__ = ["AcsFrames", "exposures_of", "frames_of"]
-
-Float = NDArray[np.float64]
 
 # Of the catalogue's pixel (5000, 5000): 00h 22m 35.0s, -72d 04' 00"
 RA, DEC = 5.645833333333333, -72.06666666666666
@@ -61,7 +59,7 @@ class AcsFrames:
     vafactor: Float  # (E,), scale by velocity aberration
     shared: Float  # (E, 2, 2), deviation of the linear terms (breathing), both chips
     own: Float  # (E, 2, 2), of WFC1 beyond that
-    outlying: NDArray[np.bool_]  # (E,), deviations drawn ten times larger
+    outlying: Bool  # (E,), deviations drawn ten times larger
     zero_point: Float  # (E,), measured less catalogue magnitude
 
     def __len__(self) -> int:

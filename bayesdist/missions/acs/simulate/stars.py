@@ -9,14 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bayesdist.arrays import Float
 from bayesdist.data import ReferenceCatalog
 
 __all__ = ["CENTRE", "FAINT", "TrueStars", "centroid_error", "measured_catalogs", "true_stars"]
-
-Float = NDArray[np.float64]
 
 HALF_SIZE = 4500.0  # pixels from the centre to each side
 CENTRE = (5000.0, 5000.0)

@@ -9,17 +9,15 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cholesky
 from scipy.sparse import csr_array
 
+from bayesdist.arrays import Float
 from bayesdist.missions.acs.simulate.distortion import CHIPS, EPOCH0, HALF, acs_solution
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.lookup import LookupTable
 
 __all__ = ["detector_tables", "filter_tables"]
-
-Float = NDArray[np.float64]
 
 STEP = 64.0
 SHAPE = (32, 64)  # nodes along y and x

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import polynomial
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.exposures import ExposureLog
@@ -18,8 +19,6 @@ from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.lookup import LookupTable, corrected
 
 __all__ = ["LINEAR_TERMS", "AcsCampaign", "AcsTruth", "DetectionTruth"]
-
-Float = NDArray[np.float64]
 
 LINEAR_TERMS = ("A_1", "A_2", "A_3", "B_1", "B_2", "B_3")
 CLOSE = 1e-10  # pixels: largest error of an inverse
@@ -39,8 +38,8 @@ class DetectionTruth:
         Stars whose position is drawn towards a close neighbour.
     """
 
-    star: NDArray[np.int64]
-    blended: NDArray[np.bool_]
+    star: Int
+    blended: Bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,10 +228,10 @@ class Field:
         A = np.stack([self.powers[1, 0], self.powers[0, 1]], axis=-1)
         return np.linalg.solve(A, np.stack([u, v]) - self.powers[0, 0][:, None])
 
-    def near(self, u: Float, v: Float) -> NDArray[np.bool_]:
+    def near(self, u: Float, v: Float) -> Bool:
         """Boolean mask of the positions (N,) that may lie on the chip."""
         X, Y = self._linear_inverse(u, v)
-        out: NDArray[np.bool_] = np.maximum(np.abs(X), np.abs(Y)) < 1.0 + self.MARGIN
+        out: Bool = np.maximum(np.abs(X), np.abs(Y)) < 1.0 + self.MARGIN
         return out
 
     def inverse(self, u: Float, v: Float) -> tuple[Float, Float]:

@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.vectors import VectorMap, distortion_vectors
 from bayesdist.infer.solution import Solution
@@ -19,8 +20,6 @@ from bayesdist.model import PolynomialBasis
 from bayesdist.model.grid import grid_pixels
 
 __all__ = ["DistortionField", "field_of_solution"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,17 +10,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.residuals.binned import BinnedSums, band_bins
 from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.missions.wise.assess.distortion_field import DistortionField
 
 __all__ = ["BandSums", "ResidualHistogram", "band_sums", "histogram"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 CALIBRATED = "calibrated"
 HISTOGRAM_BINS = 401  # an odd number: one of them lies about zero

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
+from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.residuals.binned import BinnedResiduals
 from bayesdist.missions.wise.assess.residual_field import ResidualField, residual_field
 
 __all__ = ["ResidualCorrelation", "residual_correlation"]
-
-Float = NDArray[np.float64]
 
 DRAWS = 500  # noise fields that give mean and sigma, and half a thousand more for the ranks
 _AT_ONCE = 50
@@ -33,7 +31,7 @@ class ResidualCorrelation:
     sigma_uu: Float  # (R,), their standard deviations where noise is all there is
     sigma_vv: Float  # (R,)
     sigma_uv: Float  # (R,)
-    n_pairs: NDArray[np.int64]  # (R,), pairs of bins in the ring
+    n_pairs: Int  # (R,), pairs of bins in the ring
     chi2: float  # sum of the squares of all three functions over their sigmas
     p_value: float  # share of noise fields with as large a sum; not below 1 / 500
 
@@ -93,12 +91,12 @@ class _Rings:
     """Lags between bins, sorted into rings of separation."""
 
     shape: tuple[int, int]
-    ring: NDArray[np.int64]
+    ring: Int
     counts: Float
     separation: Float
 
     @property
-    def n_pairs(self) -> NDArray[np.int64]:
+    def n_pairs(self) -> Int:
         # every pair is met from both of its bins
         return np.rint(self.counts / 2).astype(np.int64)
 

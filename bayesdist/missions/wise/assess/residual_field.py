@@ -7,15 +7,13 @@ from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.diagnose.residuals.binned import BinnedResiduals
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.model.basis import polynomial_terms
 
 __all__ = ["ResidualField", "residual_field", "scaled"]
-
-Float = NDArray[np.float64]
 
 _FEWEST_STARS = 5
 
@@ -26,7 +24,7 @@ class ResidualField:
 
     x: Float  # (nx,)
     y: Float  # (ny,), centres of the bins, FITS 1-based pixels
-    used: NDArray[np.bool_]  # (ny, nx), bins of five stars or more
+    used: Bool  # (ny, nx), bins of five stars or more
     sem: Float  # (2, M), noise of the means in u and v of the M used bins
     white: Float  # (2, M), means over their noise, the polynomial removed
     absorbed: Float  # (2, M, K), orthonormal columns: what polynomials can do to the whitened means

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.diagnose.residuals.binned import BinnedResiduals
 from bayesdist.distributions import f_sf
 from bayesdist.errors import DegenerateError, InputError
@@ -23,7 +23,6 @@ from bayesdist.model.basis import polynomial_terms
 
 __all__ = ["ResidualPartition", "residual_partition"]
 
-Float = NDArray[np.float64]
 Base = tuple[Float, Float]
 
 PARTITIONS = tuple(range(2, 13))

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput
 from bayesdist.numbers import number, size_of
 from bayesdist.report.figures.arrows import Arrows, cross_map, magnification_of, spacing, vector_map
@@ -31,7 +31,6 @@ __all__ = [
     "vectors",
 ]
 
-Float = NDArray[np.float64]
 Size = tuple[float, float]
 
 EVERY = 2  # every second vector of a map is drawn: more would hide each other in small panels

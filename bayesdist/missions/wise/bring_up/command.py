@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 from astropy.table import Table
-from numpy.typing import NDArray
 
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.output import record_folder, write_table
+from bayesdist.arrays import Float
 from bayesdist.data.detections import Detections
 from bayesdist.data.tables.column import SourceColumn, row_number
 from bayesdist.data.tables.names import find_columns
@@ -26,8 +26,6 @@ from bayesdist.model import Chip, DistortionModel
 from bayesdist.reading.tables import read_table
 
 __all__ = ["bring_up_files"]
-
-Float = NDArray[np.float64]
 
 _COLUMNS = {
     "x": ("x",),

@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
@@ -23,10 +23,6 @@ from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["BringUp", "bring_up"]
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-Bool = NDArray[np.bool_]
-
 BINS = 12  # of the coverage, on each axis
 FIRST_ORDER = 2  # polynomial order of the first fit; each round may take one order more
 GROWS = 0.01  # fraction of the bins by which the coverage must rise to count as growing
@@ -35,39 +31,19 @@ SETTLED = 0.005  # fraction of the radius in the centre by which the model may s
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """One round of the bring-up: the matches and the fit to them.
+    """One round of the bring-up: the matches and the fit to them."""
 
-    Parameters
-    ----------
-    order : int
-        Polynomial order of the fit.
-    acceptance : RadialLimit
-        Matching radius, centre to corners.
-    n_pairs : int
-        All matches.
-    n_believed : int
-        Matches in covered bins, which were fitted.
-    n_false : float
-        Expected number of false matches among those fitted, from what displaced detections find.
-    coverage : float
-        Fraction of the detector's bins with detections that have enough more matches than chance.
-    rms : float
-        Rms residual of the matches that the fit used, one axis.
-    moved : float
-        Largest change of the model over the detector.
-    theta : ndarray, shape (n_params,)
-        The model after the fit; terms beyond its order are zero.
-    """
-
-    order: int
-    acceptance: RadialLimit
-    n_pairs: int
-    n_believed: int
+    order: int  # polynomial order of the fit
+    acceptance: RadialLimit  # matching radius, centre to corners
+    n_pairs: int  # all matches
+    n_believed: int  # matches in covered bins, which were fitted
+    # expected number of false matches among those fitted, from what displaced detections find
     n_false: float
+    # fraction of the detector's bins with detections that have enough more matches than chance
     coverage: float
-    rms: float
-    moved: float
-    theta: Float
+    rms: float  # rms residual of the matches that the fit used, one axis
+    moved: float  # largest change of the model over the detector
+    theta: Float  # (n_params,), the model after the fit; terms beyond its order are zero
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import poisson
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.pairs import mutual_pairs
@@ -16,10 +16,6 @@ from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.model import DistortionModel
 
 __all__ = ["Field"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 RARE = 1e-3
 DISPLACED = 10.0  # in units of the radius in the corners

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from astropy.table import Table
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.batches import BATCH
 from bayesdist.data.formats.files import input_files
 from bayesdist.data.tables.column import Columns, Place, SourceColumn, row_number
@@ -28,7 +28,6 @@ __all__ = [
     "band_name",
     "open_rvb_files",
 ]
-
 
 PathLike = str | os.PathLike[str]
 
@@ -89,7 +88,7 @@ class RvbFile:
         name = self.found[key]
         return SourceColumn(table[name], self.source, name, place)
 
-    def bands(self, table: Columns, place: Place) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+    def bands(self, table: Columns, place: Place) -> tuple[Int, tuple[str, ...]]:
         """Code of each row's band, and the bands."""
         column = self.column(table, "band", place)
         codes, labels = column.labels()
@@ -118,8 +117,6 @@ def open_rvb_files(
         out.append(RvbFile(str(file), contents, found))
     return out
 
-
-Float = NDArray[np.float64]
 
 # Pairs that fill no more than a quarter of the array are those of a smaller one: by chance this
 # many lie there with a probability of 4^-50.

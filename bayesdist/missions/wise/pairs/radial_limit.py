@@ -10,14 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 
 __all__ = ["CHI2", "OFFSET", "RadialLimit", "radial_rows"]
-
-Float = NDArray[np.float64]
 
 OFFSET = "offset beyond the radial limit"
 CHI2 = "chi-square beyond the radial limit"
@@ -59,7 +58,7 @@ def radial_rows(
     *,
     offset: RadialLimit | None = None,
     chi2: RadialLimit | None = None,
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+) -> tuple[Bool, Bool]:
     """Boolean masks of the pairs whose reference position lies near enough to the detection.
 
     `matches`: with u, v in pixels of the array. `size`: columns and rows of the array. `offset`: on

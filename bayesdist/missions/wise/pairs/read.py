@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 from astropy.table import Column
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool
 from bayesdist.data.matches import Matches
 from bayesdist.data.reading.columns import match_columns
 from bayesdist.data.reading.options import ReadOptions, check_sigma, refuse_missing_errors
@@ -33,7 +33,6 @@ from bayesdist.missions.wise.published import WISE_ARRAYS, WISE_BANDS
 
 __all__ = ["chosen_band", "read_rvb", "rvb_bands", "stream_rvb"]
 
-Float = NDArray[np.float64]
 PathLike = str | os.PathLike[str]
 
 
@@ -198,7 +197,7 @@ def _pairs(
     table: Columns,
     first: int,
     place: Place,
-    which: NDArray[np.bool_],
+    which: Bool,
     band: str,
     unit: str,
     sigma: str | float,

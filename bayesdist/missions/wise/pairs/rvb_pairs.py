@@ -15,17 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.data.storage.write import Part, write_parts
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
 
 __all__ = ["RvbPairs", "bluest_rows", "colour_of", "colours_of", "write_rvb"]
-
-
-Float = NDArray[np.float64]
 
 NO_COLOUR = "no colour"
 COLOUR = "colour"
@@ -103,7 +101,7 @@ def colour_of(magnitudes: ArrayLike) -> Float:
     return np.where(detected.sum(axis=0) >= 2, colour, np.nan)
 
 
-def bluest_rows(colour: Float, frame: NDArray[np.int64], n: int) -> NDArray[np.bool_]:
+def bluest_rows(colour: Float, frame: Int, n: int) -> Bool:
     """Boolean mask (N,) of the n rows of smallest colour of each frame; never one without."""
     order = np.lexsort((colour, frame))  # stable, NaN last within a frame
     first = np.searchsorted(frame[order], frame[order])

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.columns.labels import merged_counts
 from bayesdist.data.matches import Matches
 from bayesdist.data.tables.checks import counted
@@ -27,10 +27,6 @@ from bayesdist.missions.wise.pairs.rvb_pairs import (
 from bayesdist.missions.wise.pairs.section import RvbBlock
 
 __all__ = ["SelectedPairs"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-Rows = NDArray[np.bool_]
 
 MOST_COLOURS = 100_000_000  # rows whose colours are compared with each other, 1.6 GB of them
 
@@ -80,7 +76,7 @@ class SelectedPairs:
         found = Matches.concatenate([pairs.matches for pairs in self])
         return found.with_counts(self.n_rows, self.rejected)
 
-    def _rules(self, pairs: RvbPairs, bluest: Rows | None) -> Mapping[str, Rows]:
+    def _rules(self, pairs: RvbPairs, bluest: Bool | None) -> Mapping[str, Bool]:
         """Boolean masks of the pairs that pass, by the reason to drop the others."""
         rules = {}
         if self.selection.by_colour:
@@ -94,13 +90,13 @@ class SelectedPairs:
             rules |= {OFFSET: near, CHI2: likely}
         return rules
 
-    def _right_colour(self, pairs: RvbPairs) -> Rows:
+    def _right_colour(self, pairs: RvbPairs) -> Bool:
         """Boolean mask (N,) of the pairs with a colour within the limits."""
         colour = colours_of(pairs)
         low, high = self.selection.colour or (-np.inf, np.inf)
         return np.asarray((colour >= low) & (colour <= high))
 
-    def _bluest(self) -> Rows | None:
+    def _bluest(self) -> Bool | None:
         """Boolean mask of the rows among the bluest of their frames; None without that rule."""
         if self.selection.bluest is None:
             return None

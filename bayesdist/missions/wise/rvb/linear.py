@@ -8,15 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform
 
 __all__ = ["LinearMoments", "fit_transform", "linear_moments"]
-
-Float = NDArray[np.float64]
 
 FREE = 5  # parameters that are fitted, the first of `PARAMETERS`
 

@@ -11,14 +11,13 @@ from collections.abc import Mapping
 from dataclasses import astuple, dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 
 __all__ = ["PARAMETERS", "RvbTransform", "rereference", "transformed"]
-
-Float = NDArray[np.float64]
 
 PARAMETERS = ("shift_u", "shift_v", "rotation", "scale_u", "scale_v", "skew")
 
@@ -153,9 +152,7 @@ def rereference(
     return _moved(matches, code, *map(np.array, zip(*moves, strict=True)))
 
 
-def _moved(
-    matches: Matches, code: NDArray[np.int64], matrix: Float, shift: Float, centre: Float
-) -> Matches:
+def _moved(matches: Matches, code: Int, matrix: Float, shift: Float, centre: Float) -> Matches:
     """Pairs moved by a linear map each: that of its code."""
 
     def moved(u: Float, v: Float) -> Float:

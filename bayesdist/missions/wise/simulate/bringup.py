@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["simulate_unpaired"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 MARGIN = 40.0  # pixels by which the reference catalogue reaches beyond the detector
 CENTROID = (0.05, 0.20)  # px, from the brightest to the faintest detection
@@ -24,26 +21,14 @@ REFERENCE_SIGMA = 0.03  # px: 2MASS, some 80 mas
 
 @dataclass(frozen=True, eq=False)
 class UnpairedStars:
-    """Detections, reference stars, and the truth about them.
+    """Detections, reference stars, and the truth about them."""
 
-    Parameters
-    ----------
-    detections : Detections
-        On the detector, pixels; the exposures are the frames.
-    reference : Detections
-        Undistorted positions in the frames, pixels.
-    partner : ndarray of int, shape (N,)
-        Row of each detection's own reference star; -1 where the catalogue has none.
-    model : DistortionModel
-    theta : ndarray, shape (D,)
-        The true distortion.
-    """
-
-    detections: Detections
-    reference: Detections
+    detections: Detections  # on the detector, pixels; the exposures are the frames
+    reference: Detections  # undistorted positions in the frames, pixels
+    # (N,), row of each detection's own reference star; -1 where the catalogue has none
     partner: Int
     model: DistortionModel
-    theta: Float
+    theta: Float  # (D,), the true distortion
 
 
 def simulate_unpaired(

@@ -9,8 +9,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.missions.wise.simulate import wise_solution
@@ -19,8 +19,6 @@ from bayesdist.products import SipHeader, write_sip
 from bayesdist.products.formats.common.cards import text_card
 
 __all__ = ["DELIVERED_TURN", "optical_model", "write_optical_model"]
-
-Float = NDArray[np.float64]
 
 BAND = "W2"  # whose longest differences from the optical model the made-up one has
 DELIVERED_TURN = 270

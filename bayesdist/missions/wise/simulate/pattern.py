@@ -10,13 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.model import PolynomialBasis
 
 __all__ = ["BLOCKS", "PartitionPattern", "partition_pattern"]
-
-Float = NDArray[np.float64]
 
 BLOCKS = {"W1": 5, "W2": 5, "W3": 2}  # on each axis
 

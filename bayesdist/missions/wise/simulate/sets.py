@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.batches import even_edges
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.published import (
@@ -25,8 +25,6 @@ from bayesdist.missions.wise.simulate.survey import FalseMatches, Survey, false_
 from bayesdist.model import DistortionModel
 
 __all__ = ["PairChunk", "WiseSet", "wise_set"]
-
-Float = NDArray[np.float64]
 
 CHUNK = 2**19  # pairs of a chunk at most
 _STEP = 8192  # positions at a time: they stay in the cache
@@ -55,11 +53,11 @@ class PairChunk:
     y: Float
     u: Float
     v: Float
-    frame: NDArray[np.int64]
+    frame: Int
     mag: Float
     colour: Float
     sigma: Float
-    false: NDArray[np.bool_]
+    false: Bool
 
     def __len__(self) -> int:
         return len(self.x)
@@ -147,7 +145,7 @@ class WiseSet:
         return PairChunk(x, y, error[0], error[1], frame, mag, colour, sigma, false)
 
     @cached_property
-    def _frame_edges(self) -> NDArray[np.int64]:
+    def _frame_edges(self) -> Int:
         """First row of each frame, and the number of all rows."""
         rng = _generator(self.band, self.seed, _FRAMES)
         counts = rng.multinomial(self.pairs, self.survey.share())

@@ -6,8 +6,8 @@ import os
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.published import SAMPLE_SIZES, WISE_ARRAYS, WISE_COEFFICIENTS
@@ -15,8 +15,6 @@ from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate.matches import Truth, simulate_matches, simulate_partitioned
 
 __all__ = ["simulate_wise", "simulate_wise_partitioned", "wise_solution"]
-
-Float = NDArray[np.float64]
 
 FAINT, BRIGHT = 14.5, 7.0
 

@@ -10,13 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.missions.wise.published import WISE_ARRAYS
 
 __all__ = ["POPULATIONS"]
-
-Float = NDArray[np.float64]
 
 COUNTS = 0.3  # slope of the logarithm of star counts by magnitude
 REFERENCE_ARCSEC = 0.08  # 2MASS positions on each axis
@@ -58,7 +56,7 @@ class Population:
         noise = self.at_limit * counts * np.cbrt(counts)
         return np.sqrt(noise**2 + (self.floor**2 + self.reference**2))
 
-    def colours(self, false: NDArray[np.bool_], rng: np.random.Generator) -> Float:
+    def colours(self, false: Bool, rng: np.random.Generator) -> Float:
         """Magnitudes (N,) at the shortest wavelength less those at the longest, of pairs.
 
         Half of the false matches are red.

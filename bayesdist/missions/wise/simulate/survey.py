@@ -9,14 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from bayesdist.arrays import Float, Int
 from bayesdist.errors import InputError
 
 __all__ = ["FalseMatches", "Survey", "false_matches", "match_radius", "survey"]
-
-Float = NDArray[np.float64]
 
 FRAMES = 5000  # framesets; one serves all bands
 CADENCE_S = 11.0
@@ -81,7 +79,7 @@ class FalseMatches:
     density: Float  # (F,), reference stars per square pixel of each frame
     unlisted: float  # fraction of sources without a counterpart in the reference
 
-    def probability(self, frame: NDArray[np.int64], r2: Float) -> Float:
+    def probability(self, frame: Int, r2: Float) -> Float:
         """Probability that pairs (N,) are false.
 
         Of sources with a counterpart all are paired with it, of those without one each that has a

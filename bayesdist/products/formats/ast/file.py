@@ -10,8 +10,8 @@ import re
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import fitted_map
 from bayesdist.calibration.plane import ARCSEC, Plane
@@ -23,8 +23,6 @@ from bayesdist.products.formats.common.document import MissingSizeError
 from bayesdist.products.formats.common.parameters import with_parameters
 
 __all__ = ["AstFile", "ast_calibration", "ast_of"]
-
-Float = NDArray[np.float64]
 
 _REMARK = re.compile(r"#\s*bayesdist\s+(\w+)\s+(.*?)\s*$", re.MULTILINE)
 _BEGIN = re.compile(r"(#.*\n|\s*\n)*\s*Begin\s+\w+")

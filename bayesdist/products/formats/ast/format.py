@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import InputError
@@ -29,8 +29,6 @@ from bayesdist.products.formats.common.parameters import parameters_content
 from bayesdist.products.formats.tpv.head import substitution
 
 __all__ = ["FORMAT", "Settings"]
-
-Float = NDArray[np.float64]
 
 _SKEW = 0.5  # sine of the angle between the axes, and ratio of their scales: no camera is below
 

@@ -12,13 +12,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model.basis import MAX_ORDER
 
 __all__ = ["PolyMap", "Step", "parse_dump", "steps_of"]
-
 
 _BEGIN = re.compile(r"\s*Begin\s+(\w+)\s*(#.*)?$")
 _END = re.compile(r"\s*End\s+(\w+)\s*(#.*)?$")
@@ -76,9 +75,6 @@ def _object(kind: str, lines: Iterator[tuple[int, str]], where: str) -> AstObjec
         else:
             raise FormatError("is no line of a dump", where=at, do="write it again")
     raise FormatError(f"the {kind} does not end: the file is cut", where=where, do="fetch it again")
-
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,9 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.polynomial import polynomial
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError
 
 __all__ = [
@@ -38,7 +39,6 @@ __all__ = [
     "sip_powers",
 ]
 
-Float = NDArray[np.float64]
 Coefficients = Mapping[tuple[int, int], float]
 
 SINGULAR = 1e-12  # determinant over the largest coefficient squared

@@ -24,6 +24,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import BayesdistError, FormatError
 from bayesdist.files import atomic_path
 from bayesdist.products.formats.common.cards import card_images, header_of
@@ -95,7 +96,7 @@ class Hdu:
         return out
 
     @cached_property
-    def image(self) -> NDArray[np.float64]:
+    def image(self) -> Float:
         """Pixels of an image extension."""
         return np.asarray(fits.ImageHDU.fromstring(self.to_bytes()).data, float)
 

@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 
 from bayesdist.calibration.calibration import Calibration, GaussianSolution
 from bayesdist.calibration.further import further_from
@@ -37,8 +36,6 @@ __all__ = [
     "stored_in",
     "with_parameters",
 ]
-
-Float = NDArray[np.float64]
 
 EXTENSION = "BDPARAM"
 AGREE = 1e-6  # pixels by which numbers that were printed may differ from the parameters

@@ -6,39 +6,27 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.model import TimeDependence
 
 __all__ = ["Positions", "ReadBack", "by_calibrations", "of_chips"]
 
-Float = NDArray[np.float64]
 Positions = Callable[[Float, Float, int, float | None], Float]
 
 
 @dataclass(frozen=True, eq=False)
 class ReadBack:
-    """What a file says of pixels, by what its bytes hold.
+    """What a file says of pixels, by what its bytes hold."""
 
-    Parameters
-    ----------
-    file : str
-        Name of the file, or of several that belong together.
-    forward : callable
-        Of pixels x and y (N,), the number of a chip and a date: positions (N, 2).
-    missed : callable or None
-        Of the same: where forward and back leads, less the pixel (N, 2); None for a file without
-        inverse.
-    own_axes : bool
-        Whether the file lies along axes of its own and counts in a unit of its own, so that shift,
-        rotation and scale are no errors of it.  Otherwise positions are along u, v and in their
-        unit.
-    """
-
-    file: str
-    forward: Positions
+    file: str  # name of the file, or of several that belong together
+    forward: Positions  # of pixels x and y (N,), the number of a chip and a date: positions (N, 2)
+    # of the same: where forward and back leads, less the pixel (N, 2); None for a file without
+    # inverse
     missed: Positions | None = None
+    # whether the file lies along axes of its own and counts in a unit of its own, so that shift,
+    # rotation and scale are no errors of it. Otherwise positions are along u, v and in their unit
     own_axes: bool = False
 
 
@@ -47,13 +35,8 @@ def by_calibrations(
 ) -> ReadBack:
     """Positions by the calibrations of a file, along axes of its own.
 
-    Parameters
-    ----------
-    file : str
-    sets : sequence of Calibration
-        One, or one for each segment of the drift.
-    time : TimeDependence or None
-        Of the solution that the file was made from.
+    `sets`: one, or one for each segment of the drift. `time`: of the solution that the file was
+    made from.
     """
 
     def of(epoch: float | None) -> Calibration:
@@ -84,10 +67,7 @@ def by_calibrations(
 def of_chips(parts: Mapping[int, ReadBack]) -> ReadBack:
     """Positions by several files of one format, each of some chips, as by one file.
 
-    Parameters
-    ----------
-    parts : mapping of int to ReadBack
-        By the number of the chip.
+    `parts`: by the number of the chip.
     """
 
     def forward(x: Float, y: Float, chip: int, epoch: float | None) -> Float:

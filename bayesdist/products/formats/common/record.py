@@ -11,9 +11,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, Field, TypeAdapter
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of_maps
 from bayesdist.calibration.further import further_from, further_records, scaled
 from bayesdist.calibration.plane import ARCSEC, Plane
@@ -23,8 +23,6 @@ from bayesdist.reading.documents import model_of
 from bayesdist.version import __version__
 
 __all__ = ["at_date", "calibration_from", "record_of"]
-
-Float = NDArray[np.float64]
 
 VERSION = 1
 Pair = tuple[float, float]

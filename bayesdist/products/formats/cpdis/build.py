@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.inverse import detector_grid
@@ -25,8 +25,6 @@ from bayesdist.products.formats.common.parameters import parameters_hdu
 from bayesdist.products.formats.cpdis.file import ERRORS, TABLES
 
 __all__ = ["cpdis_content"]
-
-Float = NDArray[np.float64]
 
 _CLOSE = 1e-4  # pixels: error between nodes that is aimed at where no step is asked for
 _STEPS = (64.0, 32.0, 16.0, 8.0, 4.0)  # pixels

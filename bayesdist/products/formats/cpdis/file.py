@@ -15,8 +15,8 @@ from functools import cached_property
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.inverse import detector_grid
@@ -30,8 +30,6 @@ from bayesdist.products.formats.lookup.plane import Plane as TablePlane
 from bayesdist.products.formats.sip.read import cd_matrix, image_size
 
 __all__ = ["ERRORS", "TABLES", "CpdisFile", "CpdisImage", "cpdis_calibration", "cpdis_of"]
-
-Float = NDArray[np.float64]
 
 TABLES, ERRORS = "WCSDVARR", "WCSDVERR"
 _DEGREES = {"deg": 1.0, "arcsec": 1 / 3600, "mas": 1 / 3.6e6, "rad": 180 / np.pi, "": 1.0}

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 
 from bayesdist.calibration.calibration import Calibration, as_calibration
 from bayesdist.calibration.plane import ARCSEC
@@ -40,7 +39,6 @@ from bayesdist.products.formats.idctab.table import IdcTab
 
 __all__ = ["idctab_from_solution"]
 
-Float = NDArray[np.float64]
 Filter = str | tuple[str, ...]
 Source = Solution | Calibration
 

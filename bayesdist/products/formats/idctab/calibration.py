@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.inverse import ExplicitInverse
@@ -28,7 +29,6 @@ from bayesdist.products.formats.idctab.table import FILTER_COLUMNS, IdcTab
 
 __all__ = ["idctab_calibration"]
 
-Float = NDArray[np.float64]
 Filters = Sequence[str] | None
 
 

@@ -15,8 +15,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import InputError
@@ -26,7 +26,6 @@ from bayesdist.model import TimeDependence
 
 __all__ = ["RATES", "Loss", "drift", "scheme_of", "storable"]
 
-Float = NDArray[np.float64]
 Term = tuple[str, int, int]
 
 NEGLIGIBLE = 1e-3  # mas: a drift held at zero by a prior, or by the gauge, is not reported
@@ -53,7 +52,7 @@ def drift(
     chip: int,
     epoch: float,
     where: str,
-) -> NDArray[np.float64]:
+) -> Float:
     """Change (2, n_terms) of the coefficients of a chip at an epoch (decimal years).
 
     `keywords` are all that begin with TDD, `terms` the powers of the coefficients; `where` names

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import Orientation
 from bayesdist.products.formats.common.cards import number_card, text_card, wrapped_cards
@@ -35,9 +35,6 @@ __all__ = [
     "sigma_hdu",
     "tdd_cards",
 ]
-
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

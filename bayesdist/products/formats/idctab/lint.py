@@ -16,8 +16,6 @@ from bayesdist.products.formats.idctab.table import FILTER_COLUMNS, IdcTab
 
 __all__ = ["lint_idctab"]
 
-Float = NDArray[np.float64]
-
 _SCALE_RATIO = 1.25
 
 

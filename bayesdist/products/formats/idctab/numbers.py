@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.inverse import fitted_inverse
@@ -34,8 +34,6 @@ __all__ = [
     "chip_numbers",
     "joint_covariance",
 ]
-
-Float = NDArray[np.float64]
 
 INVERSE_NODES = 33  # points of each axis of the fit
 

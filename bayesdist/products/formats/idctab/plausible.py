@@ -51,12 +51,7 @@ def implausible(tab: IdcTab) -> Iterator[Finding]:
 
 
 def refuse_implausible(tab: IdcTab, rows: Iterable[int]) -> None:
-    """Refuse rows of a table that a calibration cannot be made of.
-
-    Raises
-    ------
-    FormatError
-    """
+    """Refuse rows of a table that a calibration cannot be made of."""
     for row in rows:
         for name, (least, most, unit) in LIMITS.items():
             value = float(tab.rows[name][row]) if name in tab.columns else least

@@ -28,6 +28,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import ArrayLike, NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import polynomial_terms
 from bayesdist.products.formats.common.cards import named_in
@@ -37,8 +38,6 @@ from bayesdist.products.formats.idctab.drift import drift, scheme_of
 from bayesdist.products.formats.idctab.hst import serves
 
 __all__ = ["FILTER_COLUMNS", "HIGHEST", "IdcTab", "read_idctab", "write_idctab"]
-
-Float = NDArray[np.float64]
 
 FILTER_COLUMNS = ("FILTER1", "FILTER2", "FILTER", "OPT_ELEM")
 HIGHEST = 9  # order: CX and CY have one digit for each power
@@ -257,7 +256,7 @@ class IdcTab:
         chip: int,
         filter: str | Sequence[str] | None = None,
         direction: str = "FORWARD",
-    ) -> NDArray[np.int64]:
+    ) -> Int:
         """Indices of all rows of a chip, filter and direction.
 
         Parameters
@@ -284,7 +283,7 @@ class IdcTab:
         columns = [c for c in FILTER_COLUMNS if c in self.columns]
         return [tuple(str(row[c]).strip() for c in columns) for row in self.rows]
 
-    def _all_equal(self, found: NDArray[np.int64]) -> bool:
+    def _all_equal(self, found: Int) -> bool:
         names = [c for c in self.columns if c not in (*FILTER_COLUMNS, "DETCHIP", "DIRECTION")]
         return all((self.rows[name][found] == self.rows[name][found[0]]).all() for name in names)
 

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products.formats.common.cards import number_card, text_card, wrapped_cards
@@ -25,8 +25,6 @@ from bayesdist.products.formats.common.content import hdus_of
 from bayesdist.products.formats.lookup.file import AXES, LookupFile
 
 __all__ = ["Part", "identity_cards", "lookup_file", "one_per_chip", "optional_cards"]
-
-Float = NDArray[np.float64]
 
 # A maximum below this fraction of the largest absolute value may turn negative on the way.
 _CLEARLY = 0.01

@@ -21,8 +21,8 @@ from functools import cached_property
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products.formats.common.cards import named_in
@@ -30,8 +30,6 @@ from bayesdist.products.formats.common.content import Hdu, read_hdus, write_hdus
 from bayesdist.products.formats.lookup.plane import Plane
 
 __all__ = ["AXES", "LookupFile", "check_kind", "read_lookup_file", "write_lookup_file"]
-
-Float = NDArray[np.float64]
 
 AXES = ("DX", "DY")
 _SIGMA = "SIGMA_"

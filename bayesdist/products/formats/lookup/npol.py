@@ -15,8 +15,8 @@ import os
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError, FormatError, InputError
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products.formats.common.cards import number_card, text_card
@@ -37,8 +37,6 @@ from bayesdist.products.formats.lookup.file import (
 )
 
 __all__ = ["read_npol", "write_npol"]
-
-Float = NDArray[np.float64]
 
 
 def write_npol(

@@ -7,14 +7,12 @@ from functools import cached_property
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import FormatError
 from bayesdist.products.formats.common.content import Hdu
 
 __all__ = ["Plane"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap, Monomials
 from bayesdist.calibration.inverse import fit_inverse
@@ -31,8 +31,6 @@ from bayesdist.products.formats.siaf.table import (
 )
 
 __all__ = ["siaf_files"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

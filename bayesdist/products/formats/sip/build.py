@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, as_calibration
 from bayesdist.calibration.chip_map import Monomials
 from bayesdist.calibration.inverse import fit_inverse
@@ -31,8 +31,6 @@ from bayesdist.products.formats.sip.families import offset_ranges
 from bayesdist.products.formats.sip.header import LINEAR_AXES, SIP_ORDERS, SipHeader, worst_closure
 
 __all__ = ["sip_from_solution"]
-
-Float = NDArray[np.float64]
 
 # How far from the identity the linear part may be when it is to be a correction of pixels.
 _NEAR_IDENTITY = 0.5

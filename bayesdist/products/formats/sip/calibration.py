@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import fitted_map
 from bayesdist.calibration.inverse import detector_grid
@@ -24,9 +24,6 @@ from bayesdist.products.formats.common.parameters import (
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
 
 __all__ = ["side_file", "sip_calibration", "with_covariance", "with_side_file"]
-
-
-Float = NDArray[np.float64]
 
 
 def sip_calibration(

@@ -13,15 +13,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.errors import InputError
 from bayesdist.products.formats.common.coefficients import evaluate
 
 __all__ = ["LINEAR_AXES", "SIP_ORDERS", "SipHeader", "worst_closure"]
 
-Float = NDArray[np.float64]
 Terms = Mapping[tuple[int, int], float]
 
 # Programs ignore lower orders, and a keyword has room for one digit.

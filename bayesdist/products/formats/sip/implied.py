@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.errors import InputError
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.formats.common.coefficients import evaluate, sip_keyword
@@ -27,7 +27,6 @@ from bayesdist.products.formats.sip.header import SipHeader
 
 __all__ = ["Implied", "StatedMaxima", "implied_values", "with_error"]
 
-Float = NDArray[np.float64]
 Frozen = Any  # a distribution of scipy.stats with its parameters
 
 # Odds of a further, independent fault, for values that a suspect leaves unexplained.
@@ -139,7 +138,7 @@ class _Closure:
     x: Float
     y: Float
     projector: Float  # (K, N)
-    odd: NDArray[np.bool_]  # (2 K,): components of odd total degree
+    odd: Bool  # (2 K,): components of odd total degree
 
     @classmethod
     def of(cls, sip: SipHeader, size: tuple[int, int]) -> _Closure:

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky.tangent import tangent_plane
@@ -20,8 +20,6 @@ from bayesdist.products.formats.sip.read import sip_of
 from bayesdist.products.formats.sip.write import sip_header
 
 __all__ = ["headers_read_back", "sip_positions", "sip_read_back", "sky_of_header"]
-
-Float = NDArray[np.float64]
 
 
 def sip_positions(

@@ -6,8 +6,8 @@ import os
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import FormatError, InputError
 from bayesdist.products.formats.common.cards import card_images
 from bayesdist.products.formats.common.coefficients import sip_powers
@@ -181,7 +181,7 @@ def _order(header: fits.Header, keyword: str, where: str) -> int:
     return int(value)
 
 
-def cd_matrix(header: fits.Header, where: str) -> NDArray[np.float64]:
+def cd_matrix(header: fits.Header, where: str) -> Float:
     """CD matrix (2, 2), also of a header with PC and CDELT or CROTA2 (FITS 4.0, section 8.1)."""
     if any(keyword in header for keyword in CD_KEYWORDS):
         return np.array([_number(header, k, where, 0.0) for k in CD_KEYWORDS]).reshape(2, 2)

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.rotation import coefficient_map, is_exact, pixel_matrix
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.formats.common.cards import header_of, keyword_of
@@ -15,7 +15,6 @@ from bayesdist.products.formats.sip.header import SipHeader
 
 __all__ = ["rotated_sip"]
 
-Float = NDArray[np.float64]
 Terms = Mapping[tuple[int, int], float]
 
 # Cards that describe the shape of an image, which after a rotation by any angle is no rectangle.

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.area import pixel_areas
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
@@ -24,8 +24,6 @@ from bayesdist.products.formats.common.parameters import parameters_hdu
 from bayesdist.products.formats.stdgdc.file import EXTENSIONS, SIGMAS, CorrectedFrame, frame_of
 
 __all__ = ["stdgdc_content"]
-
-Float = NDArray[np.float64]
 
 _BETWEEN = 997  # points along each axis, between pixels, at which the tables are checked
 _LARGEST = 2**26  # pixels: beyond it a detector is a misprint

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import fitted_map
 from bayesdist.calibration.inverse import detector_grid
@@ -18,8 +18,6 @@ from bayesdist.products.formats.common.parameters import stored_calibration, sto
 from bayesdist.products.formats.stdgdc.file import CorrectedFrame, StdGdc
 
 __all__ = ["stdgdc_calibration"]
-
-Float = NDArray[np.float64]
 
 _SLACK = 1e-9  # pixels: rounding of the check itself
 _GRID = 129

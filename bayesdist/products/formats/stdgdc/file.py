@@ -25,16 +25,13 @@ from functools import cached_property
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import FormatError
 from bayesdist.products.formats.common.content import Content, Hdu
 
 __all__ = ["EXTENSIONS", "SIGMAS", "CorrectedFrame", "StdGdc", "frame_of", "stdgdc_of"]
-
-
-Float = NDArray[np.float64]
 
 _S = ("BDS1_1", "BDS1_2", "BDS2_1", "BDS2_2")
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.errors import FormatError
 from bayesdist.model import LookupTable
@@ -15,8 +15,6 @@ from bayesdist.products.formats.stdgdc.calibration import stdgdc_calibration
 from bayesdist.products.formats.stdgdc.file import EXTENSIONS, SIGMAS, StdGdc
 
 __all__ = ["lint_stdgdc"]
-
-Float = NDArray[np.float64]
 
 _CLOSE = 0.3  # pixels: an inverse that closes worse is counted from another pixel
 _TOO_FAR = 0.5  # of the detector: no camera moves pixels so far

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
@@ -29,8 +28,6 @@ from bayesdist.products.formats.tpv.head import (
 )
 
 __all__ = ["tpv_cards", "tpv_heads"]
-
-Float = NDArray[np.float64]
 
 _GRID = 33  # points of each axis over which CRDER is the rms error
 

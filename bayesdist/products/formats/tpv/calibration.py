@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.inverse import detector_grid
@@ -15,8 +15,6 @@ from bayesdist.products.formats.common.parameters import with_parameters
 from bayesdist.products.formats.tpv.head import TpvFile, TpvHead
 
 __all__ = ["tpv_calibration"]
-
-Float = NDArray[np.float64]
 
 _RADIAL_ORDER = 9  # of the polynomial that stands for odd powers of r
 _EXACT = 1e-9  # pixels: below it a map is the polynomial that it was taken for

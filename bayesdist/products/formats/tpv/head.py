@@ -16,8 +16,9 @@ from math import comb
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.errors import FormatError
 from bayesdist.model import polynomial_terms
 from bayesdist.products.formats.common.content import Content, readable
@@ -35,8 +36,6 @@ __all__ = [
     "tpv_of",
 ]
 
-
-Float = NDArray[np.float64]
 Powers = tuple[int, int]
 
 HIGHEST = 7  # order of a TPV

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.model import LookupTable
 from bayesdist.numbers import count, display_scale, number, size_of
 from bayesdist.report.campaign import CampaignResults, ChipResiduals
@@ -36,8 +36,6 @@ __all__ = [
     "table_nodes",
     "table_residuals",
 ]
-
-Float = NDArray[np.float64]
 
 WITHOUT, WITH = PALETTE["vermilion"], PALETTE["blue"]
 _REACH = 4.5  # times the robust width of the residuals without tables: where axes end

@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.ticker import ScalarFormatter
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.numbers import count, number, percent, size_of
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
@@ -129,7 +129,7 @@ def catalogue_errors(r: ReportInput) -> Plot:
     )
 
 
-def _motions(ax: Axes, catalog: CatalogStars, error: NDArray[np.float64]) -> None:
+def _motions(ax: Axes, catalog: CatalogStars, error: Float) -> None:
     good = np.ones(len(catalog.mag), bool)
     if catalog.limit is not None:
         mag, sigma = catalog.limit
@@ -258,7 +258,7 @@ def footprints(r: ReportInput) -> Plot:
     bar.ax.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
     ax.tick_params(colors=INK)
     n = len(field.outlines) // len(c.chips)
-    rolls: NDArray[np.float64] = np.ma.filled(np.ma.asarray(c.matching["pa_v3"], float), np.nan)
+    rolls: Float = np.ma.filled(np.ma.asarray(c.matching["pa_v3"], float), np.nan)
     text = (
         f"Outlines of the chips of {count(n)} exposures over the catalogue, coloured by date; the"
         " first, the middle and the last one are drawn strong."

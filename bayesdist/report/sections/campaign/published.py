@@ -23,19 +23,10 @@ class PublishedLine:
 
 @dataclass(frozen=True)
 class Published:
-    """Lines of one term.
+    """Lines of one term."""
 
-    Parameters
-    ----------
-    source : str
-        The publication.
-    where : str
-        In it.
-    lines : tuple of PublishedLine
-    """
-
-    source: str
-    where: str
+    source: str  # the publication
+    where: str  # in it
     lines: tuple[PublishedLine, ...]
 
 
@@ -54,12 +45,7 @@ def published_terms(
 ) -> dict[str, Published]:
     """Published lines of the detector and filter of a run, by term.
 
-    Parameters
-    ----------
-    config : mapping
-        The resolved configuration: the release names instrument and detector.
-    filter : str
-    chips : tuple of str
-        Their names.
+    `config`: the resolved configuration: the release names instrument and detector. `chips`: their
+    names.
     """
     return {k: v for source in _SOURCES for k, v in source(config, filter, chips).items()}

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.numbers import count, display_scale, number, size_of
 from bayesdist.report.campaign import CampaignResults
 from bayesdist.report.contents import REPORT
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 __all__ = [
     "series",
 ]
-
-Float = NDArray[np.float64]
 
 ABREAST = 2  # chips in a figure
 FALLS = 1.2  # scatter before VAFACTOR over that after it, above which the aberration is seen

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from bayesdist.arrays import Bool, Float
 
 if TYPE_CHECKING:
     from bayesdist.report.campaign import LinearSeries
@@ -20,8 +21,6 @@ __all__ = [
     "name_of_term",
     "terms_of",
 ]
-
-Float = NDArray[np.float64]
 
 TERM_ORDER = ("A_2", "B_3", "B_2", "A_3", "B_1", "A_1")  # as in the published report
 _FEWEST = 3  # dates in a segment that fix a parabola
@@ -68,7 +67,7 @@ class TermCourse:
     alpha: Float  # (S,)
     beta: Float  # (S,)
     epoch0: Float  # (S,)
-    good: NDArray[np.bool_]  # (E,), exposures that are not off
+    good: Bool  # (E,), exposures that are not off
 
     @property
     def chip(self) -> str:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float
 from bayesdist.numbers import MISSING, count, display_scale, number
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
@@ -26,8 +26,6 @@ __all__ = [
     "data_tables",
     "residuals_by_magnitude",
 ]
-
-Float = NDArray[np.float64]
 
 
 @REPORT.table("data")
@@ -185,7 +183,7 @@ def coverage(r: ReportInput) -> Plot:
     )
 
 
-def _magnitudes(r: ReportInput) -> NDArray[np.bool_]:
+def _magnitudes(r: ReportInput) -> Bool:
     """Boolean mask (N,) of the stars whose magnitude is known."""
     mag = r.stars.table.mag
     return np.zeros(len(r.stars.table), bool) if mag is None else np.isfinite(mag)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool
 from bayesdist.diagnose.residuals.binned import residual_statistics
 from bayesdist.diagnose.score.result import POWER
 from bayesdist.infer.skew import skew_of
@@ -129,7 +129,7 @@ def _drifting(r: ReportInput) -> str:
     return f"{text}; besides, the constants of {chips} may step at {breaks}"
 
 
-def _chips_of_stars(r: ReportInput) -> list[tuple[str, NDArray[np.bool_]]]:
+def _chips_of_stars(r: ReportInput) -> list[tuple[str, Bool]]:
     """Row names and masks (N,) of the stars used: of all chips and, where several, of each."""
     table, used = r.stars.table, r.stars.used
     if not r.several:

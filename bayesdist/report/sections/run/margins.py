@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.numbers import count, counted, display_scale, interval, number, percent, rounded
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
@@ -34,8 +34,6 @@ __all__ = [
     "rests_on_table",
     "validity_period",
 ]
-
-Float = NDArray[np.float64]
 
 VERDICT_LEVELS = {"met": "pass", "undecided": "warn", "missed": "fail"}
 _SHOWN = (0.001, 0.999)  # quantiles of the draws that a histogram runs between

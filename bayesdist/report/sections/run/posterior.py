@@ -6,8 +6,8 @@ from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.infer.catalogue.added_errors import DECISIVE
 from bayesdist.numbers import (
     MISSING,
@@ -48,8 +48,6 @@ __all__ = [
     "ranks",
     "slowest_parameters",
 ]
-
-Float = NDArray[np.float64]
 
 _MIXTURE_LABELS = {"f": "f", "j": "j", "s_out": r"$s_\mathrm{out}$"}
 _MAX_POINTS = 20_000  # draws that enter a corner plot
@@ -277,7 +275,7 @@ def ranks(r: ReportInput) -> Plot:
     )
 
 
-def rank_counts(draws: Float, bins: int) -> NDArray[np.int64]:
+def rank_counts(draws: Float, bins: int) -> Int:
     """Numbers (ensembles, bins) of draws (ensembles, draws) in equal bins of their ranks."""
     order = np.argsort(draws, axis=None, kind="stable")
     which = np.empty(draws.size, np.int64)

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
+from bayesdist.arrays import Float
 from bayesdist.numbers import display_scale
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
@@ -36,8 +37,6 @@ __all__ = [
     "residual_panels",
     "residual_vectors",
 ]
-
-Float = NDArray[np.float64]
 
 _SIGMA_BINS = 200
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.numbers import count, display_scale, number
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
@@ -34,9 +34,6 @@ __all__ = [
     "residuals_by_property",
 ]
 
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
 _POINTS = 1200  # single stars in a panel: more hide each other
 _MIN_STARS = 25  # in a bin on average
 _BINS, _FINE_BINS = 20, 100  # most bins along an axis
@@ -52,7 +49,7 @@ class Means:
     at: Float  # (B,), mean of the quantity in the bin
     mean: Float  # (B, 2), of u and v
     error: Float  # (B, 2), from the scatter inside the bin
-    n: NDArray[np.int64]  # (B,)
+    n: Int  # (B,)
 
     @property
     def chi2(self) -> Float:
@@ -79,7 +76,7 @@ def means_in_bins(t: Float, residual: Float, weight: Float, edges: Float) -> Mea
 class _Residuals:
     """Residuals of the stars that are probably true, along the axes of the polynomials."""
 
-    shown: Mask  # (N,), of the sample
+    shown: Bool  # (N,), of the sample
     residual: Float  # (n, 2), of those shown
     variance: Float  # (n, 2), expected of them
 
@@ -107,7 +104,7 @@ def _residuals_of(r: ReportInput) -> _Residuals:
     return _Residuals(shown, residual, r.stars.expected_square[shown])
 
 
-def _on_chips(r: ReportInput, shown: Mask) -> Iterator[tuple[int, str, Mask]]:
+def _on_chips(r: ReportInput, shown: Bool) -> Iterator[tuple[int, str, Bool]]:
     """Index, name and mask (n,) of the stars that are shown, of each chip that has some."""
     numbers = r.stars.table.chip_number[shown]
     for k, c in enumerate(r.chips):

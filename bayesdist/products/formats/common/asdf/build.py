@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from astropy.modeling import Model
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.inverse import detector_grid, fitted_inverse
 from bayesdist.calibration.plane import Plane
@@ -40,7 +40,7 @@ class ChipTransform:
     closure: float  # pixels
 
     @property
-    def table_arrays(self) -> list[NDArray[np.float64]]:
+    def table_arrays(self) -> list[Float]:
         """Arrays of the look-up tables, forward and back."""
         both = [*tables_of(self.model), *tables_of(self.model.inverse)]
         return [array for one in both for array in (one.lookup_table, *one.points)]

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 from astropy.modeling import Model
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import fitted_map
 from bayesdist.calibration.inverse import detector_grid
@@ -32,8 +33,6 @@ __all__ = [
     "transform_in",
     "transforms_read_back",
 ]
-
-Float = NDArray[np.float64]
 
 ARCSEC = {"arcsec": 1.0, "deg": 3600.0, "mas": 1e-3, "rad": 180 / np.pi * 3600, "arcmin": 60.0}
 AGREEMENT = 1e-6  # pixels: as far as record and transform of one file may differ

@@ -31,30 +31,15 @@ Settings = TypeVar("Settings", bound=PlacedSettings)
 
 @dataclass(frozen=True)
 class Observatory(Generic[Settings]):
-    """What the files of one observatory have of their own.
+    """What the files of one observatory have of their own."""
 
-    Parameters
-    ----------
-    key : str
-        As of `Format`.
-    name : str
-        As in "JWST".
-    parse : callable
-        As of `Format`.
-    lint_meta : callable
-        From the node meta to findings.
-    instrument : callable
-        From settings to the name of the instrument.
-    tree : callable
-        From the transform of a chip, the name of its detector, settings and the name of the file to
-        the tree of the file.
-    """
-
-    key: str
-    name: str
-    parse: Callable[[Content], DistortionFile | None]
-    lint_meta: Callable[[Mapping[str, Any]], Iterable[Finding]]
-    instrument: Callable[[Settings], str]
+    key: str  # as of `Format`
+    name: str  # as in "JWST"
+    parse: Callable[[Content], DistortionFile | None]  # as of `Format`
+    lint_meta: Callable[[Mapping[str, Any]], Iterable[Finding]]  # from the node meta to findings
+    instrument: Callable[[Settings], str]  # from settings to the name of the instrument
+    # from the transform of a chip, the name of its detector, settings and the name of the file to
+    # the tree of the file
     tree: Callable[[ChipTransform, str, Settings, str], dict[str, Any]]
 
     def format(self, title: str, rank: int, settings: type[Settings]) -> Format:

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from astropy.modeling import Model, models
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import BayesdistError
 from bayesdist.products.formats.common.asdf.distortion import (
     AGREEMENT,
@@ -20,9 +20,6 @@ from bayesdist.products.formats.common.asdf.transforms import exchanged, leaves,
 from bayesdist.products.formats.common.document import Finding, finding_lines, repeated_values
 
 __all__ = ["describe_distortion", "lint_distortion"]
-
-
-Float = NDArray[np.float64]
 
 PIXEL, SKY = ("pix", "pixel"), ("arcsec",)
 # Closure that a good inverse reaches, and one that only a wrong coefficient leaves; pixels.

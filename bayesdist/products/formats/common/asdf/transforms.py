@@ -12,8 +12,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from astropy.modeling import CompoundModel, Model, models
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.chip_map import Monomials
 from bayesdist.calibration.inverse import ExplicitInverse
 from bayesdist.model import LookupTable
@@ -28,8 +29,6 @@ __all__ = [
     "order_of",
     "tables_of",
 ]
-
-Float = NDArray[np.float64]
 
 # Fixed-point steps that invert tables: each leaves the table's largest slope times what was left.
 _LEFT, _MOST_STEPS = 1e-10, 12

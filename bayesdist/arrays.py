@@ -1,0 +1,11 @@
+"""Types of arrays, by what they hold: positions and errors, numbers of rows, masks."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+Complex = NDArray[np.complex128]
