@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,12 +13,12 @@ from bayesdist.errors import InputError
 from bayesdist.reading.regular import opened
 
 _MARK = ".bayesdist-"
-_watchers: list[Callable[[Path], None]] = []
+_watchers: list[Callable[[Sequence[Path]], None]] = []
 
 
 @contextmanager
-def watched_writes(note: Callable[[Path], None]) -> Iterator[None]:
-    """Call a function with every path that `atomic_path` writes, before the file takes its name.
+def watched_writes(note: Callable[[Sequence[Path]], None]) -> Iterator[None]:
+    """Call a function with the paths that `atomic_path` writes, before a file takes its name.
 
     `note`: where it raises, the file does not appear.
     """
@@ -27,6 +27,17 @@ def watched_writes(note: Callable[[Path], None]) -> Iterator[None]:
         yield
     finally:
         _watchers.remove(note)
+
+
+def announce(paths: Sequence[Path]) -> None:
+    """Tell those who watch writes of files to come, all at once: sooner than one by one.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+    """
+    for note in _watchers:
+        note(paths)
 
 
 @contextmanager
@@ -46,8 +57,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield temporary
         with temporary.open("rb+") as written:
             os.fsync(written.fileno())  # a rename may reach the disk before the content does
-        for note in _watchers:
-            note(target)
+        announce([target])
         temporary.replace(target)
     except OSError as error:
         if not _concerns(error, temporary, target):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import shlex
 import sys
 from collections.abc import Callable, Sequence
@@ -15,6 +16,9 @@ from bayesdist.mission import load_mission, mission_names, missions
 from bayesdist.version import __version__
 
 _LONGEST = 1000  # letters of a sentence
+# objects between collections of garbage: imports make half a million that stay, and looking at
+# them again and again takes a tenth of a small run
+SELDOM = 50_000, 20, 100
 COMMANDS = "bayesdist.app.commands"
 CORE = {
     "init": f"{COMMANDS}.runs:init",
@@ -104,6 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     memory; 74 refused by the system; 130 interrupted.
     """
     open_streams()
+    gc.set_threshold(*SELDOM)
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     line = shlex.join(["bayesdist", *arguments])
     return _exit_code(

@@ -133,7 +133,7 @@ def save_diagnosed(results: Results) -> None:
     solved = results.fitted.solved
     if solved is not None:
         notes = provenance_notes(results.posterior, solved.gauge_words)
-        stars = write_stars(run.path, solved, found.correlated, notes)
+        stars = write_stars(run.path, solved, found.correlated, notes, results.config.resources())
         run.summarise(selfcal=run.summary.get("selfcal", {}) | {"stars": stars})
 
 

@@ -33,7 +33,7 @@ from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.model import DistortionModel
 from bayesdist.reading.documents import json_of
 from bayesdist.reading.faults import restoring
-from bayesdist.reading.hdf5 import netcdf_dataset, netcdf_tree
+from bayesdist.reading.hdf5 import netcdf_groups
 
 SCHEMA = 2
 POSTERIOR_NUMBERS = ("n_stars", "n_flagged", "n_false", "reference_sigma")
@@ -185,10 +185,10 @@ def load_posterior(path: str | Path) -> Posterior:
     if path.is_dir():
         path = path / "posterior.nc"
     with _reading(path, "a posterior", "sample"):
-        tree = netcdf_tree(path)
-        attrs = tree.attrs
-        draws, checks = tree["posterior"].to_dataset(), tree["diagnostics"].to_dataset()
-        stats = tree["sample_stats"].to_dataset()
+        groups = netcdf_groups(path)
+        attrs, draws = groups[""].attrs, groups["posterior"].arrays
+        checks, limits = groups["diagnostics"].arrays, groups["diagnostics"].attrs
+        stats = groups["sample_stats"]
         if attrs.get("creator") != "bayesdist":
             raise KeyError("creator")
         mixture = _tree(attrs["mixture"])
@@ -196,32 +196,34 @@ def load_posterior(path: str | Path) -> Posterior:
         info: dict[str, Any] = {str(k): _plain(v) for k, v in stats.attrs.items()}
         info["exact"] = bool(info["exact"])
         model = DistortionModel.from_dict(_tree(attrs["model"]))
-        shape = (*draws["theta"].shape[:2], len(model.names))
-        _refuse_other_shape(draws["theta"].values, shape)
-        for one in (stats["lp"], *(draws[k] for k in ("j", "f", "s_out") if k in draws)):
-            _refuse_other_shape(one.values, shape[:2])
+        theta, log_prob = draws["theta"], stats.arrays["lp"]
+        hyper = {str(name): draws[name] for name in ("j", "f", "s_out") if name in draws}
+        shape = (*theta.shape[:2], len(model.names))
+        _refuse_other_shape(theta, shape)
+        for one in (log_prob, *hyper.values()):
+            _refuse_other_shape(one, shape[:2])
         for check in DIAGNOSTICS:  # NaN where a parameter does not move
-            _refuse_other_shape(np.nan_to_num(checks[check].values), checks["sampled"].shape)
-        if (checks["rhat"].values < LEAST_RHAT).any():  # False for NaN
+            _refuse_other_shape(np.nan_to_num(checks[check]), checks["sampled"].shape)
+        if (checks["rhat"] < LEAST_RHAT).any():  # False for NaN
             raise FormatError(f"R-hat is below {LEAST_RHAT}, which no draws have")
         return Posterior(
             model=model,
             mixture=OutlierMixture(**mixture),
-            theta=draws["theta"].values,
-            hyper={k: draws[k].values for k in ("j", "f", "s_out") if k in draws},
-            log_prob=stats["lp"].values,
+            theta=theta,
+            hyper=hyper,
+            log_prob=log_prob,
             n_stars=int(attrs["n_stars"]),
             n_flagged=int(attrs["n_flagged"]),
             n_false=float(attrs["n_false"]),
             reference_sigma=float(attrs["reference_sigma"]),
             convergence=Convergence(
-                names=tuple(str(n) for n in checks["sampled"].values),
-                **{name: checks[name].values for name in DIAGNOSTICS},
-                pareto_k=float(checks.attrs["pareto_k"]),
-                importance_efficiency=float(checks.attrs["importance_efficiency"]),
-                converged=bool(checks.attrs["converged"]),
-                reasons=tuple(_tree(checks.attrs["reasons"])),
-                limits=Limits(float(checks.attrs["limit_ess"]), float(checks.attrs["limit_rhat"])),
+                names=tuple(str(n) for n in checks["sampled"]),
+                **{name: checks[name] for name in DIAGNOSTICS},
+                pareto_k=float(limits["pareto_k"]),
+                importance_efficiency=float(limits["importance_efficiency"]),
+                converged=bool(limits["converged"]),
+                reasons=tuple(_tree(limits["reasons"])),
+                limits=Limits(float(limits["limit_ess"]), float(limits["limit_rhat"])),
             ),
             sampler=SamplerInfo(**info),
             certificate=_certificate(_tree(attrs["certificate"])),
@@ -285,22 +287,23 @@ def load_fit(path: str | Path) -> LinearFit:
     """
     path = Path(path)
     with _reading(path, "a fit", "fit"):
-        data = netcdf_dataset(path)
-        model = DistortionModel.from_dict(_tree(data.attrs["model"]))
+        top = netcdf_groups(path)[""]
+        data, attrs = top.arrays, top.attrs
+        model = DistortionModel.from_dict(_tree(attrs["model"]))
         n = len(model.names)
         for name, shape in (("mean", (n,)), ("cov", (n, n)), ("clip", (n,))):
-            _refuse_other_shape(data[name].values, shape)
+            _refuse_other_shape(data[name], shape)
         return LinearFit(
             model=model,
-            mean=data["mean"].values,
-            cov=data["cov"].values,
+            mean=data["mean"],
+            cov=data["cov"],
             clip=Clip(
-                data["clip"].values,
-                float(data.attrs["clip_chi2_limit"]),
-                float(data.attrs["clip_abs_limit"]),
+                data["clip"],
+                float(attrs["clip_chi2_limit"]),
+                float(attrs["clip_abs_limit"]),
             ),
-            rejected=_tree(data.attrs["rejected"]),
-            **{name: data.attrs[name].item() for name in FIT_NUMBERS},
+            rejected=_tree(attrs["rejected"]),
+            **{name: attrs[name].item() for name in FIT_NUMBERS},
         )
 
 
@@ -319,8 +322,7 @@ class _Group:
 def _write(groups: Mapping[str, _Group], path: str | Path) -> None:
     """Write the groups of a file, '' at its top, replaced atomically.
 
-    By h5netcdf itself: xarray, by which they are read, takes a second to import.  The file is built
-    in memory: on a full disk HDF5 itself would crash when it is closed.
+    The file is built in memory: on a full disk HDF5 itself would crash when it is closed.
     """
     buffer = io.BytesIO()
     with h5netcdf.File(buffer, "w") as file:

@@ -6,6 +6,7 @@ its derivative, alone.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,38 +41,40 @@ class EffectiveCoefficients(ParameterLayout):
         poly = theta[..., : self.n_polynomial].reshape(*theta.shape[:-1], len(self.chips), 2, K)
         out = poly[..., chip, :, :]
         if self.time is not None:
-            for g, d in enumerate(self._drift(self.time, chip, epoch)):
-                own = theta[..., self.drift_slice(int(chip[g]))]
-                out[..., g, :, :] += np.einsum("akm,...m->...ak", d, own)
+            for c in np.unique(chip):
+                own = chip == c
+                d = self._drift(self.time, int(c), epoch[own])
+                by_time = theta[..., self.drift_slice(int(c))]
+                out[..., own, :, :] += np.einsum("gakm,...m->...gak", d, by_time)
         return out
 
-    def _drift(self, time: TimeDependence, chip: Int, epoch: Float) -> list[Float]:
-        """Derivative of a group's polynomial by the chip's tdd parameters, (2, K, n_tdd) each."""
+    def _drift(self, time: TimeDependence, chip: int, epoch: Float) -> Float:
+        """Derivatives (G, 2, K, n_tdd) of a chip's polynomial by its tdd parameters at epochs."""
         columns, axes = self.drift_columns
         weights = time.weights(epoch)
-        out = []
-        for c, w in zip(chip, weights, strict=True):
-            d = np.zeros((2, self.n_terms, self.n_tdd))
-            for t, axis in enumerate(axes):
-                cols = slice(t * time.n_values, (t + 1) * time.n_values)
-                d[axis, :, cols] = np.outer(columns[c][t], w)
-            out.append(d)
-        return out
+        out = np.zeros((len(weights), 2, self.n_terms, len(axes), time.n_values))
+        for t, axis in enumerate(axes):
+            out[:, axis, :, t] = columns[chip][t][:, None] * weights[:, None, :]
+        return out.reshape(len(weights), 2, self.n_terms, self.n_tdd)
 
     def frame(self, theta: ArrayLike, exposure: int) -> tuple[Float, Float]:
         """Linear part (..., 2, 2) and shift (..., 2) of T_e for an exposure code."""
         return frame_matrix(*self._frame_parameters(np.asarray(theta, float), exposure))
 
-    def _frame_parameters(self, theta: Float, exposure: int) -> tuple[str, Float]:
-        """Kind of an exposure's frame, and all its parameters (..., q), held ones included."""
-        if not self.has_frame(exposure):
-            return "none", theta[..., :0]
+    def _frame_parameters(self, theta: Float, exposure: int | Int) -> tuple[str, Float]:
+        """Kind of a frame, and all its parameters (..., q), held ones included.
+
+        Of one exposure, or of several (n,) that are all later than the first: then (..., n, q).
+        """
+        first = int(np.ravel(exposure)[0])
+        if not self.has_frame(first):
+            return "none", np.zeros((*theta.shape[:-1], *np.shape(exposure), 0))
         names = frame_names(self.frames)
-        values = theta[..., self.frame_slice(exposure)]
-        if exposure:
+        values = theta[..., self.frame_columns(exposure)]
+        if first:
             return self.frames, values[..., : len(names)]
         free = self.free_frame_names(0)
-        out = np.empty((*theta.shape[:-1], len(names)))
+        out = np.empty((*values.shape[:-1], len(names)))
         for k, name in enumerate(names):
             out[..., k] = (
                 self.held[RIGID.index(name)] if name in RIGID else values[..., free.index(name)]
@@ -91,34 +94,33 @@ class EffectiveCoefficients(ParameterLayout):
         """
         theta = np.asarray(theta, float)
         out = self.polynomials(theta, groups.chip, groups.epoch)
-        if not self.n_frame:
-            return out
         o = np.asarray(self.origin)
-        if self.chip_deviations:
-            at_centre = np.stack([basis.monomial_matrix[0] for basis in self.bases])
-            centre = np.einsum("...gak,gk->...ga", out, at_centre[groups.chip])
-            for g, (c, e) in enumerate(zip(groups.chip, groups.exposure, strict=True)):
-                own = self.own_slice(int(c), int(e))
-                if own.stop:
-                    L, d = chip_matrix(theta[..., self.frame_slice(int(e))][..., own])
-                    w = out[..., g, :, :]
-                    w += np.einsum("...ab,...bk->...ak", L, self._about_chip(w, int(c)))
-                    w[..., 0] += d
-        for e in np.unique(groups.exposure):
-            if not self.has_frame(int(e)):
+        for rows in self._alike(groups):
+            chip, exposure = int(groups.chip[rows[0]]), groups.exposure[rows]
+            own = self.own_slice(chip, int(exposure[0]))
+            if not self.has_frame(int(exposure[0])):
                 continue
-            M, d = self.frame(theta, int(e))
-            sel = groups.exposure == e
-            w = out[..., sel, :, :]
+            w = out[..., rows, :, :]
+            centre = w @ self.bases[chip].monomial_matrix[0]  # of the chip, before its deviations
+            if own.stop:
+                L, d = chip_matrix(theta[..., self.frame_columns(exposure)][..., own])
+                w += np.einsum("...ab,...bk->...ak", L, self._about_chip(w, chip))
+                w[..., 0] += d
+            frame = self._frame_parameters(theta, exposure)
+            M, d = frame_matrix(*frame)
             w[..., 0] -= o
-            w = np.einsum("...ab,...gbk->...gak", M, w)
-            w[..., 0] += (o + d)[..., None, :]
-            if self.chip_deviations:
-                R, _ = rigid_part(*self._frame_parameters(theta, int(e)))
-                back = np.einsum("...ab,...gb->...ga", M - R, centre[..., sel, :] - o)
-                w[..., 0] -= back * (groups.chip[sel] > 0)[:, None]
-            out[..., sel, :, :] = w
+            w = np.einsum("...ab,...bk->...ak", M, w)
+            w[..., 0] += o + d
+            if self.chip_deviations and chip:
+                R, _ = rigid_part(*frame)
+                w[..., 0] -= np.einsum("...ab,...b->...a", M - R, centre - o)
+            out[..., rows, :, :] = w
         return out
+
+    def _alike(self, groups: Groups) -> list[Int]:
+        """Indices of groups of one chip: of the first exposure, and of all later ones."""
+        kind = 3 * groups.chip + np.sign(groups.exposure)
+        return [np.flatnonzero(kind == one) for one in np.unique(kind)]
 
     def effective_jacobian(self, theta: ArrayLike, groups: Groups) -> list[tuple[Int, Float]]:
         """Derivatives of the effective coefficients.
@@ -127,51 +129,79 @@ class EffectiveCoefficients(ParameterLayout):
         are the entries of theta that the group depends on (global ones first), `derivative` (2, K,
         m).
         """
+        out = [(np.zeros(0, np.int64), np.zeros(0))] * len(groups)
+        for rows, columns, derivative in self.jacobian_blocks(theta, groups):
+            for g, *one in zip(rows, columns, derivative, strict=True):
+                out[g] = tuple(one)
+        return out
+
+    def jacobian_blocks(self, theta: ArrayLike, groups: Groups) -> Iterator[tuple[Int, Int, Float]]:
+        """Derivatives of the effective coefficients, many groups at a time.
+
+        Parameters
+        ----------
+        theta, groups
+            As of `effective_jacobian`.
+
+        Yields
+        ------
+        rows : ndarray of int, shape (n,)
+            Groups of one chip that depend on the same global parameters, and on as many of their
+            exposures.
+        columns : ndarray of int, shape (n, m)
+            Entries of theta, global ones first.
+        derivative : ndarray, shape (n, 2, K, m)
+        """
         theta = np.asarray(theta, float)
         K, o = self.n_terms, np.asarray(self.origin)
-        poly = self.polynomials(theta, groups.chip, groups.epoch)
-        time = self.time
-        drift = None if time is None else self._drift(time, groups.chip, groups.epoch)
-        out = []
-        for g in range(len(groups)):
-            chip, e = int(groups.chip[g]), int(groups.exposure[g])
-            M, _ = self.frame(theta, e)
-            block, own = self.frame_slice(e), self.own_slice(chip, e)
-            values = theta[block][own]
-            L, d = chip_matrix(values) if own.stop else (np.zeros((2, 2)), np.zeros(2))
+        poly_of = self.polynomials(theta, groups.chip, groups.epoch)
+        for rows in self._alike(groups):
+            chip, exposure, poly = int(groups.chip[rows[0]]), groups.exposure[rows], poly_of[rows]
+            n, first = len(rows), int(exposure[0])
+            frame = self._frame_parameters(theta, exposure)
+            M, _ = frame_matrix(*frame)
+            block, own = self.frame_columns(exposure), self.own_slice(chip, first)
+            about_chip = self._about_chip(poly, chip)
 
             # by the polynomial's coefficients, then by the parameters of the drift
             columns = [np.r_[slice(2 * K * chip, 2 * K * (chip + 1))]]
-            direct = np.einsum("ab,kl->akbl", M, np.eye(K))
+            direct = np.einsum("nab,kl->nakbl", M, np.eye(K))
             if own.stop:
-                R, turning = rigid_part(*self._frame_parameters(theta, e))
+                L, d = chip_matrix(theta[block][:, own])
+                R, turning = rigid_part(*frame)
                 at_centre = self.bases[chip].monomial_matrix[0]
-                direct += np.einsum("ab,kl->akbl", M @ L, self._about_chip(np.eye(K), chip).T)
-                direct[:, 0] -= np.einsum("ab,l->abl", M - R, at_centre)
-            blocks = [direct.reshape(2, K, 2 * K)]
-            if drift is not None:
+                direct += np.einsum("nab,kl->nakbl", M @ L, self._about_chip(np.eye(K), chip).T)
+                direct[:, :, 0] -= np.einsum("nab,l->nabl", M - R, at_centre)
+            direct = direct.reshape(n, 2 * K, 2 * K)
+            blocks = [direct]
+            if self.time is not None:
                 columns.append(np.r_[self.drift_slice(chip)])
-                blocks.append(np.einsum("akbl,blm->akm", direct, drift[g]))
-            if block.stop > block.start:
-                about_chip = self._about_chip(poly[g], chip)
-                w = poly[g] + L @ about_chip
-                w[:, 0] += d - o
-                shift = np.zeros((2, K, 2))
-                shift[0, 0, 0] = shift[1, 0, 1] = 1.0
-                tangent = frame_tangent(*self._frame_parameters(theta, e))
-                by_frame = np.einsum("mab,bk->akm", tangent, w)
+                drift = self._drift(self.time, chip, groups.epoch[rows])
+                blocks.append(direct @ drift.reshape(n, 2 * K, -1))
+            columns = [np.broadcast_to(one, (n, len(one))) for one in columns]
+            if block.size:
+                w = poly.copy()
                 if own.stop:
-                    by_frame[:, 0] -= ((tangent - turning) @ (poly[g] @ at_centre - o)).T
-                of_all = np.concatenate([shift, by_frame], axis=2)
+                    w += L @ about_chip
+                    w[..., 0] += d
+                w[..., 0] -= o
+                shift = np.zeros((n, 2, K, 2))
+                shift[:, 0, 0, 0] = shift[:, 1, 0, 1] = 1.0
+                tangent = frame_tangent(*frame)
+                by_frame = np.einsum("nmab,nbk->nakm", tangent, w)
+                if own.stop:
+                    off = poly @ at_centre - o
+                    by_frame[:, :, 0] -= np.einsum("nmab,nb->nam", tangent - turning, off)
+                of_all = np.concatenate([shift, by_frame], axis=-1)
                 names = frame_names(self.frames)
-                fitted = [n for n in self.free_frame_names(e) if n in names]
-                columns.append(np.r_[block][: len(fitted)])
-                blocks.append(of_all[..., [names.index(n) for n in fitted]])
+                fitted = [k for k in self.free_frame_names(first) if k in names]
+                columns.append(block[:, : len(fitted)])
+                blocks.append(of_all[..., [names.index(k) for k in fitted]])
                 if own.stop:
                     shapes, shifts = chip_matrix(np.eye(len(CHIP_DEVIATIONS)))
-                    by_own = np.einsum("mab,bk->akm", shapes, about_chip)
-                    by_own[:, 0] += shifts.T
-                    columns.append(np.r_[block][own])
-                    blocks.append(np.einsum("ab,bkm->akm", M, by_own))
-            out.append((np.concatenate(columns), np.concatenate(blocks, axis=2)))
-        return out
+                    by_own = np.einsum("mab,nbk->nakm", shapes, about_chip)
+                    by_own[:, :, 0] += shifts.T
+                    columns.append(block[:, own])
+                    blocks.append(np.einsum("nab,nbkm->nakm", M, by_own))
+            derivative = [one.reshape(n, 2, K, -1) for one in blocks]
+            yield rows, np.concatenate(columns, axis=1), np.concatenate(derivative, axis=-1)

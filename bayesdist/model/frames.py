@@ -83,16 +83,16 @@ def frame_matrix(kind: str, p: ArrayLike) -> tuple[Float, Float]:
 
 
 def frame_tangent(kind: str, p: ArrayLike) -> Float:
-    """Derivatives (q - 2, 2, 2) of M by each parameter after the two shifts; else (0, 2, 2)."""
-    names = frame_names(kind)[2:]
-    if not names:
-        return np.zeros((0, 2, 2))
+    """Derivatives (..., q - 2, 2, 2) of M by each parameter after the two shifts."""
     p = np.asarray(p, float)
+    names = frame_names(kind)[2:]
     turn, behind = _parts(kind, p)
     quarter = LINEAR_MATRICES["rotation"]
-    return np.stack(
-        [turn @ (quarter @ behind if n == "rotation" else LINEAR_MATRICES[n]) for n in names]
-    )
+    out = np.zeros((*p.shape[:-1], len(names), 2, 2))
+    for k, name in enumerate(names):
+        by_name = quarter @ behind if name == "rotation" else LINEAR_MATRICES[name]
+        out[..., k, :, :] = turn @ by_name
+    return out
 
 
 def rigid_part(kind: str, p: ArrayLike) -> tuple[Float, Float]:

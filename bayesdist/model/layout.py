@@ -314,6 +314,13 @@ class ParameterLayout:
         start = self.n_global + (exposure - 1) * self.n_frame
         return slice(start, start + self.n_frame)
 
+    def frame_columns(self, exposure: int | Int) -> Int:
+        """Entries (..., q) of theta of exposures (codes), which are all the first or all later."""
+        codes = np.asarray(exposure)
+        first = int(codes.flat[0])
+        block = self.frame_slice(first)
+        return np.arange(block.start, block.stop) + self.n_frame * (codes - first)[..., None]
+
     @property
     def local_blocks(self) -> tuple[slice, ...]:
         """Local blocks of theta, one for each exposure but the first."""

@@ -25,7 +25,7 @@ from matplotlib.spines import Spine
 from matplotlib.transforms import Bbox
 from PIL import Image
 
-from bayesdist.files import atomic_path, made_folder
+from bayesdist.files import announce, atomic_path, made_folder
 from bayesdist.report.figures.figure_numbers import numbers_of
 from bayesdist.report.figures.style import figure_style, plain_ticks
 from bayesdist.report.registry import Item, Plot, Registry
@@ -243,10 +243,9 @@ def save_drawings(
 
 
 def _saved(files: Mapping[str, bytes], folder: Path) -> tuple[Path, ...]:
-    paths = []
-    for name, content in files.items():
-        path = folder / name
+    paths = {folder / name: content for name, content in files.items()}
+    announce(tuple(paths))
+    for path, content in paths.items():
         with atomic_path(path) as temporary:
             temporary.write_bytes(content)
-        paths.append(path)
     return tuple(paths)

@@ -17,7 +17,17 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.files import atomic_path
-from tests.benchmarks import budget, dithers, likelihood, linear, samplers, scaling, scamp, wise
+from tests.benchmarks import (
+    budget,
+    commands,
+    dithers,
+    likelihood,
+    linear,
+    samplers,
+    scaling,
+    scamp,
+    wise,
+)
 from tests.benchmarks.figure import draw_scaling
 from tests.benchmarks.history import HISTORY, read_history, regressions, with_run, write_history
 from tests.benchmarks.machine import describe
@@ -29,6 +39,7 @@ __all__ = ["main"]
 
 FIGURE = "figures/scaling.png"  # beside the page
 PARTS = {
+    "commands": commands,
     "samplers": samplers,
     "kernel": likelihood,
     "linear": linear,

@@ -30,7 +30,7 @@ class Sizes:
     seconds: float  # limit for each
 
 
-FULL = Sizes(5, ((28, 16_000), (55, 32_000), (110, 65_500)), 900)
+FULL = Sizes(5, ((14, 8_000), (28, 16_000), (110, 65_500)), 900)
 QUICK = Sizes(2, ((4, 400),), 300)
 
 

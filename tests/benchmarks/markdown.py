@@ -47,6 +47,19 @@ def _machine(m: dict[str, Any]) -> list[str]:
     return ["| | |", "|---|---|", *(f"| {k} | {v} |" for k, v in facts.items()), ""]
 
 
+def _commands(part: dict[str, Any]) -> list[str]:
+    out = [
+        "## Commands",
+        "",
+        f"{part['n_stars']:,} simulated stars of WISE, order {part['order']}, two requirements. "
+        "Each command is a process of its own, imports included; the first run compiles all that "
+        "it needs.",
+        "",
+    ]
+    body = [(r["what"], _number(r["cpu_s"]), _number(r["seconds"])) for r in part["rows"]]
+    return out + _table(("command", "CPU s", "s"), body)
+
+
 def _samplers(part: dict[str, Any]) -> list[str]:
     out = [
         "## Samplers",
@@ -374,6 +387,7 @@ def _dithers(part: dict[str, Any]) -> list[str]:
 
 
 _PARTS = {
+    "commands": _commands,
     "samplers": _samplers,
     "kernel": _kernel,
     "linear": _linear,

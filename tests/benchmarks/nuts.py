@@ -27,7 +27,6 @@ Float = NDArray[np.float64]
 BASES = ("orthogonal", "whitened")
 CHAINS = 4
 BLOCK = 25  # draws of one compiled call
-SHORT_BLOCK = 5  # the same where a draw takes seconds
 
 
 def log_density(problem: Problem) -> tuple[Any, tuple[Any, ...]]:
@@ -81,7 +80,6 @@ def nuts(
     seconds: float,
     warmup: int,
     draws: int,
-    known: dict[str, Any] | None = None,
     seed: int = 5,
 ) -> tuple[dict[str, Any], Float]:
     """Four vectorised chains until so many draws are made or the time is up.
@@ -96,9 +94,6 @@ def nuts(
         For warm-up and sampling together; compilation is timed apart.
     warmup, draws : int
         Of each chain.
-    known : dict, optional
-        Row of fewer stars in the same coordinates.  Its step size is kept, so that a short warm-up
-        will do, and its effective draws per gradient: a short run only measures what one costs.
     seed : int
 
     Returns
@@ -114,23 +109,17 @@ def nuts(
     if basis == "orthogonal":
         root = np.diag(np.sqrt((root**2).sum(axis=1)))
     centre, matrix = jax.numpy.asarray(white.centre), jax.numpy.asarray(root)
-    options: dict[str, Any] = {}
-    if known is not None:
-        # both sets of coordinates have unit scale whatever the number of stars
-        options = {"step_size": known["step_size"], "adapt_step_size": False}
-        options |= {"adapt_mass_matrix": False}
-    block = BLOCK if known is None else SHORT_BLOCK
 
     def advance(state: Any, *data: Any) -> tuple[Any, tuple[Any, Any]]:
         # the data are arguments: as constants the compiler would fold them into the program
-        kernel = NUTS(potential_fn=lambda z: -function(centre + matrix @ z, *data), **options)
+        kernel = NUTS(potential_fn=lambda z: -function(centre + matrix @ z, *data))
         _setup(kernel)
 
         def one(state: Any, _: None) -> tuple[Any, tuple[Any, Any]]:
             state = kernel.sample(state, (), {})
             return state, (state.z, state.num_steps)
 
-        return jax.lax.scan(one, state, None, length=block)
+        return jax.lax.scan(one, state, None, length=BLOCK)
 
     def _setup(kernel: Any) -> Any:
         keys = jax.random.split(jax.random.PRNGKey(seed), CHAINS)
@@ -142,20 +131,18 @@ def nuts(
         warnings.simplefilter("ignore")
         clock = Deadline(seconds)
         state = jax.jit(
-            lambda *data: _setup(
-                NUTS(potential_fn=lambda z: -function(centre + matrix @ z, *data), **options)
-            )
+            lambda *data: _setup(NUTS(potential_fn=lambda z: -function(centre + matrix @ z, *data)))
         )(*data)
         program = jax.jit(advance).lower(state, *data).compile()
         compile_s = clock.elapsed
 
         clock = Deadline(seconds)
-        for _ in range(-(-warmup // block)):
+        for _ in range(-(-warmup // BLOCK)):
             state, out = program(state, *data)
         jax.block_until_ready(out)
         warm_s = clock.elapsed
         points, gradients, sampling = [], 0, Deadline(max(seconds - warm_s, 0.0))
-        while len(points) * block < draws and not (points and sampling.over):
+        while len(points) * BLOCK < draws and not (points and sampling.over):
             state, (z, steps) = program(state, *data)
             points.append(np.asarray(z))
             gradients += int(np.asarray(steps).sum())
@@ -163,17 +150,8 @@ def nuts(
     chains = np.concatenate(points).swapaxes(0, 1)
     psi = white.centre + chains @ root.T
     bulk, tail = smallest_ess(psi)
-    flags = []
-    per_pass = min(bulk, tail) / gradients
-    if known is not None:
-        # the effective size of so few draws would be far too small
-        per_pass = known["per_pass"]
-        flags.append(
-            f"short run of {psi.shape[1]} draws: seconds of a gradient measured, "
-            f"step size and effective draws per gradient from N = {known['n_stars']:,}"
-        )
-    elif min(bulk, tail) < 400:
-        flags.append(f"short run of {psi.shape[1]} draws")
+    worst = min(bulk, tail)
+    flags = [f"short run of {psi.shape[1]} draws"] if worst < 400 else []
     row = {
         "ess_bulk": bulk,
         "ess_tail": tail,
@@ -181,13 +159,11 @@ def nuts(
         "warmup_s": warm_s,
         "compile_s": compile_s,
         "passes": gradients,
-        "rate": per_pass * gradients / sample_s,
-        "per_pass": per_pass,
-        "step_size": float(np.mean(np.asarray(state.adapt_state.step_size))),
+        "rate": worst / sample_s,
+        "rate_total": worst / (sample_s + warm_s),
+        "per_pass": worst / gradients,
         "acceptance": float(np.mean(np.asarray(state.mean_accept_prob))),
         "setting": f"{basis}, {CHAINS} chains",
         "flags": flags,
     }
-    if known is None:
-        row["rate_total"] = min(bulk, tail) / (sample_s + warm_s)
     return row, psi

@@ -217,6 +217,8 @@ def test_json_and_markdown_are_complete(quick):
     assert len(selfcal["rows"]) == (2 if selfcal["absent"] else 5)
     (dithers,) = bench["parts"]["dithers"]["rows"]
     assert dithers["converged"] and dithers["n_stars"] > dithers["stars"] > 0
+    commands = {row["what"]: row["cpu_s"] for row in bench["parts"]["commands"]["rows"]}
+    assert commands["run, first of all"] > commands["run, warm"] > commands["--help"] > 0
     budget = bench["parts"]["budget"]["rows"]
     assert len(budget) == 4 and all(row["seconds"] > 0 for row in budget)
     assert (quick / "figures" / "scaling.png").read_bytes().startswith(b"\x89PNG")

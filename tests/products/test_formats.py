@@ -6,6 +6,7 @@ import json
 import sys
 import types
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,12 @@ HOLD_COVARIANCE = ("cpdis", "idctab", "jwst", "roman", "stdgdc")
 ALONE = dict.fromkeys(("ast", "siaf", "tpv"), "none") | dict.fromkeys(HOLD_COVARIANCE, "covariance")
 SCALE = 0.11
 OPTIONS = BuildOptions(scale_arcsec=SCALE)
-SIZES = {"wise_meta": (1016.0, 1016.0), "jwst": (1032.0, 1024.0), "roman": (4088.0, 4088.0)}
+SIZES = {
+    "stdgdc": (300.0, 225.0),  # it has tables of every pixel
+    "wise_meta": (1016.0, 1016.0),
+    "jwst": (1032.0, 1024.0),
+    "roman": (4088.0, 4088.0),
+}
 
 
 def calibration_for(key: str) -> Calibration:
@@ -63,6 +69,7 @@ def calibration_for(key: str) -> Calibration:
     return calibration_of(some_solution(4), "made up")
 
 
+@cache
 def built(key: str) -> Built:
     """The file itself, which comes after those that stand beside it."""
     settings = registry.product_settings()[key](**SETTINGS[key])

@@ -22,7 +22,7 @@ from bayesdist.errors import FormatError, InputError
 from bayesdist.reading import regular
 from bayesdist.reading.documents import DEEPEST, json_of, toml_of
 from bayesdist.reading.fits import open_fits
-from bayesdist.reading.hdf5 import hdf5_arrays, netcdf_tree
+from bayesdist.reading.hdf5 import hdf5_arrays, netcdf_groups
 from bayesdist.reading.regular import read_bytes, read_lines, read_text
 from bayesdist.reading.tables import read_table
 from bayesdist.reading.unpacked import unpacked
@@ -53,7 +53,7 @@ def test_a_pipe_is_not_waited_for_by_formats_that_take_paths(tmp_path):
         os.mkfifo(tmp_path / name)
     with pytest.raises(InputError, match="is a pipe"):
         read_table(tmp_path / "pipe.parquet")
-    for read in (hdf5_arrays, netcdf_tree):
+    for read in (hdf5_arrays, netcdf_groups):
         with pytest.raises(InputError, match="is a pipe"):
             read(tmp_path / "pipe.h5")
 
@@ -139,7 +139,7 @@ def test_columns_that_are_a_million_times_their_file(tmp_path, monkeypatch):
         read_table(tmp_path / "a.parquet")
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("x", (10**12,), np.float64, chunks=(1000,))
-    for read in (hdf5_arrays, netcdf_tree):
+    for read in (hdf5_arrays, netcdf_groups):
         with pytest.raises(FormatError, match="announces 8 TB in a file of"):
             read(tmp_path / "a.h5")
 

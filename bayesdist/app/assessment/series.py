@@ -20,7 +20,6 @@ __all__ = ["write_series_tables"]
 log = logging.getLogger("bayesdist")
 
 N_EPOCHS = 25  # epochs at which the drift is tabulated
-MAX_SWEEPS = 6000  # chips that scatter nearly alike make slow chains
 MIN_EXPOSURES = 8  # exposures below which nothing is said of time
 
 
@@ -40,7 +39,7 @@ def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> No
         return
     trend = TrendModel("lines" if time.breaks else "line", time.breaks, reference=time.epoch0)
     try:
-        posterior = fit_series(series, trend, seed=seed, max_sweeps=MAX_SWEEPS)
+        posterior = fit_series(series, trend, seed=seed)
     except DegenerateError as error:
         if config.has_free_rates:
             raise

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -21,7 +21,7 @@ from bayesdist.reading.documents import model_of, read_json
 from bayesdist.version import __version__
 
 SCHEMA = 2
-PACKAGES = ("arviz-stats", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
+PACKAGES = ("arviz-stats", "astropy", "emcee", "h5py", "numba", "numpy", "scipy")
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -202,11 +202,11 @@ class Record:
         found = {name for one in self.artefacts.values() for name in one.files}
         return found.union((self.under_way or {}).get("files", ()))
 
-    def begins_file(self, name: str) -> bool:
-        """Note that the stage under way writes a file; False where that is known."""
-        if self.under_way is None or name in self.under_way["files"]:
+    def begins_files(self, names: Set[str]) -> bool:
+        """Note that the stage under way writes files; False where that is known of all."""
+        if self.under_way is None or names <= set(self.under_way["files"]):
             return False
-        self.under_way["files"] = sorted([*self.under_way["files"], name])
+        self.under_way["files"] = sorted({*names, *self.under_way["files"]})
         return True
 
     def write(self, path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -190,10 +190,8 @@ class ArtefactStore:
         known = record.artefacts.get(name)
         written: set[str] = set()
 
-        def note(path: Path) -> None:
-            name = self._own(path)
-            if name is not None:
-                written.add(name)
+        def note(paths: Sequence[Path]) -> None:
+            written.update(self._own(paths))
 
         with watched_writes(note):
             yield record.facts
@@ -270,13 +268,10 @@ class ArtefactStore:
     def _noted(self, stage: str) -> Iterator[None]:
         """Note in run.json whatever is written, before it takes its name."""
 
-        def note(path: Path) -> None:
-            name = self._own(path)
-            if name is None:
-                return
-            self._written.add(name)
-            record = self.record
-            if record.begins_file(name):
+        def note(paths: Sequence[Path]) -> None:
+            names, record = self._own(paths), self.record
+            self._written |= names
+            if record.begins_files(names):
                 record.write(self.path / RECORD)
 
         self._making = stage
@@ -286,14 +281,13 @@ class ArtefactStore:
         finally:
             self._making = ""
 
-    def _own(self, path: Path) -> str | None:
-        """Name of a file in the folder, None for one elsewhere and for the record itself."""
-        path, folder = path.absolute(), self.path.absolute()
-        if not path.is_relative_to(folder):
-            return None
-        name = path.relative_to(folder).as_posix()
-        checkpoints = (one for stage in self.stages.values() for one in stage.checkpoints)
-        return None if name in (RECORD, SUMMARY) or _is_one_of(name, (*checkpoints,)) else name
+    def _own(self, paths: Sequence[Path]) -> set[str]:
+        """Names of the files that lie in the folder, without checkpoints and the record itself."""
+        folder = self.path.absolute()
+        places = (path.absolute() for path in paths)
+        names = {p.relative_to(folder).as_posix() for p in places if p.is_relative_to(folder)}
+        checkpoints = tuple(one for stage in self.stages.values() for one in stage.checkpoints)
+        return {n for n in names - {RECORD, SUMMARY} if not _is_one_of(n, checkpoints)}
 
     def _checkpoints(self, name: str) -> list[str]:
         """Files by which a stage goes on, as they are there."""

@@ -102,15 +102,13 @@ class Arrow:
 
         Raises numpy.linalg.LinAlgError when the matrix is not positive definite.
         """
-        if len(self.blocks):
-            chol_blocks = np.linalg.cholesky(self.blocks)
-            # C^-1 B^T, for all blocks at once
-            gain = np.linalg.solve(self.blocks, np.swapaxes(self.edge, 1, 2))
-            schur = self.border - np.einsum("nbq,nqc->bc", self.edge, gain)
-        else:
-            chol_blocks, gain, schur = self.blocks, np.swapaxes(self.edge, 1, 2), self.border
-        chol_border = np.linalg.cholesky((schur + schur.T) / 2)
-        return ArrowFactor(self, chol_border, chol_blocks, gain)
+        chol_blocks = np.linalg.cholesky(self.blocks)
+        inverse_blocks = np.linalg.inv(chol_blocks)
+        # L_e^-1 B_e^T of all blocks, one below the other
+        half = inverse_blocks @ self.edge.mT
+        rows = half.reshape(-1, len(self.border))
+        chol_border = np.linalg.cholesky(self.border - rows.T @ rows)
+        return ArrowFactor(self, chol_border, chol_blocks, inverse_blocks, inverse_blocks.mT @ half)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +118,7 @@ class ArrowFactor:
     matrix: Arrow
     chol_border: Float  # lower Cholesky factor (b, b) of the Schur complement
     chol_blocks: Float  # of each block (n_blocks, q, q)
+    inverse_blocks: Float  # inverses of these
     gain: Float  # C^-1 B^T (n_blocks, q, b) of each block
 
     def solve(self, right: Float) -> Float:
@@ -127,9 +126,8 @@ class ArrowFactor:
         b, l = self.matrix.split(right)
         b = b - np.einsum("nqb,...nq->...b", self.gain, l)
         top = cho_solve((self.chol_border, True), b.reshape(-1, b.shape[-1]).T).T.reshape(b.shape)
-        low = l
-        if len(self.chol_blocks):
-            low = np.linalg.solve(self.matrix.blocks, l[..., None])[..., 0]
+        white = np.einsum("nqr,...nr->...nq", self.inverse_blocks, l)
+        low = np.einsum("nrq,...nr->...nq", self.inverse_blocks, white)
         return self.matrix.join(top, low - np.einsum("nqb,...b->...nq", self.gain, top))
 
     @cached_property
@@ -145,19 +143,15 @@ class ArrowFactor:
         """
         b, l = self.matrix.split(z)
         top = b @ self._inverse_border
-        low = np.einsum("nrq,...nr->...nq", self._inverse_blocks, l)
+        low = np.einsum("nrq,...nr->...nq", self.inverse_blocks, l)
         return self.matrix.join(top, low - np.einsum("nqb,...b->...nq", self.gain, top))
 
-    # Explicit inverses: `colour` is called for every proposal, with few vectors at a time, where
-    # a triangular solve costs a hundred times its arithmetic.
+    # Explicit inverses, of the blocks too: `colour` is called for every proposal, with few vectors
+    # at a time, where a triangular solve costs a hundred times its arithmetic.
 
     @cached_property
     def _inverse_border(self) -> Float:
         return solve_triangular(self.chol_border, np.eye(len(self.chol_border)), lower=True)
-
-    @cached_property
-    def _inverse_blocks(self) -> Float:
-        return np.linalg.inv(self.chol_blocks)
 
     def whiten(self, x: Float) -> Float:
         """White vectors z from x (..., size): the inverse of `colour`."""
@@ -171,7 +165,7 @@ class ArrowFactor:
         root = self._inverse_border
         top = (root**2).sum(axis=0)
         spread = self.gain @ root.T
-        low = (self._inverse_blocks**2).sum(axis=1) + (spread**2).sum(axis=2)
+        low = (self.inverse_blocks**2).sum(axis=1) + (spread**2).sum(axis=2)
         return self.matrix.join(top, low)
 
     def covariance(self) -> Float:

@@ -66,24 +66,28 @@ class NormalEquations(Sums):
         blocks = np.zeros((n_blocks, q, q))
         right = np.zeros(model.n_params)
         tail = slice(G, G + h)
-        for g, (columns, d) in enumerate(model.effective_jacobian(theta, self.groups)):
-            uu, uv, vv = self.weight[g]
-            wd_u = uu @ d[0] + uv @ d[1]
-            wd_v = uv @ d[0] + vv @ d[1]
-            H = d[0].T @ wd_u + d[1].T @ wd_v
-            right[columns] += d[0].T @ self.right[g, 0] + d[1].T @ self.right[g, 1]
-            X = np.einsum("hak,akm->hm", self.cross[g], d)
-            n = int((columns < G).sum())
-            glob = columns[:n]
-            border[np.ix_(glob, glob)] += H[:n, :n]
-            border[tail, glob] += X[:, :n]
-            border[glob, tail] += X[:, :n].T
-            if n < len(columns):
-                e, first = divmod(columns[n] - G, q)
-                local = columns[n:] - columns[n] + first
-                edge[np.ix_([e], glob, local)] += H[None, :n, n:]
-                edge[np.ix_([e], np.r_[tail], local)] += X[None, :, n:]
-                blocks[np.ix_([e], local, local)] += H[None, n:, n:]
+        for rows, columns, d in model.jacobian_blocks(theta, self.groups):
+            du, dv = d[:, 0], d[:, 1]
+            uu, uv, vv = np.moveaxis(self.weight[rows], 1, 0)
+            H = du.mT @ (uu @ du + uv @ dv) + dv.mT @ (uv @ du + vv @ dv)
+            np.add.at(right, columns, np.einsum("nakm,nak->nm", d, self.right[rows]))
+            X = np.einsum("nhak,nakm->nhm", self.cross[rows], d)
+            n, m = int((columns[0] < G).sum()), columns.shape[1]
+            glob = columns[0, :n]
+            border[np.ix_(glob, glob)] += H[:, :n, :n].sum(axis=0)
+            across = X[:, :, :n].sum(axis=0)
+            border[tail, glob] += across
+            border[glob, tail] += across.T
+            if n < m:
+                # groups stand in the order of their exposures, of which some have several dates
+                e, first = divmod(columns[:, n] - G, q)
+                local = columns[0, n:] - columns[0, n] + first[0]
+                at, starts = np.unique(e, return_index=True)
+                by_local = np.concatenate([H[:, :, n:], X[:, :, n:]], axis=1)
+                of_exposure = np.add.reduceat(by_local, starts)
+                edge[np.ix_(at, glob, local)] += of_exposure[:, :n]
+                edge[np.ix_(at, np.r_[tail], local)] += of_exposure[:, m:]
+                blocks[np.ix_(at, local, local)] += of_exposure[:, n:m]
         return Arrow(border, edge, blocks, n_tail=h), right
 
 

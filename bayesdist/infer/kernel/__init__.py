@@ -20,6 +20,7 @@ with kept_by_content():
         mixture_moments,
     )
     from bayesdist.infer.kernel.sky_places import linearised, positions
+    from bayesdist.infer.kernel.small import densities, draw_deviations, precisions, shear
     from bayesdist.infer.kernel.star_modes import DOUBTFUL, FALSE, MEMBER
     from bayesdist.infer.kernel.stars import memberships, residuals
     from bayesdist.infer.kernel.stars_unknown import (
@@ -47,6 +48,8 @@ __all__ = [
     "UNIFORM",
     "Constants",
     "Moments",
+    "densities",
+    "draw_deviations",
     "eliminate_stars",
     "least_squares_moments",
     "linearised",
@@ -56,8 +59,10 @@ __all__ = [
     "mixture_moments",
     "pieces_of",
     "positions",
+    "precisions",
     "residuals",
     "set_threads",
+    "shear",
     "truncated_log_likelihood",
     "truncated_memberships",
     "truncated_moments",

@@ -6,7 +6,7 @@ Threads are Python's.  numba's own compile each pass several times over, and do 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import pairwise
@@ -71,6 +71,12 @@ def share_out(loop: Callable[..., None], n: int, *arguments: Any) -> None:
     with ThreadPoolExecutor(threads) as pool:
         for done in [pool.submit(loop, a, e, *arguments) for a, e in pairwise(edges)]:
             done.result()
+
+
+def at_once(function: Callable[..., Any], *arguments: Iterable[Any]) -> list[Any]:
+    """Results of a function that is called as by `map`, on all threads at a time."""
+    with ThreadPoolExecutor(nb.get_num_threads()) as pool:
+        return list(pool.map(function, *arguments))
 
 
 @contextmanager

@@ -49,6 +49,7 @@ def fit_with_tables(
     tolerance: float = 2e-4,
     step: tuple[float, float] = STEP,
     smoothness: Sequence[float] = SMOOTHNESS,
+    thorough: bool = True,
     report: Callable[[Iteration], None] | None = None,
 ) -> TableFit:
     """Fit the polynomial and the look-up tables of one filter in turn.
@@ -75,6 +76,8 @@ def fit_with_tables(
         Pixels between nodes.
     smoothness : sequence of float
         Matern smoothness to choose from, for 'field'.
+    thorough : bool
+        As of `field_table`.
     report : callable, optional
         Called with each iteration.
 
@@ -143,6 +146,7 @@ def fit_with_tables(
             smoothness=smoothness,
             earlier=posteriors.get(chip),
             hold=number > SEARCHED,
+            thorough=thorough,
         )
         return posteriors[chip].table
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse
 
 from bayesdist.arrays import Float, Int
@@ -99,6 +100,18 @@ class NodeGrid:
         """Node values (n_nodes, ...) without their polynomial part."""
         Q = self.polynomials
         return values - Q @ (Q.T @ values)
+
+    def without_their_polynomials(self, matrix: Float) -> Float:
+        """Symmetric matrix (n_nodes, n_nodes) over nodes without polynomials, in place.
+
+        What is left of node values with this covariance, or of information about them.
+        """
+        Q = self.polynomials
+        MQ = matrix @ Q
+        Z = MQ - 0.5 * Q @ (Q.T @ MQ)
+        left, right = np.concatenate([Z, Q], axis=1), np.concatenate([Q, Z], axis=1)
+        # the transpose of a C array has the order of BLAS, and the matrix is symmetric
+        return scipy.linalg.blas.dgemm(-1.0, left, right, 1.0, matrix.T, trans_b=1, overwrite_c=1).T
 
     @cached_property
     def lag(self) -> Int:

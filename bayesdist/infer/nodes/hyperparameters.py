@@ -57,10 +57,7 @@ class Matern:
 
     def restricted(self, grid: NodeGrid) -> Float:
         """Covariance (n_nodes, n_nodes) of node values without their polynomial part."""
-        C, Q = self.covariance(grid), grid.polynomials
-        CQ = C @ Q
-        Z = CQ - 0.5 * Q @ (Q.T @ CQ)
-        return C - np.concatenate([Z, Q], axis=1) @ np.concatenate([Q, Z], axis=1).T
+        return grid.without_their_polynomials(self.covariance(grid))
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,10 +81,10 @@ class Evidence:
         """Covariance B (n, n) of the rough node values."""
         Q, A = self.grid.polynomials, self.sums.information
         scale = np.median(np.diag(A)[np.diag(A) > 0])
-        A = self.grid.without_polynomials(self.grid.without_polynomials(A).T)
-        A = A + scale * (Q @ Q.T)
+        A = self.grid.without_their_polynomials(A)
+        A += scale * (Q @ Q.T)
         A[np.diag_indices_from(A)] += EMPTY * scale
-        inverse, _ = scipy.linalg.lapack.dpotri(_cholesky(A), lower=1, overwrite_c=1)
+        inverse, _ = scipy.linalg.lapack.dpotri(cholesky(A), lower=1, overwrite_c=1)
         return np.tril(inverse) + np.tril(inverse, -1).T
 
     @cached_property
@@ -99,7 +96,7 @@ class Evidence:
         """Log marginal likelihood, up to a constant that does not depend on the prior."""
         V = prior.restricted(self.grid)
         V += self.noise
-        L = _cholesky(V)
+        L = cholesky(V)
         z = scipy.linalg.solve_triangular(L, self.rough, lower=True, check_finite=False)
         return float(-0.5 * z @ z - np.log(np.diag(L)).sum())
 
@@ -125,9 +122,12 @@ class Evidence:
         lag, noise, rough = self._tile_parts
         by_lag = prior.amplitude**2 * prior.correlation(self.grid.lags)
         by_lag[0] += prior.amplitude**2 * NUGGET
-        L = np.linalg.cholesky(by_lag[lag] + noise)
-        z = np.linalg.solve(L, rough[:, :, None])
-        return float(-0.5 * (z**2).sum() - np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
+        out = 0.0
+        for B, b in zip(noise, rough, strict=True):
+            L = cholesky(by_lag[lag] + B)
+            z = scipy.linalg.solve_triangular(L, b, lower=True, check_finite=False)
+            out -= 0.5 * z @ z + np.log(np.diag(L)).sum()
+        return float(out)
 
     def log_prior(self, prior: Matern) -> float:
         """Log prior density of log amplitude and log length, up to a constant.
@@ -249,7 +249,7 @@ def _widths(covariance: Float) -> Float:
     return np.clip(0.5 * np.sqrt(np.diag(covariance)), 0.01, 0.3)
 
 
-def _cholesky(matrix: Float) -> Float:
+def cholesky(matrix: Float) -> Float:
     """Lower factor of a symmetric matrix, which is overwritten."""
     # the transpose of a C array has the order of LAPACK, and the matrix is symmetric
     L, failed = scipy.linalg.lapack.dpotrf(matrix.T, lower=1, clean=1, overwrite_a=1)

@@ -10,11 +10,12 @@ from numpy.typing import ArrayLike
 
 from bayesdist.arrays import Float
 from bayesdist.infer.nodes.grid import NodeGrid
-from bayesdist.infer.nodes.hyperparameters import FittedField, Matern
+from bayesdist.infer.nodes.hyperparameters import FittedField, Matern, cholesky
 from bayesdist.infer.nodes.sums import NodeSums
 from bayesdist.model.lookup import LookupTable
 
 BLOCK = 2048  # pixels whose rows over all nodes are in memory at once
+COLUMNS = 512  # of a symmetric product, of which no more than one triangle is made
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,9 +108,13 @@ class TablePosterior:
         out = np.empty((len(x), 2))
         for start in range(0, len(x), BLOCK):
             rows = slice(start, start + BLOCK)
+            weights = self.grid.interpolation(x[rows], y[rows])
+            phi = self.grid.basis.evaluate(x[rows], y[rows])
             for a, axis in enumerate(self.axes):
-                response = self.rows(x[rows], y[rows], a, refitted=refitted)
-                out[rows, a] = np.linalg.norm(response @ axis.root, axis=1)
+                response = weights @ axis.root
+                if refitted:
+                    response -= phi @ (axis.sums.absorbed @ axis.root)
+                out[rows, a] = np.linalg.norm(response, axis=1)
         return out
 
     def rows(self, x: Float, y: Float, axis: int, *, refitted: bool = False) -> Float:
@@ -134,14 +139,14 @@ def axis_posterior(grid: NodeGrid, sums: NodeSums, field: FittedField) -> AxisFi
     With d = L z, z ~ N(0, 1) and L the polynomial-free part of the Cholesky factor of the prior,
     the precision of z is 1 + L^T A L: never singular, whatever bins are empty.
     """
-    L = np.asarray(np.linalg.cholesky(field.prior.covariance(grid)), np.float64)
-    L = grid.without_polynomials(L)
-    M = L.T @ sums.informed(L)
-    M = (M + M.T) / 2
+    L = grid.without_polynomials(cholesky(field.prior.covariance(grid)))
+    informed = sums.informed(L)
+    M = np.zeros_like(L)
+    for start in range(0, len(L), COLUMNS):
+        M[start : start + COLUMNS, start:] = L[:, start : start + COLUMNS].T @ informed[:, start:]
     M[np.diag_indices_from(M)] += 1.0
-    root = scipy.linalg.solve_triangular(
-        np.linalg.cholesky(M), L.T, lower=True, overwrite_b=True, check_finite=False
-    ).T
+    # R^T = K^-1 L^T with K K^T = M
+    root = scipy.linalg.blas.dtrsm(1.0, cholesky(M), L.T, lower=1, overwrite_b=1).T
     # the prior's factor has rounding errors of 1e-16 of its size in the polynomial space
     root = grid.without_polynomials(root)
     return AxisField(root @ (root.T @ sums.marginal_right), root, field, sums)

@@ -62,7 +62,7 @@ class NodeSums(Sums):
         """Information about the nodes, for a free polynomial, times values (n, ...)."""
         return self.nodes @ values - self.cross.T @ (self.absorbed @ values)
 
-    @cached_property
+    @property
     def information(self) -> Float:
         """Information (n, n) about the nodes, for a polynomial that is free to follow them."""
         return self.nodes.toarray() - self.cross.T @ self.absorbed

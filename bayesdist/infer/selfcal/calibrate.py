@@ -17,6 +17,7 @@ from bayesdist.infer.selfcal.gauge import Gauge
 from bayesdist.infer.selfcal.mode import PriorAt, SelfCalibrationMode, gauge_of, solve_in_gauge
 from bayesdist.infer.selfcal.problem import Problem, StarPriors, prepare
 from bayesdist.infer.selfcal.tangent import TangentPlane, places_of
+from bayesdist.infer.stars.shards import Compute
 from bayesdist.model import DistortionModel
 
 __all__ = ["SelfCalibration", "scatter_by_magnitude", "self_calibrate"]
@@ -77,6 +78,7 @@ def self_calibrate(
     plane: TangentPlane | None = None,
     max_iterations: int = MAX_ITERATIONS,
     log: Callable[[str], None] = lambda text: None,
+    compute: Compute | None = None,
 ) -> SelfCalibration:
     """Calibrate a detector from detections alone.
 
@@ -108,6 +110,8 @@ def self_calibrate(
     max_iterations : int
     log : callable, optional
         Called with a sentence for each iteration.
+    compute : Compute, optional
+        Where the passes over the detections are made; in this process by default.
 
     Returns
     -------
@@ -148,7 +152,9 @@ def self_calibrate(
         if references is not None:
             problem = replace(problem, priors=references(problem, theta))
         known = None if mode is None else _still(problem, mode)
-        mode = solve_in_gauge(problem, theta, prior_at, jitter=jitter, mixture=known)
+        mode = solve_in_gauge(
+            problem, theta, prior_at, jitter=jitter, mixture=known, compute=compute
+        )
         theta = mode.theta
         log(
             f"iteration {turn + 1}: linking length {radius:.3g} pix, {friends.n_stars} stars, "
@@ -169,6 +175,7 @@ def self_calibrate(
                     stars=mode.stars,
                     jitter=jitter,
                     mixture=mode.mixture,
+                    compute=compute,
                 )
             gauge = gauge_of(mode.problem, mode.theta, prior_at(mode.theta), mode)
             found = replace(found, sigma=detections.sigma)

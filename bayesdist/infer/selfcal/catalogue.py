@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.selfcal.elimination import eliminated_rows, memberships
+from bayesdist.infer.selfcal.elimination import Mixture, eliminated_rows, memberships
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
+from bayesdist.infer.selfcal.pieces import StarPiece, in_pieces
+from bayesdist.infer.stars.shards import Compute
 
 __all__ = ["StarCatalogue", "star_catalogue"]
 
@@ -48,7 +50,9 @@ class StarCatalogue:
         return len(self.values)
 
 
-def star_catalogue(solution: SelfCalibrationMode, cov: Float | None = None) -> StarCatalogue:
+def star_catalogue(
+    solution: SelfCalibrationMode, cov: Float | None = None, *, compute: Compute | None = None
+) -> StarCatalogue:
     """Stars at their modes, with Laplace covariances.
 
     The covariance of a star is that by its own detections for a known distortion, plus that by
@@ -59,10 +63,10 @@ def star_catalogue(solution: SelfCalibrationMode, cov: Float | None = None) -> S
     solution : SelfCalibrationMode
     cov : ndarray, shape (D, D), optional
         Sigma; that of the solution by default.
+    compute : Compute, optional
+        Where the passes over the detections are made; in this process by default.
     """
     problem = solution.problem
-    S, q = problem.n_stars, problem.n_star
-    total, own = np.empty((S, q, q)), np.empty((S, q, q))
     root = np.zeros((len(solution.theta), len(solution.free)))
     if cov is None:
         root[solution.free] = np.linalg.inv(np.linalg.cholesky(solution.precision)).T
@@ -70,16 +74,9 @@ def star_catalogue(solution: SelfCalibrationMode, cov: Float | None = None) -> S
         scale = np.sqrt(np.diag(cov)[solution.free])
         inner = cov[np.ix_(solution.free, solution.free)] / np.outer(scale, scale)
         root[solution.free] = scale[:, None] * np.linalg.cholesky(inner)
-    for some, rows, factors in eliminated_rows(
-        problem, solution.theta, solution.mixture, solution.stars
-    ):
-        back = np.linalg.inv(np.tril(factors))  # L^-1
-        own[some] = np.swapaxes(back, 1, 2) @ back
-        # A^-1 B = L^-T (L^-1 B)
-        spread = np.swapaxes(back, 1, 2) @ (rows @ root)
-        total[some] = own[some] + spread @ np.swapaxes(spread, 1, 2)
-    w = memberships(problem, solution.theta, solution.mixture, solution.stars)
-    members = np.asarray(np.bincount(problem.star, w, minlength=S), float)
+    with in_pieces(problem, solution.stars, compute) as pieces:
+        parts = pieces.sum(_covariances, solution.theta, solution.mixture, root)
+    total, own, members = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     # a star without members is somewhere in the match circle
     widest = problem.least_root**-2
     lost = (members < 0.5) & (np.trace(own[:, :2, :2], axis1=1, axis2=2) > 2 * widest)
@@ -95,3 +92,23 @@ def star_catalogue(solution: SelfCalibrationMode, cov: Float | None = None) -> S
         problem.epoch0,
         problem.model.unit,
     )
+
+
+def _covariances(
+    piece: StarPiece, theta: Float, mixture: Mixture, root: Float
+) -> tuple[tuple[Float, Float, Float], ...]:
+    """Covariances (S, q, q) of the stars of a piece, in all and of their own; members (S,).
+
+    `root` (D, F) is a square root of the covariance of the parameters.
+    """
+    p, stars = piece.problem, piece.stars
+    S, q = p.n_stars, p.n_star
+    total, own = np.empty((S, q, q)), np.empty((S, q, q))
+    for some, rows, factors in eliminated_rows(p, theta, mixture, stars):
+        back = np.linalg.inv(np.tril(factors))  # L^-1
+        own[some] = np.swapaxes(back, 1, 2) @ back
+        # A^-1 B = L^-T (L^-1 B)
+        spread = np.swapaxes(back, 1, 2) @ (rows @ root)
+        total[some] = own[some] + spread @ np.swapaxes(spread, 1, 2)
+    w = memberships(p, theta, mixture, stars)
+    return ((total, own, np.asarray(np.bincount(p.star, w, minlength=S), float)),)

@@ -21,6 +21,7 @@ from bayesdist.infer import kernel
 from bayesdist.infer.kernel.blocks import threads_for
 from bayesdist.infer.kernel.moments import product_table
 from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.infer.stars.sums import Sums
 
 __all__ = [
     "Expansion",
@@ -87,23 +88,22 @@ class PlaceDerivatives:
 
 
 @dataclass(frozen=True, eq=False)
-class Expansion:
+class Expansion(Sums):
     """Second-order expansion of the log density at a solution, the stars eliminated."""
 
     value: float  # log density with the stars integrated out (Laplace), up to a constant
     gradient: Float  # (D,) at the stars' modes
     curvature: Float  # minus the Hessian (D, D)
-    stars: Float  # modes (S, q)
     n_members: float  # expected number of true detections
     chi2: float  # sum of w times the squared normalised residual
 
 
 def expand(
     problem: Problem, theta: Float, mixture: Mixture, stars: Float, *, observed: bool = True
-) -> Expansion:
-    """Expansion at theta (D,) by one pass over the detections.
+) -> tuple[Expansion, Float]:
+    """Expansion at theta (D,) and the stars' modes (S, q), by one pass over the detections.
 
-    The search for the stars' modes starts at `stars` (S, q).  If `observed` the curvature is that
+    The search for the modes starts at `stars` (S, q).  If `observed` the curvature is that
     of the mixture itself; otherwise that with EM weights, which is never indefinite.
     """
     structure, D = PlaceDerivatives.at(problem, theta), problem.model.n_params
@@ -123,7 +123,7 @@ def expand(
         gradient[columns] += pull.ravel() @ by
     curvature = (curvature + curvature.T) / 2
     value, members, chi2 = scalars
-    return Expansion(float(value), gradient, curvature, found, members, chi2)
+    return Expansion(float(value), gradient, curvature, members, chi2), found
 
 
 def eliminated_rows(

@@ -82,7 +82,7 @@ def expected_solution(
     problem = prepare(model, detections, truth, match_radius=1.0, min_detections=min_detections)
     stars = problem.mean_places(truth)
     problem = problem.at(truth, stars)
-    curvature = expand(problem, truth, NONE_FALSE, stars).curvature
+    curvature = expand(problem, truth, NONE_FALSE, stars)[0].curvature
     gauge = find_gauge(problem, truth, curvature, prior)
     free = np.setdiff1d(np.arange(model.n_params), gauge.held)
     precision = (curvature + prior.precision)[np.ix_(free, free)]

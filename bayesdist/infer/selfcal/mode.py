@@ -9,6 +9,7 @@ uses.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,12 +19,14 @@ from numpy.typing import NDArray
 from bayesdist.errors import DegenerateError, NotSettledError
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.linear import LinearFit
-from bayesdist.infer.selfcal.elimination import Expansion, Mixture, expand
+from bayesdist.infer.selfcal import pieces as of
+from bayesdist.infer.selfcal.elimination import Expansion, Mixture
 from bayesdist.infer.selfcal.gauge import Decision, Gauge, find_gauge
-from bayesdist.infer.selfcal.problem import Problem, StarPriors
+from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.stars.likelihood import Clip
+from bayesdist.infer.stars.shards import Compute, MappedPieces
 
-__all__ = ["PriorAt", "SelfCalibrationMode", "curvatures", "gauge_of", "solve", "solve_in_gauge"]
+__all__ = ["PriorAt", "SelfCalibrationMode", "gauge_of", "mode_at", "solve", "solve_in_gauge"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -54,6 +57,9 @@ class SelfCalibrationMode:
     free : ndarray of int, shape (F,)
         Parameters that were fitted; the others are fixed by the gauge.
     expansion : Expansion
+    curvatures : tuple of ndarray, shape (D, D)
+        With EM weights, hence never indefinite: by the detections alone, and with the priors of
+        the stars.
     prior : Prior
     decision : Decision, optional
         Directions taken as free; None where only `free` was given.
@@ -65,6 +71,7 @@ class SelfCalibrationMode:
     mixture: Mixture
     free: Int
     expansion: Expansion
+    curvatures: tuple[Float, Float]
     prior: Prior
     decision: Decision | None = None
 
@@ -156,25 +163,77 @@ def solve(
     stars: Float | None = None,
     mixture: Mixture | None = None,
     jitter: float | None = None,
+    compute: Compute | None = None,
 ) -> SelfCalibrationMode:
     """Mode by Newton's method with the stars eliminated in each pass.
 
     Errors begin as large as the scatter of the start and shrink with it, so that a start that is
     far off loses no star.  `jitter` is fitted by default; so are `stars` (S, q) and `mixture`,
-    which are starting values.  DegenerateError when the parameters `free` are not determined;
+    which are starting values.  `compute` is where the passes over the detections are made, in this
+    process by default.  DegenerateError when the parameters `free` are not determined;
     NotSettledError when it does not converge.
     """
-    stars = problem.median_places(theta) if stars is None else stars
-    problem = problem.at(theta, stars)
-    mixture = mixture or wide_mixture(problem, theta, stars)
-    near = False
+    with _loaded(problem, stars, compute) as loaded:
+        begin = _Begun(loaded, theta, mixture, medians=stars is None)
+        return _solved(problem, begin, free, prior, jitter).mode(problem)
+
+
+@dataclass(frozen=True, eq=False)
+class _Begun:
+    """Start of a search."""
+
+    pieces: MappedPieces
+    theta: Float
+    mixture: Mixture | None = None  # wide errors by default
+    medians: bool = False  # begin with the stars at the medians of their detections
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """End of a search."""
+
+    pieces: MappedPieces
+    theta: Float
+    mixture: Mixture
+    free: Int
+    expansion: Expansion
+    curvatures: tuple[Float, Float]
+    prior: Prior
+    decision: Decision | None = None
+
+    @property
+    def again(self) -> _Begun:
+        """Start of another search from here."""
+        return _Begun(self.pieces, self.theta, self.mixture)
+
+    def mode(self, problem: Problem) -> SelfCalibrationMode:
+        """The mode, with all detections in this process."""
+        whole = of.gathered(problem, self.pieces)
+        rest = self.mixture, self.free, self.expansion, self.curvatures, self.prior, self.decision
+        return SelfCalibrationMode(whole.problem, self.theta, whole.stars, *rest)
+
+
+def _loaded(
+    problem: Problem, stars: Float | None, compute: Compute | None
+) -> AbstractContextManager[MappedPieces]:
+    """Context with the pieces of a problem, at given stars (S, q) or at none yet."""
+    places = np.zeros((problem.n_stars, problem.n_star)) if stars is None else stars
+    return of.in_pieces(problem, places, compute)
+
+
+def _solved(
+    problem: Problem, begin: _Begun, free: Int, prior: Prior, jitter: float | None
+) -> _Found:
+    theta, near = begin.theta, False
+    pieces = begin.pieces.map(of.at_medians if begin.medians else of.at_stars, theta)
+    mixture = begin.mixture or wide_mixture(pieces, theta)
     for _ in range(MAX_PASSES):
-        found = expand(problem, theta, mixture, stars, observed=near)
-        stars = problem.found_again(theta, found.stars)
+        at_modes = pieces.map(of.at_modes, theta, mixture, near)
+        found = at_modes.sum(of.expansion_of)
         gradient = found.gradient + prior.pull(theta)
         step = newton_step(found.curvature + prior.precision, gradient, free)
         if step is None and near:
-            near = False
+            near, pieces = False, at_modes
             continue
         if step is None:
             raise DegenerateError(
@@ -183,19 +242,16 @@ def solve(
                 do="look at the gauge: dither more, add roll angles, or give priors",
             )
         decrement = float(gradient @ step)
-        before = problem.middles(theta)
+        pieces = at_modes.map(of.moved, theta, theta + step)
         theta = theta + step
-        stars = stars.copy()
-        stars[:, :2] += problem.middles(theta) - before
-        problem = problem.at(theta, stars)
         after = _mixture(problem, mixture, found, len(free), jitter)
         change = abs(after.fraction / mixture.fraction - 1.0) + abs(
             (problem.var + after.jitter**2).mean() / (problem.var + mixture.jitter**2).mean() - 1.0
         )
         if near and decrement < MAX_DECREMENT and change < MAX_CHANGE:
-            found = expand(problem, theta, mixture, stars)
-            stars = problem.found_again(theta, found.stars)
-            return SelfCalibrationMode(problem, theta, stars, mixture, free, found, prior)
+            pieces = pieces.map(of.at_modes, theta, mixture, True)
+            found, both = pieces.sum(of.expansion_of), curvatures(problem, pieces, theta, mixture)
+            return _Found(pieces, theta, mixture, free, found, both, prior)
         near = decrement < NEAR and change < 0.1
         mixture = after
     raise NotSettledError(
@@ -221,9 +277,9 @@ def newton_step(curvature: Float, gradient: Float, free: Int) -> Float | None:
     return out
 
 
-def wide_mixture(problem: Problem, theta: Float, stars: Float) -> Mixture:
+def wide_mixture(pieces: MappedPieces, theta: Float) -> Mixture:
     """Mixture with errors as large as those of a start."""
-    square = problem.squares(theta, stars)
+    square = np.concatenate(pieces.sum(of.squares, theta))
     # the median of r^2 is 1.386 sigma^2
     return Mixture(START_SCALE * float(np.sqrt(np.median(square) / (2 * np.log(2)))), 0.02)
 
@@ -254,49 +310,61 @@ def solve_in_gauge(
     stars: Float | None = None,
     mixture: Mixture | None = None,
     jitter: float | None = None,
+    compute: Compute | None = None,
 ) -> SelfCalibrationMode:
     """Mode of a problem, with the parameters fixed by convention as decided there.
 
     The search starts at theta (D,); `prior_at` gives information from other sources than the
     detections, linearised at parameters (D,).  Where the detections determine more at the mode than
     at the start, that is fitted; where it then turns out to be free after all, it stays fixed.
-    DegenerateError and NotSettledError as `solve`.
+    Other arguments, DegenerateError and NotSettledError as `solve`.
     """
     prior = prior_at(theta)
 
-    def solved(gauge: Gauge, begin: SelfCalibrationMode | None) -> SelfCalibrationMode:
+    def solved(gauge: Gauge, begin: _Begun) -> _Found:
         free = np.setdiff1d(np.arange(problem.model.n_params), gauge.held)
-        found = solve(
-            problem,
-            theta if begin is None else begin.theta,
-            free,
-            prior,
-            stars=stars if begin is None else begin.stars,
-            mixture=mixture if begin is None else begin.mixture,
-            jitter=jitter,
-        )
-        return replace(found, decision=gauge.decision)
+        return replace(_solved(problem, begin, free, prior, jitter), decision=gauge.decision)
 
-    def asked_at(solution: SelfCalibrationMode) -> Gauge:
-        bare = replace(solution, decision=None)
-        return gauge_of(bare.problem, bare.theta, prior_at(bare.theta), bare)
+    def asked_at(found: _Found) -> Gauge:
+        alone, known = found.curvatures
+        return find_gauge(problem, found.theta, alone, prior_at(found.theta), known=known)
 
-    gauge = gauge_of(problem, theta, prior)
-    solution = solved(gauge, None)
-    at_mode = asked_at(solution)
-    if at_mode.held.size > gauge.held.size:
-        return solved(at_mode, solution)
-    while at_mode.held.size < gauge.held.size:
-        try:
-            freer = solved(at_mode, solution)
-        except (DegenerateError, NotSettledError):
-            return solution
-        gauge, at_mode = at_mode, asked_at(freer)
+    with _loaded(problem, stars, compute) as loaded:
+        gauge = _gauge_at_start(problem, loaded, theta, prior)
+        found = solved(gauge, _Begun(loaded, theta, mixture, medians=stars is None))
+        at_mode = asked_at(found)
         if at_mode.held.size > gauge.held.size:
-            return solution
-        solution = freer
-    # as many are fixed: the choice of the parameters is arbitrary
-    return replace(solution, decision=replace(at_mode.decision, held=gauge.held))
+            return solved(at_mode, found.again).mode(problem)
+        while at_mode.held.size < gauge.held.size:
+            try:
+                freer = solved(at_mode, found.again)
+            except (DegenerateError, NotSettledError):
+                return found.mode(problem)
+            gauge, at_mode = at_mode, asked_at(freer)
+            if at_mode.held.size > gauge.held.size:
+                return found.mode(problem)
+            found = freer
+        # as many are fixed: the choice of the parameters is arbitrary
+        decision = replace(at_mode.decision, held=gauge.held)
+        return replace(found, decision=decision).mode(problem)
+
+
+def mode_at(
+    problem: Problem,
+    theta: Float,
+    stars: Float,
+    mixture: Mixture,
+    free: Int,
+    prior: Prior,
+    decision: Decision | None = None,
+    *,
+    compute: Compute | None = None,
+) -> SelfCalibrationMode:
+    """Mode that was found before, from its parameters: `problem` is linearised there."""
+    with of.in_pieces(problem, stars, compute) as loaded:
+        pieces = loaded.map(of.at_modes, theta, mixture, True)
+        found, both = pieces.sum(of.expansion_of), curvatures(problem, pieces, theta, mixture)
+        return _Found(pieces, theta, mixture, free, found, both, prior, decision).mode(problem)
 
 
 def gauge_of(
@@ -307,23 +375,24 @@ def gauge_of(
     Before there is a solution, stars lie at the means of their detections.  The solution's decision
     on the free directions is used.
     """
-    decision = None if solution is None else solution.decision
     if solution is None:
-        stars = problem.mean_places(theta)
-        problem = problem.at(theta, stars)
-        mixture = wide_mixture(problem, theta, stars)
-    else:
-        stars, mixture = solution.stars, solution.mixture
-    alone, known = curvatures(problem, theta, mixture, stars)
-    return find_gauge(problem, theta, alone, prior, known=known, decision=decision)
+        with _loaded(problem, None, None) as loaded:
+            return _gauge_at_start(problem, loaded, theta, prior)
+    alone, known = solution.curvatures
+    return find_gauge(problem, theta, alone, prior, known=known, decision=solution.decision)
+
+
+def _gauge_at_start(problem: Problem, loaded: MappedPieces, theta: Float, prior: Prior) -> Gauge:
+    pieces = loaded.map(of.at_means, theta)
+    alone, known = curvatures(problem, pieces, theta, wide_mixture(pieces, theta))
+    return find_gauge(problem, theta, alone, prior, known=known)
 
 
 def curvatures(
-    problem: Problem, theta: Float, mixture: Mixture, stars: Float
+    problem: Problem, pieces: MappedPieces, theta: Float, mixture: Mixture
 ) -> tuple[Float, Float]:
     """Curvature (D, D) by the detections alone, and with the priors of the stars."""
-    known = expand(problem, theta, mixture, stars, observed=False).curvature
+    known = pieces.sum(of.expansion, theta, mixture, False, True).curvature
     if not problem.priors.informed.any():
         return known, known
-    bare = replace(problem, priors=StarPriors.none(problem.n_stars, problem.n_star))
-    return expand(bare, theta, mixture, stars, observed=False).curvature, known
+    return pieces.sum(of.expansion, theta, mixture, False, False).curvature, known

@@ -1,8 +1,8 @@
-"""Detections in pieces of whole stars, for the passes over them that the posterior needs.
+"""Detections in pieces of whole stars, for all passes over them: here or on a cluster.
 
-A piece has its stars at the mode.  What it contributes at other parameters depends on these alone,
-for the search for its stars begins where their detections move them: so no star travels, and a
-piece that is lost is made again from the same detections.
+A piece has its stars at a current solution.  Its next state and its part of every sum depend on the
+piece and on the parameters alone: so no star travels, and a piece that is lost is made again from
+its detections.
 """
 
 from __future__ import annotations
@@ -10,18 +10,39 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.selfcal.elimination import Mixture, StarModes, expand, log_marginal
-from bayesdist.infer.selfcal.mode import SelfCalibrationMode
-from bayesdist.infer.selfcal.problem import Problem
-from bayesdist.infer.stars.shards import Compute, Pieces, Task
-from bayesdist.infer.stars.sums import Sums
+from bayesdist.infer.selfcal.elimination import (
+    Expansion,
+    Mixture,
+    StarModes,
+    expand,
+    log_marginal,
+)
+from bayesdist.infer.selfcal.problem import Problem, StarPriors
+from bayesdist.infer.stars.shards import Compute, MappedPieces, Task
 
-__all__ = ["Slope", "StarPiece", "in_pieces", "log_density", "slope"]
+__all__ = [
+    "Expanded",
+    "ModePiece",
+    "StarPiece",
+    "at_means",
+    "at_medians",
+    "at_modes",
+    "at_stars",
+    "expansion",
+    "expansion_of",
+    "gathered",
+    "in_pieces",
+    "log_density",
+    "moved",
+    "slope",
+    "squares",
+    "to_sample",
+]
 
 Float = NDArray[np.float64]
 
@@ -30,66 +51,145 @@ PIECE = 2**17  # detections: some tenths of a second for the draws that are eval
 
 @dataclass(frozen=True, eq=False)
 class StarPiece:
-    """Some stars with all their detections, at the mode of a self-calibration."""
+    """Some stars with all their detections."""
 
-    problem: Problem
-    modes: StarModes
-
-    @classmethod
-    def at(cls, solution: SelfCalibrationMode) -> StarPiece:
-        """All stars of a solution."""
-        s = solution
-        return cls(s.problem, StarModes.at(s.problem, s.theta, s.mixture, s.stars))
+    problem: Problem  # linearised at the stars of the last step
+    stars: Float  # (S, q)
 
     def __sizeof__(self) -> int:
         """Bytes of all columns, without which Dask would move a piece as if it were nothing."""
-        m = self.modes
-        columns = (*self.problem.columns, m.stars, m.weight, m.middles, m.state)
+        columns = (*self.problem.columns, self.problem.seen, self.stars)
         return sum(column.nbytes for column in columns)
 
     def split(self, detections: int) -> Iterator[StarPiece]:
         """Pieces of consecutive stars with about so many detections."""
-        p, m = self.problem, self.modes
+        p = self.problem
         ends = np.searchsorted(p.starts, np.arange(detections, len(p), detections))
         for stars in np.split(np.arange(p.n_stars), np.unique(ends)):
-            if not len(stars):
-                continue
-            rows = slice(p.starts[stars[0]], p.starts[stars[-1] + 1])
-            # of a star's detections nothing is needed but the columns of the passes
-            part = replace(p.of_stars(stars), seen=np.empty((2, 0)), rows=np.empty(0, np.int64))
-            part.__dict__["least_root"] = p.least_root  # from pixels of the whole
-            some = m.stars[stars], m.weight[rows], m.middles[stars], m.state[rows]
-            yield StarPiece(part, StarModes(*some))
+            if len(stars):
+                part = replace(p.of_stars(stars), rows=np.empty(0, np.int64))
+                yield StarPiece(part, self.stars[stars])
 
 
 @dataclass(frozen=True, eq=False)
-class Slope(Sums):
-    """Gradient and curvature of the log density at a solution, the stars eliminated."""
+class Expanded(StarPiece):
+    """Stars at their modes, with the expansion there."""
 
-    gradient: Float  # (D,)
-    curvature: Float  # minus the Hessian (D, D)
+    expansion: Expansion
 
 
-def log_density(piece: StarPiece, theta: Float, mixtures: Float) -> Float:
-    """Log densities (n,) as of `log_marginal`: a task for `Pieces.sum`."""
+# -- next states ----------------------------------------------------------------------------------
+
+
+def at_stars(piece: StarPiece, theta: Float) -> StarPiece:
+    """Piece linearised at theta (D,) and its own stars."""
+    return StarPiece(piece.problem.at(theta, piece.stars), piece.stars)
+
+
+def at_means(piece: StarPiece, theta: Float) -> StarPiece:
+    """Piece with the stars at the means of their detections."""
+    return at_stars(replace(piece, stars=piece.problem.mean_places(theta)), theta)
+
+
+def at_medians(piece: StarPiece, theta: Float) -> StarPiece:
+    """Piece with the stars at the medians of their detections."""
+    return at_stars(replace(piece, stars=piece.problem.median_places(theta)), theta)
+
+
+def at_modes(piece: StarPiece, theta: Float, mixture: Mixture, observed: bool) -> Expanded:
+    """Piece with the stars at their modes, lost ones found again, and its expansion as `expand`."""
+    found, stars = expand(piece.problem, theta, mixture, piece.stars, observed=observed)
+    return Expanded(piece.problem, piece.problem.found_again(theta, stars), found)
+
+
+def moved(piece: StarPiece, before: Float, after: Float) -> StarPiece:
+    """Piece at other parameters (D,), the stars moved as the means of their detections are."""
+    p, stars = piece.problem, piece.stars.copy()
+    stars[:, :2] += p.middles(after) - p.middles(before)
+    return StarPiece(p.at(after, stars), stars)
+
+
+@dataclass(frozen=True, eq=False)
+class ModePiece(StarPiece):
+    """Stars at the modes of a solution, and how they follow their detections from there."""
+
+    modes: StarModes
+
+    def __sizeof__(self) -> int:
+        """As `StarPiece`."""
+        m = self.modes
+        return super().__sizeof__() + sum(c.nbytes for c in (m.weight, m.middles, m.state))
+
+
+def to_sample(piece: StarPiece, theta: Float, mixture: Mixture) -> ModePiece:
+    """Piece of a solution, for densities of draws about it."""
+    # of a star's detections nothing is needed but the columns of the passes
+    p = replace(piece.problem, seen=np.empty((2, 0)))
+    return ModePiece(p, piece.stars, StarModes.at(p, theta, mixture, piece.stars))
+
+
+# -- sums -----------------------------------------------------------------------------------------
+
+
+def expansion_of(piece: Expanded) -> Expansion:
+    """Expansion of a piece that has one."""
+    return piece.expansion
+
+
+def expansion(
+    piece: StarPiece, theta: Float, mixture: Mixture, observed: bool, priors: bool
+) -> Expansion:
+    """Expansion as of `expand`, with or without the priors of the stars."""
+    p = piece.problem
+    if not priors:
+        p = replace(p, priors=StarPriors.none(p.n_stars, p.n_star))
+    return expand(p, theta, mixture, piece.stars, observed=observed)[0]
+
+
+def log_density(piece: ModePiece, theta: Float, mixtures: Float) -> Float:
+    """Log densities (n,) as of `log_marginal`."""
     return log_marginal(piece.problem, theta, mixtures, piece.modes)
 
 
-def slope(piece: StarPiece, theta: Float, mixture: Mixture, observed: bool) -> Slope:
-    """Gradient and curvature at theta (D,), as of `expand`: a task for `Pieces.sum`."""
+def slope(piece: ModePiece, theta: Float, mixture: Mixture, observed: bool) -> Expansion:
+    """Expansion at theta (D,) as of `expand`."""
     stars = piece.modes.moved(piece.problem, theta)
-    found = expand(piece.problem, theta, mixture, stars, observed=observed)
-    return Slope(found.gradient, found.curvature)
+    return expand(piece.problem, theta, mixture, stars, observed=observed)[0]
+
+
+def squares(piece: StarPiece, theta: Float) -> tuple[Float, ...]:
+    """Squared distances (N,) of detections from their stars: sums are the pieces' one by one."""
+    return (piece.problem.squares(theta, piece.stars),)
+
+
+def _state(piece: StarPiece) -> tuple[tuple[Float, ...], ...]:
+    p = piece.problem
+    return ((p.X, p.Y, p.offset, p.W, piece.stars),)
+
+
+def gathered(problem: Problem, pieces: MappedPieces) -> StarPiece:
+    """All stars of a problem as one piece, in the state of its pieces."""
+    states = pieces.sum(_state)
+    X, Y, offset, W, stars = (
+        columns[0] if len(columns) == 1 else np.concatenate(columns)
+        for columns in zip(*states, strict=True)
+    )
+    return StarPiece(replace(problem, X=X, Y=Y, offset=offset, W=W), stars)
+
+
+# -- where they are -------------------------------------------------------------------------------
 
 
 @contextmanager
-def in_pieces(solution: SelfCalibrationMode, compute: Compute | None = None) -> Iterator[Pieces]:
-    """Context with the detections of a solution: one piece in this process, or many on a cluster.
+def in_pieces(
+    problem: Problem, stars: Float, compute: Compute | None = None
+) -> Iterator[MappedPieces]:
+    """Context with detections and stars (S, q): one piece in this process, or many on a cluster.
 
     InputError as `ClusterPieces`.
     """
-    whole = StarPiece.at(solution)
-    pieces: Pieces = _Whole(whole)
+    whole = StarPiece(problem, stars)
+    pieces: MappedPieces = _Whole(whole)
     if compute is not None and compute.engine == "dask":
         # dask is imported where it is asked for
         from bayesdist.infer.stars.cluster import ClusterPieces
@@ -101,15 +201,19 @@ def in_pieces(solution: SelfCalibrationMode, compute: Compute | None = None) -> 
         pieces.close()
 
 
-class _Whole(Pieces):
+class _Whole(MappedPieces):
     """One piece in this process, whose passes use its threads."""
 
-    def __init__(self, piece: StarPiece) -> None:
+    def __init__(self, piece: Any) -> None:
         self._piece = piece
 
     def sum(self, task: Task, *args: Any) -> Any:
         """Result of the task."""
         return task(self._piece, *args)
+
+    def map(self, task: Task, *args: Any) -> Self:
+        """Piece that the task makes."""
+        return type(self)(task(self._piece, *args))
 
     def close(self) -> None:
         """Nothing is to be released."""

@@ -29,7 +29,7 @@ from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.sampler.chains import Settings, ensemble_seeds, run_chains
 from bayesdist.infer.selfcal.elimination import Mixture, memberships
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
-from bayesdist.infer.selfcal.pieces import in_pieces, log_density, slope
+from bayesdist.infer.selfcal.pieces import in_pieces, log_density, slope, to_sample
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.stars.mixture import Hyper, OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Pieces
@@ -153,8 +153,9 @@ def sample_selfcal(
     """
     seeds = ensemble_seeds(seed, ensembles)
     started = time.monotonic()
-    with in_pieces(solution, compute) as pieces:
-        target = SelfTarget(solution, pieces, outliers)
+    with in_pieces(solution.problem, solution.stars, compute) as pieces:
+        at_mode = pieces.map(to_sample, solution.theta, solution.mixture)
+        target = SelfTarget(solution, at_mode, outliers)
         settings = Settings(
             seeds=seeds,
             n_stars=RELATIVE_COST * len(solution.problem),

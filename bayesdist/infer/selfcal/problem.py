@@ -65,6 +65,7 @@ class Problem:
     priors: StarPriors
     rows: Int  # input row (N,) of each detection
     match_radius: float  # pixels: largest distance of detections of one star, and of false ones
+    pixel: float  # median size of a pixel on the sky at the start, in the unit of u, v
     epoch0: float = 0.0  # date of the stars' positions
     # known scale (E,) of the sky in each exposure, about the frames' origin: VAFACTOR
     dilation: Float | None = None
@@ -105,12 +106,7 @@ class Problem:
         """Log density of a false detection per square pixel, without the fraction of such."""
         return -float(np.log(np.pi * self.match_radius**2))
 
-    @cached_property
-    def pixel(self) -> float:
-        """Median size of a pixel on the sky, in the unit of u, v."""
-        return float(np.median(np.linalg.det(_square(self.W))) ** -0.25)
-
-    @cached_property
+    @property
     def least_root(self) -> float:
         """Root of the curvature of a star whose position is unknown within its match circle."""
         return float(np.sqrt(2.0) / (self.match_radius * self.pixel))
@@ -276,10 +272,6 @@ class Problem:
         )
 
 
-def _square(W: Float) -> Float:
-    return np.asarray(W[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
-
-
 def prepare(
     model: DistortionModel,
     detections: Detections,
@@ -357,7 +349,10 @@ def prepare(
         priors=StarPriors.none(len(starts) - 1, q),
         rows=rows,
         match_radius=match_radius,
+        pixel=np.nan,
         epoch0=epoch0,
         dilation=None if dilation is None else np.asarray(dilation, float),
     )
-    return problem.at(theta, problem.mean_places(theta))
+    problem = problem.at(theta, problem.mean_places(theta))
+    uu, uv, vv = problem.W.T
+    return replace(problem, pixel=float(np.median(uu * vv - uv**2) ** -0.25))

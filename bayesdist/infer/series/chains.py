@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.convergence import Convergence, Limits, diagnose
+from bayesdist.infer.kernel import precisions
 from bayesdist.infer.series.breaks import BreakMoves
-from bayesdist.infer.series.gibbs import sweep
+from bayesdist.infer.series.gibbs import draw_trend, sweep
 from bayesdist.infer.series.problem import Problem, State, break_likelihood
 from bayesdist.infer.series.scatter import FRACTION_PRIOR, KAPPA_RATE, MAX_FRACTION, RandomWalk
 from bayesdist.infer.series.series import MAD_TO_SIGMA
-from bayesdist.infer.series.small import cholesky, precision_of
 
 __all__ = ["Draws", "Engine", "run"]
 
@@ -21,9 +21,7 @@ Float = NDArray[np.float64]
 
 ENSEMBLES = 4  # the chains are judged in as many groups
 N_SCANS = 10  # sweeps of the warm-up in which breaks are drawn among all gaps
-# the scatter needs further moves above this fraction of the formal errors in the variance, and with
-# this many exposures that may or may not lie off
-MAX_FORMAL_FRACTION, MAX_UNCLEAR = 0.25, 1.0
+MAX_UNCLEAR = 1.0  # exposures that may or may not lie off, above which a random walk is needed
 EQUAL_WEIGHTS = np.zeros(25)  # no proposal, no importance weights
 
 
@@ -65,7 +63,7 @@ class Draws:
         nothing = np.zeros((len(fraction), 0))
         return State(
             b=some(self.b),
-            sigma=np.moveaxis(some(self.sigma), 0, -1),
+            sigma=some(self.sigma),
             off=nothing.astype(bool),
             probability=nothing,
             fraction=fraction,
@@ -121,18 +119,18 @@ def starting_state(
     step = np.diff(problem.y[:, order], axis=1)
     scale = np.maximum(MAD_TO_SIGMA * np.median(np.abs(step), axis=1) / np.sqrt(2), 0.05)
     if problem.sigma is None:
-        stretch = np.exp(0.5 * rng.standard_normal((k, n_chains)))
-        sigma = np.eye(k)[:, :, None] * (scale[:, None] * stretch) ** 2
+        stretch = np.exp(0.5 * rng.standard_normal((n_chains, k)))
+        sigma = np.eye(k) * (scale * stretch)[:, :, None] ** 2
     else:
-        sigma = np.repeat(problem.sigma[:, :, None], n_chains, axis=2)
-    precision = precision_of(cholesky(problem.formal[:, :, None] + sigma[..., None]))
+        sigma = np.tile(problem.sigma, (n_chains, 1, 1))
+    precision = precisions(problem.formal, sigma)
     breaks = np.zeros((n_chains, 0))
     if moves is not None:
         breaks = moves.start(n_chains, break_likelihood(problem, precision), rng)
     fraction = np.zeros(n_chains)
     if problem.outliers:
         fraction = np.clip(rng.beta(*FRACTION_PRIOR, size=n_chains), 1e-6, MAX_FRACTION)
-    return State(
+    state = State(
         b=np.zeros((n_chains, k, problem.design.n_columns)),
         sigma=sigma,
         off=np.zeros((n_chains, n), bool),
@@ -142,6 +140,7 @@ def starting_state(
         breaks=breaks,
         drift=np.exp(rng.standard_normal((n_chains, k))),
     )
+    return draw_trend(problem, state, precision, rng, included=np.ones((n_chains, n)))
 
 
 def warm_up(
@@ -164,14 +163,12 @@ def warm_up(
 
 def _further_moves(problem: Problem, seen: list[State]) -> RandomWalk | None:
     """Random-walk steps, where exact draws alone would mix slowly."""
-    sigma = np.concatenate([s.sigma for s in seen], axis=-1)
-    formal = np.median(np.diagonal(problem.formal), axis=0)
-    intrinsic = np.median(np.diagonal(sigma), axis=0)
     unclear = np.mean([(s.probability * (1 - s.probability)).sum(axis=1).mean() for s in seen])
-    if unclear < MAX_UNCLEAR and (formal < MAX_FORMAL_FRACTION * (formal + intrinsic)).all():
+    if unclear < MAX_UNCLEAR:
         return None
-    fraction = np.concatenate([s.fraction for s in seen])
-    kappa2 = np.concatenate([s.kappa2 for s in seen])
+    sigma, fraction, kappa2 = (
+        np.concatenate([getattr(s, name) for s in seen]) for name in ("sigma", "fraction", "kappa2")
+    )
     return RandomWalk.learn(sigma, fraction, kappa2, outliers=problem.outliers)
 
 
@@ -205,7 +202,6 @@ def _collected(states: list[State]) -> Draws:
     def stacked(name: str) -> Float:
         return np.stack([getattr(s, name) for s in states], axis=1)
 
-    sigma = np.stack([np.moveaxis(s.sigma, -1, 0) for s in states], axis=1)
     probability = np.mean([s.probability.mean(axis=0) for s in states], axis=0)
-    names = ("b", "fraction", "kappa2", "breaks", "drift")
-    return Draws(**{n: stacked(n) for n in names}, sigma=sigma, outlier_probability=probability)
+    names = ("b", "sigma", "fraction", "kappa2", "breaks", "drift")
+    return Draws(**{n: stacked(n) for n in names}, outlier_probability=probability)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from bayesdist.distributions import t_ppf
 from bayesdist.errors import InputError
+from bayesdist.infer.kernel import precisions
 from bayesdist.infer.series.breaks import BreakMoves
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.fit import fit_series
@@ -28,7 +29,6 @@ from bayesdist.infer.series.heldout import HeldOut, block_folds, exposure_folds,
 from bayesdist.infer.series.posterior import Change, SeriesPosterior
 from bayesdist.infer.series.problem import WIDE, Problem, normal_equations
 from bayesdist.infer.series.series import Series
-from bayesdist.infer.series.small import cholesky, precision_of
 from bayesdist.infer.series.trend import KINDS, TrendModel
 
 __all__ = ["Comparison", "FilterDependence", "compare", "filter_dependence", "serial_correlation"]
@@ -184,13 +184,12 @@ def _gain(trend: TrendModel, plain: SeriesPosterior) -> float:
     moves = BreakMoves(design)
     dates = (moves.dates[:-1] + moves.width / 2)[:, None]
     broken = replace(problem, design=design).columns(dates[moves.possible(dates)])
-    sigma = plain.raw.sigma.mean(axis=(0, 1))[..., None]
-    precision = precision_of(cholesky(problem.formal + sigma))[:, :, None]
+    precision = precisions(problem.formal, plain.raw.sigma.mean(axis=(0, 1))[None])
     lies_off = plain.outlier_probability
     gains = []
     for off in (np.zeros(len(lies_off)), lies_off):
         weight = precision / (1 - off + off * plain.raw.kappa2.mean())
-        total = np.einsum("ie,ijce,je->", problem.y, weight, problem.y)
+        total = np.einsum("ie,cije,je->", problem.y, weight, problem.y)
         none, best = (
             total - _explained(problem, weight, columns).max()
             for columns in (problem.columns(plain.raw.breaks[:1, 0]), broken)

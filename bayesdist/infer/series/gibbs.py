@@ -12,9 +12,13 @@ with probability f.  Everything is in units of the series' spread.  Priors, all 
     drift    half-Student-t standard deviation of each coefficient, two degrees of freedom
     breaks   uniform in time: see breaks.py
 
-A sweep draws the breaks with b and the deviations integrated out, b with the deviations integrated
-out, the drift's amplitude, then memberships, f, kappa and Sigma.  Many chains run in parallel; some
-exposures may be held out of some of them, which gives exact refits without one.
+A sweep moves the mixture with memberships and deviations integrated out, and draws the
+memberships; then the breaks with b and the deviations integrated out, b with the deviations
+integrated out, the drift's amplitude, the deviations, and Sigma given them.  Before Sigma is drawn,
+deviations and Sigma are sheared and stretched together, which leaves the posterior as it is (Liu
+and Sabatti 2000, Biometrika 87, 353): given the deviations alone Sigma moves slowly where formal
+errors are large.  Many chains run in parallel; some exposures may be held out of some of them,
+which gives exact refits without one.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betainc, betaincinv, gammainc, gammaincinv
 
+from bayesdist.infer.kernel import densities, draw_deviations, precisions, shear
 from bayesdist.infer.series.breaks import BreakMoves
 from bayesdist.infer.series.problem import Problem, State, break_likelihood, trend_equations
 from bayesdist.infer.series.scatter import (
@@ -34,11 +39,12 @@ from bayesdist.infer.series.scatter import (
     MAX_FRACTION,
     MIN_KAPPA,
     RandomWalk,
+    draw_scales,
     draw_scatter,
+    scale_prior,
 )
-from bayesdist.infer.series.small import cholesky, precision_of
 
-__all__ = ["sweep"]
+__all__ = ["draw_trend", "sweep"]
 
 Float = NDArray[np.float64]
 
@@ -62,14 +68,39 @@ def sweep(
     moves of the scatter and of the mixture, `moves` those of breaks that are to be found.  With
     `scan` the breaks are drawn among all gaps, for warming up only.
     """
-    k, n_exposures = problem.y.shape
-    n_chains = len(state.fraction)
     if included is None:
-        included = np.ones((n_chains, n_exposures))
-    factor = cholesky(problem.formal[:, :, None] + state.sigma[..., None])
-    precision = precision_of(factor)
-    seen = precision * (included / np.where(state.off, state.kappa2[:, None], 1.0))
+        included = np.ones(state.off.shape)
+    residual = problem.residual(state.b, problem.columns(state.breaks))
+    if walk is not None:
+        sigma, fraction, kappa2 = walk.move(
+            state.sigma, state.fraction, state.kappa2, residual, problem.formal, included, rng
+        )
+        state = replace(state, sigma=sigma, fraction=fraction, kappa2=kappa2)
+    if problem.outliers:
+        state = _draw_memberships(problem, state, residual, included, rng)
+    precision = precisions(problem.formal, state.sigma)
+    state = draw_trend(problem, state, precision, rng, included=included, moves=moves, scan=scan)
+    if problem.sigma is None:
+        state = _draw_sigma(problem, state, precision, included, rng)
+    return state
 
+
+def draw_trend(
+    problem: Problem,
+    state: State,
+    precision: Float,
+    rng: np.random.Generator,
+    *,
+    included: Float,
+    moves: BreakMoves | None = None,
+    scan: bool = False,
+) -> State:
+    """Breaks, parameters and amplitude of the trend given scatter and memberships.
+
+    `precision` (C, k, k, E) is that of exposures that do not lie off.
+    """
+    weight = included / np.where(state.off, state.kappa2[:, None], 1.0)
+    seen = precision * weight[:, None, None]
     breaks = state.breaks
     if moves is not None:
         likelihood = break_likelihood(problem, seen)
@@ -82,36 +113,20 @@ def sweep(
     # if the noise has the covariance of the matrix, its solution has that of the inverse
     noise = np.linalg.cholesky(matrix) @ rng.standard_normal((*right.shape, 1))
     b = np.asarray(np.linalg.solve(matrix, right[..., None] + noise), np.float64)
-    b = b.reshape(n_chains, k, -1)
-    state = replace(state, b=b, breaks=breaks)
-
+    state = replace(state, b=b.reshape(state.b.shape), breaks=breaks)
     if problem.design.drift is not None:
         state = _move_drift(problem, state, columns, seen, rng)
-    fitted = np.moveaxis(state.b @ np.swapaxes(columns, -1, -2), 1, 0)  # (k, C, E)
-    residual = problem.y[:, None] - fitted
-    if walk is not None:
-        sigma, fraction, kappa2 = walk.move(
-            state.sigma, state.fraction, state.kappa2, residual, problem.formal, included, rng
-        )
-        state = replace(state, sigma=sigma, fraction=fraction, kappa2=kappa2)
-        precision = precision_of(cholesky(problem.formal[:, :, None] + sigma[..., None]))
-    if problem.outliers:
-        pull = np.einsum("ijce,jce->ice", precision, residual)
-        state = _draw_memberships(state, (residual * pull).sum(axis=0), included, k, rng)
-    if problem.sigma is None:
-        scaled = residual / np.where(state.off, np.sqrt(state.kappa2)[:, None], 1.0)
-        sigma = _draw_sigma(problem, state.sigma, precision, scaled, included, rng)
-        state = replace(state, sigma=sigma)
     return state
 
 
 def _draw_memberships(
-    state: State, distance: Float, included: Float, k: int, rng: np.random.Generator
+    problem: Problem, state: State, residual: Float, included: Float, rng: np.random.Generator
 ) -> State:
-    """Memberships given squared distances (C, E), then fraction and inflation given them."""
-    f, kappa2 = state.fraction[:, None], state.kappa2[:, None]
-    log_odds = np.log(f / (1 - f)) - 0.5 * k * np.log(kappa2) + 0.5 * distance * (1 - 1 / kappa2)
-    probability = 1 / (1 + np.exp(-np.clip(log_odds, -700, 700)))
+    """Memberships given residuals (C, k, E), then fraction and inflation given them."""
+    k = residual.shape[1]
+    _, distance, probability = densities(
+        problem.formal, state.sigma, residual, state.fraction, state.kappa2
+    )
     off = rng.random(probability.shape) < probability
     count = (off * included).sum(axis=1)
     a, b = FRACTION_PRIOR
@@ -129,22 +144,21 @@ def _draw_memberships(
 
 
 def _draw_sigma(
-    problem: Problem,
-    sigma: Float,
-    precision: Float,
-    residual: Float,
-    included: Float,
-    rng: np.random.Generator,
-) -> Float:
-    """Intrinsic covariance given deviations, which are drawn from the residuals (k, C, E)."""
-    # Matheron: a draw from the prior, corrected for its part of the residual
-    free = np.einsum("ijc,jce->ice", cholesky(sigma), rng.standard_normal(residual.shape))
-    formal = np.einsum("ije,jce->ice", problem.root, rng.standard_normal(residual.shape))
-    missed = np.einsum("ijce,jce->ice", precision, residual - free - formal)
-    deviation = (free + np.einsum("ijc,jce->ice", sigma, missed)) * included
-    by_chain = np.moveaxis(deviation, 0, 1)
-    scatter = by_chain @ np.swapaxes(by_chain, 1, 2)
-    return draw_scatter(sigma, scatter, included.sum(axis=1), rng)
+    problem: Problem, state: State, precision: Float, included: Float, rng: np.random.Generator
+) -> State:
+    """Intrinsic covariance given deviations, which are drawn from the residuals."""
+    residual = problem.residual(state.b, problem.columns(state.breaks))
+    residual /= np.where(state.off, np.sqrt(state.kappa2)[:, None], 1.0)[:, None]
+    scale = draw_scales(state.sigma, rng)
+    deviation = draw_deviations(state.sigma, problem.root, precision, residual, rng)
+    if problem.inverse is not None:
+        prior = scale_prior(scale.shape[1])
+        deviation, scale = shear(
+            deviation, residual, problem.inverse, state.sigma, scale, prior, included, rng
+        )
+    scatter = (deviation * included[:, None]) @ np.swapaxes(deviation, 1, 2)
+    sigma = draw_scatter(scale, scatter, included.sum(axis=1), rng)
+    return replace(state, sigma=sigma)
 
 
 def _move_drift_alone(
@@ -195,22 +209,21 @@ def _move_drift(
     drift = np.sqrt(rate / rng.gamma((DRIFT_NU + random.shape[2]) / 2, size=shape))
     # the second move: the likelihood decides, where the first one would move slowly near zero
     b = state.b.copy()
-    moving = np.moveaxis(random @ np.swapaxes(columns[..., n:], -1, -2), 1, 0)
-    fixed = np.moveaxis(b[..., :n] @ np.swapaxes(columns[..., :n], -1, -2), 1, 0)
-    residual = problem.y[:, None] - fixed - moving
-    for j in range(len(problem.y)):
+    moving = random @ np.swapaxes(columns[..., n:], -1, -2)
+    residual = problem.residual(b, columns)
+    for j in range(b.shape[1]):
         step = rng.standard_normal(len(b))
         factor = np.exp(step)
-        change = (1 - factor)[:, None] * moving[j]
-        pull = np.einsum("jce,jce->ce", precision[j], residual)
+        change = (1 - factor)[:, None] * moving[:, j]
+        pull = np.einsum("cje,cje->ce", precision[:, j], residual)
         gain = -(change * pull).sum(axis=1)
-        gain -= 0.5 * (change**2 * precision[j, j]).sum(axis=1)
+        gain -= 0.5 * (change**2 * precision[:, j, j]).sum(axis=1)
         new = drift[:, j] * factor
         prior = [np.log(d) - 1.5 * np.log1p((d / DRIFT_SCALE) ** 2 / 2) for d in (new, drift[:, j])]
         taken = np.log(rng.random(len(b))) < gain + prior[0] - prior[1]
         factor = np.where(taken, factor, 1.0)
-        residual[j] += np.where(taken[:, None], change, 0.0)
-        moving[j] *= factor[:, None]
+        residual[:, j] += np.where(taken[:, None], change, 0.0)
+        moving[:, j] *= factor[:, None]
         b[:, j, n:] *= factor[:, None]
         drift[:, j] *= factor
     return replace(state, b=b, drift=drift)

@@ -15,10 +15,9 @@ from scipy.special import ndtr
 
 from bayesdist.infer.convergence import smoothed_weights
 from bayesdist.infer.equations.scaled import one_thread
+from bayesdist.infer.kernel import densities
 from bayesdist.infer.series.posterior import SeriesPosterior
 from bayesdist.infer.series.problem import State
-from bayesdist.infer.series.scatter import log_mixture
-from bayesdist.infer.series.small import cholesky, solve_factor
 from bayesdist.limits import PARETO_K
 
 __all__ = ["HeldOut", "block_folds", "exposure_folds", "held_out"]
@@ -193,17 +192,12 @@ def predictive(posterior: SeriesPosterior, state: State) -> tuple[Float, Float]:
     """Log density (C, E) of exposures at a draw, and probability (C, E, k) below their values."""
     problem = posterior.engine.problem
     columns = problem.columns(state.breaks)
-    fitted = np.moveaxis(state.b @ np.swapaxes(columns, -1, -2), 1, 0)
-    residual = problem.y[:, None] - fitted
-    cov = problem.formal[:, :, None] + state.sigma[..., None]
-    factor = cholesky(cov)
-    distance = (solve_factor(factor, residual) ** 2).sum(axis=0)
-    k = len(residual)
-    log_det = 2 * sum(np.log(factor[j, j]) for j in range(k))
+    residual = problem.residual(state.b, columns)
     f, kappa2 = state.fraction, state.kappa2
-    log_density = log_mixture(distance, log_det, k, f, kappa2)
-    sd = np.sqrt(np.stack([cov[j, j] for j in range(k)]))
+    log_density = densities(problem.formal, state.sigma, residual, f, kappa2)[0]
+    variance = np.diagonal(problem.formal).T + np.diagonal(state.sigma, axis1=1, axis2=2)[..., None]
+    sd = np.sqrt(variance)
     good = ndtr(residual / sd)
-    bad = ndtr(residual / sd / np.sqrt(kappa2)[:, None])
-    f = f[:, None]
-    return log_density, np.moveaxis((1 - f) * good + f * bad, 0, -1)
+    bad = ndtr(residual / sd / np.sqrt(kappa2)[:, None, None])
+    f = f[:, None, None]
+    return log_density, np.swapaxes((1 - f) * good + f * bad, 1, 2)

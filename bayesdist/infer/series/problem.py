@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ Bool = NDArray[np.bool_]
 
 WIDE = 100.0  # prior standard deviation of the trend's parameters
 CANDIDATES_AT_ONCE = 8
+MIN_EIGENVALUE = 1e-10  # of a formal covariance, as a fraction of the largest, that is inverted
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +54,29 @@ class Problem:
             outliers=outliers,
         )
 
+    @cached_property
+    def inverse(self) -> Float | None:
+        """Inverse (k, k, E) of the formal covariance; None where some exposure's is singular."""
+        formal = np.moveaxis(self.formal, -1, 0)
+        values = np.linalg.eigvalsh(formal)
+        if not (values[:, 0] > MIN_EIGENVALUE * values[:, -1]).all():
+            return None
+        return np.ascontiguousarray(np.moveaxis(np.linalg.inv(formal), 0, -1))
+
+    def residual(self, b: Float, columns: Float) -> Float:
+        """Values less the trend (C, k, E) of parameters (C, k, p) and columns (C or 1, E, p)."""
+        return self.y - b @ np.swapaxes(columns, -1, -2)
+
     def columns(self, breaks: Float) -> Float:
         """Columns (C or 1, E, p) of the trend at the exposures, for breaks (..., B)."""
-        given = None if self.design.trend.find == 0 else breaks
-        series = self.series
-        return self.design.matrix(series.epoch, series.group_code, given)
+        if not self.design.trend.find:
+            return self._given_columns
+        return self.design.matrix(self.series.epoch, self.series.group_code, breaks)
+
+    @cached_property
+    def _given_columns(self) -> Float:
+        """Columns (1, E, p) of a trend whose breaks are given."""
+        return self.design.matrix(self.series.epoch, self.series.group_code)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +84,7 @@ class State:
     """State of C chains."""
 
     b: Float  # (C, k, p)
-    sigma: Float  # (k, k, C)
+    sigma: Float  # (C, k, k)
     off: Bool  # outliers (C, E)
     probability: Float  # of an outlier (C, E), given everything else
     fraction: Float  # (C,)
@@ -76,7 +96,7 @@ class State:
         """State of some of the chains, possibly several times."""
         return State(
             self.b[chains],
-            self.sigma[..., chains],
+            self.sigma[chains],
             self.off[chains],
             self.probability[chains],
             self.fraction[chains],
@@ -97,14 +117,14 @@ def prior_precision(problem: Problem, drift: Float) -> Float:
 def normal_equations(precision: Float, y: Float, columns: Float) -> tuple[Float, Float]:
     """Normal matrices (..., k p, k p) and right-hand sides (..., k p).
 
-    `precision` (k, k, C, E) is the inverse covariance of each exposure, `y` (k, E), `columns` (C or
+    `precision` (C, k, k, E) is the inverse covariance of each exposure, `y` (k, E), `columns` (C or
     1, E, p) or (C, M, E, p).
     """
     k = len(y)
     *_, n, p = columns.shape
     pairs = (columns[..., :, None] * columns[..., None, :]).reshape(*columns.shape[:-1], p * p)
-    flat = np.moveaxis(precision.reshape(k * k, *precision.shape[2:]), 0, 1)  # (C, k k, E)
-    pull = np.einsum("ijce,je->cie", precision, y)
+    flat = precision.reshape(len(precision), k * k, n)
+    pull = (precision * y).sum(axis=2)
     if columns.ndim == 4:
         flat, pull = flat[:, None], pull[:, None]
     if columns.ndim == 3 and len(columns) == 1:  # one matrix product for all chains
@@ -124,7 +144,7 @@ def trend_equations(
 ) -> tuple[Float, Float]:
     """Precision (C, k p, k p) of the parameters b given everything else, and that times their mean.
 
-    `precision` (k, k, C, E) is the inverse covariance of each exposure, `columns` (C or 1, E, p),
+    `precision` (C, k, k, E) is the inverse covariance of each exposure, `columns` (C or 1, E, p),
     `drift` (C, k).
     """
     matrix, right = normal_equations(precision, problem.y, columns)

@@ -13,6 +13,7 @@ The only module that uses dask and distributed; it is imported when the engine i
 from __future__ import annotations
 
 import asyncio
+import copy
 import logging
 import pickle
 import threading
@@ -22,12 +23,19 @@ from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from functools import partial
 from time import monotonic
-from typing import Any
+from typing import Any, Self
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import kernel
-from bayesdist.infer.stars.shards import Compute, Pieces, Shards, Task, shard_of, total
+from bayesdist.infer.stars.shards import (
+    Compute,
+    MappedPieces,
+    Shards,
+    Task,
+    shard_of,
+    total,
+)
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.survey import Survey
 from bayesdist.model import DistortionModel
@@ -55,7 +63,11 @@ TOGETHER = 256  # results that are fetched at a time
 _one_pass = threading.Lock()  # a pass uses all threads of its process
 
 
-class ClusterPieces(Pieces):
+class _Lease:
+    """Held by all pieces on a cluster: without any it is closed."""
+
+
+class ClusterPieces(MappedPieces):
     """Pieces on the workers of a Dask cluster, made there by one function.
 
     With a `scheduler` in `compute`, the cluster is that one; the version of bayesdist must be the
@@ -72,7 +84,8 @@ class ClusterPieces(Pieces):
         self._loading: set[str] = set()  # workers that sources are tied to
         self._client, cluster, self._threads = _connected(compute)
         self._where = self._client.scheduler.address
-        self._end = weakref.finalize(self, _end, self._client, cluster)
+        self._lease = _Lease()
+        self._end = weakref.finalize(self._lease, _end, self._client, cluster)
         try:
             places = _places(self._client)
             self._loading = set(places)
@@ -102,17 +115,34 @@ class ClusterPieces(Pieces):
         InputError when there are no workers any more, or when they die of the task; else any
         exception that the task raises on the first piece, in their order, that it fails on.
         """
-        work: _Work | Future = _Work(task, args, self._threads)
         with _large_graphs():
-            if len(pickle.dumps(args, protocol=5)) > LARGE:
-                # sent once; a task's result, unlike scattered data, outlives its worker
-                work = self._client.submit(_same, work, pure=False)
-            return total(self._results(self._on_each(_pass, work=work)))
+            return total(self._results(self._tasks(task, args)))
+
+    def map(self, task: Task, *args: Any) -> Self:
+        """Pieces ``task(piece, *args)``, each on the worker that has the piece.
+
+        They are made again from the first ones where a worker is lost.  Errors as `sum`.
+        """
+        out = copy.copy(self)
+        with _large_graphs():
+            out._pieces = self._tasks(task, args)
+        for _ in out._results(out._on_each(_made)):
+            pass
+        out._settle()
+        return out
 
     def close(self) -> None:
         """Release the data, and the cluster where it was started for them."""
         self._pieces = []
         self._end()
+
+    def _tasks(self, task: Task, args: tuple[Any, ...]) -> list[Future]:
+        """A task on each piece."""
+        work: _Work | Future = _Work(task, args, self._threads)
+        if len(pickle.dumps(args, protocol=5)) > LARGE:
+            # sent once; a task's result, unlike scattered data, outlives its worker
+            work = self._client.submit(_same, work, pure=False)
+        return self._on_each(_pass, work=work)
 
     def _on_each(self, function: Task, **options: Any) -> list[Future]:
         # Tied to some workers, loosely.  Tasks that are not, and few, count as roots of a graph:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 from bayesdist.data.matches import BatchReader, Matches
 from bayesdist.errors import InputError
@@ -76,6 +76,14 @@ class Pieces(ABC):
     @abstractmethod
     def close(self) -> None:
         """Release the data."""
+
+
+class MappedPieces(Pieces):
+    """Pieces from which others are made, where they are."""
+
+    @abstractmethod
+    def map(self, task: Task, *args: Any) -> Self:
+        """Pieces ``task(piece, *args)``, which live no longer than the first ones."""
 
 
 class Shards(Pieces):

@@ -37,9 +37,8 @@ def folder(tmp_path_factory) -> Path:
 def run(folder, full) -> Path:
     """The run of F606W.
 
-    In full the course over time is told of the first term, from few sweeps, and reported.  It
-    would take as long as all the rest; tests/infer/series shows what is said of it, and
-    tests/report what campaigns show.
+    In full the course over time is told of the first term, and reported.  That of all would take
+    long; tests/infer/series shows what is said of it, and tests/report what campaigns show.
     """
     out, of_term = folder / "run_f606w", series._verdict
 
@@ -49,7 +48,6 @@ def run(folder, full) -> Path:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(series, "_verdict", first)
-        patch.setattr(series, "MAX_SWEEPS", 1000 if full else 100)
         if not full:
             patch.setattr("bayesdist.app.run.report", lambda results, pdf: [])
         good("run", folder / "campaign_f606w.toml", "-o", out, "-q")

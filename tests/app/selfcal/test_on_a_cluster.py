@@ -1,4 +1,4 @@
-"""A self-calibration whose configuration asks for the Dask engine is sampled by its workers."""
+"""A self-calibration that asks for the Dask engine is solved and sampled by its workers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,9 @@ def test_draws_are_those_of_one_process(tmp_path, monkeypatch):
     sections = {"sampler": {"target_ess": 100}, "compute": {"engine": "dask", "workers": 2}}
     path = write_selfcal(tmp_path, list_table(small()), **sections)
     config, _ = load_config(path)
-    data = fit(match(read(config, tmp_path), config, tmp_path), config, tmp_path)
+    data = fit(match(read(config, tmp_path), config), config, tmp_path)
+    assert {pieces.expansion_of, pieces.expansion} < set(passes)
+    passes.clear()
     there = sample(data, config)
     assert {pieces.log_density, pieces.slope} == set(passes)
     here = sample(data, config.model_copy(update={"compute": ComputeBlock()}))

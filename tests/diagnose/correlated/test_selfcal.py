@@ -13,8 +13,8 @@ from bayesdist.diagnose.selfcal.eliminated import Columns, eliminated, without_p
 from bayesdist.diagnose.selfcal.sandwich import sandwich
 from bayesdist.diagnose.selfcal.scores import DetectionScores, scores_of_detections
 from bayesdist.infer.equations.priors import Prior
-from bayesdist.infer.selfcal.elimination import Mixture, expand
-from bayesdist.infer.selfcal.mode import SelfCalibrationMode, gauge_of, solve
+from bayesdist.infer.selfcal.elimination import Mixture
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode, gauge_of, mode_at, solve
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import TimeDependence
 from tests.infer.selfcal.fields import field, problem_of
@@ -33,8 +33,7 @@ def solution_of(simulated, *, motion="none", mixture=NO_FALSE) -> SelfCalibratio
     information = Prior.none(theta)
     held = gauge_of(problem, theta, information).held
     free = np.setdiff1d(np.arange(problem.model.n_params), held)
-    found = expand(problem, theta, mixture, stars)
-    return SelfCalibrationMode(problem, theta, found.stars, mixture, free, found, information)
+    return mode_at(problem, theta, stars, mixture, free, information)
 
 
 def star_design(p: Problem) -> np.ndarray:

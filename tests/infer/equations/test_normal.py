@@ -98,6 +98,19 @@ def test_rejection_is_decided_at_other_parameters(problem):
     assert found.chi2 == pytest.approx(chi2, rel=1e-9) and found.scalars[0] == used.sum()
 
 
+def test_exposures_of_several_dates_are_assembled_by_the_full_jacobian(problem):
+    """Groups of one exposure that differ by their date alone share its block."""
+    model, _, matches, theta = problem
+    dates = matches.epoch + 0.25 * (np.arange(len(matches)) % 3) * (matches.exposure > 0)
+    several = matches.with_columns(epoch=dates)
+    equations = least_squares(stars_of(model, several), theta)
+    assert len(equations.groups) > 2 * len(model.exposures)
+    matrix, right = equations.assemble(model, theta)
+    H, g, _ = dense_of(model, several, theta)
+    close(matrix.dense(), H)
+    close(right, g, 1e-8)
+
+
 def test_the_mixture_is_assembled_by_the_full_jacobian(problem):
     """Gradient, Hessian by the parameters, and the mixed part, with the weights of each star."""
     model, stars, matches, theta = problem

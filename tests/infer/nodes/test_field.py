@@ -154,6 +154,15 @@ def test_no_pattern_no_table(rng):
     assert (pull**2).mean() < 2.0
 
 
+def test_a_table_by_tiles_is_nearly_that_of_the_whole_chip(rng):
+    d = pattern(rng, Matern(0.05, 120.0, 1.5))
+    x, y = places(rng, 20_000)
+    r, variance = measured(rng, x, y, d)
+    whole, tiles = (table_of(x, y, r, variance, thorough=k) for k in (True, False))
+    off = (tiles.table.values - whole.table.values) / whole.table.sigma
+    assert 0 < np.abs(off).max() < 0.5 and off.std() < 0.1
+
+
 def test_where_there_are_no_stars_the_prior_speaks(rng):
     """In a hole of three correlation lengths sigma rises to the amplitude, and tells the truth."""
     x, y = places(rng, 20_000)

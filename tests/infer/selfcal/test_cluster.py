@@ -16,12 +16,12 @@ import pytest
 
 from bayesdist.infer import Compute
 from bayesdist.infer.equations.priors import Prior
-from bayesdist.infer.selfcal import pieces, posterior, sample_selfcal
-from bayesdist.infer.selfcal.elimination import Mixture, expand
-from bayesdist.infer.selfcal.mode import solve_in_gauge
-from bayesdist.infer.selfcal.pieces import StarPiece, in_pieces, log_density, slope
+from bayesdist.infer.selfcal import pieces, sample_selfcal, star_catalogue
+from bayesdist.infer.selfcal.elimination import Mixture, StarModes, expand
+from bayesdist.infer.selfcal.mode import mode_at, solve_in_gauge
+from bayesdist.infer.selfcal.pieces import StarPiece, in_pieces, log_density, slope, to_sample
 from bayesdist.infer.selfcal.problem import StarPriors
-from bayesdist.infer.stars.shards import Pieces
+from bayesdist.infer.stars.cluster import ClusterPieces
 from tests.infer.selfcal import fields
 from tests.infer.workers import local_workers
 from tests.reduced import only_in_full
@@ -32,15 +32,20 @@ pytestmark = pytest.mark.timeout(300)
 
 
 @pytest.fixture(scope="module")
-def solution():
-    """Mode with false detections, and stars that have a prior."""
+def start():
+    """Problem with false detections, and stars that have a prior; parameters to begin with."""
     simulated = fields.field(3, 8, 300, n_chips=2, disturbed=0.03)
     problem, stars = fields.problem_of(simulated, min_detections=3)
     priors = StarPriors.none(problem.n_stars, problem.n_star)
     priors.precision[::5] += np.eye(2) / 0.02**2
     priors.centre[::5] = stars[::5]
     problem.priors.centre[:], problem.priors.precision[:] = priors.centre, priors.precision
-    return solve_in_gauge(problem, simulated.theta, Prior.none)
+    return problem, simulated.theta
+
+
+@pytest.fixture(scope="module")
+def solution(start):
+    return solve_in_gauge(*start, Prior.none)
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +101,7 @@ def die_once(piece, mark, first) -> np.ndarray:
 
 @pytest.mark.parametrize("size", [1, 50, PIECE, 10**9])
 def test_pieces_hold_each_star_once_with_all_its_detections(solution, size):
-    whole = StarPiece.at(solution)
+    whole = StarPiece(solution.problem, solution.stars)
     parts = list(whole.split(size))
     problems = [part.problem for part in parts]
     counts = np.concatenate([p.counts for p in problems])
@@ -104,7 +109,7 @@ def test_pieces_hold_each_star_once_with_all_its_detections(solution, size):
     for name in ("X", "Y", "offset", "W", "var"):
         joined = np.concatenate([getattr(p, name) for p in problems])
         assert np.array_equal(joined, getattr(solution.problem, name)), name
-    assert np.array_equal(np.concatenate([part.modes.stars for part in parts]), solution.stars)
+    assert np.array_equal(np.concatenate([part.stars for part in parts]), solution.stars)
     most = solution.problem.counts.max()
     assert max(len(p) for p in problems) < size + most
     assert (len(parts) == 1) == (size > len(solution.problem))
@@ -119,7 +124,11 @@ def test_density_and_slope_are_those_of_the_whole(solution, compute):
     )
     theta = solution.theta + off
     mixtures = np.column_stack([rng.uniform(0.001, 0.05, 20), rng.uniform(0.001, 0.1, 20)])
-    with in_pieces(solution) as here, in_pieces(solution, compute) as there:
+    all_stars = solution.problem, solution.stars
+    with in_pieces(*all_stars) as here, in_pieces(*all_stars, compute) as there:
+        here, there = (
+            one.map(to_sample, solution.theta, solution.mixture) for one in (here, there)
+        )
         assert len(set(there.sum(pid_of))) == 2
         assert_close(
             there.sum(log_density, theta, mixtures), here.sum(log_density, theta, mixtures)
@@ -135,9 +144,54 @@ def test_density_and_slope_are_those_of_the_whole(solution, compute):
     root = np.sqrt(np.diag(known.curvature))
     assert_close(found.curvature, known.curvature, np.outer(root, root))
     assert np.abs(found.gradient[solution.free] / root[solution.free]).max() < 0.01
-    again = expand(solution.problem, theta[0], Mixture(0.01, 0.02), solution.stars.copy())
-    modes = StarPiece.at(solution).modes
-    assert np.abs(modes.moved(solution.problem, theta[0]) - again.stars).max() < 0.01
+    _, again = expand(solution.problem, theta[0], Mixture(0.01, 0.02), solution.stars.copy())
+    modes = StarModes.at(solution.problem, solution.theta, solution.mixture, solution.stars)
+    assert np.abs(modes.moved(solution.problem, theta[0]) - again).max() < 0.01
+
+
+def assert_same_mode(a, b):
+    """Parameters, stars, curvatures, and detections as linearised there."""
+    sigma = np.sqrt(np.diag(b.cov))
+    free = sigma > 0
+    assert np.array_equal(a.free, b.free) and np.array_equal(a.decision.held, b.decision.held)
+    assert_close(a.theta[free], b.theta[free], sigma[free])
+    assert_close(a.stars, b.stars, b.error * b.problem.pixel)
+    assert_close(a.mixture.jitter, b.mixture.jitter)
+    assert_close(a.mixture.fraction, b.mixture.fraction)
+    for one, other in (
+        (a.expansion.curvature, b.expansion.curvature),
+        *zip(a.curvatures, b.curvatures, strict=True),
+    ):
+        root = np.sqrt(np.diag(other))
+        assert_close(one, other, np.outer(root, root))
+    for name in ("X", "Y", "offset", "W"):
+        assert_close(getattr(a.problem, name), getattr(b.problem, name)), name
+
+
+def test_solution_and_stars_are_those_of_one_process(start, solution, compute):
+    found = solve_in_gauge(*start, Prior.none, compute=compute)
+    assert_same_mode(found, solution)
+    again = mode_at(
+        *(solution.problem, solution.theta, solution.stars, solution.mixture, solution.free),
+        *(solution.prior, solution.decision),
+        compute=compute,
+    )
+    assert_same_mode(again, solution)
+    here, there = star_catalogue(solution), star_catalogue(solution, compute=compute)
+    assert np.array_equal(here.values, there.values) and np.array_equal(here.n, there.n)
+    assert_close(there.n_members, here.n_members)
+    for name in ("cov", "own"):
+        one, other = getattr(there, name), getattr(here, name)
+        root = np.sqrt(np.diagonal(other, axis1=1, axis2=2))
+        assert_close(one, other, root[:, :, None] * root[:, None])
+
+
+@pytest.mark.slow
+@only_in_full("tests/infer/stars kills one of them")
+def test_one_of_two_workers_is_killed_while_solving(start, solution, compute, strike):
+    found = solve_in_gauge(*start, Prior.none, compute=compute)
+    assert strike.victims and strike.passes > strike.at
+    assert_same_mode(found, solution)
 
 
 def test_posterior_is_that_of_one_process(solution, compute):
@@ -146,52 +200,42 @@ def test_posterior_is_that_of_one_process(solution, compute):
 
 
 @dataclass
-class Interrupted(Pieces):
-    """Pieces, one of whose workers is killed before a pass."""
+class Strike:
+    """Kills one worker before a pass."""
 
-    pieces: Pieces
-    at: int
+    at: int = 12
     passes: int = 0
     victims: list[int] = field(default_factory=list)
 
-    def sum(self, task, *args):
-        self.passes += 1
-        if self.passes == self.at:
-            self.victims.append(self.pieces.sum(pid_of)[0])
-            os.kill(self.victims[0], signal.SIGKILL)
-        return self.pieces.sum(task, *args)
 
-    def close(self):
-        self.pieces.close()
+@pytest.fixture
+def strike(monkeypatch) -> Strike:
+    struck, inner = Strike(), ClusterPieces.sum
+
+    def interrupted(self, task, *args):
+        struck.passes += 1
+        if struck.passes == struck.at:
+            struck.victims.append(inner(self, pid_of)[0])
+            os.kill(struck.victims[0], signal.SIGKILL)
+        return inner(self, task, *args)
+
+    monkeypatch.setattr(ClusterPieces, "sum", interrupted)
+    return struck
 
 
 @pytest.mark.slow
 @only_in_full("tests/infer/stars kills one of them")
-def test_one_of_two_workers_is_killed_while_sampling(solution, compute, monkeypatch):
-    struck = []
-
-    def interrupted(solution, compute=None):
-        class Context:
-            def __enter__(self):
-                self.inner = in_pieces(solution, compute)
-                struck.append(Interrupted(self.inner.__enter__(), at=12))
-                return struck[-1]
-
-            def __exit__(self, *error):
-                return self.inner.__exit__(*error)
-
-        return Context()
-
+def test_one_of_two_workers_is_killed_while_sampling(solution, compute, strike):
     expected = sample_selfcal(solution, seed=5, target_ess=100)
-    monkeypatch.setattr(posterior, "in_pieces", interrupted)
     assert_same_draws(sample_selfcal(solution, seed=5, target_ess=100, compute=compute), expected)
-    assert struck[0].passes > 12 and struck[0].victims
+    assert strike.victims and strike.passes > strike.at
 
 
 @pytest.mark.slow
 @only_in_full("tests/infer/stars kills one")
 def test_worker_dies_of_a_task_and_its_pieces_are_made_again(solution, compute, tmp_path):
-    with in_pieces(solution, compute) as there:
+    with in_pieces(solution.problem, solution.stars, compute) as loaded:
+        there = loaded.map(to_sample, solution.theta, solution.mixture)
         before = there.sum(content)
         first = solution.problem.X[0]
         assert there.sum(die_once, tmp_path / "mark", first) is not None
@@ -204,4 +248,6 @@ def test_worker_dies_of_a_task_and_its_pieces_are_made_again(solution, compute, 
 def test_a_cluster_knows_how_large_a_piece_is(solution):
     """Otherwise it would move pieces as if they were nothing."""
     p = solution.problem
-    assert sys.getsizeof(StarPiece.at(solution)) > 8 * 8 * len(p)
+    piece = StarPiece(p, solution.stars)
+    assert sys.getsizeof(piece) > 10 * 8 * len(p)
+    assert sys.getsizeof(to_sample(piece, solution.theta, solution.mixture)) > 9 * 8 * len(p)

@@ -18,7 +18,7 @@ SKEW = {"skew_plus", "skew_cross"}
 
 def _gauge(simulated, information=None):
     problem, stars = problem_of(simulated)
-    found = expand(problem, simulated.theta, Mixture(0.0, 0.01), stars, observed=False)
+    found, _ = expand(problem, simulated.theta, Mixture(0.0, 0.01), stars, observed=False)
     information = information or Prior.none(simulated.theta)
     return find_gauge(problem, simulated.theta, found.curvature, information), found
 

@@ -23,10 +23,10 @@ def indefinite(when):
 
     def wrapped(*args, observed=True):
         passes[observed] += 1
-        found = expand(*args, observed=observed)
+        found, modes = expand(*args, observed=observed)
         if when(observed, passes[observed]):
-            return replace(found, curvature=-found.curvature)
-        return found
+            found = replace(found, curvature=-found.curvature)
+        return found, modes
 
     return wrapped
 
@@ -38,8 +38,8 @@ def target():
     K = simulated.model.n_terms
     free = np.setdiff1d(np.arange(simulated.model.n_params), [0, 1, K, K + 1])
     mode = solve(problem, simulated.theta, free, Prior.none(simulated.theta))
-    with pieces.in_pieces(mode) as whole:
-        yield SelfTarget(mode, whole)
+    with pieces.in_pieces(mode.problem, mode.stars) as whole:
+        yield SelfTarget(mode, whole.map(pieces.to_sample, mode.theta, mode.mixture))
 
 
 def test_nodes_are_found_past_an_indefinite_curvature(target, monkeypatch):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from bayesdist.infer.kernel import precisions
 from bayesdist.infer.series import (
     Design,
     Series,
@@ -15,7 +16,6 @@ from bayesdist.infer.series import (
     held_out,
 )
 from bayesdist.infer.series.problem import WIDE, Problem, trend_equations
-from bayesdist.infer.series.small import cholesky, precision_of
 from tests.reduced import case_in_full
 
 from .straight import straight_lines
@@ -58,10 +58,8 @@ def test_known_scatter_is_generalised_least_squares(trend, rng):
     design = Design(trend, series)
     problem = Problem.of(series, design, SCATTER, outliers=False)
     columns = problem.columns(np.zeros((1, 0)))
-    covariance = problem.formal[:, :, None] + problem.sigma[:, :, None, None]
-    matrix, right = trend_equations(
-        problem, precision_of(cholesky(covariance)), columns, np.ones((1, 2))
-    )
+    precision = precisions(problem.formal, problem.sigma[None])
+    matrix, right = trend_equations(problem, precision, columns, np.ones((1, 2)))
     unit = np.repeat(series.spread, design.n_columns)
     mean, cov = least_squares(series, columns[0])
     np.testing.assert_allclose(np.linalg.solve(matrix[0], right[0]) * unit, mean, rtol=1e-8)

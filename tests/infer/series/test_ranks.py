@@ -43,7 +43,7 @@ def ranks_of(name: str, seed: int) -> dict[str, float]:
     epoch = np.sort(rng.uniform(2002, 2014, n))
     dummy = Series.of(epoch, rng.standard_normal((n, k)), coefficients=("a", "b"))
     design = Design(trend, dummy)
-    sigma = prior_draws(k, 1, rng)[..., 0]
+    sigma = prior_draws(k, 1, rng)[0]
     fraction = truncated(lambda: rng.beta(*FRACTION_PRIOR), lambda f: f <= MAX_FRACTION)
     kappa = truncated(lambda: np.sqrt(KAPPA_RATE / rng.standard_gamma(1)), lambda v: v >= MIN_KAPPA)
     drift = np.abs(rng.standard_t(2, size=k))

@@ -172,7 +172,8 @@ def _with_errors(matched: CampaignMatched, held: tuple[LookupTable, ...]) -> Mat
     """Pairs with errors by magnitude, free of the pattern that the tables are to describe.
 
     The scatter of the residuals before any table is twice that of the stars: with errors from
-    there the tables would be smoothed too much, and their own errors twice too large.
+    there the tables would be smoothed too much, and their own errors twice too large.  How smooth
+    the rough tables are hardly matters: their stars scatter alike.
     """
     pairs, inputs, model = matched.stars, matched.inputs, matched.affine_model
     block = inputs.config.tables
@@ -185,6 +186,7 @@ def _with_errors(matched: CampaignMatched, held: tuple[LookupTable, ...]) -> Mat
         method=block.method,
         step=block.step,
         max_iterations=ROUGH_ITERATIONS,
+        thorough=False,
     )
     _, _, errors = scatter_by_magnitude(rough.corrected(pairs), model, inputs)
     return pairs.with_errors(errors)

@@ -26,9 +26,9 @@ from bayesdist.app.kinds.selfcal.matched import SelfcalMatched, magnitude_errors
 from bayesdist.infer import GaussianPriors, Posterior
 from bayesdist.infer.sampler.checkpoints import read_arrays
 from bayesdist.infer.selfcal import SelfCalibrationMode, sample_selfcal
-from bayesdist.infer.selfcal.elimination import Mixture, expand
+from bayesdist.infer.selfcal.elimination import Mixture
 from bayesdist.infer.selfcal.gauge import Decision
-from bayesdist.infer.selfcal.mode import gauge_of, solve_in_gauge
+from bayesdist.infer.selfcal.mode import gauge_of, mode_at, solve_in_gauge
 from bayesdist.model import DistortionModel
 
 __all__ = ["fit_selfcal", "load_selfcal", "sample_detections"]
@@ -80,16 +80,15 @@ def solved_of(
     problem = inputs.problem(model, matched.detections, theta, matched.theta)
     for _ in range(RELINEARISED):
         problem = problem.at(theta, stars)
-    found = expand(problem, theta, mixture, stars)
-    solution = SelfCalibrationMode(
+    solution = mode_at(
         problem,
         theta,
-        problem.found_again(theta, found.stars),
+        stars,
         mixture,
         np.setdiff1d(np.arange(model.n_params), held),
-        found,
         known(arrays["reference"]),
         Decision(n_null, n_open, held),
+        compute=inputs.config.resources(),
     )
     gauge = gauge_of(problem, theta, known(theta), solution)
     fixed, places = fixed_by(gauge, solution, known), solution.stars
@@ -122,6 +121,7 @@ def fit_selfcal(matched: SelfcalMatched) -> Fitted:
         stars=matched.places,
         mixture=matched.mixture,
         jitter=inputs.jitter,
+        compute=inputs.config.resources(),
     )
     solved = solved_of(matched, model, arrays_of(mode, matched.theta))
     summary = gauge_summary(solved.gauge, solved.fixed, model)

@@ -10,7 +10,7 @@ from astropy.table import Table
 from bayesdist.app.kinds.selfcal.known import GaugeConstraints
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.gauge import FAR, Gauge, NamedDirection, find_gauge
-from bayesdist.infer.selfcal.mode import SelfCalibrationMode, curvatures
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.model import DistortionModel
 
 __all__ = ["CONVENTION", "fixed_by", "gauge_summary", "gauge_table", "gauge_words"]
@@ -25,7 +25,7 @@ def fixed_by(
 ) -> dict[str, str]:
     """Source that fixes each property of the solution, by its name."""
     problem, theta = solution.problem, solution.theta
-    alone, known = curvatures(problem, theta, solution.mixture, solution.stars)
+    alone, known = solution.curvatures
     found = {name: piece(theta) for name, piece in pieces.pieces.items()}
     sigmas: dict[str, dict[str, float]] = {}
     none = Prior.none(theta)

@@ -106,6 +106,7 @@ def calibrated(inputs: Inputs, report: Callable[[str], None]) -> SelfCalibration
             plane=inputs.tangent_plane,
             max_iterations=block.max_iterations,
             log=report,
+            compute=inputs.config.resources(),
         )
     except (NotSettledError, DegenerateError) as error:
         frames = [model.frame(theta, e)[0] for e in range(len(model.exposures))]

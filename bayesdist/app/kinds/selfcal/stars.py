@@ -17,6 +17,7 @@ from bayesdist.app.store.output import write_table
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.storage.write import write_columns
 from bayesdist.diagnose.correlated import Discrepancy
+from bayesdist.infer import Compute
 from bayesdist.infer.selfcal import SelfCalibrationMode, StarCatalogue, star_catalogue
 
 __all__ = ["star_table", "write_stars"]
@@ -37,6 +38,7 @@ def write_stars(
     solved: SelfCalibrated,
     correlated: Discrepancy | None,
     notes: Mapping[str, Any],
+    compute: Compute,
 ) -> dict[str, Any]:
     """Write stars.ecsv, and of many stars stars.parquet.
 
@@ -48,6 +50,8 @@ def write_stars(
         Whose covariance of the parameters the stars share.
     notes : mapping
         Meta data of the table.
+    compute : Compute
+        Where the passes over the detections are made.
 
     Returns
     -------
@@ -56,7 +60,7 @@ def write_stars(
     """
     solution, references = solved.mode, solved.references
     cov = None if correlated is None else correlated.covariance
-    found = star_catalogue(solution, cov)
+    found = star_catalogue(solution, cov, compute=compute)
     table = star_table(solution, found, solved.matches.mag, references)
     table.meta |= notes
     write_table(table, folder / "stars.ecsv")

@@ -1,0 +1,313 @@
+"""Passes over very many small covariances: those of the exposures of a series, chain by chain.
+
+The innermost loops run over the exposures, so that they fill vectors whatever the number k of
+coefficients; the work of a chain stays in the cache.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+
+from bayesdist.arrays import Float
+from bayesdist.infer.kernel.blocks import PASS
+from bayesdist.infer.kernel.lanes import FAST
+from bayesdist.infer.kernel.star_modes import cholesky, solve
+
+SUMS = PASS | {"fastmath": FAST | {"reassoc"}}
+
+
+@nb.njit(cache=True)
+def _factor(formal, sigma, L):
+    """Lower Cholesky factors (k, k, E) of formal + sigma, with inverse diagonals."""
+    k, _, n = formal.shape
+    for j in range(k):
+        for i in range(j, k):
+            row, given, more = L[i, j], formal[i, j], sigma[i, j]
+            for e in range(n):
+                row[e] = given[e] + more
+            for m in range(j):
+                a, b = L[i, m], L[j, m]
+                for e in range(n):
+                    row[e] -= a[e] * b[e]
+            if i == j:
+                for e in range(n):
+                    row[e] = 1.0 / math.sqrt(row[e])
+            else:
+                d = L[j, j]
+                for e in range(n):
+                    row[e] *= d[e]
+
+
+@nb.njit(**PASS)
+def _precisions(formal, sigma, precision):
+    k, _, n = formal.shape
+    L, W = np.empty((k, k, n)), np.empty((k, k, n))
+    for c in range(len(sigma)):
+        _factor(formal, sigma[c], L)
+        for j in range(k):
+            for i in range(j, k):
+                row, d = W[i, j], L[i, i]
+                for e in range(n):
+                    row[e] = 1.0 if i == j else 0.0
+                for m in range(j, i):
+                    a, b = L[i, m], W[m, j]
+                    for e in range(n):
+                        row[e] -= a[e] * b[e]
+                for e in range(n):
+                    row[e] *= d[e]
+        for i in range(k):
+            for j in range(i + 1):
+                out, same = precision[c, i, j], precision[c, j, i]
+                for e in range(n):
+                    out[e] = 0.0
+                for m in range(i, k):
+                    a, b = W[m, i], W[m, j]
+                    for e in range(n):
+                        out[e] += a[e] * b[e]
+                for e in range(n):
+                    same[e] = out[e]
+
+
+def precisions(formal: Float, sigma: Float) -> Float:
+    """Inverses (C, k, k, E) of formal (k, k, E) + sigma (C, k, k), both positive."""
+    out = np.empty((*sigma.shape, formal.shape[-1]))
+    _precisions(formal, np.ascontiguousarray(sigma), out)
+    return out
+
+
+@nb.njit(**PASS)
+def _densities(formal, sigma, residual, fraction, kappa2, density, distance, odd):
+    k, _, n = formal.shape
+    L, white, root = np.empty((k, k, n)), np.empty((k, n)), np.empty(n)
+    for c in range(len(sigma)):
+        _factor(formal, sigma[c], L)
+        squares = distance[c]
+        for e in range(n):
+            squares[e], root[e] = 0.0, 1.0
+        for i in range(k):
+            row, r, d = white[i], residual[c, i], L[i, i]
+            for e in range(n):
+                row[e] = r[e]
+            for m in range(i):
+                a, b = L[i, m], white[m]
+                for e in range(n):
+                    row[e] -= a[e] * b[e]
+            for e in range(n):
+                row[e] *= d[e]
+                squares[e] += row[e] * row[e]
+                root[e] *= d[e]
+        f, narrow = fraction[c], 1.0 / kappa2[c]
+        bad = f * narrow ** (0.5 * k)
+        constant = -0.5 * k * math.log(2.0 * math.pi)
+        for e in range(n):
+            s = squares[e]
+            if bad > 0.0:
+                total = bad + (1.0 - f) * math.exp(-0.5 * s * (1.0 - narrow))
+                density[c, e] = constant + math.log(total * root[e]) - 0.5 * s * narrow
+                odd[c, e] = bad / total
+            else:
+                density[c, e] = constant + math.log(root[e]) - 0.5 * s
+                odd[c, e] = 0.0
+
+
+def densities(
+    formal: Float, sigma: Float, residual: Float, fraction: Float, kappa2: Float
+) -> tuple[Float, Float, Float]:
+    """Log densities, squared distances, and outlier probabilities (C, E) of exposures.
+
+    `formal` (k, k, E) + `sigma` (C, k, k) is the covariance of an exposure that does not lie off,
+    and the metric of the distance; a `fraction` (C,) has `kappa2` (C,) times that covariance.
+    `residual` is (C, k, E).
+    """
+    out = np.empty((3, len(sigma), formal.shape[-1]))
+    density, distance, probability = out
+    sigma, residual = np.ascontiguousarray(sigma), np.ascontiguousarray(residual)
+    _densities(formal, sigma, residual, fraction, kappa2, density, distance, probability)
+    return density, distance, probability
+
+
+@nb.njit(**PASS)
+def _deviations(sigma, root, precision, residual, noise, deviation):
+    n_chains, k, n = residual.shape
+    missed = np.empty((k, n))
+    for c in range(n_chains):
+        for i in range(k):
+            row, r, free = missed[i], residual[c, i], deviation[c, i]
+            for e in range(n):
+                row[e] = r[e] - free[e]
+            for j in range(k):
+                a, b = root[i, j], noise[c, j]
+                for e in range(n):
+                    row[e] -= a[e] * b[e]
+        for j in range(k):
+            pull = noise[c, j]
+            for e in range(n):
+                pull[e] = 0.0
+            for m in range(k):
+                a, b = precision[c, j, m], missed[m]
+                for e in range(n):
+                    pull[e] += a[e] * b[e]
+        for i in range(k):
+            row = deviation[c, i]
+            for j in range(k):
+                s, pull = sigma[c, i, j], noise[c, j]
+                for e in range(n):
+                    row[e] += s * pull[e]
+
+
+def draw_deviations(
+    sigma: Float, root: Float, precision: Float, residual: Float, rng: np.random.Generator
+) -> Float:
+    """Draws (C, k, E) of the intrinsic part of residuals (C, k, E).
+
+    By Matheron: a draw from the prior, corrected for its part of the residual.  `root` (k, k, E) is
+    that of the formal covariance, `precision` (C, k, k, E) as `precisions`.
+    """
+    sigma = np.ascontiguousarray(sigma)
+    out = np.linalg.cholesky(sigma) @ rng.standard_normal(residual.shape)
+    _deviations(sigma, root, precision, residual, rng.standard_normal(residual.shape), out)
+    return out
+
+
+@nb.njit(cache=True)
+def _gaussian(matrix, x, noise):
+    """Draw in place of x, with precision `matrix` and mean matrix^-1 x; False if not positive."""
+    k = len(x)
+    if not cholesky(matrix, k):
+        return False
+    for i in range(k):
+        for j in range(i + 1):
+            x[i] += matrix[i, j] * noise[j]
+    solve(matrix, x, k)
+    return True
+
+
+@nb.njit(**SUMS)
+def _shear(deviation, residual, inverse, precision, scale, prior, included, noise, luck):
+    n_chains, k, n = deviation.shape
+    variance, dof = prior
+    matrix, x, row = np.empty((k, k)), np.empty(k), np.empty(k)
+    weighted, pull, left = np.empty(n), np.empty(n), np.empty(n)
+    for c in range(n_chains):
+        u, r, P, D, seen = deviation[c], residual[c], precision[c], scale[c], included[c]
+        for i in range(k):
+            for e in range(n):
+                pull[e] = 0.0
+            for j in range(k):
+                a, z, v = inverse[i, j], r[j], u[j]
+                for e in range(n):
+                    pull[e] += a[e] * (z[e] - v[e])
+            for j in range(k):
+                own, a = u[j], inverse[i, i]
+                total = 0.0
+                for e in range(n):
+                    weighted[e] = seen[e] * a[e] * own[e]
+                    total += seen[e] * pull[e] * own[e]
+                x[j] = total + D[j] ** 2 * P[i, j]
+                for m in range(j + 1):
+                    other, total = u[m], 0.0
+                    for e in range(n):
+                        total += weighted[e] * other[e]
+                    matrix[j, m] = total
+                matrix[j, j] += D[j] ** 2 * P[i, i]
+            for j in range(k):
+                matrix[max(i, j), min(i, j)] = 1.0 if i == j else 0.0
+            if not _gaussian(matrix, x, noise[c, i]):
+                continue
+            x[i] = 0.0
+            for j in range(k):
+                own, v = u[i], u[j]
+                for e in range(n):
+                    own[e] += x[j] * v[e]
+            diagonal = P[i, i]
+            for j in range(k):
+                row[j] = P[i, j]
+            for j in range(k):
+                for m in range(k):
+                    change = x[j] * row[m] + row[j] * x[m]
+                    P[j, m] += diagonal * x[j] * x[m] - change
+            # what is left of it given the others, stretched
+            own, a, size, total = u[i], inverse[i, i], 0.0, 0.0
+            for e in range(n):
+                pull[e] = left[e] = 0.0
+            for j in range(k):
+                v, z, f, w = u[j], r[j], inverse[i, j], P[i, j] / diagonal
+                for e in range(n):
+                    pull[e] += f[e] * (z[e] - v[e])
+                    left[e] += w * v[e]
+            for e in range(n):
+                size += seen[e] * a[e] * left[e] ** 2
+                total += seen[e] * pull[e] * left[e]
+            tail = 0.0
+            for j in range(k):
+                tail += 0.5 * (D[j] * P[i, j]) ** 2 / diagonal
+            s = 1.0 + (total / size + noise[c, i, i] / math.sqrt(size) if size > 0.0 else 0.0)
+            if luck[c, i] < tail * (1.0 - 1.0 / s**2) - (dof + k) * math.log(abs(s)):
+                for e in range(n):
+                    own[e] += (s - 1.0) * left[e]
+                for j in range(k):
+                    row[j] = P[i, j] / diagonal
+                for j in range(k):
+                    for m in range(k):
+                        P[j, m] += diagonal * (1.0 / s**2 - 1.0) * row[j] * row[m]
+        for j in range(k):
+            own = u[j]
+            for e in range(n):
+                own[e] /= D[j]
+        for j in range(k):
+            own = u[j]
+            for e in range(n):
+                pull[e] = 0.0
+            for m in range(k):
+                a, z = inverse[j, m], r[m]
+                for e in range(n):
+                    pull[e] += a[e] * z[e]
+            total = 0.0
+            for e in range(n):
+                total += seen[e] * pull[e] * own[e]
+            x[j] = total
+            for m in range(j + 1):
+                a, other, total = inverse[j, m], u[m], 0.0
+                for e in range(n):
+                    total += seen[e] * a[e] * own[e] * other[e]
+                matrix[j, m] = total
+            matrix[j, j] += 1.0 / variance
+        moved = _gaussian(matrix, x, noise[c, k])
+        for j in range(k):
+            own = u[j]
+            if moved:
+                D[j] = x[j]
+            for e in range(n):
+                own[e] *= D[j]
+
+
+def shear(
+    deviation: Float,
+    residual: Float,
+    inverse: Float,
+    sigma: Float,
+    scale: Float,
+    prior: tuple[float, float],
+    included: Float,
+    rng: np.random.Generator,
+) -> tuple[Float, Float]:
+    """Deviations (C, k, E) sheared and stretched together with their covariance, and new scales.
+
+    The covariance is inverse Wishart with scale matrix diag(scale^2), `scale` (C, k) normal;
+    `prior` has the variance of the scales and the degrees of freedom.  In turn each coefficient
+    gets a part of the others' deviations, and what is left of it given them another size; then all
+    get another scale.  All that is as the residuals (C, k, E) ask for, of which `inverse` (k, k, E)
+    is the formal precision.  So the covariance moves by as much as the residuals leave open, and
+    not only by what the present deviations leave open, which is little where formal errors are
+    large.
+    """
+    n_chains, k, _ = deviation.shape
+    out, scale = deviation.copy(), scale.copy()
+    precision = np.linalg.inv(sigma)
+    noise = rng.standard_normal((n_chains, k + 1, k))
+    luck = -rng.standard_exponential((n_chains, k))
+    _shear(out, residual, inverse, precision, scale, prior, included, noise, luck)
+    return out, scale
