@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from bayesdist.infer.kernel.blocks import PASS
 from bayesdist.infer.kernel.lanes import FAST
+from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.star_modes import cholesky, solve
 
 __all__ = ["densities", "draw_deviations", "precisions", "shear"]
@@ -109,7 +110,7 @@ def _densities(formal, sigma, residual, fraction, kappa2, density, distance, odd
         for e in range(n):
             s = squares[e]
             if bad > 0.0:
-                total = bad + (1.0 - f) * math.exp(-0.5 * s * (1.0 - narrow))
+                total = bad + (1.0 - f) * exp_negative(-0.5 * s * (1.0 - narrow))
                 density[c, e] = constant + math.log(total * root[e]) - 0.5 * s * narrow
                 odd[c, e] = bad / total
             else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ EQUAL_WEIGHTS = np.zeros(25)  # no proposal, no importance weights
 
 @dataclass(frozen=True, eq=False)
 class Engine:
-    """Problem and moves of a sweep, fixed after the warm-up."""
+    """Problem and moves of a sweep, fixed while draws are made."""
 
     problem: Problem
     walk: RandomWalk | None
@@ -36,6 +36,15 @@ class Engine:
     def step(self, state: State, rng: np.random.Generator, included: Float | None = None) -> State:
         """Next state of all chains."""
         return sweep(self.problem, state, rng, included=included, walk=self.walk, moves=self.moves)
+
+    def learned(self, seen: list[State]) -> Engine:
+        """Engine with the random walk of past states, where exact draws alone mix slowly."""
+        unclear = np.mean([(s.probability * (1 - s.probability)).sum(axis=1).mean() for s in seen])
+        if self.problem.sigma is not None or unclear < MAX_UNCLEAR:
+            return replace(self, walk=None)
+        names = ("sigma", "fraction", "kappa2")
+        past = [np.concatenate([getattr(s, name) for s in seen]) for name in names]
+        return replace(self, walk=RandomWalk.learn(*past, outliers=self.problem.outliers))
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,19 +166,7 @@ def warm_up(
             moves.learn()
         if t >= sweeps // 2:
             seen.append(state)
-    walk = _further_moves(problem, seen) if problem.sigma is None else None
-    return Engine(problem, walk, moves), state
-
-
-def _further_moves(problem: Problem, seen: list[State]) -> RandomWalk | None:
-    """Random-walk steps, where exact draws alone would mix slowly."""
-    unclear = np.mean([(s.probability * (1 - s.probability)).sum(axis=1).mean() for s in seen])
-    if unclear < MAX_UNCLEAR:
-        return None
-    sigma, fraction, kappa2 = (
-        np.concatenate([getattr(s, name) for s in seen]) for name in ("sigma", "fraction", "kappa2")
-    )
-    return RandomWalk.learn(sigma, fraction, kappa2, outliers=problem.outliers)
+    return Engine(problem, None, moves).learned(seen), state
 
 
 def run(
@@ -182,20 +179,22 @@ def run(
     most: int,
     limits: Limits,
 ) -> tuple[Engine, State, Draws, Convergence]:
-    """Warm up, then draw until the limits are reached or `most` sweeps are drawn.
+    """Warm up, then draw twice as much each time until the limits are reached.
 
-    `warmup` sweeps warm the chains up; convergence is judged after every `sweeps` draws.
+    `warmup` sweeps warm the chains up, `sweeps` are drawn first and at most `most` at last.  What
+    was drawn before counts as warm-up.
     """
     engine, state = warm_up(problem, chains, warmup, rng)
-    states: list[State] = []
     while True:
+        states: list[State] = []
         for _ in range(sweeps):
             state = engine.step(state, rng)
             states.append(state)
         draws = _collected(states)
         convergence = draws.judged(problem, limits)
-        if convergence.converged or len(states) + sweeps > most:
+        if convergence.converged or 2 * sweeps > most:
             return engine, state, draws, convergence
+        engine, sweeps = engine.learned(states), 2 * sweeps
 
 
 def _collected(states: list[State]) -> Draws:
