@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from bayesdist.infer.kernel import precisions
 from bayesdist.infer.series.breaks import BreakMoves
 from bayesdist.infer.series.gibbs import draw_trend, sweep
 from bayesdist.infer.series.problem import Problem, State, break_likelihood
-from bayesdist.infer.series.scatter import FRACTION_PRIOR, KAPPA_RATE, MAX_FRACTION, RandomWalk
+from bayesdist.infer.series.scatter import FRACTION_PRIOR, KAPPA_RATE, MAX_FRACTION
 from bayesdist.infer.series.series import MAD_TO_SIGMA
 
 __all__ = ["Draws", "Engine", "run"]
@@ -21,7 +21,6 @@ Float = NDArray[np.float64]
 
 ENSEMBLES = 4  # the chains are judged in as many groups
 N_SCANS = 10  # sweeps of the warm-up in which breaks are drawn among all gaps
-MAX_UNCLEAR = 1.0  # exposures that may or may not lie off, above which a random walk is needed
 EQUAL_WEIGHTS = np.zeros(25)  # no proposal, no importance weights
 
 
@@ -30,21 +29,11 @@ class Engine:
     """Problem and moves of a sweep, fixed while draws are made."""
 
     problem: Problem
-    walk: RandomWalk | None
     moves: BreakMoves | None
 
     def step(self, state: State, rng: np.random.Generator, included: Float | None = None) -> State:
         """Next state of all chains."""
-        return sweep(self.problem, state, rng, included=included, walk=self.walk, moves=self.moves)
-
-    def learned(self, seen: list[State]) -> Engine:
-        """Engine with the random walk of past states, where exact draws alone mix slowly."""
-        unclear = np.mean([(s.probability * (1 - s.probability)).sum(axis=1).mean() for s in seen])
-        if self.problem.sigma is not None or unclear < MAX_UNCLEAR:
-            return replace(self, walk=None)
-        names = ("sigma", "fraction", "kappa2")
-        past = [np.concatenate([getattr(s, name) for s in seen]) for name in names]
-        return replace(self, walk=RandomWalk.learn(*past, outliers=self.problem.outliers))
+        return sweep(self.problem, state, rng, included=included, moves=self.moves)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,15 +147,12 @@ def warm_up(
     """Chains that have forgotten their start, and moves that are fixed from now on."""
     moves = BreakMoves(problem.design) if problem.design.trend.find else None
     state = starting_state(problem, moves, n_chains, rng)
-    seen: list[State] = []
     for t in range(sweeps):
         scan = moves is not None and t < N_SCANS
         state = sweep(problem, state, rng, moves=moves, scan=scan)
         if moves is not None and t + 1 == N_SCANS:
             moves.learn()
-        if t >= sweeps // 2:
-            seen.append(state)
-    return Engine(problem, None, moves).learned(seen), state
+    return Engine(problem, moves), state
 
 
 def run(
@@ -194,7 +180,7 @@ def run(
         convergence = draws.judged(problem, limits)
         if convergence.converged or 2 * sweeps > most:
             return engine, state, draws, convergence
-        engine, sweeps = engine.learned(states), 2 * sweeps
+        sweeps *= 2
 
 
 def _collected(states: list[State]) -> Draws:
