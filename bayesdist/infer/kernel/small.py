@@ -14,6 +14,7 @@ import numpy as np
 from bayesdist.arrays import Float
 from bayesdist.infer.kernel.blocks import PASS
 from bayesdist.infer.kernel.lanes import FAST
+from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.star_modes import cholesky, solve
 
 SUMS = PASS | {"fastmath": FAST | {"reassoc"}}
@@ -105,7 +106,7 @@ def _densities(formal, sigma, residual, fraction, kappa2, density, distance, odd
         for e in range(n):
             s = squares[e]
             if bad > 0.0:
-                total = bad + (1.0 - f) * math.exp(-0.5 * s * (1.0 - narrow))
+                total = bad + (1.0 - f) * exp_negative(-0.5 * s * (1.0 - narrow))
                 density[c, e] = constant + math.log(total * root[e]) - 0.5 * s * narrow
                 odd[c, e] = bad / total
             else:
@@ -186,102 +187,131 @@ def _gaussian(matrix, x, noise):
 
 
 @nb.njit(**SUMS)
+def _pull(weight, r, u, out):
+    """Row of the formal precision, `weight` (k, E), times residuals less deviations."""
+    k, n = r.shape
+    for e in range(n):
+        out[e] = 0.0
+    for j in range(k):
+        a, z, v = weight[j], r[j], u[j]
+        for e in range(n):
+            out[e] += a[e] * (z[e] - v[e])
+
+
+@nb.njit(**SUMS)
+def _share(i, u, r, inverse, P, D, seen, noise, matrix, pull, part):
+    """Add a part of the others' deviations to those of coefficient i.
+
+    With D given the log density is quadratic in the parts: u becomes Lambda u, and the precision P
+    of the covariance Lambda^-T P Lambda^-1, whose diagonal its prior weights with D^2.
+    """
+    k, n = u.shape
+    x, row, own, a = np.empty(k), P[i].copy(), u[i], inverse[i, i]
+    _pull(inverse[i], r, u, pull)
+    for j in range(k):
+        v, total = u[j], 0.0
+        for e in range(n):
+            part[e] = seen[e] * v[e]
+            total += part[e] * pull[e]
+        x[j] = total + D[j] ** 2 * row[j]
+        for m in range(j + 1):
+            v, total = u[m], 0.0
+            for e in range(n):
+                total += part[e] * a[e] * v[e]
+            matrix[j, m] = total
+        matrix[j, j] += D[j] ** 2 * row[i]
+    for j in range(k):  # nothing of its own
+        matrix[max(i, j), min(i, j)] = 1.0 if i == j else 0.0
+    if not _gaussian(matrix, x, noise):
+        return
+    x[i] = 0.0
+    for j in range(k):
+        v = u[j]
+        for e in range(n):
+            own[e] += x[j] * v[e]
+        for m in range(k):
+            P[j, m] += row[i] * x[j] * x[m] - x[j] * row[m] - row[j] * x[m]
+
+
+@nb.njit(**SUMS)
+def _stretch(i, u, r, inverse, P, D, seen, dof, normal, luck, pull, part):
+    """Stretch by s what is left of the deviations of coefficient i given the others.
+
+    s is proposed as the residuals ask for; its prior density, with those of the covariance and of
+    the group of stretches, is s^-(dof + k) exp(-tail / s^2).
+    """
+    k, n = u.shape
+    row, own, a = P[i].copy(), u[i], inverse[i, i]
+    _pull(inverse[i], r, u, pull)
+    for e in range(n):
+        part[e] = 0.0
+    tail = 0.0
+    for j in range(k):
+        v, share = u[j], row[j] / row[i]
+        tail += 0.5 * (D[j] * row[j]) ** 2 / row[i]
+        for e in range(n):
+            part[e] += share * v[e]
+    size = total = 0.0
+    for e in range(n):
+        size += seen[e] * a[e] * part[e] ** 2
+        total += seen[e] * pull[e] * part[e]
+    if not size > 0.0:
+        return
+    s = 1.0 + total / size + normal / math.sqrt(size)
+    if luck < tail * (1.0 - 1.0 / s**2) - (dof + k) * math.log(abs(s)):
+        for e in range(n):
+            own[e] += (s - 1.0) * part[e]
+        for j in range(k):
+            for m in range(k):
+                P[j, m] += (1.0 / s**2 - 1.0) * row[j] * row[m] / row[i]
+
+
+@nb.njit(**SUMS)
+def _rescale(u, r, inverse, D, seen, variance, noise, matrix, pull, part):
+    """Draw the scales D, of which the deviations are multiples, from their Gaussian density."""
+    k, n = u.shape
+    x = np.empty(k)
+    for j in range(k):
+        v = u[j]
+        for e in range(n):
+            v[e] /= D[j]
+    for j in range(k):
+        v, total = u[j], 0.0
+        for e in range(n):
+            part[e] = seen[e] * v[e]
+            pull[e] = 0.0
+        for m in range(k):
+            a, z, w = inverse[j, m], r[m], u[m]
+            product = 0.0
+            for e in range(n):
+                pull[e] += a[e] * z[e]
+                product += part[e] * a[e] * w[e]
+            matrix[j, m] = product
+        for e in range(n):
+            total += part[e] * pull[e]
+        x[j] = total
+        matrix[j, j] += 1.0 / variance
+    moved = _gaussian(matrix, x, noise)
+    for j in range(k):
+        v = u[j]
+        if moved:
+            D[j] = x[j]
+        for e in range(n):
+            v[e] *= D[j]
+
+
+@nb.njit(**PASS)
 def _shear(deviation, residual, inverse, precision, scale, prior, included, noise, luck):
     n_chains, k, n = deviation.shape
     variance, dof = prior
-    matrix, x, row = np.empty((k, k)), np.empty(k), np.empty(k)
-    weighted, pull, left = np.empty(n), np.empty(n), np.empty(n)
+    matrix, pull, part = np.empty((k, k)), np.empty(n), np.empty(n)
     for c in range(n_chains):
         u, r, P, D, seen = deviation[c], residual[c], precision[c], scale[c], included[c]
         for i in range(k):
-            for e in range(n):
-                pull[e] = 0.0
-            for j in range(k):
-                a, z, v = inverse[i, j], r[j], u[j]
-                for e in range(n):
-                    pull[e] += a[e] * (z[e] - v[e])
-            for j in range(k):
-                own, a = u[j], inverse[i, i]
-                total = 0.0
-                for e in range(n):
-                    weighted[e] = seen[e] * a[e] * own[e]
-                    total += seen[e] * pull[e] * own[e]
-                x[j] = total + D[j] ** 2 * P[i, j]
-                for m in range(j + 1):
-                    other, total = u[m], 0.0
-                    for e in range(n):
-                        total += weighted[e] * other[e]
-                    matrix[j, m] = total
-                matrix[j, j] += D[j] ** 2 * P[i, i]
-            for j in range(k):
-                matrix[max(i, j), min(i, j)] = 1.0 if i == j else 0.0
-            if not _gaussian(matrix, x, noise[c, i]):
-                continue
-            x[i] = 0.0
-            for j in range(k):
-                own, v = u[i], u[j]
-                for e in range(n):
-                    own[e] += x[j] * v[e]
-            diagonal = P[i, i]
-            for j in range(k):
-                row[j] = P[i, j]
-            for j in range(k):
-                for m in range(k):
-                    change = x[j] * row[m] + row[j] * x[m]
-                    P[j, m] += diagonal * x[j] * x[m] - change
-            # what is left of it given the others, stretched
-            own, a, size, total = u[i], inverse[i, i], 0.0, 0.0
-            for e in range(n):
-                pull[e] = left[e] = 0.0
-            for j in range(k):
-                v, z, f, w = u[j], r[j], inverse[i, j], P[i, j] / diagonal
-                for e in range(n):
-                    pull[e] += f[e] * (z[e] - v[e])
-                    left[e] += w * v[e]
-            for e in range(n):
-                size += seen[e] * a[e] * left[e] ** 2
-                total += seen[e] * pull[e] * left[e]
-            tail = 0.0
-            for j in range(k):
-                tail += 0.5 * (D[j] * P[i, j]) ** 2 / diagonal
-            s = 1.0 + (total / size + noise[c, i, i] / math.sqrt(size) if size > 0.0 else 0.0)
-            if luck[c, i] < tail * (1.0 - 1.0 / s**2) - (dof + k) * math.log(abs(s)):
-                for e in range(n):
-                    own[e] += (s - 1.0) * left[e]
-                for j in range(k):
-                    row[j] = P[i, j] / diagonal
-                for j in range(k):
-                    for m in range(k):
-                        P[j, m] += diagonal * (1.0 / s**2 - 1.0) * row[j] * row[m]
-        for j in range(k):
-            own = u[j]
-            for e in range(n):
-                own[e] /= D[j]
-        for j in range(k):
-            own = u[j]
-            for e in range(n):
-                pull[e] = 0.0
-            for m in range(k):
-                a, z = inverse[j, m], r[m]
-                for e in range(n):
-                    pull[e] += a[e] * z[e]
-            total = 0.0
-            for e in range(n):
-                total += seen[e] * pull[e] * own[e]
-            x[j] = total
-            for m in range(j + 1):
-                a, other, total = inverse[j, m], u[m], 0.0
-                for e in range(n):
-                    total += seen[e] * a[e] * own[e] * other[e]
-                matrix[j, m] = total
-            matrix[j, j] += 1.0 / variance
-        moved = _gaussian(matrix, x, noise[c, k])
-        for j in range(k):
-            own = u[j]
-            if moved:
-                D[j] = x[j]
-            for e in range(n):
-                own[e] *= D[j]
+            normal, chance = noise[c, i], luck[c, i]
+            _share(i, u, r, inverse, P, D, seen, normal, matrix, pull, part)
+            _stretch(i, u, r, inverse, P, D, seen, dof, normal[i], chance, pull, part)
+        _rescale(u, r, inverse, D, seen, variance, noise[c, k], matrix, pull, part)
 
 
 def shear(

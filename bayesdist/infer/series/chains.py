@@ -12,7 +12,7 @@ from bayesdist.infer.kernel import precisions
 from bayesdist.infer.series.breaks import BreakMoves
 from bayesdist.infer.series.gibbs import draw_trend, sweep
 from bayesdist.infer.series.problem import Problem, State, break_likelihood
-from bayesdist.infer.series.scatter import FRACTION_PRIOR, KAPPA_RATE, MAX_FRACTION, RandomWalk
+from bayesdist.infer.series.scatter import FRACTION_PRIOR, KAPPA_RATE, MAX_FRACTION
 from bayesdist.infer.series.series import MAD_TO_SIGMA
 
 __all__ = ["Draws", "Engine", "run"]
@@ -21,21 +21,19 @@ Float = NDArray[np.float64]
 
 ENSEMBLES = 4  # the chains are judged in as many groups
 N_SCANS = 10  # sweeps of the warm-up in which breaks are drawn among all gaps
-MAX_UNCLEAR = 1.0  # exposures that may or may not lie off, above which a random walk is needed
 EQUAL_WEIGHTS = np.zeros(25)  # no proposal, no importance weights
 
 
 @dataclass(frozen=True, eq=False)
 class Engine:
-    """Problem and moves of a sweep, fixed after the warm-up."""
+    """Problem and moves of a sweep, fixed while draws are made."""
 
     problem: Problem
-    walk: RandomWalk | None
     moves: BreakMoves | None
 
     def step(self, state: State, rng: np.random.Generator, included: Float | None = None) -> State:
         """Next state of all chains."""
-        return sweep(self.problem, state, rng, included=included, walk=self.walk, moves=self.moves)
+        return sweep(self.problem, state, rng, included=included, moves=self.moves)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,27 +147,12 @@ def warm_up(
     """Chains that have forgotten their start, and moves that are fixed from now on."""
     moves = BreakMoves(problem.design) if problem.design.trend.find else None
     state = starting_state(problem, moves, n_chains, rng)
-    seen: list[State] = []
     for t in range(sweeps):
         scan = moves is not None and t < N_SCANS
         state = sweep(problem, state, rng, moves=moves, scan=scan)
         if moves is not None and t + 1 == N_SCANS:
             moves.learn()
-        if t >= sweeps // 2:
-            seen.append(state)
-    walk = _further_moves(problem, seen) if problem.sigma is None else None
-    return Engine(problem, walk, moves), state
-
-
-def _further_moves(problem: Problem, seen: list[State]) -> RandomWalk | None:
-    """Random-walk steps, where exact draws alone would mix slowly."""
-    unclear = np.mean([(s.probability * (1 - s.probability)).sum(axis=1).mean() for s in seen])
-    if unclear < MAX_UNCLEAR:
-        return None
-    sigma, fraction, kappa2 = (
-        np.concatenate([getattr(s, name) for s in seen]) for name in ("sigma", "fraction", "kappa2")
-    )
-    return RandomWalk.learn(sigma, fraction, kappa2, outliers=problem.outliers)
+    return Engine(problem, moves), state
 
 
 def run(
@@ -182,20 +165,22 @@ def run(
     most: int,
     limits: Limits,
 ) -> tuple[Engine, State, Draws, Convergence]:
-    """Warm up, then draw until the limits are reached or `most` sweeps are drawn.
+    """Warm up, then draw twice as much each time until the limits are reached.
 
-    `warmup` sweeps warm the chains up; convergence is judged after every `sweeps` draws.
+    `warmup` sweeps warm the chains up, `sweeps` are drawn first and at most `most` at last.  What
+    was drawn before counts as warm-up.
     """
     engine, state = warm_up(problem, chains, warmup, rng)
-    states: list[State] = []
     while True:
+        states: list[State] = []
         for _ in range(sweeps):
             state = engine.step(state, rng)
             states.append(state)
         draws = _collected(states)
         convergence = draws.judged(problem, limits)
-        if convergence.converged or len(states) + sweeps > most:
+        if convergence.converged or 2 * sweeps > most:
             return engine, state, draws, convergence
+        sweeps *= 2
 
 
 def _collected(states: list[State]) -> Draws:

@@ -17,7 +17,7 @@ from bayesdist.infer.series.trend import TrendModel
 
 __all__ = ["fit_series"]
 
-CHAINS, WARMUP, SWEEPS = 32, 100, 100
+CHAINS, WARMUP, SWEEPS = 32, 50, 50
 
 
 @one_thread
@@ -46,7 +46,8 @@ def fit_series(
     target_ess, target_rhat : float
         Limits of convergence, for every parameter.
     max_sweeps : int
-        Draws of each chain at most; 100 are made before convergence is first judged.
+        Draws of each chain at most; convergence is judged of 50, then of 100 further ones, and so
+        on.
 
     Returns
     -------

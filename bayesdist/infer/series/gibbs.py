@@ -12,13 +12,13 @@ with probability f.  Everything is in units of the series' spread.  Priors, all 
     drift    half-Student-t standard deviation of each coefficient, two degrees of freedom
     breaks   uniform in time: see breaks.py
 
-A sweep moves the mixture with memberships and deviations integrated out, and draws the
-memberships; then the breaks with b and the deviations integrated out, b with the deviations
-integrated out, the drift's amplitude, the deviations, and Sigma given them.  Before Sigma is drawn,
-deviations and Sigma are sheared and stretched together, which leaves the posterior as it is (Liu
-and Sabatti 2000, Biometrika 87, 353): given the deviations alone Sigma moves slowly where formal
-errors are large.  Many chains run in parallel; some exposures may be held out of some of them,
-which gives exact refits without one.
+A sweep draws the memberships with the deviations integrated out, f and kappa given them; then the
+breaks with b and the deviations integrated out, b with the deviations integrated out, the drift's
+amplitude, the deviations, and Sigma given them.  Before Sigma is drawn, deviations and Sigma are
+sheared and stretched together, which leaves the posterior as it is (Liu and Sabatti 2000,
+Biometrika 87, 353): given the deviations alone Sigma moves slowly where formal errors are large.
+Many chains run in parallel; some exposures may be held out of some of them, which gives exact
+refits without one.
 """
 
 from __future__ import annotations
@@ -38,7 +38,6 @@ from bayesdist.infer.series.scatter import (
     KAPPA_SHAPE,
     MAX_FRACTION,
     MIN_KAPPA,
-    RandomWalk,
     draw_scales,
     draw_scatter,
     scale_prior,
@@ -58,26 +57,19 @@ def sweep(
     rng: np.random.Generator,
     *,
     included: Float | None = None,
-    walk: RandomWalk | None = None,
     moves: BreakMoves | None = None,
     scan: bool = False,
 ) -> State:
     """State after one draw of everything.
 
-    `included` (C, E) is 0 for exposures that a chain must not see, else 1; `walk` makes further
-    moves of the scatter and of the mixture, `moves` those of breaks that are to be found.  With
-    `scan` the breaks are drawn among all gaps, for warming up only.
+    `included` (C, E) is 0 for exposures that a chain must not see, else 1; `moves` are those of
+    breaks that are to be found.  With `scan` the breaks are drawn among all gaps, for warming up
+    only.
     """
     if included is None:
         included = np.ones(state.off.shape)
-    residual = problem.residual(state.b, problem.columns(state.breaks))
-    if walk is not None:
-        sigma, fraction, kappa2 = walk.move(
-            state.sigma, state.fraction, state.kappa2, residual, problem.formal, included, rng
-        )
-        state = replace(state, sigma=sigma, fraction=fraction, kappa2=kappa2)
     if problem.outliers:
-        state = _draw_memberships(problem, state, residual, included, rng)
+        state = _draw_memberships(problem, state, included, rng)
     precision = precisions(problem.formal, state.sigma)
     state = draw_trend(problem, state, precision, rng, included=included, moves=moves, scan=scan)
     if problem.sigma is None:
@@ -120,10 +112,11 @@ def draw_trend(
 
 
 def _draw_memberships(
-    problem: Problem, state: State, residual: Float, included: Float, rng: np.random.Generator
+    problem: Problem, state: State, included: Float, rng: np.random.Generator
 ) -> State:
-    """Memberships given residuals (C, k, E), then fraction and inflation given them."""
-    k = residual.shape[1]
+    """Memberships given trend and scatter, then fraction and inflation given them."""
+    k = len(problem.y)
+    residual = problem.residual(state.b, problem.columns(state.breaks))
     _, distance, probability = densities(
         problem.formal, state.sigma, residual, state.fraction, state.kappa2
     )

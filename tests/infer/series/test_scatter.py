@@ -12,7 +12,6 @@ from bayesdist.infer.series.scatter import (
     PRIOR_SCALE,
     draw_scales,
     draw_scatter,
-    log_prior,
     scale_prior,
 )
 
@@ -26,14 +25,7 @@ def prior_draws(k: int, n: int, rng: np.random.Generator) -> np.ndarray:
     return out
 
 
-def test_one_scatter_is_half_student_t():
-    sd = np.geomspace(0.01, 50, 40)
-    value = log_prior((sd**2)[:, None, None]) + np.log(2 * sd)  # density of sd
-    expected = stats.t(NU, scale=PRIOR_SCALE).logpdf(sd)
-    np.testing.assert_allclose(value - value[0], expected - expected[0], atol=1e-9)
-
-
-def test_closed_form_is_the_hierarchy(rng):
+def test_hierarchy_is_half_student_t_and_uniform(rng):
     """Marginals of draws of the hierarchy: half-Student-t scatter, uniform correlation."""
     sigma = prior_draws(3, 1500, rng)
     for j in range(3):
