@@ -164,7 +164,8 @@ def test_meta_data_of_wise_go_into_themselves(tmp_path):
 def test_bad_requests_get_a_sentence(tmp_path):
     path = write(tmp_path, "tpv", on_sky(3))
     high = write(tmp_path, "ast", on_sky(8))
-    pixels = write(tmp_path, "stdgdc", calibration_of(some_solution(3), "made up"))
+    small = some_solution(3, size=SIZE, reference_pixel=(140.0, 90.0))
+    pixels = write(tmp_path, "stdgdc", calibration_of(small, "made up"))
     (notes := tmp_path / "notes.txt").write_text("nothing\n")
     new = ("-o", tmp_path / "x")
     for arguments, message in (

@@ -7,6 +7,9 @@ from collections.abc import Iterator
 import numba
 import pytest
 
+# files whose tasks go to workers
+ON_WORKERS = ("tests.infer.stars.test_cluster", "tests.infer.selfcal.test_cluster")
+
 
 @pytest.fixture(scope="module")
 def one_thread() -> Iterator[None]:
@@ -15,3 +18,12 @@ def one_thread() -> Iterator[None]:
     numba.set_num_threads(1)
     yield
     numba.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def forked_workers() -> Iterator[None]:
+    """Workers of Dask start in no time."""
+    from tests.infer.workers import forked  # dask, which other tests do not need
+
+    with forked(*ON_WORKERS):
+        yield

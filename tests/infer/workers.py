@@ -3,10 +3,27 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import forkserver
 
+import dask
 from distributed import LocalCluster
+from distributed.utils import get_mp_context
 
-__all__ = ["local_workers"]
+__all__ = ["forked", "local_workers"]
+
+
+@contextmanager
+def forked(*modules: str) -> Iterator[None]:
+    """Context in which workers are forks of one process that has imported these modules.
+
+    Each by itself would import them anew, for seconds.
+    """
+    with dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
+        get_mp_context().set_forkserver_preload(["distributed.worker", *modules])
+        forkserver.ensure_running()
+        yield
 
 
 def local_workers(n: int) -> LocalCluster:

@@ -20,9 +20,9 @@ QUICK = {
 
 @pytest.fixture(scope="package")
 def folder(tmp_path_factory) -> Path:
-    """20 exposures in F606W, 8 in F814W, and a configuration of each filter."""
+    """16 exposures in F606W, 8 in F814W, and a configuration of each filter."""
     folder = tmp_path_factory.mktemp("campaign") / "acs"
-    options = ("--exposures", 20, "--secondary-exposures", 8, "--stars", 6000, "--seed", 5, "-q")
+    options = ("--exposures", 16, "--secondary-exposures", 8, "--stars", 8000, "--seed", 5, "-q")
     good("simulate", "acs", "-o", folder, "--filters", "F606W,F814W", *options)
     for config in folder.glob("campaign_*.toml"):
         text = config.read_text(encoding="utf-8")

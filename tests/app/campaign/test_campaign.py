@@ -36,7 +36,7 @@ GAP = 2079.58  # B_1 of WFC1, Section 4.4.1
 
 def test_nearly_all_stars_are_matched_and_hardly_any_wrongly(run, folder):
     found = summary_of(run)["matching"]
-    assert found["n_exposures"] == 20
+    assert found["n_exposures"] == 16
     assert found["completeness"]["median"] > 0.95
     assert found["false_fraction"] < 0.01
     truth = read_acs(folder).truth
@@ -163,7 +163,7 @@ def test_published_errors_of_tables_hold_what_lies_between_nodes(run):
 
 def test_check_says_what_there_is(folder):
     text = good("check", folder / "campaign_f606w.toml").out
-    assert "20 in F606W" in text and "VAFACTOR" in text and "WARNING" not in text
+    assert "16 in F606W" in text and "VAFACTOR" in text and "WARNING" not in text
 
 
 # -- wrong input ----------------------------------------------------------------------------------

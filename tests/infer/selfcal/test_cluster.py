@@ -28,7 +28,7 @@ from tests.reduced import only_in_full
 
 PIECE = 200  # detections: some ten pieces on two workers
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.usefixtures("forked_workers"), pytest.mark.timeout(300)]
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def solution(start):
 
 
 @pytest.fixture(scope="module")
-def cluster():
+def cluster(forked_workers):
     """Two workers that somebody else has started."""
     with local_workers(2) as cluster:
         yield cluster

@@ -39,7 +39,10 @@ from tests.reduced import only_in_full
 PIECE = 500
 N = 2200  # five pieces on three workers
 
-pytestmark = [pytest.mark.usefixtures("small_pieces"), pytest.mark.timeout(120)]
+pytestmark = [
+    pytest.mark.usefixtures("small_pieces", "forked_workers"),
+    pytest.mark.timeout(120),
+]
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +53,7 @@ def small_pieces() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[LocalCluster]:
+def cluster(forked_workers) -> Iterator[LocalCluster]:
     """Three workers that somebody else has started."""
     with local_workers(3) as cluster:
         yield cluster
