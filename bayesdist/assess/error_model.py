@@ -359,7 +359,7 @@ def with_diagnosed_errors(
         before = before + stars.extra
     # frames follow as they are correlated with polynomials and drift
     D = found.model.n_distortion
-    follow = np.linalg.solve(before[:D, :D], before[:D]).T
+    follow = np.asarray(np.linalg.solve(before[:D, :D], before[:D]).T, float)
     more = _least(before, follow, (cov - found.formal)[:D, :D])
     return solution.mapped(recolouring(before, before + more))
 
