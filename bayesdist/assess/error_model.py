@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from bayesdist.arrays import Float
 from bayesdist.assess.budget.budget import ErrorBudget, budget_of
@@ -347,9 +348,9 @@ def with_diagnosed_errors(
         before = before + stars.extra
     # frames follow as they are correlated with polynomials and drift
     D = found.model.n_distortion
-    follow = np.linalg.solve(before[:D, :D], before[:D]).T
-    more = follow @ (cov - found.formal)[:D, :D] @ follow.T
-    return solution.mapped(recolouring(before, before + _least(before, (more + more.T) / 2)))
+    follow = np.asarray(np.linalg.solve(before[:D, :D], before[:D]).T, float)
+    more = _least(before, follow, (cov - found.formal)[:D, :D])
+    return solution.mapped(recolouring(before, before + more))
 
 
 def _covariance(posterior: Posterior, fit: LinearFit) -> Float:
@@ -359,10 +360,14 @@ def _covariance(posterior: Posterior, fit: LinearFit) -> Float:
     return wider * formal
 
 
-def _least(before: Float, more: Float) -> Float:
-    """Addition to a covariance, limited so that no direction loses more than half its variance."""
+def _least(before: Float, follow: Float, change: Float) -> Float:
+    """Addition to a covariance (D, D), limited so that no direction loses more than half of it.
+
+    It is that of some parameters, `change` (d, d), which the others `follow` (D, d).
+    """
     root = scaled_cholesky(before)
-    white = np.linalg.solve(root, np.linalg.solve(root, more).T)
-    values, vectors = np.linalg.eigh((white + white.T) / 2)
-    turned = root @ vectors
+    basis, white = np.linalg.qr(solve_triangular(root, follow, lower=True))
+    inner = white @ change @ white.T
+    values, vectors = np.linalg.eigh((inner + inner.T) / 2)
+    turned = root @ (basis @ vectors)
     return np.asarray((turned * np.maximum(values, -0.5)) @ turned.T)

@@ -105,7 +105,7 @@ def _parts(
     model, mean = solution.model, np.asarray(solution.mean, float)
 
     def static(chip: int) -> Float:
-        return _static(model, theta - mean, chip)
+        return _static(model, theta, chip) - _static(model, mean, chip)
 
     def drift(chip: int) -> Float:
         gauge = place_of(model, epoch=epoch, chip=chip)

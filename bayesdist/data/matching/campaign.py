@@ -9,10 +9,12 @@ catalogue positions (ACS ISR 2015-06, Section 4.1).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from astropy.table import Table
@@ -44,6 +46,7 @@ __all__ = [
 ]
 
 Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 Start = Callable[[Float, Float, NDArray[np.int64], float], ArrayLike]
 
 _UNMATCHED = "no counterpart in the catalogue"
@@ -127,7 +130,8 @@ def match_campaign(
         stay relative to its own origin.
     start : callable
         Known distortion: ``start(x, y, chip, epoch) -> (N, 2)`` from raw pixels and chip numbers to
-        a plane in the catalogue's unit, any rotation and origin; all chips on one plane.
+        a plane in the catalogue's unit, any rotation and origin; all chips on one plane.  It is
+        called by several threads at a time.
     cuts : StarCuts, optional
         Cuts on detections to be matched; by default none.  Those that the cuts leave out still help
         to recognise the field.
@@ -158,36 +162,44 @@ def match_campaign(
     chips = sorted({chip for one in lists for chip in one.chips})
     mean_epoch = float(np.mean([log[one.name].epoch for one in lists]))
     views = [_View(catalog, one, mean_epoch) for one in mirrored]
-    found: list[ExposureMatch] = []
-    failed: dict[str, InputError] = {}
-    for one, (good, rejected) in zip(lists, passed, strict=True):
+
+    def attempt(one: Detections, cut: tuple[Bool, dict[str, int]], views: list[_View]) -> _Outcome:
+        good, rejected = cut
         exposure = log[one.name]
         plane = _started(start, one, exposure.epoch)
+        match = partial(
+            match_exposure,
+            one,
+            good,
+            plane,
+            exposure=exposure,
+            chips=chips,
+            rejected=rejected,
+            radius=radius,
+            source=one.where,
+        )
         try:
             if not good.any():
                 raise all_cut(one, rejected)
-            match = partial(
-                match_exposure,
-                one,
-                good,
-                plane,
-                exposure=exposure,
-                chips=chips,
-                rejected=rejected,
-                radius=radius,
-                source=one.where,
-            )
-            pairs, view = _matched(match, views, exposure.epoch)
-            views = [view]
+            return _matched(match, views, exposure.epoch)
         except InputError as error:
-            reason = ""
-            if good.any() and not found and not failed:
-                reason = mismatch_reason(plane, one.mag, views[0].index)
-            failed[one.name] = error
-            if reason or too_many(len(failed), len(found), len(lists)):
-                raise failure(failed, reason, len(lists), mirrored) from error
+            return error
+
+    found: list[ExposureMatch] = []
+    failed: dict[str, InputError] = {}
+    outcomes = _in_turn(attempt, zip(lists, passed, strict=True), views)
+    for one, (good, _), outcome in zip(lists, passed, outcomes, strict=True):
+        if not isinstance(outcome, InputError):
+            pairs, views = outcome[0], [outcome[1]]
+            found.append(pairs)
             continue
-        found.append(pairs)
+        reason = ""
+        if good.any() and not found and not failed:
+            plane = _started(start, one, log[one.name].epoch)
+            reason = mismatch_reason(plane, one.mag, views[0].index)
+        failed[one.name] = outcome
+        if reason or too_many(len(failed), len(found), len(lists)):
+            raise failure(failed, reason, len(lists), mirrored) from outcome
     refuse_astray([one.report for one in found], catalog)
     matched = [one for one in lists if one.name not in failed]
     shown = catalog.mirrored() if views[0].mirrored else catalog
@@ -200,20 +212,37 @@ def match_campaign(
     return CampaignMatches(table, reports, left_out, views[0].mirrored)
 
 
+_Outcome: TypeAlias = "tuple[ExposureMatch, _View] | InputError"
+
+
+def _in_turn(
+    attempt: Callable[..., _Outcome],
+    lists: Iterable[tuple[Detections, Any]],
+    views: list[_View],
+) -> Iterator[_Outcome]:
+    """Outcomes for the lists: one by one until one matches in a parity, the others on all cores."""
+    rest = iter(lists)
+    for one in rest:
+        outcome = attempt(*one, views)
+        yield outcome
+        if not isinstance(outcome, InputError):
+            views = [outcome[1]]
+            break
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        yield from pool.map(lambda one: attempt(*one, views), rest)
+
+
 class _View:
     """Catalogue in one of its parities, at any epoch."""
 
     def __init__(self, catalog: ReferenceCatalog, mirrored: bool, mean_epoch: float) -> None:
         self.mirrored = mirrored
         self._catalog, self._mean_epoch = catalog, mean_epoch
-        self._last: tuple[float, ReferenceCatalog] | None = None
 
     def at(self, epoch: float) -> ReferenceCatalog:
         """Catalogue as seen at an epoch."""
-        if self._last is None or self._last[0] != epoch:
-            then = self._catalog if self._catalog.pm_u is None else self._catalog.as_seen(epoch)
-            self._last = epoch, then.mirrored() if self.mirrored else then
-        return self._last[1]
+        then = self._catalog if self._catalog.pm_u is None else self._catalog.as_seen(epoch)
+        return then.mirrored() if self.mirrored else then
 
     @cached_property
     def index(self) -> PatternIndex:

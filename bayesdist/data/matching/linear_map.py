@@ -85,7 +85,7 @@ def iterated_map(
     current, size, reach = start, _FIRST_SAMPLE, max(reach, radius)
     for _ in range(_MAX_ROUNDS):
         sample = points[outwards[:size][:: -(-min(size, len(points)) // MAX_SAMPLE)]]
-        distance, nearest = tree.query(current(sample), distance_upper_bound=reach, workers=-1)
+        distance, nearest = tree.query(current(sample), distance_upper_bound=reach)
         near = np.isfinite(distance)
         origin = start.origin
         fitted = _robust_linear(sample[near] - origin, reference[nearest[near]] - origin)

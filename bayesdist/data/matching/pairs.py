@@ -118,7 +118,7 @@ def chance_rate(points: Float, tree: cKDTree, radius: float | Float, step: float
     found = 0
     for direction in _DIRECTIONS:
         moved = sample + step * np.array([direction.real, direction.imag])
-        distance, _ = tree.query(moved, distance_upper_bound=float(reach.max()), workers=-1)
+        distance, _ = tree.query(moved, distance_upper_bound=float(reach.max()))
         found += int((distance <= reach).sum())
     return found / (len(sample) * len(_DIRECTIONS))
 
@@ -134,7 +134,7 @@ def beats_chance(points: Float, reference: Float, tree: cKDTree, distance: Float
 
     def neighbours(shift: complex) -> int:
         moved = sample + np.array([shift.real, shift.imag])
-        found = tree.query(moved, distance_upper_bound=reach * (1 + 1e-9), workers=-1)[0]
+        found = tree.query(moved, distance_upper_bound=reach * (1 + 1e-9))[0]
         return int(np.isfinite(found).sum())
 
     here = neighbours(0j)

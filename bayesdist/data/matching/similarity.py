@@ -271,7 +271,7 @@ def _support(candidate: Candidate, stars: Complex, reference: PatternIndex) -> t
     moved = candidate.turn * sample + candidate.target
     points = np.stack([moved.real, moved.imag], axis=-1)
     reach = float(np.clip(3.0 * candidate.slack, 0.02 * reference.spacing, 0.2 * reference.spacing))
-    distance, _ = reference.tree.query(points, distance_upper_bound=reach, workers=-1)
+    distance, _ = reference.tree.query(points, distance_upper_bound=reach)
     expected = len(sample) * chance_rate(points, reference.tree, reach, 4.0 * reach)
     return int(np.isfinite(distance).sum()), max(expected, 0.5)
 

@@ -49,7 +49,7 @@ def triangles_of(stars: Complex, anchors: Int, neighbours: int) -> Triangles:
     neighbours = min(neighbours, len(stars) - 1)
     if neighbours < 2 or not len(anchors):
         return _described(stars, np.zeros((0, 3), np.int64))
-    _, near = cKDTree(points).query(points[anchors], k=neighbours + 1, workers=-1)
+    _, near = cKDTree(points).query(points[anchors], k=neighbours + 1)
     pairs = np.array(list(combinations(range(1, neighbours + 1), 2)))
     first = np.broadcast_to(near[:, :1, None], (len(anchors), len(pairs), 1))
     corners = np.concatenate([first, near[:, pairs]], axis=2).reshape(-1, 3)

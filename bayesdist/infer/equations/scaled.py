@@ -65,7 +65,7 @@ def recolouring(before: Float, after: Float) -> Float:
     inner = np.ix_(free, free)
     old, new = (scaled_cholesky(cov[inner]) for cov in (before, after))
     out = np.eye(len(before))
-    out[inner] = np.linalg.solve(old.T, new.T).T
+    out[inner] = scipy.linalg.solve_triangular(old, new.T, trans="T", lower=True).T
     return out
 
 
