@@ -20,7 +20,13 @@ with kept_by_content():
         mixture_moments,
     )
     from bayesdist.infer.kernel.sky_places import linearised, positions
-    from bayesdist.infer.kernel.small import densities, draw_deviations, precisions, shear
+    from bayesdist.infer.kernel.small import (
+        densities,
+        draw_deviations,
+        gaussians,
+        precisions,
+        shear,
+    )
     from bayesdist.infer.kernel.star_modes import DOUBTFUL, FALSE, MEMBER
     from bayesdist.infer.kernel.stars import memberships, residuals
     from bayesdist.infer.kernel.stars_unknown import (
@@ -51,6 +57,7 @@ __all__ = [
     "densities",
     "draw_deviations",
     "eliminate_stars",
+    "gaussians",
     "least_squares_moments",
     "linearised",
     "log_likelihood",

@@ -15,7 +15,7 @@ from bayesdist.arrays import Float
 from bayesdist.infer.kernel.blocks import PASS
 from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.infer.kernel.numeric import exp_negative
-from bayesdist.infer.kernel.star_modes import cholesky, solve
+from bayesdist.infer.kernel.star_modes import cholesky
 
 SUMS = PASS | {"fastmath": FAST | {"reassoc"}}
 
@@ -173,17 +173,44 @@ def draw_deviations(
     return out
 
 
-@nb.njit(cache=True)
+@nb.njit(**SUMS)
 def _gaussian(matrix, x, noise):
-    """Draw in place of x, with precision `matrix` and mean matrix^-1 x; False if not positive."""
-    k = len(x)
+    """Draw in place of x from exp(x'y - y' matrix y / 2), and the log of its integral over y.
+
+    The integral is up to a constant, and NaN where the matrix is not positive.
+    """
+    k, value = len(x), 0.0
     if not cholesky(matrix, k):
-        return False
+        return math.nan
     for i in range(k):
-        for j in range(i + 1):
-            x[i] += matrix[i, j] * noise[j]
-    solve(matrix, x, k)
-    return True
+        total = x[i]
+        for j in range(i):
+            total -= matrix[i, j] * x[j]
+        x[i] = total / matrix[i, i]
+        value += 0.5 * x[i] ** 2 - math.log(matrix[i, i])
+    for i in range(k - 1, -1, -1):
+        total = x[i] + noise[i]
+        for j in range(i + 1, k):
+            total -= matrix[j, i] * x[j]
+        x[i] = total / matrix[i, i]
+    return value
+
+
+@nb.njit(**PASS)
+def _gaussians(matrix, x, noise, value):
+    for c in range(len(x)):
+        value[c] = _gaussian(matrix[c], x[c], noise[c])
+
+
+def gaussians(matrix: Float, right: Float, noise: Float) -> tuple[Float, Float]:
+    """Draws y (C, q) from densities exp(right'y - y' matrix y / 2), and logs of their integrals.
+
+    `matrix` is (C, q, q), `right` (C, q), `noise` (C, q) standard normal.  The integrals (C,) are
+    up to a constant, and NaN where a matrix is not positive.
+    """
+    draws, value = right.copy(), np.empty(len(right))
+    _gaussians(matrix.copy(), draws, noise, value)
+    return draws, value
 
 
 @nb.njit(**SUMS)
@@ -222,7 +249,7 @@ def _share(i, u, r, inverse, P, D, seen, noise, matrix, pull, part):
         matrix[j, j] += D[j] ** 2 * row[i]
     for j in range(k):  # nothing of its own
         matrix[max(i, j), min(i, j)] = 1.0 if i == j else 0.0
-    if not _gaussian(matrix, x, noise):
+    if math.isnan(_gaussian(matrix, x, noise)):
         return
     x[i] = 0.0
     for j in range(k):
@@ -291,7 +318,7 @@ def _rescale(u, r, inverse, D, seen, variance, noise, matrix, pull, part):
             total += part[e] * pull[e]
         x[j] = total
         matrix[j, j] += 1.0 / variance
-    moved = _gaussian(matrix, x, noise)
+    moved = not math.isnan(_gaussian(matrix, x, noise))
     for j in range(k):
         v = u[j]
         if moved:

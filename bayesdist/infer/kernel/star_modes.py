@@ -77,7 +77,7 @@ def cholesky(A, q):
 
 
 @nb.njit(cache=True, forceinline=True)
-def solve(L, b, q):
+def _solve(L, b, q):
     """Solve L L^T x = b in place and return the squared length of L^-1 b."""
     decrement = 0.0
     for i in range(q):
@@ -306,7 +306,7 @@ def to_mode(
                 break  # nothing known: a star without members
             observed, failed = False, True
             continue
-        left = solve(A, b, q)
+        left = _solve(A, b, q)
         if observed and left > NEAR:
             observed = False
             continue

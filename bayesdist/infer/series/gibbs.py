@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betainc, betaincinv, gammainc, gammaincinv
 
-from bayesdist.infer.kernel import densities, draw_deviations, precisions, shear
+from bayesdist.infer.kernel import densities, draw_deviations, gaussians, precisions, shear
 from bayesdist.infer.series.breaks import BreakMoves
 from bayesdist.infer.series.problem import Problem, State, break_likelihood, trend_equations
 from bayesdist.infer.series.scatter import (
@@ -102,9 +102,7 @@ def draw_trend(
     if problem.design.drift is not None:
         matrix, drift = _move_drift_alone(problem, matrix, right, state.drift, rng)
         state = replace(state, drift=drift)
-    # if the noise has the covariance of the matrix, its solution has that of the inverse
-    noise = np.linalg.cholesky(matrix) @ rng.standard_normal((*right.shape, 1))
-    b = np.asarray(np.linalg.solve(matrix, right[..., None] + noise), np.float64)
+    b = gaussians(matrix, right, rng.standard_normal(right.shape))[0]
     state = replace(state, b=b.reshape(state.b.shape), breaks=breaks)
     if problem.design.drift is not None:
         state = _move_drift(problem, state, columns, seen, rng)
@@ -166,11 +164,9 @@ def _move_drift_alone(
     chain, n_random = np.arange(n_chains), p - n
 
     def value(m: Float, d: Float) -> Float:
-        root = np.linalg.cholesky(m)
-        white = np.linalg.solve(root, right[..., None])[..., 0]
-        log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
         prior = np.log(d) - 1.5 * np.log1p((d / DRIFT_SCALE) ** 2 / 2)
-        return 0.5 * (white**2).sum(axis=1) - log_det + (prior - n_random * np.log(d)).sum(axis=1)
+        evidence = gaussians(m, right, np.zeros_like(right))[1]
+        return evidence + (prior - n_random * np.log(d)).sum(axis=1)
 
     here = value(matrix, drift)
     for _ in range(min(k, N_DRIFT_MOVES)):

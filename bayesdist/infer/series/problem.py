@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.infer.kernel import gaussians
 from bayesdist.infer.series.breaks import Likelihood
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.series import Series
@@ -159,9 +160,9 @@ def break_likelihood(problem: Problem, precision: Float) -> Likelihood:
         columns = problem.columns(breaks)
         matrix, right = normal_equations(precision, problem.y, columns)
         matrix = matrix + WIDE**-2 * np.eye(matrix.shape[-1])
-        half = np.linalg.solve(matrix, right[..., None])[..., 0]
-        log_det = np.linalg.slogdet(matrix)[1]
-        return 0.5 * (right * half).sum(axis=-1) - 0.5 * log_det
+        flat = right.reshape(-1, right.shape[-1])
+        square = matrix.reshape(len(flat), *matrix.shape[-2:])
+        return gaussians(square, flat, np.zeros_like(flat))[1].reshape(right.shape[:-1])
 
     def of(breaks: Float) -> Float:
         # a few candidates at a time: all their columns would not fit into the cache, or into memory

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.infer.kernel import densities, draw_deviations, precisions
+from bayesdist.infer.kernel import densities, draw_deviations, gaussians, precisions
 
 N_CHAINS, N_EXPOSURES = 3, 6
 
@@ -69,3 +69,17 @@ def test_deviations_are_those_of_two_gaussians(rng):
     )
     assert np.abs(white.mean(axis=1)).max() < 4.5 / np.sqrt(n)
     np.testing.assert_allclose(np.cov(white), np.eye(k), atol=4.5 * np.sqrt(2 / n))
+
+
+def test_gaussians_are_drawn_and_integrated(rng):
+    """Mean and covariance of the draws, and the integral by completing the square."""
+    n, q = 40_000, 3
+    matrix, right = covariances(q, 1, rng)[0], rng.standard_normal(q)
+    many = np.tile(matrix, (n, 1, 1))
+    draws, value = gaussians(many, np.tile(right, (n, 1)), rng.standard_normal((n, q)))
+    mean = np.linalg.solve(matrix, right)
+    white = np.linalg.cholesky(matrix).T @ (draws - mean).T
+    assert np.abs(white.mean(axis=1)).max() < 4.5 / np.sqrt(n)
+    np.testing.assert_allclose(np.cov(white), np.eye(q), atol=4.5 * np.sqrt(2 / n))
+    expected = 0.5 * right @ mean - 0.5 * np.linalg.slogdet(matrix)[1]
+    np.testing.assert_allclose(value, expected, rtol=1e-9)
