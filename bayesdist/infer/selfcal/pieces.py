@@ -105,7 +105,7 @@ def at_modes(piece: StarPiece, theta: Float, mixture: Mixture, observed: bool) -
 def moved(piece: StarPiece, before: Float, after: Float) -> StarPiece:
     """Piece at other parameters (D,), the stars moved as the means of their detections are."""
     p, stars = piece.problem, piece.stars.copy()
-    stars[:, :2] += p.middles(after) - p.middles(before)
+    stars[:, :2] += p.shifts(before, after)
     return StarPiece(p.at(after, stars), stars)
 
 
