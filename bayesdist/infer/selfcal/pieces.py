@@ -39,6 +39,7 @@ __all__ = [
     "in_pieces",
     "log_density",
     "moved",
+    "one_cluster",
     "slope",
     "squares",
     "to_sample",
@@ -105,7 +106,7 @@ def at_modes(piece: StarPiece, theta: Float, mixture: Mixture, observed: bool) -
 def moved(piece: StarPiece, before: Float, after: Float) -> StarPiece:
     """Piece at other parameters (D,), the stars moved as the means of their detections are."""
     p, stars = piece.problem, piece.stars.copy()
-    stars[:, :2] += p.middles(after) - p.middles(before)
+    stars[:, :2] += p.shifts(before, after)
     return StarPiece(p.at(after, stars), stars)
 
 
@@ -199,6 +200,18 @@ def in_pieces(
         yield pieces
     finally:
         pieces.close()
+
+
+@contextmanager
+def one_cluster(compute: Compute | None) -> Iterator[Compute | None]:
+    """Context in which all `in_pieces` of its compute share one cluster, where that is one."""
+    if compute is None or compute.engine != "dask":
+        yield compute
+        return
+    from bayesdist.infer.stars import cluster
+
+    with cluster.one_cluster(compute) as shared:
+        yield shared
 
 
 class _Whole(MappedPieces):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -40,6 +40,9 @@ Float = NDArray[np.float64]
 
 DROP = 18.0  # distance (in log density) below the top to which the nodes extend
 N_NODES = 13  # 9 lose 0.2 % of the draws where the jitter has no lower end, 25 gain nothing
+# relative change of the squared errors from the first node to the last, below which the nodes are
+# interpolated between so many
+LINEAR, N_EXACT = 0.1, 4
 MAX_DECREMENT = 1e-4  # decrement at which a node is found
 MAX_STEPS = 12
 MAX_ITERATIONS = 10  # in each of which the mesh of log j is narrowed by seven: to 1e-8
@@ -224,10 +227,12 @@ def propose(target: SelfTarget) -> GridProposal:
     )
     if not split.held:
         z, bend = _fraction(target, split, np.zeros(0))
-        return GridProposal(split, (_node(target, split, np.zeros(0), z, bend),))
+        known = target.mixture.jitter or 0.0
+        return _grid(target, split, np.zeros((1, 0)), [_mode(target, known, z)], z, bend)
     at, top = _nodes_at(target)
     z, bend = _fraction(target, split, np.array([top]))
-    return GridProposal(split, tuple(_node(target, split, np.array([x]), z, bend) for x in at))
+    modes = _modes(target, np.exp(2 * at), z)
+    return _grid(target, split, at[:, None], modes, z, bend)
 
 
 def _fraction(target: SelfTarget, split: Split, at: Float) -> tuple[float, float]:
@@ -289,20 +294,67 @@ def _nodes_at(target: SelfTarget) -> tuple[Float, float]:
     return np.linspace(fine[0], fine[-1], N_NODES), float(mesh[np.argmax(value)])
 
 
-def _node(target: SelfTarget, split: Split, at: Float, z: float, bend: float) -> Node:
-    """Node with mode and curvature of everything else at one jitter, for a given fraction."""
+def _modes(target: SelfTarget, square: Float, z: float) -> list[_Mode]:
+    """Mode at each squared jitter (n,), in ascending order, for a given fraction.
+
+    Where the jitter changes the errors by little, modes and curvatures are linear in its square.
+    """
+    change = (square[-1] - square[0]) * float(np.mean(1 / (target.problem.var + square[0])))
+    if change > LINEAR:
+        return [_mode(target, np.sqrt(x), z) for x in square]
+    few = np.linspace(square[0], square[-1], N_EXACT)
+    found = [_mode(target, np.sqrt(x), z) for x in few]
+    weights = np.stack([np.interp(square, few, one) for one in np.eye(len(few))], axis=1)
+    return [_mixed(found, w) for w in weights]
+
+
+@dataclass(frozen=True, eq=False)
+class _Mode:
+    """Free parameters (F,) at the mode for one jitter, and the curvature (F, F) there."""
+
+    theta: Float
+    curvature: Float
+
+
+def _mixed(found: Sequence[_Mode], weights: Float) -> _Mode:
+    """Weighted mean of modes."""
+    parts = [(w, one) for w, one in zip(weights, found, strict=True) if w > 0]
+    return _Mode(sum(w * one.theta for w, one in parts), sum(w * one.curvature for w, one in parts))
+
+
+def _grid(
+    target: SelfTarget, split: Split, at: Float, modes: Sequence[_Mode], z: float, bend: float
+) -> GridProposal:
+    """Proposal with nodes at the given coordinates (n, k), for a given fraction."""
+    y = np.array([np.append(one.theta, z) for one in modes])
+    # of the density itself: that of the expansion has one choice of members
+    values = target.log_density(split.to_psi(y, at)) + split.log_jacobian(y)
+    nodes = []
+    for x, mode, one, value in zip(at, y, modes, values, strict=True):
+        factor = _arrow(one.curvature, bend).factor()
+        nodes.append(Node(x, mode, factor, float(value) - 0.5 * factor.logdet))
+    return GridProposal(split, tuple(nodes))
+
+
+def _arrow(curvature: Float, bend: float) -> Arrow:
+    """Curvature of the free parameters, and that of the fraction."""
+    n = len(curvature)
+    H = np.zeros((n + 1, n + 1))
+    H[:-1, :-1], H[-1, -1] = curvature, bend
+    return Arrow(H, np.zeros((0, n + 1, 0)), np.zeros((0, 0, 0)), n_tail=1)
+
+
+def _mode(target: SelfTarget, jitter: float, z: float) -> _Mode:
+    """Mode and curvature of everything else at one jitter, for a given fraction."""
     solution, free = target.solution, target.solution.free
     theta = solution.theta.copy()
-    held = float(np.exp(at[0])) if len(at) else float(target.mixture.jitter or 0.0)
     observed = True
     for _ in range(MAX_STEPS):
-        found = target.pieces.sum(slope, theta, Mixture(held, z**3), observed)
+        found = target.pieces.sum(slope, theta, Mixture(float(jitter), z**3), observed)
         gradient = (found.gradient + target.prior.pull(theta))[free]
-        H = np.zeros((len(free) + 1,) * 2)
-        H[:-1, :-1] = (found.curvature + target.prior.precision)[np.ix_(free, free)]
-        H[-1, -1] = bend
+        curvature = (found.curvature + target.prior.precision)[np.ix_(free, free)]
         try:
-            factor = Arrow(H, np.zeros((0, len(H), 0)), np.zeros((0, 0, 0)), n_tail=1).factor()
+            factor = _arrow(curvature, 1.0).factor()
         except np.linalg.LinAlgError as error:
             if observed:  # a star between two modes: with EM weights the curvature is positive
                 observed = False
@@ -316,8 +368,4 @@ def _node(target: SelfTarget, split: Split, at: Float, z: float, bend: float) ->
         if gradient @ step < MAX_DECREMENT:
             break
         theta[free] += step
-    y = np.append(theta[free], z)
-    # of the density itself: that of the expansion has one choice of members
-    value = float(target.log_density(split.to_psi(y, at)[None])[0])
-    log_marginal = value + float(split.log_jacobian(y)) - 0.5 * factor.logdet
-    return Node(at, y, factor, log_marginal)
+    return _Mode(theta[free], curvature)

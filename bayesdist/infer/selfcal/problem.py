@@ -195,8 +195,18 @@ class Problem:
 
     def middles(self, theta: Float) -> Float:
         """Mean position (S, 2) of each star's detections."""
-        z = self.places(theta)
-        sums = [np.bincount(self.star, z[:, axis]) / self.counts for axis in (0, 1)]
+        return self._means(self.places(theta))
+
+    def shifts(self, before: Float, after: Float) -> Float:
+        """Mean shift (S, 2) of each star's detections from parameters (D,) to others."""
+        change = self.powers(after) - self.powers(before)
+        with threads_for(len(self.X)):
+            z = kernel.positions(self.groups.index, self.X, self.Y, change, self.model.order)
+        return self._means(z)
+
+    def _means(self, values: Float) -> Float:
+        """Means (S, 2) of numbers (N, 2) over the detections of each star."""
+        sums = [np.bincount(self.star, values[:, axis]) / self.counts for axis in (0, 1)]
         return np.stack(sums, axis=1)
 
     def mean_places(self, theta: Float) -> Float:
@@ -218,11 +228,12 @@ class Problem:
 
     def found_again(self, theta: Float, stars: Float) -> Float:
         """Stars (S, q), those far from all their detections moved back to the mean of these."""
-        middles, places = self.middles(theta), self.star_places(stars)
-        sums = [np.bincount(self.star, places[:, axis]) / self.counts for axis in (0, 1)]
+        middles = self.middles(theta)
+        # of stars at rest their position
+        own = stars if self.n_star == 2 else self._means(self.star_places(stars))
         # the match circle, for which a star's least curvature stands, limits its offset
         reach = np.sqrt(2.0) / self.least_root
-        lost = np.hypot(*(np.stack(sums, axis=1) - middles).T) > reach
+        lost = np.hypot(*(own - middles).T) > reach
         if not lost.any():
             return stars
         out = stars.copy()

@@ -20,7 +20,8 @@ import threading
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from time import monotonic
 from typing import Any, Self
@@ -82,7 +83,7 @@ class ClusterPieces(MappedPieces):
     def __init__(self, make: Task, sources: Iterable[Any], compute: Compute) -> None:
         self._pieces: list[Future] = []
         self._loading: set[str] = set()  # workers that sources are tied to
-        self._client, cluster, self._threads = _connected(compute)
+        self._client, cluster = _connected(compute)
         self._where = self._client.scheduler.address
         self._lease = _Lease()
         self._end = weakref.finalize(self._lease, _end, self._client, cluster)
@@ -138,7 +139,7 @@ class ClusterPieces(MappedPieces):
 
     def _tasks(self, task: Task, args: tuple[Any, ...]) -> list[Future]:
         """A task on each piece."""
-        work: _Work | Future = _Work(task, args, self._threads)
+        work: _Work | Future = _Work(task, args)
         if len(pickle.dumps(args, protocol=5)) > LARGE:
             # sent once; a task's result, unlike scattered data, outlives its worker
             work = self._client.submit(_same, work, pure=False)
@@ -267,7 +268,6 @@ class _Work:
 
     task: Task
     args: tuple[Any, ...]
-    threads: int | None
 
 
 def _made(_: Any) -> None:
@@ -283,7 +283,7 @@ def _pass(piece: Any, work: _Work) -> Any:
     """On a worker: result of a task on one piece."""
     with _one_pass:
         # of this thread, which may be another one each time
-        kernel.set_threads(work.threads or get_worker().state.nthreads)
+        kernel.set_threads(get_worker().state.nthreads)
         return work.task(piece, *work.args)
 
 
@@ -294,29 +294,31 @@ async def _in_order(client: Any, futures: Sequence[Future]) -> list[Any]:
     return await client.gather(futures, asynchronous=True)
 
 
-def _connected(compute: Compute) -> tuple[Any, LocalCluster | None, int | None]:
-    """Client, the cluster where it is our own, and threads of a pass (None: the worker's)."""
+@contextmanager
+def one_cluster(compute: Compute) -> Iterator[Compute]:
+    """Context with one cluster for all pieces of its compute, started here where none is given.
+
+    InputError as `ClusterPieces`.
+    """
     if compute.scheduler is not None:
-        try:
-            # a client that fails on a bad address would never be closed
-            resolve_address(compute.scheduler)
-            return Client(compute.scheduler, timeout=CONNECT, set_as_default=False), None, None
-        except (OSError, ValueError, TypeError) as error:
-            raise InputError(
-                f"no Dask scheduler answers at {compute.scheduler!r}",
-                where="compute.scheduler",
-                do="start one, correct the address, or leave it out for a cluster of this machine",
-            ) from error
-    workers = CPU_COUNT if compute.workers is None else compute.workers
+        yield compute
+        return
+    with _local_cluster(compute.workers) as cluster:
+        yield replace(compute, scheduler=cluster.scheduler_address)
+
+
+def _local_cluster(workers: int | None) -> LocalCluster:
+    """Processes of this machine that share its cores evenly."""
+    workers = CPU_COUNT if workers is None else workers
     if workers < 1:
         raise InputError(
             f"{workers} workers do no work", where="compute.workers", do="give 1 or more"
         )
     with dask.config.set({"distributed.scheduler.allowed-failures": ALLOWED_FAILURES}):
         try:
-            cluster = LocalCluster(
+            return LocalCluster(
                 n_workers=workers,
-                threads_per_worker=1,
+                threads_per_worker=max(1, CPU_COUNT // workers),
                 host="127.0.0.1",  # whoever reaches a scheduler runs code there: nobody else does
                 processes=True,
                 memory_limit=0,
@@ -330,12 +332,27 @@ def _connected(compute: Compute) -> tuple[Any, LocalCluster | None, int | None]:
                 where="compute.workers",
                 do="ask for fewer, and begin a script of your own with if __name__ == '__main__'",
             ) from error
+
+
+def _connected(compute: Compute) -> tuple[Any, LocalCluster | None]:
+    """Client, and the cluster where it is our own."""
+    if compute.scheduler is not None:
+        try:
+            # a client that fails on a bad address would never be closed
+            resolve_address(compute.scheduler)
+            return Client(compute.scheduler, timeout=CONNECT, set_as_default=False), None
+        except (OSError, ValueError, TypeError) as error:
+            raise InputError(
+                f"no Dask scheduler answers at {compute.scheduler!r}",
+                where="compute.scheduler",
+                do="start one, correct the address, or leave it out for a cluster of this machine",
+            ) from error
+    cluster = _local_cluster(compute.workers)
     try:
-        client = Client(cluster, set_as_default=False)
+        return Client(cluster, set_as_default=False), cluster
     except BaseException:
         cluster.close()
         raise
-    return client, cluster, max(1, CPU_COUNT // workers)
 
 
 def _places(client: Any) -> list[str]:

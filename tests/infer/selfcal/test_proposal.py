@@ -57,3 +57,25 @@ def test_what_is_indefinite_with_any_weights_is_refused(target, monkeypatch):
     monkeypatch.setattr(pieces, "expand", indefinite(lambda *_: True))
     with pytest.raises(DegenerateError, match="do not determine"):
         posterior.propose(target)
+
+
+def test_nodes_between_are_those_found_one_by_one(monkeypatch):
+    """Of many detections: modes in parts of their errors; densities much better than they vary."""
+    simulated = field(7, 12, 3000, order=2, disturbed=0.04)
+    problem, _ = problem_of(simulated, min_detections=3)
+    K = simulated.model.n_terms
+    free = np.setdiff1d(np.arange(simulated.model.n_params), [0, 1, K, K + 1])
+    mode = solve(problem, simulated.theta, free, Prior.none(simulated.theta))
+    sigma, passes = np.sqrt(np.diag(mode.cov)[free]), []
+    counted = indefinite(lambda *_: bool(passes.append(1)))
+    monkeypatch.setattr(pieces, "expand", counted)
+    with pieces.in_pieces(mode.problem, mode.stars) as whole:
+        target = SelfTarget(mode, whole.map(pieces.to_sample, mode.theta, mode.mixture))
+        few, n_few = posterior.propose(target), len(passes)
+        monkeypatch.setattr(posterior, "LINEAR", 0.0)
+        all_nodes = posterior.propose(target)
+    assert n_few < len(few.nodes) < len(passes) - n_few + 1
+    for a, b in zip(few.nodes, all_nodes.nodes, strict=True):
+        assert np.abs((a.mode - b.mode)[:-1] / sigma).max() < 0.01
+        assert a.factor.logdet == pytest.approx(b.factor.logdet, abs=0.1)
+        assert a.log_marginal == pytest.approx(b.log_marginal, abs=0.05)

@@ -23,12 +23,13 @@ from bayesdist.app.kinds.fitted import (
 )
 from bayesdist.app.kinds.selfcal.gauge import fixed_by, gauge_summary, gauge_table, gauge_words
 from bayesdist.app.kinds.selfcal.matched import SelfcalMatched, magnitude_errors_of, matches_of
-from bayesdist.infer import GaussianPriors, Posterior
+from bayesdist.infer import Compute, GaussianPriors, Posterior
 from bayesdist.infer.sampler.checkpoints import read_arrays
 from bayesdist.infer.selfcal import SelfCalibrationMode, sample_selfcal
 from bayesdist.infer.selfcal.elimination import Mixture
 from bayesdist.infer.selfcal.gauge import Decision
 from bayesdist.infer.selfcal.mode import gauge_of, mode_at, solve_in_gauge
+from bayesdist.infer.selfcal.pieces import one_cluster
 from bayesdist.model import DistortionModel
 
 __all__ = ["fit_selfcal", "load_selfcal", "sample_detections"]
@@ -64,12 +65,17 @@ def load_selfcal(folder: Path, matched: Callable[[], SelfcalMatched]) -> Fitted:
         For missing or damaged files.
     """
     fitted = load_fitted(folder)
+    found = matched()
+    compute = found.inputs.config.resources()
     arrays = read_arrays(folder / SOLUTION, "", ARRAYS, do=FIT_AGAIN)
-    return replace(fitted, solved=solved_of(matched(), fitted.linear.model, arrays))
+    return replace(fitted, solved=solved_of(found, fitted.linear.model, arrays, compute))
 
 
 def solved_of(
-    matched: SelfcalMatched, model: DistortionModel, arrays: Mapping[str, NDArray[Any]]
+    matched: SelfcalMatched,
+    model: DistortionModel,
+    arrays: Mapping[str, NDArray[Any]],
+    compute: Compute | None,
 ) -> SelfCalibrated:
     """The solution that `arrays_of` made arrays of: what the fit has is what later stages read."""
     inputs, held = matched.inputs, arrays["held"].astype(np.int64)
@@ -88,7 +94,7 @@ def solved_of(
         np.setdiff1d(np.arange(model.n_params), held),
         known(arrays["reference"]),
         Decision(n_null, n_open, held),
-        compute=inputs.config.resources(),
+        compute=compute,
     )
     gauge = gauge_of(problem, theta, known(theta), solution)
     fixed, places = fixed_by(gauge, solution, known), solution.stars
@@ -114,16 +120,17 @@ def fit_selfcal(matched: SelfcalMatched) -> Fitted:
         As `solve_in_gauge`.
     """
     inputs, model = matched.inputs, matched.problem.model
-    mode = solve_in_gauge(
-        matched.problem,
-        matched.theta,
-        inputs.known_for(model),
-        stars=matched.places,
-        mixture=matched.mixture,
-        jitter=inputs.jitter,
-        compute=inputs.config.resources(),
-    )
-    solved = solved_of(matched, model, arrays_of(mode, matched.theta))
+    with one_cluster(inputs.config.resources()) as compute:
+        mode = solve_in_gauge(
+            matched.problem,
+            matched.theta,
+            inputs.known_for(model),
+            stars=matched.places,
+            mixture=matched.mixture,
+            jitter=inputs.jitter,
+            compute=compute,
+        )
+        solved = solved_of(matched, model, arrays_of(mode, matched.theta), compute)
     summary = gauge_summary(solved.gauge, solved.fixed, model)
     return Fitted(
         mode.solution,

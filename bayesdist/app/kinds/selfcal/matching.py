@@ -21,6 +21,7 @@ from bayesdist.infer.selfcal import SelfCalibration
 from bayesdist.infer.selfcal.calibrate import self_calibrate
 from bayesdist.infer.selfcal.elimination import memberships
 from bayesdist.infer.selfcal.gauge import NamedDirection
+from bayesdist.infer.selfcal.pieces import one_cluster
 from bayesdist.infer.selfcal.tangent import places_of
 from bayesdist.model import DistortionModel
 
@@ -90,24 +91,25 @@ def calibrated(inputs: Inputs, report: Callable[[str], None]) -> SelfCalibration
     """
     (model, theta), block = inputs.start, inputs.config.selfcal
     try:
-        return self_calibrate(
-            model,
-            inputs.detections,
-            theta,
-            prior_at=inputs.known_for(model),
-            match_radius=block.match_radius,
-            start_radius=block.start_radius,
-            min_detections=block.min_detections,
-            motion=block.motion,
-            parallax_factors=inputs.parallax_factors,
-            dilation=inputs.dilation,
-            jitter=inputs.jitter,
-            references=inputs.references,
-            plane=inputs.tangent_plane,
-            max_iterations=block.max_iterations,
-            log=report,
-            compute=inputs.config.resources(),
-        )
+        with one_cluster(inputs.config.resources()) as compute:
+            return self_calibrate(
+                model,
+                inputs.detections,
+                theta,
+                prior_at=inputs.known_for(model),
+                match_radius=block.match_radius,
+                start_radius=block.start_radius,
+                min_detections=block.min_detections,
+                motion=block.motion,
+                parallax_factors=inputs.parallax_factors,
+                dilation=inputs.dilation,
+                jitter=inputs.jitter,
+                references=inputs.references,
+                plane=inputs.tangent_plane,
+                max_iterations=block.max_iterations,
+                log=report,
+                compute=compute,
+            )
     except (NotSettledError, DegenerateError) as error:
         frames = [model.frame(theta, e)[0] for e in range(len(model.exposures))]
         turned = rolled_180(np.array([np.arctan2(M[1, 0], M[0, 0]) for M in frames]))
