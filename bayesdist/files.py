@@ -30,12 +30,7 @@ def watched_writes(note: Callable[[Sequence[Path]], None]) -> Iterator[None]:
 
 
 def announce(paths: Sequence[Path]) -> None:
-    """Tell those who watch writes of files to come, all at once: sooner than one by one.
-
-    Parameters
-    ----------
-    paths : sequence of Path
-    """
+    """Tell those who watch writes of files to come, all at once: sooner than one by one."""
     for note in _watchers:
         note(paths)
 

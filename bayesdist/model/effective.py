@@ -138,19 +138,9 @@ class EffectiveCoefficients(ParameterLayout):
     def jacobian_blocks(self, theta: ArrayLike, groups: Groups) -> Iterator[tuple[Int, Int, Float]]:
         """Derivatives of the effective coefficients, many groups at a time.
 
-        Parameters
-        ----------
-        theta, groups
-            As of `effective_jacobian`.
-
-        Yields
-        ------
-        rows : ndarray of int, shape (n,)
-            Groups of one chip that depend on the same global parameters, and on as many of their
-            exposures.
-        columns : ndarray of int, shape (n, m)
-            Entries of theta, global ones first.
-        derivative : ndarray, shape (n, 2, K, m)
+        `theta`, `groups`: as of `effective_jacobian`. Result: `rows` (n,): groups of one chip that
+        depend on the same global parameters, and on as many of their exposures; `columns` (n, m):
+        entries of theta, global ones first; `derivative` (n, 2, K, m).
         """
         theta = np.asarray(theta, float)
         K, o = self.n_terms, np.asarray(self.origin)

@@ -15,8 +15,6 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.series import Series, SeriesPosterior, TrendModel, describe, fit_series
 
-__all__ = ["write_series_tables"]
-
 log = logging.getLogger("bayesdist")
 
 N_EPOCHS = 25  # epochs at which the drift is tabulated
@@ -26,12 +24,7 @@ MIN_EXPOSURES = 8  # exposures below which nothing is said of time
 def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> None:
     """Write series.ecsv and drift.ecsv, and a section of summary.json.
 
-    Parameters
-    ----------
-    run : RunDirectory
-    fitted : Fitted
-        With exposures that were each fitted alone.
-    config : Config
+    `fitted`: with exposures that were each fitted alone.
     """
     series = required(fitted.alone, "fits of single exposures")
     time, seed = fitted.linear.model.time, config.sampler.seed

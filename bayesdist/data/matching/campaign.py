@@ -20,6 +20,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.columns.labels import merged_counts
 from bayesdist.data.detections import Detections
@@ -40,14 +41,7 @@ from bayesdist.data.starlists import StarCuts
 from bayesdist.data.tables.column import encoded
 from bayesdist.errors import InputError, required
 
-__all__ = [
-    "CampaignMatches",
-    "match_campaign",
-]
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-Start = Callable[[Float, Float, NDArray[np.int64], float], ArrayLike]
+Start = Callable[[Float, Float, Int, float], ArrayLike]
 
 _UNMATCHED = "no counterpart in the catalogue"
 _LEFT_OUT = "exposure left out"

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.exposures import Exposure
@@ -38,12 +38,6 @@ from bayesdist.data.matching.similarity import (
     grown_map,
 )
 from bayesdist.errors import InputError
-
-__all__ = ["ExposureMatch", "match_exposure"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 _ASTRAY_FRACTION = 0.2  # of the matched fraction of the best chip: a chip below lies elsewhere
 _MIN_DETECTIONS_ON_CHIP = 20  # detections of a chip for that comparison

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.matching.linear_map import LinearMap
 from bayesdist.data.matching.similarity import (
     PatternIndex,
@@ -22,10 +22,6 @@ from bayesdist.data.matching.similarity import (
     pattern_index,
 )
 from bayesdist.errors import InputError
-
-__all__ = ["MutualFrames", "mutual_frames", "refuse_duplicates"]
-
-Float = NDArray[np.float64]
 
 BRIGHT_STARS = 3000  # stars of an exposure that are used
 WIDE = 0.3  # of the spacing: stars farther from those of others are new
@@ -133,13 +129,13 @@ def _onto(points: Float, mag: Float | None, index: PatternIndex) -> LinearMap | 
     return grown_map(points, found, index, narrow=NARROW)
 
 
-def _brightest(plane: Float, mag: Float | None) -> NDArray[np.int64]:
+def _brightest(plane: Float, mag: Float | None) -> Int:
     if mag is None or len(plane) <= BRIGHT_STARS:
         return np.arange(len(plane))
     return np.sort(np.argsort(mag, kind="stable")[:BRIGHT_STARS])
 
 
-def _of(mags: Sequence[Float] | None, e: int, rows: NDArray[np.int64]) -> Float | None:
+def _of(mags: Sequence[Float] | None, e: int, rows: Int) -> Float | None:
     return None if mags is None else mags[e][rows]
 
 

@@ -5,17 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.detections import NO_STAR
-
-__all__ = ["Friends", "friends_of_friends"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 FINE = 16  # cells in a linking length: detections of one cell are friends without a comparison
 MAX_EXTENT = 3.0  # linking lengths that a group may span: a longer one is a chain of stars

@@ -13,29 +13,16 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-__all__ = [
-    "MAX_SAMPLE",
-    "MIN_PAIRS",
-    "LinearMap",
-    "RobustFit",
-    "SmoothMap",
-    "best_similarity",
-    "iterated_map",
-    "robust_fit",
-    "smooth_map",
-]
+from bayesdist.arrays import Bool, Float, Int
 
-Float = NDArray[np.float64]
 Solution = TypeVar("Solution")
 MAX_SAMPLE = 20_000  # detections that the iterations use
 _FIRST_SAMPLE = 150  # detections of the first round
 _MAX_ROUNDS = 25
 MIN_PAIRS = 6  # pairs: with fewer, a linear map fits their noise
 _CLIP = 3.0  # times the median distance: 3.5 sigma of a circular normal
-Int = NDArray[np.int64]
 _ORDER = 3
 _POWERS = [(i, j) for i in range(_ORDER + 1) for j in range(_ORDER + 1 - i)]
 _MIN_PAIRS_ON_CHIP = 20 * len(_POWERS)  # pairs of a chip; with fewer, their noise is fitted
@@ -103,11 +90,11 @@ class RobustFit(NamedTuple, Generic[Solution]):
 
     solution: Solution
     away: Float
-    use: NDArray[np.bool_]
+    use: Bool
 
 
 def robust_fit(
-    fit: Callable[[NDArray[np.bool_]], tuple[Solution, Float] | None],
+    fit: Callable[[Bool], tuple[Solution, Float] | None],
     n: int,
     *,
     least: int,
@@ -141,7 +128,7 @@ def _robust_linear(p: Float, q: Float) -> tuple[Float, Float] | None:
     """Least-squares matrix and shift from p to q, with pairs far from them left out."""
     design = np.column_stack([p, np.ones(len(p))])
 
-    def fit(use: NDArray[np.bool_]) -> tuple[Float, Float] | None:
+    def fit(use: Bool) -> tuple[Float, Float] | None:
         solution, _, rank, _ = np.linalg.lstsq(design[use], q[use], rcond=None)
         away = np.asarray(np.hypot(*(q - design @ solution).T), float)
         return (np.asarray(solution, float), away) if rank == 3 else None
@@ -190,7 +177,7 @@ def smooth_map(points: Float, chip: Int, residual: Float, index: Int) -> SmoothM
     return SmoothMap(low, high, coefficients)
 
 
-def _cubic(design: Float, wanted: Float, use: NDArray[np.bool_]) -> tuple[Float, Float]:
+def _cubic(design: Float, wanted: Float, use: Bool) -> tuple[Float, Float]:
     """Coefficients by least squares, and distances of all pairs from them."""
     # Legendre polynomials leave normal equations well conditioned
     normal, right = design[use].T @ design[use], design[use].T @ wanted[use]

@@ -3,25 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.matching.linear_map import MAX_SAMPLE
-
-__all__ = [
-    "beats_chance",
-    "chance_radius",
-    "chance_rate",
-    "hull_of",
-    "inside_hull",
-    "mean_spacing",
-    "mutual_pairs",
-    "overlap",
-]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 _MAX_PROBES = 20_000  # displaced detections that sample chance matches
 _DIRECTIONS = np.exp(2j * np.pi * np.arange(8) / 8)

@@ -11,11 +11,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-__all__ = ["SearchRadius", "search_radius"]
-
-Float = NDArray[np.float64]
+from bayesdist.arrays import Float
 
 _MIN_PAIRS_IN_RING = 100
 _MAX_RINGS = 8

@@ -13,27 +13,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from bayesdist.arrays import Complex, Float
 from bayesdist.data.matching.linear_map import LinearMap, iterated_map
 from bayesdist.data.matching.pairs import chance_rate, hull_of, mean_spacing
 from bayesdist.data.matching.triangles import Candidate, Level, candidates
 from bayesdist.errors import InputError
-
-__all__ = [
-    "MIRRORED",
-    "PatternIndex",
-    "Similarity",
-    "brightest",
-    "find_similarity",
-    "grown_map",
-    "mismatch_reason",
-    "pattern_index",
-]
-
-Float = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 _MIN_STARS_TRIED = 60  # stars of the shallowest try
 _STARS_OF_FIRST_LEVEL = 400  # each further one has three times as many

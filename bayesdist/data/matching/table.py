@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Int
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, iterated_map
@@ -18,11 +19,6 @@ from bayesdist.data.matching.similarity import (
     pattern_index,
 )
 from bayesdist.errors import InputError
-
-__all__ = ["Matching", "match_table", "match_to_catalog"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 _NARROW = 0.25  # mean distances between reference stars: reach of its last pairs
 _FALSE_RATE = 0.02  # chance matches of a detection that the default radius allows

@@ -8,16 +8,10 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bayesdist.arrays import Bool, Complex, Float, Int
 from bayesdist.data.matching.linear_map import robust_fit
-
-__all__ = ["Candidate", "Level", "Triangles", "candidates", "triangles_of"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-Complex = NDArray[np.complex128]
 
 _MIN_SIDE_RATIO = 0.15  # shortest to longest side: below, a small error turns the shape around
 _MAX_SIDE_RATIO = 0.985  # sides nearer to each other than this may change places
@@ -34,7 +28,7 @@ class Triangles:
     corners: Int  # (T, 3), indices of stars
     shape: Float  # (T, 2), logarithms of middle and shortest side over the longest
     log_size: Float  # (T,), of the longest side
-    left: NDArray[np.bool_]  # (T,), anticlockwise; a mirror changes it
+    left: Bool  # (T,), anticlockwise; a mirror changes it
 
     def __len__(self) -> int:
         return len(self.corners)
@@ -172,7 +166,7 @@ def _fitted(stars: Complex, others: Complex, pairs: Int, reach: float) -> Candid
     """Least-squares similarity of pairs of stars that belong together."""
     z, w = stars[pairs[:, 0]], others[pairs[:, 1]]
 
-    def fit(use: NDArray[np.bool_]) -> tuple[tuple[complex, complex], NDArray[np.float64]]:
+    def fit(use: Bool) -> tuple[tuple[complex, complex], Float]:
         middle_z, middle_w = z[use].mean(), w[use].mean()
         dz, dw = z[use] - middle_z, w[use] - middle_w
         turn = complex((np.conj(dz) * dw).sum() / (np.abs(dz) ** 2).sum())

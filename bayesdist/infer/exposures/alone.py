@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.scaled import one_thread
@@ -20,10 +20,6 @@ from bayesdist.infer.linear import DEFAULT_REJECTION, Rejection, fit_linear
 from bayesdist.infer.solution import TransformedSolution
 from bayesdist.infer.transforms import LinearTerms, bare_model, linear_terms, reference_gauge
 from bayesdist.model import DistortionModel
-
-__all__ = ["ExposureSolutions", "fit_exposures"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,14 +18,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.model import DistortionModel, Groups
-
-__all__ = ["Settling"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 AXES = ("u", "v")
 
@@ -38,7 +33,7 @@ class _Place:
     constants: Int  # indices (p,) in theta of the constant term and its steps
     shifts: Int  # indices (E,) in theta of the shifts
     design: Float  # X (E, p)
-    used: NDArray[np.bool_]  # exposures (E,) whose shifts scatter by tau
+    used: Bool  # exposures (E,) whose shifts scatter by tau
 
     @property
     def inverse(self) -> Float:
@@ -73,8 +68,8 @@ class Settling:
         model: DistortionModel,
         kinds: Sequence[str],
         groups: Groups,
-        held: NDArray[np.bool_],
-        outlying: NDArray[np.bool_],
+        held: Bool,
+        outlying: Bool,
     ) -> Settling:
         """Transformation for the shifts of single chips among the kinds of deviation.
 

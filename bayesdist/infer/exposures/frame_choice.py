@@ -12,8 +12,6 @@ from bayesdist.infer.linear import Rejection, fit_linear, residuals
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import FRAME_KINDS
 
-__all__ = ["FrameChoice", "frames_that_help"]
-
 GAIN = 2.0  # factor by which the scatter must shrink
 FITS = 3
 MEDIAN_LENGTH = 1.1774  # standard deviations, of the length of two normal numbers

@@ -23,8 +23,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.distributions import f_sf
 from bayesdist.errors import DegenerateError, InputError
@@ -41,9 +42,6 @@ from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.transforms import bare_model, reference_gauge
 from bayesdist.model import DistortionModel
 
-__all__ = ["HierarchicalFit", "fit_hierarchical", "held_in_reference", "trend_p_values"]
-
-Float = NDArray[np.float64]
 SCALE = 1e-4  # of the prior on tau: variation of the scale by velocity aberration in a year
 # A focal plane that breathes moves its chips too: then the gap's deviations repeat those of scale
 # and shear, and taken as independent they would halve the error of a drift.  At four times their
@@ -89,7 +87,7 @@ class HierarchicalFit(Solution):
     outlying: tuple[str, ...] = ()
 
     @property
-    def index(self) -> NDArray[np.int64]:
+    def index(self) -> Int:
         """Indices in theta of the deviations."""
         return self.scatter.index
 
@@ -103,7 +101,7 @@ class HierarchicalFit(Solution):
         """Normal errors of the stars in the second pass, at the mean."""
         return ClippedGaussian(self.mean, self.fit.clip)
 
-    def uses(self, matches: Matches) -> NDArray[np.bool_]:
+    def uses(self, matches: Matches) -> Bool:
         """Boolean mask (N,) of a table's stars that were used."""
         return self.fit.uses(matches)
 
@@ -160,9 +158,7 @@ def _root_mean_square(tau: Float) -> Float:
     return np.asarray(np.sqrt((tau**2).mean(axis=0)))
 
 
-def _with_deviations(
-    others: GaussianPriors, index: NDArray[np.int64], inverse_variance: Float
-) -> GaussianPriors:
+def _with_deviations(others: GaussianPriors, index: Int, inverse_variance: Float) -> GaussianPriors:
     centre, precision = others.centre.copy(), others.precision.copy()
     centre[index], precision[index] = 0.0, inverse_variance
     return GaussianPriors(centre, precision)
@@ -307,7 +303,7 @@ def fit_hierarchical(
     return HierarchicalFit(fit, scatter, tau_draws, others, settling, names_of)
 
 
-def _outlying(scatter: Scatter, member: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _outlying(scatter: Scatter, member: Int) -> Bool:
     """Boolean mask (E,) of exposures that went wrong, removed one by one, the worst first.
 
     Tau is that of the remaining ones.  None are named where they are more than a fifth: then they

@@ -21,16 +21,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.infer.density.piecewise import PiecewiseExponential
 from bayesdist.infer.equations.arrow import Arrow, ArrowFactor
-
-__all__ = ["Scatter"]
-
-Float = NDArray[np.float64]
 
 DEGREES = 4.0  # of freedom of the prior on tau, a half-Student-t
 MESH = np.concatenate([np.arange(-10.0, -3.0), np.arange(-3.0, 4.25, 0.5), [5.0, 7.0]])  # sigmas
@@ -50,13 +46,13 @@ class Scatter:
     """Likelihood of the deviations, and hence of their scatter."""
 
     kinds: tuple[str, ...]  # k kinds of deviation
-    kind: NDArray[np.int64]  # kind (m,) of each deviation
-    index: NDArray[np.int64]  # indices (m,) in theta of the deviations
+    kind: Int  # kind (m,) of each deviation
+    index: Int  # indices (m,) in theta of the deviations
     matrix: Arrow  # H, without the prior on the deviations
     right: Float  # r (D,)
     about: Float  # theta_0 (D,)
     scale: Float  # (k,) of the half-Student-t prior on each tau, with 4 degrees of freedom
-    loose: NDArray[np.bool_]  # mask (m,) of deviations that have the prior N(0, scale^2)
+    loose: Bool  # mask (m,) of deviations that have the prior N(0, scale^2)
     # factor (k,), 1 or more, on tau in all that follows from it for theta, so that a kind that may
     # be correlated with others does not constrain them by an assumed independence
     caution: Float
@@ -123,7 +119,7 @@ class Scatter:
             out[k] = max(spread, 0.1 * float(np.median(sigma[self.kind == k])))
         return np.minimum(out, self.scale)
 
-    def odds(self, tau: Float, member: NDArray[np.int64]) -> Float:
+    def odds(self, tau: Float, member: Int) -> Float:
         """Log odds (n,) that a group of deviations went wrong: ten times the scatter of the others.
 
         They are 1 to 49 beforehand.  `member` (m,) is the group (exposure) of each deviation, from
@@ -162,7 +158,7 @@ class Scatter:
             out[group] = evidence[1] - evidence[0] + prior
         return out
 
-    def loosened(self, loose: NDArray[np.bool_]) -> Scatter:
+    def loosened(self, loose: Bool) -> Scatter:
         """Scatter with other loose deviations (m,)."""
         return replace(self, loose=loose)
 

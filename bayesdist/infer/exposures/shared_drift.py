@@ -10,18 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.scaled import scaled_inverse, unit_diagonal
 from bayesdist.infer.solution import DerivedSolution, Solution
 from bayesdist.infer.transforms import reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.similarity import turned, turned_model
-
-__all__ = ["SharedDrift", "drift_priors", "with_drift_of"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.detections import Detections
 from bayesdist.data.matching.friends import Friends, friends_of_friends
 from bayesdist.errors import NotSettledError
@@ -19,10 +19,6 @@ from bayesdist.infer.selfcal.problem import Problem, StarPriors, prepare
 from bayesdist.infer.selfcal.tangent import TangentPlane, places_of
 from bayesdist.infer.stars.shards import Compute
 from bayesdist.model import DistortionModel
-
-__all__ = ["SelfCalibration", "scatter_by_magnitude", "self_calibrate"]
-
-Float = NDArray[np.float64]
 
 MAX_ITERATIONS = 12
 SHRINK = 0.5  # smallest factor on the linking length from one iteration to the next
@@ -41,22 +37,12 @@ References = Callable[[Problem, Float], StarPriors]
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibration:
-    """A mode with its gauge and the last grouping of detections.
-
-    Parameters
-    ----------
-    mode : SelfCalibrationMode
-    gauge : Gauge
-    friends : Friends
-        Of the last iteration; its `star` is of the detections given.
-    detections : Detections
-        With star codes and errors, on one tangent plane where that is requested.
-    iterations : int
-    """
+    """A mode with its gauge and the last grouping of detections."""
 
     mode: SelfCalibrationMode
     gauge: Gauge
-    friends: Friends
+    friends: Friends  # of the last iteration; its `star` is of the detections given
+    # with star codes and errors, on one tangent plane where that is requested
     detections: Detections
     iterations: int
 
@@ -225,7 +211,7 @@ def _changed(before: Friends, after: Friends) -> int:
     return int(np.sum(_previous(before.star) != _previous(after.star)))
 
 
-def _previous(star: NDArray[np.int64]) -> NDArray[np.int64]:
+def _previous(star: Int) -> Int:
     """Index of the previous detection (N,) of the same star, or -1."""
     order = np.argsort(star, kind="stable")
     same = (star[order[1:]] == star[order[:-1]]) & (star[order[1:]] >= 0)

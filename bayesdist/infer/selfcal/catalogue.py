@@ -5,44 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.infer.selfcal.elimination import Mixture, eliminated_rows, memberships
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.pieces import StarPiece, in_pieces
 from bayesdist.infer.stars.shards import Compute
 
-__all__ = ["StarCatalogue", "star_catalogue"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-
 
 @dataclass(frozen=True, eq=False)
 class StarCatalogue:
-    """Stars on the sky of the solution.
+    """Stars on the sky of the solution."""
 
-    Parameters
-    ----------
-    values : ndarray, shape (S, q)
-        Position at `epoch`, then motion per year, then parallax.
-    cov : ndarray, shape (S, q, q)
-        With the errors of distortion and frames, in the gauge of the solution.
-    own : ndarray, shape (S, q, q)
-        Without these: by the star's own detections alone.
-    n : ndarray of int, shape (S,)
-        Detections.
-    n_members : ndarray, shape (S,)
-        Expected number of true detections among these.
-    epoch : float
-    unit : str
-    """
-
-    values: Float
-    cov: Float
-    own: Float
-    n: Int
-    n_members: Float
+    values: Float  # (S, q), position at `epoch`, then motion per year, then parallax
+    cov: Float  # (S, q, q), with the errors of distortion and frames, in the gauge of the solution
+    own: Float  # (S, q, q), without these: by the star's own detections alone
+    n: Int  # (S,), detections
+    n_members: Float  # (S,), expected number of true detections among these
     epoch: float
     unit: str
 
@@ -58,13 +37,8 @@ def star_catalogue(
     The covariance of a star is that by its own detections for a known distortion, plus that by
     the error of the distortion: A^-1 + A^-1 B Sigma B^T A^-1.
 
-    Parameters
-    ----------
-    solution : SelfCalibrationMode
-    cov : ndarray, shape (D, D), optional
-        Sigma; that of the solution by default.
-    compute : Compute, optional
-        Where the passes over the detections are made; in this process by default.
+    `cov` (D, D): sigma; that of the solution by default. `compute`: where the passes over the
+    detections are made; in this process by default.
     """
     problem = solution.problem
     root = np.zeros((len(solution.theta), len(solution.free)))

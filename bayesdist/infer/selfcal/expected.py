@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data.detections import Detections
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.elimination import Mixture, expand
@@ -19,10 +19,6 @@ from bayesdist.infer.selfcal.problem import Problem, prepare
 from bayesdist.infer.selfcal.sky_moves import gauge_free_matrix
 from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
-
-__all__ = ["ExpectedSolution", "expected_solution"]
-
-Float = NDArray[np.float64]
 
 BOUNDED = 1e-3  # fraction of a free direction that the others may leave unexplained
 NONE_FALSE = Mixture(jitter=0.0, fraction=1e-300)

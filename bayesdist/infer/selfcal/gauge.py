@@ -11,9 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import qr
 
+from bayesdist.arrays import Float, Int
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.selfcal.sky_moves import (
@@ -28,11 +28,6 @@ from bayesdist.infer.selfcal.sky_moves import (
 )
 from bayesdist.model import DistortionModel
 
-__all__ = ["FAR", "SAME_ROLL", "Decision", "Gauge", "NamedDirection", "find_gauge"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-
 NULL = 1e-10  # of the largest eigenvalue: no information
 ROUNDING = 1e-13  # of the largest eigenvalue: less is only rounding
 FREE_PIX = 10.0  # error at the detector's edge above which a direction counts as free
@@ -46,27 +41,16 @@ HIDDEN = 1e-5  # of a property that lies along undetermined directions: it is fr
 
 @dataclass(frozen=True, eq=False)
 class NamedDirection:
-    """A property of the solution, and its error.
+    """A property of the solution, and its error."""
 
-    Parameters
-    ----------
-    name : str
-        Of `GENERATORS`, relative; 'zero_point_u', 'zero_point_v'; of another chip against the first
-        with its name before: 'WFC1.shift_u', 'WFC1.rotation', ...
-    unit : str
-    sigma : float
-        From the detections alone; infinite where these do not determine it.
-    sigma_fixed : float
-        With information from other sources; infinite where the gauge fixes it by convention.
-    edge_pix : float
-        Displacement by one unit of it at the edge of the detector, pixels.
-    """
-
+    # of `GENERATORS`, relative; 'zero_point_u', 'zero_point_v'; of another chip against the first
+    # with its name before: 'WFC1.shift_u', 'WFC1.rotation',
     name: str
     unit: str
-    sigma: float
+    sigma: float  # from the detections alone; infinite where these do not determine it
+    # with information from other sources; infinite where the gauge fixes it by convention
     sigma_fixed: float
-    edge_pix: float
+    edge_pix: float  # displacement by one unit of it at the edge of the detector, pixels
 
     @property
     def free(self) -> bool:
@@ -100,39 +84,21 @@ class Decision:
 
 @dataclass(frozen=True, eq=False)
 class Gauge:
-    """The free directions of a problem, and what fixes them.
+    """The free directions of a problem, and what fixes them."""
 
-    Parameters
-    ----------
-    null : ndarray, shape (D, d)
-        Basis of the directions that detections leave free.
-    open : ndarray, shape (D, k)
-        Of those, directions that are free even with information from other sources.
-    held : ndarray of int, shape (k,)
-        Parameters that are fixed, so that the others are determined.
-    directions : tuple of NamedDirection
-    unnamed : tuple of str
-        Largest parameters in free directions which the names do not describe.
-    weakest : ndarray, shape (w, 2)
-        Of each nearly free combination of parameters: its error in pixels, and index of the
-        largest parameter in it.
-    spread : float
-        Largest difference of two roll angles, radians, a half turn counted as none.
-    whole : tuple of str
-        Moves of the whole sky that are free, of `GENERATORS`.
-    rates : tuple of str
-        Where stars move: moves of the whole sky with time that are free, of `RATES`, and
-        `PARALLAX`.
-    """
-
-    null: Float
+    null: Float  # (D, d), basis of the directions that detections leave free
+    # (D, k), of those, directions that are free even with information from other sources
     open: Float
-    held: Int
+    held: Int  # (k,), parameters that are fixed, so that the others are determined
     directions: tuple[NamedDirection, ...]
+    # largest parameters in free directions which the names do not describe
     unnamed: tuple[str, ...]
+    # (w, 2), of each nearly free combination of parameters: its error in pixels, and index of the
+    # largest parameter in it
     weakest: Float
-    spread: float
-    whole: tuple[str, ...] = ()
+    spread: float  # largest difference of two roll angles, radians, a half turn counted as none
+    whole: tuple[str, ...] = ()  # moves of the whole sky that are free, of `GENERATORS`
+    # where stars move: moves of the whole sky with time that are free, of `RATES`, and `PARALLAX`
     rates: tuple[str, ...] = ()
 
     @property

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.errors import DegenerateError, NotSettledError
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.linear import LinearFit
@@ -26,10 +26,6 @@ from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.shards import Compute, MappedPieces
 
-__all__ = ["PriorAt", "SelfCalibrationMode", "gauge_of", "mode_at", "solve", "solve_in_gauge"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 PriorAt = Callable[[Float], Prior]  # linearised at parameters (D,)
 
 MAX_PASSES = 80
@@ -44,36 +40,19 @@ REJECTED = 25.0  # chi-square of both axes beyond which a detection counts as re
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibrationMode:
-    """Mode of a self-calibration.
+    """Mode of a self-calibration."""
 
-    Parameters
-    ----------
-    problem : Problem
-        Linearised there.
-    theta : ndarray, shape (D,)
-    stars : ndarray, shape (S, q)
-    mixture : Mixture
-        Errors by moments; fraction of false detections at its mode.
-    free : ndarray of int, shape (F,)
-        Parameters that were fitted; the others are fixed by the gauge.
-    expansion : Expansion
-    curvatures : tuple of ndarray, shape (D, D)
-        With EM weights, hence never indefinite: by the detections alone, and with the priors of
-        the stars.
-    prior : Prior
-    decision : Decision, optional
-        Directions taken as free; None where only `free` was given.
-    """
-
-    problem: Problem
-    theta: Float
-    stars: Float
-    mixture: Mixture
-    free: Int
+    problem: Problem  # linearised there
+    theta: Float  # (D,)
+    stars: Float  # (S, q)
+    mixture: Mixture  # errors by moments; fraction of false detections at its mode
+    free: Int  # (F,), parameters that were fitted; the others are fixed by the gauge
     expansion: Expansion
+    # (D, D), with EM weights, hence never indefinite: by the detections alone, and with the priors
+    # of the stars
     curvatures: tuple[Float, Float]
     prior: Prior
-    decision: Decision | None = None
+    decision: Decision | None = None  # directions taken as free; None where only `free` was given
 
     @property
     def precision(self) -> Float:

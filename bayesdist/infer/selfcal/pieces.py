@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.infer.selfcal.elimination import (
     Expansion,
     Mixture,
@@ -24,28 +24,6 @@ from bayesdist.infer.selfcal.elimination import (
 )
 from bayesdist.infer.selfcal.problem import Problem, StarPriors
 from bayesdist.infer.stars.shards import Compute, MappedPieces, Task
-
-__all__ = [
-    "Expanded",
-    "ModePiece",
-    "StarPiece",
-    "at_means",
-    "at_medians",
-    "at_modes",
-    "at_stars",
-    "expansion",
-    "expansion_of",
-    "gathered",
-    "in_pieces",
-    "log_density",
-    "moved",
-    "one_cluster",
-    "slope",
-    "squares",
-    "to_sample",
-]
-
-Float = NDArray[np.float64]
 
 PIECE = 2**17  # detections: some tenths of a second for the draws that are evaluated together
 

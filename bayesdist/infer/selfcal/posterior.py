@@ -15,8 +15,8 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.convergence import Limits
 from bayesdist.infer.density.coordinates import Split
@@ -33,10 +33,6 @@ from bayesdist.infer.selfcal.pieces import in_pieces, log_density, slope, to_sam
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.stars.mixture import Hyper, OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Pieces
-
-__all__ = ["SelfTarget", "propose", "sample_selfcal"]
-
-Float = NDArray[np.float64]
 
 DROP = 18.0  # distance (in log density) below the top to which the nodes extend
 N_NODES = 13  # 9 lose 0.2 % of the draws where the jitter has no lower end, 25 gain nothing
@@ -133,26 +129,11 @@ def sample_selfcal(
 ) -> Posterior:
     """Sample distortion, frames, jitter and fraction of false detections.
 
-    Parameters
-    ----------
-    solution : SelfCalibrationMode
-    outliers : OutlierMixture, optional
-        In pixels; uniform within the match radius by default.
-    seed, ensembles, target_ess, target_rhat, max_steps, checkpoint_every, folder, progress
-        As `sample`.
-    compute : Compute, optional
-        Where the passes over the detections are made; in this process by default.
-
-    Returns
-    -------
-    Posterior
-        With errors in the unit of u, v.  Parameters that the gauge fixes have one value in all
-        draws and are not judged.
-
-    Raises
-    ------
-    DegenerateError, InputError
-        As `sample`.
+    `outliers`: in pixels; uniform within the match radius by default. `seed`, `ensembles`,
+    `target_ess`, `target_rhat`, `max_steps`, `checkpoint_every`, `folder`, `progress`: as `sample`.
+    `compute`: where the passes over the detections are made; in this process by default. Result:
+    with errors in the unit of u, v. Parameters that the gauge fixes have one value in all draws and
+    are not judged. DegenerateError, InputError as `sample`.
     """
     seeds = ensemble_seeds(seed, ensembles)
     started = time.monotonic()

@@ -11,19 +11,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, iterated_map
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.problem import Problem, StarPriors
 from bayesdist.model import DistortionModel
-
-__all__ = ["ReferenceStars", "frame_prior", "pointing_prior", "tie"]
-
-Float = NDArray[np.float64]
 
 MIN_REFERENCE_STARS = 2  # reference stars that fix position, rotation and scale
 MAX_DISTANCE = 5.0  # times the median from the map: not the reference star, but a neighbour
@@ -33,13 +29,7 @@ MIN_MEDIAN = 0.01  # pixels: smallest median distance in this limit
 def tie(reference: Float, row: Float, value: float, sigma: float) -> Prior:
     """Prior of one measured linear combination of the parameters.
 
-    Parameters
-    ----------
-    reference : ndarray, shape (D,)
-    row : ndarray, shape (D,)
-    value : float
-        Measured `row @ (theta - reference)`.
-    sigma : float
+    `reference`: (D,). `row`: (D,). `value`: measured `row @ (theta - reference)`.
     """
     return Prior(reference, np.outer(row, row) / sigma**2, row * value / sigma**2)
 
@@ -50,27 +40,17 @@ def pointing_prior(
     offsets: Float,
     sigma: Float,
     *,
-    group: NDArray[np.int64] | None = None,
+    group: Int | None = None,
     pixels: Sequence[tuple[int, float, float]] | None = None,
 ) -> Prior:
     """Prior of commanded offsets: sky positions of the first chip's reference pixel.
 
     The pointings of a group of exposures have one unknown origin and independent errors.
 
-    Parameters
-    ----------
-    model : DistortionModel
-    theta : ndarray, shape (D,)
-        At which it is linearised.
-    offsets : ndarray, shape (E, 2)
-        Along u and v; NaN where there is none.
-    sigma : ndarray, shape (E,)
-        Error of each on one axis.
-    group : ndarray of int, shape (E,), optional
-        Exposures with the same guide stars; all of them by default.
-    pixels : sequence of (int, float, float), optional
-        Chip number, x and y of some pixels: their mean position is pointed, in place of the
-        reference pixel.
+    `theta` (D,): at which it is linearised. `offsets` (E, 2): along u and v; NaN where there is
+    none. `sigma` (E,): error of each on one axis. `group` (E,): exposures with the same guide
+    stars; all of them by default. `pixels`: chip number, x and y of some pixels: their mean
+    position is pointed, in place of the reference pixel.
     """
     E, first = len(model.exposures), model.chips[0]
     pixels = pixels or [(first.number, *first.reference_pixel)]
@@ -119,18 +99,10 @@ def frame_prior(
 
 @dataclass(frozen=True, eq=False)
 class ReferenceStars:
-    """Catalogue that gives priors to the stars of a problem.
+    """Catalogue that gives priors to the stars of a problem."""
 
-    Parameters
-    ----------
-    catalog : ReferenceCatalog
-        With errors, on the plane and in the unit of the solution.
-    radius : float
-        Largest distance, in pixels, of a star from its reference star.
-    """
-
-    catalog: ReferenceCatalog
-    radius: float
+    catalog: ReferenceCatalog  # with errors, on the plane and in the unit of the solution
+    radius: float  # largest distance, in pixels, of a star from its reference star
 
     def __call__(self, problem: Problem, theta: Float) -> StarPriors:
         """Priors of the stars of a problem at a solution theta (D,).
@@ -139,10 +111,7 @@ class ReferenceStars:
         the identification.  A star that lies far from its reference star, compared with the others,
         has none.
 
-        Raises
-        ------
-        InputError
-            When hardly a star is found again.
+        InputError when hardly a star is found again.
         """
         catalog = self.catalog.at(problem.epoch0) if problem.epoch0 else self.catalog
         places = problem.middles(theta)
@@ -178,9 +147,7 @@ class ReferenceStars:
             precision[rows, 2 + axis, 2 + axis] += motion**-2.0 + (years / sigma) ** 2
         return replace(none, centre=centre, precision=precision)
 
-    def _pairs(
-        self, problem: Problem, catalog: ReferenceCatalog, places: Float
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _pairs(self, problem: Problem, catalog: ReferenceCatalog, places: Float) -> tuple[Int, Int]:
         """Numbers of stars and of their reference stars."""
         radius = self.radius * problem.pixel
         known = np.column_stack([catalog.u, catalog.v])

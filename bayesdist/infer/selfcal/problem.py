@@ -6,20 +6,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel.blocks import threads_for
 from bayesdist.model import DistortionModel
 from bayesdist.model.grouping import Groups
-
-__all__ = ["MIN_DETECTIONS", "MOTIONS", "Problem", "StarPriors", "prepare"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 MIN_DETECTIONS = 2  # of a star that gives information about the distortion
 MOTIONS = {"none": 2, "proper_motion": 4, "parallax": 5}
@@ -40,7 +35,7 @@ class StarPriors:
         return cls(np.zeros((n, q)), np.tile(VAGUE * np.eye(q), (n, 1, 1)))
 
     @property
-    def informed(self) -> NDArray[np.bool_]:
+    def informed(self) -> Bool:
         """Boolean mask (S,) of stars with a prior."""
         return np.asarray(np.trace(self.precision, axis1=1, axis2=2) > 10 * VAGUE)
 

@@ -5,25 +5,11 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel
 
-__all__ = [
-    "GENERATORS",
-    "PARALLAX",
-    "POINTS",
-    "functionals",
-    "gauge_free",
-    "gauge_free_matrix",
-    "largest_roll_difference",
-    "moves",
-    "parameter_scale",
-    "rates",
-]
-
-Float = NDArray[np.float64]
 # of the linear maps of the sky
 GENERATORS = {
     "scale": np.array([[1.0, 0.0], [0.0, 1.0]]),

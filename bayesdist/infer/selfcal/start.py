@@ -8,16 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.data.matching.frames import MutualFrames
 from bayesdist.data.matching.linear_map import LinearMap
 from bayesdist.model import Chip, DistortionModel, PolynomialBasis
 
-__all__ = ["chips_side_by_side", "fitted_polynomials", "start_parameters", "undistorted"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 Start = Callable[[Float, Float, int], Float]
 
 

@@ -12,50 +12,29 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.data.detections import Detections
 from bayesdist.data.sky.tangent import ARCSEC
 from bayesdist.model import DistortionModel
-
-__all__ = ["TangentPlane", "places_of"]
-
-Float = NDArray[np.float64]
 
 STEPS = 3  # of Newton's method, each of which leaves a hundredth or less
 
 
 @dataclass(frozen=True, eq=False)
 class TangentPlane:
-    """Plane of u and v, common to all exposures.
+    """Plane of u and v, common to all exposures."""
 
-    Parameters
-    ----------
-    unit_arcsec : float
-        Size of the unit of u and v.
-    point : tuple of float, optional
-        Point of contact with the sky, in u and v; the origin of the frames by default.
-    """
-
-    unit_arcsec: float
+    unit_arcsec: float  # size of the unit of u and v
+    # point of contact with the sky, in u and v; the origin of the frames by default
     point: tuple[float, float] | None = None
 
     def displacements(self, model: DistortionModel, theta: Float, flat: Float, e: int) -> Float:
         """Displacements (N, 2) from positions of an exposure to this plane.
 
-        Parameters
-        ----------
-        model : DistortionModel
-        theta : ndarray, shape (D,)
-        flat : ndarray, shape (N, 2)
-            Positions by the frame of the exposure: exact at the origin of the frames, which is
-            where the exposure's own plane touches the sky.
-        e : int
-            Code of the exposure.
-
-        Returns
-        -------
-        ndarray, shape (N, 2)
+        `theta`: (D,). `flat` (N, 2): positions by the frame of the exposure: exact at the origin of
+        the frames, which is where the exposure's own plane touches the sky. `e`: code of the
+        exposure. Result: (N, 2).
         """
         radian = ARCSEC / self.unit_arcsec
         o = np.asarray(model.origin)
@@ -72,18 +51,8 @@ class TangentPlane:
     def onto_it(self, model: DistortionModel, detections: Detections, theta: Float) -> Detections:
         """Detections at the pixels where they would be if all exposures' planes were this one.
 
-        Parameters
-        ----------
-        model : DistortionModel
-        detections : Detections
-            As they were seen.
-        theta : ndarray, shape (D,)
-            A solution: offsets and distortion.
-
-        Returns
-        -------
-        Detections
-            At the pixels that the frames alone map to the position on this plane.
+        `detections`: as they were seen. `theta` (D,): a solution: offsets and distortion. Result:
+        at the pixels that the frames alone map to the position on this plane.
         """
         flat = places_of(model, detections, theta)
         moved = np.empty_like(flat)

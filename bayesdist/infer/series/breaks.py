@@ -12,14 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.trend import MIN_EXPOSURES_FOUND
 
-__all__ = ["BreakMoves", "Likelihood"]
-
-Float = NDArray[np.float64]
 # log marginal likelihood (C, M) of dates (C, M, B), up to a constant for each chain
 Likelihood = Callable[[Float], Float]
 
@@ -39,14 +36,14 @@ class BreakMoves:
         self.density = np.tile(self.prior, (self.count, 1))
         self._seen = np.zeros_like(self.density)
 
-    def possible(self, breaks: Float) -> NDArray[np.bool_]:
+    def possible(self, breaks: Float) -> Bool:
         """Boolean mask (...) of ascending dates (..., B) with enough exposures in each segment."""
         place = np.searchsorted(self.epoch, breaks)
         shape = (*breaks.shape[:-1], 1)
         edges = np.concatenate([np.zeros(shape, int), place, np.full(shape, len(self.epoch))], -1)
         return np.all(np.diff(edges, axis=-1) >= MIN_EXPOSURES_FOUND, axis=-1)
 
-    def _at(self, gap: NDArray[np.int64], rng: np.random.Generator) -> Float:
+    def _at(self, gap: Int, rng: np.random.Generator) -> Float:
         return self.dates[gap] + self.width[gap] * rng.random(gap.shape)
 
     def start(self, n_chains: int, likelihood: Likelihood, rng: np.random.Generator) -> Float:

@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from astropy.table import Table
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float, Int
 from bayesdist.distributions import t_ppf
 from bayesdist.errors import InputError
 from bayesdist.infer.kernel import precisions
@@ -31,10 +31,6 @@ from bayesdist.infer.series.problem import WIDE, Problem, normal_equations
 from bayesdist.infer.series.series import Series
 from bayesdist.infer.series.trend import KINDS, TrendModel
 
-__all__ = ["Comparison", "FilterDependence", "compare", "filter_dependence", "serial_correlation"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 MIN_DIFFERENCE = 4.0
 CONFIDENCE = 0.95
 # lag-1 correlation, in its standard errors, from which exposures count as correlated

@@ -14,16 +14,12 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float, Int
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.series.series import Series
 from bayesdist.infer.series.trend import MIN_EXPOSURES, MIN_EXPOSURES_FOUND, TrendModel
-
-__all__ = ["Design", "Drift"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 KNOTS = {"spline": 8, "random_walk": 16}
 

@@ -15,8 +15,6 @@ from bayesdist.infer.series.problem import Problem
 from bayesdist.infer.series.series import Series
 from bayesdist.infer.series.trend import TrendModel
 
-__all__ = ["fit_series"]
-
 CHAINS, WARMUP, SWEEPS = 32, 50, 50
 
 

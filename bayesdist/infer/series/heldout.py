@@ -10,20 +10,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from bayesdist.arrays import Float, Int
 from bayesdist.infer.convergence import smoothed_weights
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.kernel import densities
 from bayesdist.infer.series.posterior import SeriesPosterior
 from bayesdist.infer.series.problem import State
 from bayesdist.limits import PARETO_K
-
-__all__ = ["HeldOut", "block_folds", "exposure_folds", "held_out"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 CHAINS, WARMUP, SWEEPS = 6, 30, 60
 CHAINS_AT_ONCE = 192

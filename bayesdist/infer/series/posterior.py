@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.infer.convergence import Convergence
 from bayesdist.infer.equations.scaled import chi_square
@@ -16,10 +17,6 @@ from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.problem import State
 from bayesdist.infer.series.series import Series
 from bayesdist.infer.series.trend import TrendModel
-
-__all__ = ["Change", "Prediction", "SeriesPosterior"]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

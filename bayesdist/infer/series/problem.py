@@ -6,17 +6,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.infer.kernel import gaussians
 from bayesdist.infer.series.breaks import Likelihood
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.series import Series
-
-__all__ = ["WIDE", "Problem", "State", "break_likelihood", "trend_equations"]
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 WIDE = 100.0  # prior standard deviation of the trend's parameters
 CANDIDATES_AT_ONCE = 8
@@ -93,7 +88,7 @@ class State:
     breaks: Float  # (C, B) those to be found
     drift: Float  # amplitude (C, k) of the random part
 
-    def take(self, chains: NDArray[np.int64]) -> State:
+    def take(self, chains: Int) -> State:
         """State of some of the chains, possibly several times."""
         return State(
             self.b[chains],

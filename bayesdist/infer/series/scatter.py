@@ -9,20 +9,8 @@ So the covariance is inverse Wishart given scales that are half-normal.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-__all__ = [
-    "FRACTION_PRIOR",
-    "KAPPA_RATE",
-    "KAPPA_SHAPE",
-    "MAX_FRACTION",
-    "MIN_KAPPA",
-    "draw_scales",
-    "draw_scatter",
-    "scale_prior",
-]
-
-Float = NDArray[np.float64]
+from bayesdist.arrays import Float
 
 NU = 2.0
 PRIOR_SCALE = 1.0

@@ -7,13 +7,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesdist.arrays import Float, Int
 from bayesdist.errors import DegenerateError, InputError
-
-__all__ = ["Series"]
-
-Float = NDArray[np.float64]
 
 MAD_TO_SIGMA = 1.4826
 
@@ -221,7 +218,7 @@ class Series:
         return tuple(sorted(counts, key=lambda name: -counts[name]))
 
     @property
-    def group_code(self) -> NDArray[np.int64]:
+    def group_code(self) -> Int:
         """Index (E,) of each exposure's group in `group_names`; zeros without groups."""
         if not self.group:
             return np.zeros(len(self), np.int64)

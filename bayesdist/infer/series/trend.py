@@ -22,8 +22,6 @@ import numpy as np
 
 from bayesdist.errors import InputError
 
-__all__ = ["KINDS", "MIN_EXPOSURES", "MIN_EXPOSURES_FOUND", "TrendModel"]
-
 PLAIN = ("constant", "line", "spline", "random_walk")
 BROKEN = ("step", "line+step", "piecewise", "lines")
 KINDS = ("constant", "line", "step", "line+step", "piecewise", "lines", "spline", "random_walk")

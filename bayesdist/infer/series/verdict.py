@@ -5,16 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesdist.arrays import Float
 from bayesdist.infer.series.compare import Comparison, compare
 from bayesdist.infer.series.posterior import SeriesPosterior
 from bayesdist.infer.series.series import Series
 from bayesdist.infer.series.trend import TrendModel
-
-__all__ = ["Verdict", "default_candidates", "describe"]
-
-Float = NDArray[np.float64]
 
 MIN_SIGNIFICANCE = 3.0  # sigma from which a coefficient's own slope or step is named
 

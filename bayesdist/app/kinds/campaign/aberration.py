@@ -18,8 +18,6 @@ from bayesdist.app.kinds.errors import ExposureScatter
 from bayesdist.assess.terms.parameters import EXPOSURE_SCATTER, ScaleError
 from bayesdist.infer.solution import Solution
 
-__all__ = ["ABERRATION", "aberration_term", "scale_error"]
-
 ABERRATION = "velocity aberration"
 # Cox & Gilliland (2002, HST Calibration Workshop): the scale varies by up to 5e-5 over an orbit
 SWING = 5e-5
@@ -51,13 +49,7 @@ def scale_error(exptime: float | None) -> float:
 def aberration_term(scatter: ExposureScatter, inputs: Inputs, solution: Solution) -> ScaleError:
     """The error of the scale that VAFACTOR leaves, at most as large as exposures scatter.
 
-    Parameters
-    ----------
-    scatter : ExposureScatter
-    inputs : Inputs
-        Of the campaign.
-    solution : Solution
-        Whose positions it moves.
+    `inputs`: of the campaign. `solution`: whose positions it moves.
     """
     source = PUBLISHED
     if inputs.config.campaign.vafactor_source == "earth":

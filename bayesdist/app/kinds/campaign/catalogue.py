@@ -16,8 +16,6 @@ from bayesdist.products import IdcTab
 from bayesdist.products.formats.idctab.hst import parity_of
 from bayesdist.reading.tables import read_table
 
-__all__ = ["errors_by_star", "parities_of", "read_campaign_catalog"]
-
 
 def read_campaign_catalog(
     block: CampaignBlock, base: Path, log: ExposureLog
@@ -27,11 +25,8 @@ def read_campaign_catalog(
     The plane touches the sky in the middle of the exposures of all filters, where the log says
     where they point and that lies among the stars; else in the middle of these.
 
-    Raises
-    ------
-    InputError
-        As `catalog_from_table`, and for proper motions without an epoch, in the configuration's
-        words.
+    InputError as `catalog_from_table`, and for proper motions without an epoch, in the
+    configuration's words.
     """
     path = base / block.catalog
     table = read_table(path)
@@ -90,12 +85,7 @@ def parities_of(block: CampaignBlock, catalog: ReferenceCatalog, tab: IdcTab) ->
     V2 and V3 lie on the sky as east and north do but for a rotation, and the table says how its
     axes lie along V2 and V3.
 
-    Parameters
-    ----------
-    block : CampaignBlock
-    catalog : ReferenceCatalog
-    tab : IdcTab
-        The known distortion.
+    `tab`: the known distortion.
     """
     if block.parity != "auto":
         return (block.parity == "mirrored",)
@@ -108,12 +98,8 @@ def parities_of(block: CampaignBlock, catalog: ReferenceCatalog, tab: IdcTab) ->
 def errors_by_star(catalog: ReferenceCatalog, largest_vafactor: float = 1.0) -> StarErrors | None:
     """Errors of the catalogue by code of the star; None where it has none.
 
-    Parameters
-    ----------
-    catalog : ReferenceCatalog
-    largest_vafactor : float
-        By which catalogue positions were divided; a star in many exposures has one error, and the
-        factors differ by less than a ten-thousandth.
+    `largest_vafactor`: by which catalogue positions were divided; a star in many exposures has one
+    error, and the factors differ by less than a ten-thousandth.
     """
     position = columns_by_code(catalog, "sigma_u", "sigma_v")
     if position is None or not position.any():

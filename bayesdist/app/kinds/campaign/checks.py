@@ -9,8 +9,6 @@ from bayesdist.checks import LARGER, Check, level_of
 from bayesdist.limits import COMPLETENESS, FALSE_MATCHES
 from bayesdist.numbers import count, percent
 
-__all__ = ["campaign_checks"]
-
 GROUP = "Campaign"
 
 # sections whose warnings a reader has to know, with their names and what they do to verdicts;
@@ -26,10 +24,7 @@ WARNING = {
 def campaign_checks(summary: Mapping[str, Any]) -> tuple[Check, ...]:
     """Criteria of matching, tables and series, and what their stages found odd.
 
-    Parameters
-    ----------
-    summary : mapping
-        As summary.json.
+    `summary`: as summary.json.
     """
     m, tables, time = (summary.get(k) or {} for k in ("matching", "tables", "time_dependence"))
     least = float(m["completeness"]["least"])

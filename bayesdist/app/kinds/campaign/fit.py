@@ -32,19 +32,14 @@ from bayesdist.limits import TREND
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.frames import RIGID
 
-__all__ = ["fit_campaign"]
-
 SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
 
 
 def fit_campaign(matched: CampaignMatched) -> Fitted:
     """Tables, errors, all exposures jointly, and every one alone.
 
-    Raises
-    ------
-    BayesdistError
-        For what the exposures do not determine, runs of other filters that do not fit to this one,
-        and stars that have outrun their catalogue.
+    BayesdistError for what the exposures do not determine, runs of other filters that do not fit to
+    this one, and stars that have outrun their catalogue.
     """
     with frames_not_set():
         return _fitted(matched)

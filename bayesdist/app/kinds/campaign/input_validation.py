@@ -7,28 +7,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.kinds.campaign.inputs import Inputs
 from bayesdist.app.kinds.campaign.reference import rehearse_references
 from bayesdist.app.kinds.star_lists import refuse_other_chips
+from bayesdist.arrays import Float, Int
 from bayesdist.data.holdout import refuse_strangers
 from bayesdist.data.matching.reports import check_campaign
 from bayesdist.errors import ConfigError, DegenerateError, InputError
 from bayesdist.model import TimeDependence
 from bayesdist.products import read_idctab
-
-__all__ = [
-    "frames_not_set",
-    "input_warnings",
-    "refuse_campaign",
-    "refuse_few",
-    "segment_counts",
-    "shear_warnings",
-]
-
-Float = NDArray[np.float64]
 
 MIN_EXPOSURES = 3  # exposures: two of them differ, but do not scatter
 ONE_DAY = 1.0 / 365.25  # years: epochs within say nothing of a rate
@@ -41,10 +30,7 @@ YEARS_AT_REST = 1.0  # years over which stars may stand still
 def refuse_campaign(inputs: Inputs) -> None:
     """Refuse inputs that do not go together, and files of others that cannot be used.
 
-    Raises
-    ------
-    BayesdistError
-        As `refuse_unsound`, `rehearse_references` and `read_idctab`.
+    BayesdistError as `refuse_unsound`, `rehearse_references` and `read_idctab`.
     """
     config, base = inputs.config, inputs.base
     refuse_unsound(inputs)
@@ -57,16 +43,11 @@ def refuse_campaign(inputs: Inputs) -> None:
 def refuse_unsound(inputs: Inputs) -> None:
     """Refuse exposures, lists and catalogue that a run could not use; nothing is matched.
 
-    Raises
-    ------
-    InputError
-        For chips that only one side knows, detections off their chip, lists that stand twice, a
-        catalogue without errors, cuts that leave nothing in any exposure, and exposures to be held
-        out that there are not.
-    DegenerateError
-        For too few exposures, and for segments of the drift without exposures or with one epoch.
-    ConfigError
-        For periods of the release outside the segment that they are to hold.
+    InputError for chips that only one side knows, detections off their chip, lists that stand
+    twice, a catalogue without errors, cuts that leave nothing in any exposure, and exposures to be
+    held out that there are not. DegenerateError for too few exposures, and for segments of the
+    drift without exposures or with one epoch. ConfigError for periods of the release outside the
+    segment that they are to hold.
     """
     config, lists = inputs.config, inputs.star_lists
     refuse_other_chips(lists.lists, config.chips(), "campaign.lists")
@@ -174,7 +155,7 @@ def segment_counts(epochs: Float, time: TimeDependence) -> list[int]:
     return [int(n) for n in counts]
 
 
-def _segment(epochs: Float, time: TimeDependence) -> NDArray[np.int64]:
+def _segment(epochs: Float, time: TimeDependence) -> Int:
     """Number of the segment of the drift, from 0, of each epoch (E,)."""
     return np.searchsorted(time.breaks, epochs, side="right")
 
@@ -193,10 +174,7 @@ def segment_text(time: TimeDependence, number: int) -> str:
 def refuse_few(epochs: Float, time: TimeDependence | None) -> None:
     """Refuse exposures at these epochs (E,) that cannot carry the scatter or the drift.
 
-    Raises
-    ------
-    DegenerateError
-        Naming the segment and its dates.
+    DegenerateError naming the segment and its dates.
     """
     n = len(epochs)
     if n < MIN_EXPOSURES:

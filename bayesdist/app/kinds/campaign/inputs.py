@@ -13,40 +13,21 @@ from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data import ExposureLog, ReferenceCatalog, read_exposures, select_motions
 from bayesdist.errors import InputError
 
-__all__ = ["Inputs", "read_campaign"]
-
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Catalogue, exposures and star lists of a campaign.
-
-    Parameters
-    ----------
-    config : CampaignConfig
-    base : Path
-        Folder that its files are relative to.
-    whole_catalog : ReferenceCatalog
-        All stars that the file holds.
-    catalog : ReferenceCatalog
-        Without stars whose proper motions are badly measured, where these were asked to go.
-    log : ExposureLog
-        Of the exposures of the filter, with VAFACTOR.
-    star_lists : StarLists
-        Of these exposures.
-    unlogged : tuple of str
-        Exposures that have a list and no entry in the log file, of whatever filter: not used.
-    plane : str
-        What the catalogue's u and v are, where they come from the sky.
-    """
+    """Catalogue, exposures and star lists of a campaign."""
 
     config: CampaignConfig
-    base: Path
-    whole_catalog: ReferenceCatalog
+    base: Path  # folder that its files are relative to
+    whole_catalog: ReferenceCatalog  # all stars that the file holds
+    # without stars whose proper motions are badly measured, where these were asked to go
     catalog: ReferenceCatalog
-    log: ExposureLog
-    star_lists: StarLists
+    log: ExposureLog  # of the exposures of the filter, with VAFACTOR
+    star_lists: StarLists  # of these exposures
+    # exposures that have a list and no entry in the log file, of whatever filter: not used
     unlogged: tuple[str, ...] = ()
-    plane: str = ""
+    plane: str = ""  # what the catalogue's u and v are, where they come from the sky
 
     @property
     def largest_vafactor(self) -> float:
@@ -72,11 +53,8 @@ class Inputs:
 def read_campaign(config: CampaignConfig, base: Path) -> Inputs:
     """Read catalogue, exposures and star lists.
 
-    Raises
-    ------
-    InputError
-        For files that cannot be read, lists without an entry in the log, a filter without
-        exposures, and exposures without VAFACTOR.
+    InputError for files that cannot be read, lists without an entry in the log, a filter without
+    exposures, and exposures without VAFACTOR.
     """
     block = config.campaign
     whole_log = read_exposures(base / block.exposures)

@@ -14,9 +14,6 @@ from bayesdist.infer.solution import ReferenceGauge, Solution, TransformedSoluti
 from bayesdist.infer.transforms import LinearTerms, lines, reference_gauge, without_frames
 from bayesdist.model import DistortionModel, TimeDependence
 
-__all__ = ["FIXED", "gap_priors", "line_sections", "with_gap"]
-
-
 CONSTANTS = (("u", 0, 0), ("v", 0, 0))
 SIGMA_HELD = 1e-6  # pixels, and pixels per year
 
@@ -35,14 +32,9 @@ def gap_priors(
 ) -> GaussianPriors:
     """Priors that leave of the constant terms' drift the steps of all chips but the first.
 
-    Parameters
-    ----------
-    model : DistortionModel
-        The reference chip comes first: its constant terms are where the exposures point.
-    asked : TimeDependence or None
-        The configured drift: constant terms that it names have rates as well.
-    pixel : float
-        Size of a pixel in the unit of u, v.
+    `model`: the reference chip comes first: its constant terms are where the exposures point.
+    `asked`: the configured drift: constant terms that it names have rates as well. `pixel`: size of
+    a pixel in the unit of u, v.
     """
     reference, named = model.chips[0].number, () if asked is None else asked.terms
     held = {

@@ -25,29 +25,19 @@ from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.solution import Solution
 from bayesdist.model import DistortionModel, LookupTable
 
-__all__ = ["CampaignMatched", "affine_model_of", "load_matched_campaign", "matched_campaign"]
-
 GAUGE_EXPOSURES = 1  # the first ones, which cannot be held out: they define the gauge
 
 
 @dataclass(frozen=True, eq=False)
 class CampaignMatched(Matched):
-    """Raw pixels beside aberration-neutral catalogue positions, with the catalogue's errors.
-
-    Parameters
-    ----------
-    inputs : Inputs
-        Catalogue, exposures and star lists.
-    pairs : Matches
-        All matches, fitted or held out.
-    """
+    """Raw pixels beside aberration-neutral catalogue positions, with the catalogue's errors."""
 
     section: ClassVar[str] = "matching"
 
     stars: Matches
     held: Matches | None = None
-    inputs: Inputs = field(kw_only=True)
-    pairs: Matches = field(kw_only=True)
+    inputs: Inputs = field(kw_only=True)  # catalogue, exposures and star lists
+    pairs: Matches = field(kw_only=True)  # all matches, fitted or held out
 
     @cached_property
     def affine_model(self) -> DistortionModel:
@@ -102,10 +92,7 @@ class CampaignMatched(Matched):
 def matched_campaign(pairs: Matches, inputs: Inputs, **more: Any) -> CampaignMatched:
     """Matches of a campaign, with what the configuration holds out set aside.
 
-    Raises
-    ------
-    InputError
-        As `set_aside`.
+    InputError as `set_aside`.
     """
     parts = set_aside(inputs.config, pairs, GAUGE_EXPOSURES)
     return CampaignMatched(*parts, catalogue=inputs.catalog, inputs=inputs, pairs=pairs, **more)

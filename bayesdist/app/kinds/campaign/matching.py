@@ -25,19 +25,14 @@ from bayesdist.errors import InputError
 from bayesdist.model import Chip
 from bayesdist.products import read_idctab
 
-__all__ = ["match_lists"]
-
 log = logging.getLogger("bayesdist")
 
 
 def match_lists(inputs: Inputs) -> CampaignMatched:
     """Star lists matched with a catalogue, exposure by exposure.
 
-    Raises
-    ------
-    BayesdistError
-        For files that cannot be read or do not go together, chips without matches, and too few
-        exposures.
+    BayesdistError for files that cannot be read or do not go together, chips without matches, and
+    too few exposures.
     """
     config, block, lists = inputs.config, inputs.config.campaign, inputs.star_lists
     tab = read_idctab(inputs.base / block.initial_distortion)

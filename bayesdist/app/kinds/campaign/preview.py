@@ -13,8 +13,6 @@ from bayesdist.app.kinds.campaign.input_validation import (
 )
 from bayesdist.app.kinds.campaign.inputs import Inputs
 
-__all__ = ["campaign_lines"]
-
 
 def campaign_lines(inputs: Inputs) -> Iterator[str]:
     """Inputs, dates and roll angles of a campaign, as lines of text."""

@@ -15,23 +15,12 @@ from bayesdist.infer.exposures.shared_drift import drift_priors
 from bayesdist.model import Chip, DistortionModel, LookupTable
 from bayesdist.products import read_d2im
 
-__all__ = ["held_tables", "rate_priors", "rehearse_references"]
-
 
 def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tuple[LookupTable, ...]:
     """The detector's tables that a run holds; none where it has none to hold.
 
-    Parameters
-    ----------
-    block : TablesBlock
-    chips : tuple of Chip
-        All of which must have a table.
-    base : Path
-
-    Raises
-    ------
-    InputError
-        For a run without tables, a file that is no D2IMFILE, and a chip without table.
+    `chips`: all of which must have a table. InputError for a run without tables, a file that is no
+    D2IMFILE, and a chip without table.
     """
     if block.detector is None:
         return ()
@@ -57,11 +46,8 @@ def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tupl
 def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianPriors | None:
     """Priors on the drift of a model from the posterior of another run; None where it is free.
 
-    Raises
-    ------
-    InputError
-        For a folder that is no finished run, a run that has not converged, and one of other chips,
-        units, drifting terms, or reference dates.
+    InputError for a folder that is no finished run, a run that has not converged, and one of other
+    chips, units, drifting terms, or reference dates.
     """
     tdd, chip = config.model.tdd, config.chips()[0].number
     if tdd is None or config.has_free_rates:
@@ -84,10 +70,7 @@ def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianP
 def rehearse_references(config: Config, unit: str, base: Path) -> None:
     """Read all that a run takes over from others; nothing is fitted.
 
-    Raises
-    ------
-    InputError
-        As `held_tables` and `rate_priors`.
+    InputError as `held_tables` and `rate_priors`.
     """
     chips = config.chips()
     held_tables(config.tables, chips, base)

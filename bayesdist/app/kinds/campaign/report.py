@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from astropy.table import Table
-from numpy.typing import NDArray
 
 from bayesdist.app.config import CampaignConfig
 from bayesdist.app.kinds.campaign.inputs import Inputs
@@ -12,6 +11,7 @@ from bayesdist.app.kinds.campaign.matched import affine_model_of
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.arrays import Bool, Float
 from bayesdist.data import Matches
 from bayesdist.data.preparing import motion_error_line
 from bayesdist.diagnose.overlap import OverlapTest
@@ -32,10 +32,6 @@ from bayesdist.report.campaign import (
     LinearSeries,
 )
 
-__all__ = ["campaign_results", "held_parameters"]
-
-Float = NDArray[np.float64]
-
 MAX_MARKERS = 20_000  # markers in a figure: more only hide each other
 CELL_PIX = 64.0  # pixels: the nodes of ACS ISR 2015-06
 MIN_STARS_PER_CELL = 20  # stars that a cell should have at the median
@@ -52,16 +48,8 @@ def campaign_results(
 ) -> CampaignResults:
     """Content that a campaign adds to the report of its run.
 
-    Parameters
-    ----------
-    run : RunDirectory
-        That has been assessed.
-    inputs : Inputs
-    data : FitData
-    posterior : Posterior
-        As it was sampled.
-    overlap : OverlapDifferences or None
-        Of stars in several exposures.
+    `run`: that has been assessed. `posterior`: as it was sampled. `overlap`: of stars in several
+    exposures.
     """
     model, fitted, matched = posterior.model, data.fitted, data.matched
     matching = read_ecsv(run / "matching.ecsv")
@@ -89,11 +77,7 @@ def held_parameters(fit: LinearFit, priors: GaussianPriors) -> tuple[str, ...]:
 
     The deviations of single exposures are not among them: their prior is what was found.
 
-    Parameters
-    ----------
-    fit : LinearFit
-    priors : GaussianPriors
-        As the fit had them.
+    `priors`: as the fit had them.
     """
     share = fit.sigma * np.sqrt(priors.precision)
     return tuple(
@@ -220,7 +204,7 @@ def _cells(size: tuple[float, float], n: int) -> tuple[int, int]:
 def _binned(
     pairs: Matches,
     residual: Float,
-    rows: NDArray[np.bool_],
+    rows: Bool,
     bins: tuple[int, int],
     size: tuple[float, float],
 ) -> BinnedResiduals:

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.campaign.inputs import Inputs
 from bayesdist.app.kinds.campaign.matched import CampaignMatched
 from bayesdist.app.kinds.campaign.reference import held_tables
 from bayesdist.app.kinds.fitted import StoredLookupTables
+from bayesdist.arrays import Float
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
@@ -32,11 +32,6 @@ from bayesdist.infer.nodes import (
 from bayesdist.model import DistortionModel, LookupTable, corrected
 from bayesdist.model.grid import grid_pixels, mesh
 
-__all__ = ["fit_tables", "scatter_by_magnitude", "tables_section"]
-
-
-Float = NDArray[np.float64]
-
 MIN_SCATTER_RATIO = 2.0  # ratio of scatters beyond which centroids are not what most of it is
 MIN_EXPLAINED = 0.5  # fraction of the variance of the scatters that the dates must explain
 MIN_EXPOSURES = 5  # exposures: a parabola in time takes three
@@ -48,18 +43,8 @@ def refuse_outrun_stars(inputs: Inputs, fit: LinearFit, pairs: Matches) -> None:
 
     The square of the residuals of stars that move is a parabola in time.
 
-    Parameters
-    ----------
-    inputs : Inputs
-    fit : LinearFit
-        Of every exposure by itself.
-    pairs : Matches
-        What it was made from.
-
-    Raises
-    ------
-    InputError
-        Naming the catalogue.
+    `fit`: of every exposure by itself. `pairs`: what it was made from. InputError naming the
+    catalogue.
     """
     if inputs.catalog.pm_u is not None or pairs.epoch is None:
         return
@@ -95,18 +80,10 @@ ROUGH_ITERATIONS = 1  # of the tables from whose residuals the errors of the sta
 
 @dataclass(frozen=True, eq=False)
 class FittedTables:
-    """Look-up tables of a fit.
+    """Look-up tables of a fit."""
 
-    Parameters
-    ----------
-    stored : StoredLookupTables
-        With their errors, as other stages take them.
-    fit : TableFit or None
-        None where none were fitted.
-    """
-
-    stored: StoredLookupTables
-    fit: TableFit | None = None
+    stored: StoredLookupTables  # with their errors, as other stages take them
+    fit: TableFit | None = None  # none where none were fitted
 
 
 def fit_tables(matched: CampaignMatched) -> FittedTables:
@@ -157,10 +134,7 @@ def scatter_by_magnitude(
 ) -> tuple[LinearFit, Matches, MagnitudeErrors]:
     """Fit of every exposure by itself and scatter by magnitude, as `fit_by_magnitude`.
 
-    Raises
-    ------
-    InputError
-        Where stars have outrun a catalogue without proper motions.
+    InputError where stars have outrun a catalogue without proper motions.
     """
     fit, _, errors = fit_by_magnitude(pairs, model)
     scattered = pairs.with_errors(errors)

@@ -23,6 +23,7 @@ from bayesdist.app.kinds.fitted import (
 )
 from bayesdist.app.kinds.selfcal.gauge import fixed_by, gauge_summary, gauge_table, gauge_words
 from bayesdist.app.kinds.selfcal.matched import SelfcalMatched, magnitude_errors_of, matches_of
+from bayesdist.arrays import Float
 from bayesdist.infer import Compute, GaussianPriors, Posterior
 from bayesdist.infer.sampler.checkpoints import read_arrays
 from bayesdist.infer.selfcal import SelfCalibrationMode, sample_selfcal
@@ -31,11 +32,6 @@ from bayesdist.infer.selfcal.gauge import Decision
 from bayesdist.infer.selfcal.mode import gauge_of, mode_at, solve_in_gauge
 from bayesdist.infer.selfcal.pieces import one_cluster
 from bayesdist.model import DistortionModel
-
-__all__ = ["fit_selfcal", "load_selfcal", "sample_detections"]
-
-
-Float = NDArray[np.float64]
 
 ARRAYS = ("theta", "stars", "mixture", "held", "n_free", "reference")
 RELINEARISED = 3  # times a problem is linearised anew about a solution that is read
@@ -59,10 +55,7 @@ def arrays_of(solution: SelfCalibrationMode, reference: Float) -> dict[str, NDAr
 def load_selfcal(folder: Path, matched: Callable[[], SelfcalMatched]) -> Fitted:
     """The fit of an earlier stage, with its solution.
 
-    Raises
-    ------
-    InputError
-        For missing or damaged files.
+    InputError for missing or damaged files.
     """
     fitted = load_fitted(folder)
     found = matched()
@@ -114,10 +107,7 @@ def solved_of(
 def fit_selfcal(matched: SelfcalMatched) -> Fitted:
     """Mode and gauge of a self-calibration, in one decision.
 
-    Raises
-    ------
-    DegenerateError, NotSettledError
-        As `solve_in_gauge`.
+    DegenerateError, NotSettledError as `solve_in_gauge`.
     """
     inputs, model = matched.inputs, matched.problem.model
     with one_cluster(inputs.config.resources()) as compute:

@@ -13,8 +13,6 @@ from bayesdist.infer.selfcal.gauge import FAR, Gauge, NamedDirection, find_gauge
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.model import DistortionModel
 
-__all__ = ["CONVENTION", "fixed_by", "gauge_summary", "gauge_table", "gauge_words"]
-
 COLUMNS = ["name", "state", "sigma_detections", "sigma_fixed", "unit", "edge_pix", "fixed_by"]
 
 CONVENTION, DETECTIONS, REFERENCES = "convention", "detections", "reference stars"

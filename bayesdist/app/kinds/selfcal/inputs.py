@@ -9,12 +9,12 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.config import SelfcalConfig
 from bayesdist.app.kinds.selfcal.known import Commanded, GaugeConstraints, read_commanded
 from bayesdist.app.kinds.selfcal.start import started
 from bayesdist.app.kinds.star_lists import lists_of, refuse_other_chips
+from bayesdist.arrays import Float
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data import ReferenceCatalog, read_catalog, read_exposures
 from bayesdist.data.detections import Detections, detections_of
@@ -26,44 +26,21 @@ from bayesdist.infer.selfcal.problem import Problem, prepare
 from bayesdist.infer.selfcal.tangent import TangentPlane
 from bayesdist.model import DistortionModel
 
-__all__ = ["Inputs", "read_selfcal", "refuse_selfcal"]
-
 log = logging.getLogger("bayesdist")
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Detections, and what is known of exposures and stars.
-
-    Parameters
-    ----------
-    config : SelfcalConfig
-    base : Path
-        Folder that its files are relative to.
-    detections : Detections
-        That pass the cuts; without star codes.
-    n_read : int
-        Detections of the lists.
-    rejected : mapping of str to int
-        Those that were cut, by reason.
-    dilation : ndarray, shape (E,), or None
-        VAFACTOR, where the log has it.
-    catalog : ReferenceCatalog or None
-        Reference stars, where there are any.
-    commanded : Commanded or None
-        Commanded offsets and rolls, where there are any.
-    """
+    """Detections, and what is known of exposures and stars."""
 
     config: SelfcalConfig
-    base: Path
-    detections: Detections
-    n_read: int
-    rejected: Mapping[str, int]
-    dilation: Float | None = None
-    catalog: ReferenceCatalog | None = None
-    commanded: Commanded | None = None
+    base: Path  # folder that its files are relative to
+    detections: Detections  # that pass the cuts; without star codes
+    n_read: int  # detections of the lists
+    rejected: Mapping[str, int]  # those that were cut, by reason
+    dilation: Float | None = None  # (E,), VAFACTOR, where the log has it
+    catalog: ReferenceCatalog | None = None  # reference stars, where there are any
+    commanded: Commanded | None = None  # commanded offsets and rolls, where there are any
 
     @property
     def unit_arcsec(self) -> float | None:
@@ -96,10 +73,7 @@ class Inputs:
     def parallax_factors(self) -> Float | None:
         """Parallax factors (E, 2) of exposures along u and v; None where stars have no parallax.
 
-        Raises
-        ------
-        InputError
-            Where the field's place on the sky is not known, or the exposures have no dates.
+        InputError where the field's place on the sky is not known, or the exposures have no dates.
         """
         if self.config.selfcal.motion != "parallax":
             return None
@@ -122,10 +96,7 @@ class Inputs:
     def start(self) -> tuple[DistortionModel, Float]:
         """Model, and parameters (D,) by which the detections of a star lie near each other.
 
-        Raises
-        ------
-        InputError
-            As `started`.
+        InputError as `started`.
         """
         given = self.detections, self.unit_arcsec, self.catalog, self.commanded
         return started(self.config, self.base, *given)
@@ -133,10 +104,7 @@ class Inputs:
     def known_for(self, model: DistortionModel) -> GaugeConstraints:
         """Constraints on the gauge beside the detections.
 
-        Raises
-        ------
-        InputError
-            As `GaugeConstraints.of`.
+        InputError as `GaugeConstraints.of`.
         """
         return GaugeConstraints.of(self.config, model, self.commanded, self.unit_arcsec)
 
@@ -145,14 +113,8 @@ class Inputs:
     ) -> Problem:
         """Detections of stars, linearised at parameters (D,) near the solution.
 
-        Parameters
-        ----------
-        model : DistortionModel
-        detections : Detections
-            With codes of stars and errors.
-        theta : ndarray, shape (D,)
-        first : ndarray, shape (D,)
-            By which reference stars are found among the detected ones.
+        `detections`: with codes of stars and errors. `theta`: (D,). `first` (D,): by which
+        reference stars are found among the detected ones.
         """
         block = self.config.selfcal
         problem = prepare(
@@ -174,12 +136,9 @@ class Inputs:
 def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
     """Read all that a self-calibration begins with; paths are relative to `base`.
 
-    Raises
-    ------
-    InputError
-        For files that cannot be read, a list of which nothing passes the cuts, a single exposure,
-        one that stands there twice, detections off the chips, exposures that the log does not have,
-        and as `read_commanded`.
+    InputError for files that cannot be read, a list of which nothing passes the cuts, a single
+    exposure, one that stands there twice, detections off the chips, exposures that the log does not
+    have, and as `read_commanded`.
     """
     block, gauge = config.selfcal, config.gauge
     found = lists_of(block, base, errors=block.sigma == "columns")
@@ -258,10 +217,7 @@ def _of_log(
 def _read_references(config: SelfcalConfig, base: Path) -> ReferenceCatalog | None:
     """The reference stars, in the unit of u and v; None where there are none.
 
-    Raises
-    ------
-    InputError
-        As `read_catalog`, and for stars without errors.
+    InputError as `read_catalog`, and for stars without errors.
     """
     block, unit_arcsec = config.gauge.reference, _unit_arcsec(config)
     if block is None or unit_arcsec is None:  # the configuration asks for a scale with references

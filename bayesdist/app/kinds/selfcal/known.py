@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.config import SelfcalConfig
+from bayesdist.arrays import Float, Int
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import find_columns
 from bayesdist.data.tables.units import conversion
@@ -21,12 +21,6 @@ from bayesdist.infer.selfcal.sky_moves import functionals
 from bayesdist.limits import GAUGE_CONTRADICTION
 from bayesdist.model import DistortionModel
 from bayesdist.reading.tables import read_table
-
-__all__ = ["Commanded", "GaugeConstraints", "read_commanded"]
-
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 _COLUMNS = {
     "exposure": ("exposure", "name", "rootname"),
@@ -40,24 +34,13 @@ _COLUMNS = {
 
 @dataclass(frozen=True, eq=False)
 class Commanded:
-    """Where exposures were to point.
+    """Where exposures were to point."""
 
-    Parameters
-    ----------
-    offsets : ndarray, shape (E, 2)
-        Along u and v, NaN where there is none; None in a file of rolls alone.
-    sigma : ndarray, shape (E,)
-        Of each, on one axis.
-    roll : ndarray, shape (E,), or None
-        Radians, from u to v.
-    group : ndarray of int, shape (E,)
-        Exposures with the same guide stars.
-    """
-
+    # (E, 2), along u and v, NaN where there is none; None in a file of rolls alone
     offsets: Float | None
-    sigma: Float
-    roll: Float | None
-    group: Int
+    sigma: Float  # (E,), of each, on one axis
+    roll: Float | None  # (E,), radians, from u to v
+    group: Int  # (E,), exposures with the same guide stars
 
 
 def read_commanded(
@@ -65,23 +48,11 @@ def read_commanded(
 ) -> Commanded:
     """Commanded offsets and rolls of exposures from a table.
 
-    Parameters
-    ----------
-    path : Path
-        Columns exposure, du and dv along u and v, sigma, roll in degrees from u to v, group.
-    names : sequence of str
-        Exposures, in their order.
-    unit : str
-        Of u and v, for columns without one.
-    scale_mas : float, optional
-        Size of a pixel, where units have to be converted.
-    sigma : float, optional
-        Of the offsets, where the table has no such column.
-
-    Raises
-    ------
-    InputError
-        For files that cannot be read, missing columns or values, and units that do not go together.
+    `path`: columns exposure, du and dv along u and v, sigma, roll in degrees from u to v, group.
+    `names`: exposures, in their order. `unit`: of u and v, for columns without one. `scale_mas`:
+    size of a pixel, where units have to be converted. `sigma`: of the offsets, where the table has
+    no such column. InputError for files that cannot be read, missing columns or values, and units
+    that do not go together.
     """
     table = read_table(path)
     found = find_columns(table.colnames, None, _COLUMNS, source=str(path))
@@ -157,15 +128,9 @@ Piece = Callable[[Float], Prior]
 
 @dataclass(frozen=True, eq=False)
 class GaugeConstraints:
-    """Constraints on the gauge beside the detections, each from one source.
+    """Constraints on the gauge beside the detections, each from one source."""
 
-    Parameters
-    ----------
-    pieces : mapping of str to callable
-        Prior linearised at parameters (D,), by what it is from.
-    """
-
-    pieces: Mapping[str, Piece]
+    pieces: Mapping[str, Piece]  # prior linearised at parameters (D,), by what it is from
 
     def __call__(self, theta: Float) -> Prior:
         """Prior of all pieces together, linearised at theta (D,)."""
@@ -198,11 +163,8 @@ class GaugeConstraints:
     ) -> GaugeConstraints:
         """Constraints that a configuration gives.
 
-        Raises
-        ------
-        InputError
-            For a prior on a parameter that the model does not have, and errors of rolls without
-            rolls.
+        InputError for a prior on a parameter that the model does not have, and errors of rolls
+        without rolls.
         """
         block, pieces = config.gauge, dict[str, Piece]()
         if commanded is not None and commanded.offsets is not None:

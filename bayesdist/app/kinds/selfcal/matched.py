@@ -14,10 +14,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 from astropy.table import Table
-from numpy.typing import NDArray
 
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.selfcal.inputs import Inputs
+from bayesdist.arrays import Float
 from bayesdist.data import MagnitudeErrors
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
@@ -30,17 +30,6 @@ from bayesdist.model import DistortionModel
 from bayesdist.reading.documents import json_of
 from bayesdist.reading.faults import restoring
 
-__all__ = [
-    "SelfcalMatched",
-    "load_matched_selfcal",
-    "magnitude_errors_of",
-    "matches_of",
-    "selfcal_matched",
-]
-
-
-Float = NDArray[np.float64]
-
 
 def matches_of(
     problem: Problem,
@@ -51,17 +40,8 @@ def matches_of(
 ) -> Matches:
     """Detections of the stars beside these, in the frame of each exposure's own VAFACTOR.
 
-    Parameters
-    ----------
-    problem : Problem
-        Linearised at a solution.
-    stars : ndarray, shape (S, q)
-        Of the solution.
-    detections : Detections
-        Of which the problem has some.
-    inputs : Inputs
-    unused : mapping of str to int
-        Detections that are of no star, by reason.
+    `problem`: linearised at a solution. `stars` (S, q): of the solution. `detections`: of which the
+    problem has some. `unused`: detections that are of no star, by reason.
     """
     p, d = problem, detections
     rows, model = p.rows, p.model
@@ -120,33 +100,19 @@ ARRAYS = ("x", "y", "star", "sigma", "theta", "stars", "mixture", "model")
 
 @dataclass(frozen=True, eq=False)
 class SelfcalMatched(Matched):
-    """Detections beside their stars, by a first solution.
-
-    Parameters
-    ----------
-    inputs : Inputs
-    detections : Detections
-        With their stars and errors, on one tangent plane.
-    problem : Problem
-        Linearised at the first solution.
-    theta : ndarray, shape (D,)
-        Of the first solution.
-    places : ndarray, shape (S, q)
-        Its stars.
-    mixture : Mixture
-        Its errors.
-    """
+    """Detections beside their stars, by a first solution."""
 
     section: ClassVar[str] = "selfcal"
     has_catalogue: ClassVar[bool] = False
 
     stars: Matches
     inputs: Inputs = field(kw_only=True)
+    # with their stars and errors, on one tangent plane
     detections: Detections = field(kw_only=True)
-    problem: Problem = field(kw_only=True)
-    theta: Float = field(kw_only=True)
-    places: Float = field(kw_only=True)
-    mixture: Mixture = field(kw_only=True)
+    problem: Problem = field(kw_only=True)  # linearised at the first solution
+    theta: Float = field(kw_only=True)  # (D,), of the first solution
+    places: Float = field(kw_only=True)  # (S, q), its stars
+    mixture: Mixture = field(kw_only=True)  # its errors
 
     @property
     def tangent_point(self) -> None:
@@ -175,10 +141,7 @@ def load_matched_selfcal(
 ) -> SelfcalMatched:
     """The detections of an earlier stage.
 
-    Raises
-    ------
-    InputError
-        For a missing or damaged file.
+    InputError for a missing or damaged file.
     """
     arrays = read_arrays(folder / DETECTIONS, "", ARRAYS, do="run the stage 'match' again")
     path = folder / DETECTIONS

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 from astropy.table import Table
-from numpy.typing import NDArray
 
 from bayesdist.app.kinds.selfcal.gauge import CONVENTION, fixed_by
 from bayesdist.app.kinds.selfcal.inputs import Inputs
 from bayesdist.app.kinds.selfcal.matched import SelfcalMatched, selfcal_matched
 from bayesdist.app.screen import number
+from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.detections import NO_STAR, Detections
 from bayesdist.data.matching.pairs import hull_of, inside_hull
 from bayesdist.errors import DegenerateError, InputError, NotSettledError
@@ -25,13 +25,8 @@ from bayesdist.infer.selfcal.pieces import one_cluster
 from bayesdist.infer.selfcal.tangent import places_of
 from bayesdist.model import DistortionModel
 
-__all__ = ["match_dithers", "refuse_unconnected", "selfcal_lines"]
-
-
 log = logging.getLogger("bayesdist")
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 FEW_COMMON = 0.5  # of the usual fraction of common detections: an exposure that does not fit
 HALF_TURN = np.radians(10.0)  # from half a turn
@@ -42,10 +37,7 @@ AMBIGUOUS = 0.05  # fraction of groups that may be of one star or several, worth
 def match_dithers(inputs: Inputs) -> SelfcalMatched:
     """Detections of dithered exposures with their stars, and a first solution.
 
-    Raises
-    ------
-    BayesdistError
-        As `calibrated`, and for an exposure that hardly shares stars with the others.
+    BayesdistError as `calibrated`, and for an exposure that hardly shares stars with the others.
     """
     found = calibrated(inputs, lambda text: log.info("match: %s", text))
     table, facts = exposure_table(found, inputs), matching_facts(found, inputs)
@@ -77,17 +69,8 @@ def match_dithers(inputs: Inputs) -> SelfcalMatched:
 def calibrated(inputs: Inputs, report: Callable[[str], None]) -> SelfCalibration:
     """Stars and solution of a self-calibration.
 
-    Parameters
-    ----------
-    inputs : Inputs
-    report : callable
-        Called with what happens, in words.
-
-    Raises
-    ------
-    BayesdistError
-        As `self_calibrate`; where that does not settle and one exposure lies half a turn from
-        all the others, naming it.
+    `report`: called with what happens, in words. BayesdistError as `self_calibrate`; where that
+    does not settle and one exposure lies half a turn from all the others, naming it.
     """
     (model, theta), block = inputs.start, inputs.config.selfcal
     try:
@@ -174,10 +157,7 @@ def refuse_unconnected(table: Table) -> None:
 
     `table` is as `exposure_table` makes it.
 
-    Raises
-    ------
-    InputError
-        Naming it, and whether it lies half a turn from the others.
+    InputError naming it, and whether it lies half a turn from the others.
     """
     share = np.asarray(table["fraction_common"], float)
     if len(share) < 3:  # of two nobody knows which one is wrong
@@ -242,9 +222,7 @@ def _moved(detections: Detections, raw: Detections) -> float:
     return float(np.hypot(detections.x - raw.x, detections.y - raw.y).max())
 
 
-def _seen_by_others(
-    model: DistortionModel, theta: Float, places: Float, exposure: NDArray[np.int64]
-) -> Bool:
+def _seen_by_others(model: DistortionModel, theta: Float, places: Float, exposure: Int) -> Bool:
     """Boolean mask (N,) of detections that lie on the sky where another exposure has a chip."""
     E = len(model.exposures)
     outlines = [

@@ -10,17 +10,15 @@ from typing import Any
 import numpy as np
 from astropy.table import Column, Table
 from astropy.units import Unit
-from numpy.typing import NDArray
 
 from bayesdist.app.kinds.fitted import SelfCalibrated
 from bayesdist.app.store.output import write_table
+from bayesdist.arrays import Float
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.storage.write import write_columns
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.infer import Compute
 from bayesdist.infer.selfcal import SelfCalibrationMode, StarCatalogue, star_catalogue
-
-__all__ = ["star_table", "write_stars"]
 
 NAMES = ("u", "v", "pm_u", "pm_v", "parallax")
 FEW, DOUBTFUL, REFERENCE = 1, 2, 4
@@ -42,21 +40,8 @@ def write_stars(
 ) -> dict[str, Any]:
     """Write stars.ecsv, and of many stars stars.parquet.
 
-    Parameters
-    ----------
-    folder : Path
-    solved : SelfCalibrated
-    correlated : Discrepancy or None
-        Whose covariance of the parameters the stars share.
-    notes : mapping
-        Meta data of the table.
-    compute : Compute
-        Where the passes over the detections are made.
-
-    Returns
-    -------
-    dict
-        For summary.json.
+    `correlated`: whose covariance of the parameters the stars share. `notes`: meta data of the
+    table. `compute`: where the passes over the detections are made. Result: for summary.json.
     """
     solution, references = solved.mode, solved.references
     cov = None if correlated is None else correlated.covariance
@@ -88,7 +73,7 @@ def write_stars(
 def star_table(
     solution: SelfCalibrationMode,
     found: StarCatalogue,
-    mag: NDArray[np.float64] | None = None,
+    mag: Float | None = None,
     references: ReferenceCatalog | None = None,
 ) -> Table:
     """Stars with their covariance: one row for each.
@@ -97,14 +82,7 @@ def star_table(
     the gauge of the run, cov_u_v and so on, sigma_own_u, sigma_own_v of the star's detections
     alone, n, n_members, mag (the median), flags.
 
-    Parameters
-    ----------
-    solution : SelfCalibrationMode
-        With its stars.
-    found : StarCatalogue
-    mag : ndarray, shape (N,), optional
-        Magnitudes of the detections.
-    references : ReferenceCatalog, optional
+    `solution`: with its stars. `mag` (N,): magnitudes of the detections.
     """
     names = NAMES[: found.values.shape[1]]
     units = [f"{found.unit} / yr" if name.startswith("pm") else found.unit for name in names]

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.app.config import SelfcalConfig
 from bayesdist.app.config.section import one_chip
 from bayesdist.app.kinds.selfcal.known import Commanded
 from bayesdist.app.kinds.star_lists import positions_by_chip, start_of
+from bayesdist.arrays import Float, Int
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.matching.frames import mutual_frames
@@ -27,10 +27,6 @@ from bayesdist.infer.selfcal.start import (
 )
 from bayesdist.model import Chip, DistortionModel
 
-__all__ = ["started"]
-
-Float = NDArray[np.float64]
-
 
 def started(
     config: SelfcalConfig,
@@ -45,22 +41,9 @@ def started(
     The sky lies as the reference stars do, or else as the commanded offsets, or else as the first
     exposure.
 
-    Parameters
-    ----------
-    config : SelfcalConfig
-    base : Path
-        Folder that its files are relative to.
-    d : Detections
-    unit_arcsec : float or None
-        Size of the unit of u, v, where it is known.
-    references : ReferenceCatalog or None
-    commanded : Commanded or None
-
-    Raises
-    ------
-    InputError
-        Naming exposures that have no stars in common; for a start that cannot be read, and
-        reference stars that are not found again.
+    `base`: folder that its files are relative to. `unit_arcsec`: size of the unit of u, v, where it
+    is known. InputError naming exposures that have no stars in common; for a start that cannot be
+    read, and reference stars that are not found again.
     """
     block, number = config.selfcal, int(d.chip[0])  # of a detector of one chip, as in the data
     chips = config.chips()
@@ -108,7 +91,7 @@ def started(
     return model, start_parameters(model, coefficients, frames, middles)
 
 
-def _lists(d: Detections, *, apart: bool) -> tuple[NDArray[np.int64], NDArray[np.int64], list]:
+def _lists(d: Detections, *, apart: bool) -> tuple[Int, Int, list]:
     """Exposure and chip of each list, and the rows of its detections."""
     found = []
     for e in range(len(d.exposure_names)):
