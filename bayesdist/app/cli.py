@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
@@ -19,6 +20,8 @@ _LONGEST = 1000  # letters of a sentence
 # objects between collections of garbage: imports make half a million that stay, and looking at
 # them again and again takes a tenth of a small run
 SELDOM = 50_000, 20, 100
+# a command has threads of its own on all cores: those of linear algebra would only wait beside them
+ALGEBRA = "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"
 COMMANDS = "bayesdist.app.commands"
 CORE = {
     "init": f"{COMMANDS}.runs:init",
@@ -109,6 +112,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     open_streams()
     gc.set_threshold(*SELDOM)
+    for name in ALGEBRA:
+        os.environ.setdefault(name, "1")
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     line = shlex.join(["bayesdist", *arguments])
     return _exit_code(

@@ -28,6 +28,7 @@ from bayesdist.checks import Check, in_order, worst
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError, required
 from bayesdist.infer import LinearFit, Posterior
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.selfcal import gauge_free
 from bayesdist.infer.selfcal.sky_moves import gauge_free_matrix
 from bayesdist.model import Chip
@@ -135,6 +136,7 @@ def _of_margin(margin: Margin) -> Check:
     return Check("Requirements", name, level=VERDICT_LEVELS[margin.verdict], sentence=sentence)
 
 
+@one_thread
 def evaluate(
     errors: ErrorModel,
     diagnostics: Diagnostics,

@@ -12,6 +12,7 @@ import numpy as np
 
 from bayesdist.arrays import Float, Int
 from bayesdist.errors import require_known
+from bayesdist.infer.equations.scaled import one_thread
 
 _PERCENTILES = {"p50": 50.0, "p68": 68.0, "p90": 90.0, "p95": 95.0, "p99": 99.0}
 _DIRECTIONS = 64  # over half a turn
@@ -93,6 +94,7 @@ def extent(name: str, error: Float) -> Float:
     return functools.reduce(np.maximum, along)
 
 
+@one_thread  # of each thread that it starts
 def drawn_statistics(
     errors: Sequence[ErrorsOf],
     names: Sequence[str],

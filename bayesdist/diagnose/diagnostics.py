@@ -52,6 +52,7 @@ from bayesdist.diagnose.selfcal.score import selfcal_score_tests
 from bayesdist.diagnose.selfcal.scores import taken_by_stars
 from bayesdist.infer import GaussianPriors, LinearFit, Posterior, Shards
 from bayesdist.infer.catalogue.star_errors import StarCovariance, StarErrors, star_covariance
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.stars.likelihood import Likelihood
@@ -242,6 +243,7 @@ def _taken(eliminated: SelfCalibrationMode, rows: Int) -> Float:
     return taken[rows]
 
 
+@one_thread
 def diagnose(
     fit: LinearFit,
     posterior: Posterior,

@@ -44,7 +44,7 @@ FULL = Sizes(
     order=5,
     each=(
         Size(5_000, stock_plain=10, stock_chain=100, de=25, nuts=20, ours=6),
-        Size(50_000, stock_plain=10, stock_chain=0, de=25, nuts=60, ours=6, bases=("whitened",)),
+        Size(50_000, stock_plain=10, stock_chain=0, de=25, nuts=110, ours=6, bases=("whitened",)),
         Size(1_000_000, stock_plain=8, stock_chain=0, de=12, nuts=0, ours=15, bases=()),
     ),
     rows=5_000,
