@@ -269,10 +269,13 @@ class ArtefactStore:
         """Note in run.json whatever is written, before it takes its name."""
 
         def note(paths: Sequence[Path]) -> None:
-            names, record = self._own(paths), self.record
-            self._written |= names
+            names = self._own(paths) - self._written
+            if not names:  # as of run.json itself, which need not be read again then
+                return
+            record = self.record
             if record.begins_files(names):
                 record.write(self.path / RECORD)
+            self._written |= names
 
         self._making = stage
         try:
