@@ -148,6 +148,11 @@ def _draw_sigma(
     return replace(state, sigma=sigma)
 
 
+def _drift_prior(drift: Float) -> Float:
+    """Log density of the logarithms of amplitudes, up to a constant."""
+    return np.asarray(np.log(drift) - 1.5 * np.log1p((drift / DRIFT_SCALE) ** 2 / 2))
+
+
 def _move_drift_alone(
     problem: Problem, matrix: Float, right: Float, drift: Float, rng: np.random.Generator
 ) -> tuple[Float, Float]:
@@ -160,9 +165,8 @@ def _move_drift_alone(
     chain, n_random = np.arange(n_chains), p - n
 
     def value(m: Float, d: Float) -> Float:
-        prior = np.log(d) - 1.5 * np.log1p((d / DRIFT_SCALE) ** 2 / 2)
         evidence = gaussians(m, right, np.zeros_like(right))[1]
-        return evidence + (prior - n_random * np.log(d)).sum(axis=1)
+        return evidence + (_drift_prior(d) - n_random * np.log(d)).sum(axis=1)
 
     here = value(matrix, drift)
     for _ in range(min(k, N_DRIFT_MOVES)):
@@ -204,8 +208,8 @@ def _move_drift(
         gain = -(change * pull).sum(axis=1)
         gain -= 0.5 * (change**2 * precision[:, j, j]).sum(axis=1)
         new = drift[:, j] * factor
-        prior = [np.log(d) - 1.5 * np.log1p((d / DRIFT_SCALE) ** 2 / 2) for d in (new, drift[:, j])]
-        taken = np.log(rng.random(len(b))) < gain + prior[0] - prior[1]
+        odds = gain + _drift_prior(new) - _drift_prior(drift[:, j])
+        taken = np.log(rng.random(len(b))) < odds
         factor = np.where(taken, factor, 1.0)
         residual[:, j] += np.where(taken[:, None], change, 0.0)
         moving[:, j] *= factor[:, None]

@@ -41,7 +41,7 @@ def draw_scatter(scale: Float, scatter: Float, count: Float, rng: np.random.Gene
     """
     n_chains, k = scale.shape
     psi = scatter + scale[:, :, None] ** 2 * np.eye(k)
-    dof = NU + k - 1 + count
+    dof = scale_prior(k)[1] + count
     bartlett = np.zeros((n_chains, k, k))
     for i in range(k):
         bartlett[:, i, i] = np.sqrt(2 * rng.standard_gamma((dof - i) / 2))
