@@ -62,15 +62,15 @@ def time_checks(
     """
     if time is None:
         return
-    visits = visits_of(dates)
-    counts, _ = np.histogram(visits, [-np.inf, *time.breaks, np.inf])
-    if visits.size and counts[counts > 0].min() <= 2:
+    segment = np.searchsorted(time.breaks, dates, side="right")
+    counts = [visits_of(dates[segment == k], whole=dates).size for k in np.unique(segment)]
+    if counts and min(counts) <= 2:
         yield Check(
             GROUP,
             "Dates that the drift is fitted to",
             level="warn",
-            sentence=f"a drift is fitted to {counts[counts > 0].min()} dates, so that neither the "
-            "variation between exposures nor the curvature of the drift is measured",
+            sentence=f"a drift is fitted to {('one date', 'two dates')[min(counts) - 1]}, so that "
+            "neither the variation between exposures nor the curvature of the drift is measured",
             doubt=EITHER,
         )
     if motions_stated is False:
@@ -87,13 +87,16 @@ def time_checks(
         )
 
 
-def visits_of(dates: Float) -> Float:
-    """Dates of which none are next to the same, in rising order: exposures of a visit are one.
+def visits_of(dates: Float, *, whole: Float | None = None) -> Float:
+    """First dates of the visits, in rising order: exposures next to each other are one visit.
 
-    Those within a day, or a fiftieth of the whole time.
+    It spans a day at most, or a fiftieth of the time of all dates. `whole`: all, if not `dates`.
     """
     if not dates.size:
         return dates
-    apart = max(1 / 365.25, (dates.max() - dates.min()) / 50)
-    ordered = np.sort(dates)
-    return np.asarray(ordered[np.append(True, np.diff(ordered) > apart)])
+    span = max(1 / 365.25, float(np.ptp(dates if whole is None else whole)) / 50)
+    ordered = np.unique(dates)
+    first = [ordered[0]]
+    while (i := np.searchsorted(ordered, first[-1] + span, side="right")) < ordered.size:
+        first.append(ordered[i])
+    return np.array(first)

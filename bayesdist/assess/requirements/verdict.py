@@ -85,6 +85,8 @@ def rests_on(
         first, last = float(visits.min()), float(visits.max())
         beyond = max(first - epoch, epoch - last)
         text = f"{visits.size} dates from {first:.2f} to {last:.2f}"
+        if visits.size == 1:
+            text = f"one date, {first:.2f}"
         out.append(text + (f", judged {beyond:.1f} years beyond" if beyond > 0 else ""))
     tests = diagnostics.score_tests
     passed = [t for t in tests if not t.significant]
