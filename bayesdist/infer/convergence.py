@@ -87,6 +87,15 @@ class Convergence:
         """Smallest tail effective sample size."""
         return float(np.nanmin(self.ess_tail))
 
+    def worst(self, n: int) -> tuple[str, ...]:
+        """Names of the `n` parameters that are farthest from the limits."""
+        ess = np.minimum(self.ess_bulk, self.ess_tail)
+        lacking = np.maximum(
+            (self.rhat - 1) / max(self.limits.rhat - 1, 1e-6),
+            self.limits.ess / np.maximum(ess, 1e-3),
+        )
+        return tuple(self.names[k] for k in np.argsort(-lacking)[:n])
+
     def among(self, names: tuple[str, ...]) -> Convergence:
         """Convergence with further names, of parameters that are fixed and not judged."""
         at = [names.index(name) for name in self.names]

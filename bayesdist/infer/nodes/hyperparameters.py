@@ -220,12 +220,11 @@ def _summit(
     """Maximum of a smooth function of two variables, the covariance there, and its value.
 
     Newton's method on differences of half a standard error: a few steps from a good start, and the
-    curvature is obtained too.
+    curvature is obtained too.  It ends where the parabola has foretold the value at its own top.
     """
     x = np.asarray(start, float)
-    h = _widths(covariance)
+    h, f = _widths(covariance), density(x)
     for _ in range(8):
-        f = density(x)
         ends = np.array([[density(x + s * h[k] * np.eye(2)[k]) for s in (1, -1)] for k in (0, 1)])
         corner = density(x + h)
         slope = (ends[:, 0] - ends[:, 1]) / (2 * h)
@@ -238,11 +237,14 @@ def _summit(
         covariance = (vectors / values) @ vectors.T
         step = covariance @ slope
         gain = 0.5 * float(slope @ step)
-        x = x + step * min(1.0, 1.0 / float(np.abs(step).max() + 1e-300))
+        shorter = min(1.0, 1.0 / float(np.abs(step).max() + 1e-300))
+        x, foretold = x + step * shorter, f + gain * shorter * (2 - shorter)
         if gain < SETTLED:
+            return x, covariance, foretold
+        h, f = _widths(covariance), density(x)
+        if shorter == 1.0 and abs(f - foretold) < SETTLED:
             break
-        h = _widths(covariance)
-    return x, covariance, f + min(gain, 1.0)
+    return x, covariance, f
 
 
 def _widths(covariance: Float) -> Float:

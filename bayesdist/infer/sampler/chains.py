@@ -58,6 +58,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("bayesdist")
 
 LEAST_ROWS = 10  # rows of a chain that diagnostics need at least
+HARDEST = 30  # parameters that are judged before all of them are
 
 
 @dataclass(frozen=True)
@@ -250,6 +251,7 @@ def _drawn_ahead(
     states, taken, further = runs.starts()
     rest = pilot.without(taken, first * W)
     history, weights = _History(runs, 0), [pilot.log_weights]
+    worst: tuple[str, ...] = ()
     passes += further
     warmup = warmup_steps(pilot.log_weights)
     cost = draws_per_effective(pilot.log_weights)
@@ -270,12 +272,12 @@ def _drawn_ahead(
         trusted = quality.efficiency > EFFICIENT and quality.k < PARETO_K.value
         if (made < wanted or not trusted) and not last:
             continue
-        verdict = _verdict(target, history, dropped, quality, s.limits)
+        verdict = _verdict(target, history, dropped, quality, s.limits, () if last else worst)
         if not trusted:
             verdict = _distrusted(verdict, quality)
         if verdict.converged or last:
             break
-        wanted = next_check(made, verdict, s.n_stars, total)
+        wanted, worst = next_check(made, verdict, s.n_stars, total), verdict.worst(HARDEST)
     return history.chains(dropped, verdict, passes), quality, passes, history.end
 
 
@@ -301,6 +303,7 @@ def _state_dependent(
     states, _, further = runs.starts()
     passes += further
     history, wanted, nothing = _History(runs, begin), 0.0, runs.pilot[slice(0, 0)]
+    worst: tuple[str, ...] = ()
     schedule = doubling_schedule(begin, s.checkpoint_every, s.max_steps, plan.thin)
     for span, _ in history.walk(states, schedule, nothing, s):
         passes += total * (span.end - span.begin)
@@ -310,25 +313,46 @@ def _state_dependent(
         trial = not plan.coupled and span.begin < begin + mixed <= span.end
         if made < max(wanted, total * LEAST_ROWS) and not last and not trial:
             continue
-        verdict = _verdict(target, history, warmup, quality, s.limits)
+        verdict = _verdict(
+            target, history, warmup, quality, s.limits, () if last or trial else worst
+        )
         if verdict.converged or last:
             break
         ess = min(verdict.ess_bulk_min, verdict.ess_tail_min)
         hopeless = is_hopeless(len(target.names), s.n_stars, len(s.seeds))
         if trial and not has_mixed(ess, len(target.names), total, hopeless=hopeless):
             return history.chains(warmup, verdict, passes), False
-        wanted = next_check(made, verdict, s.n_stars, total)
+        wanted, worst = next_check(made, verdict, s.n_stars, total), verdict.worst(HARDEST)
     return history.chains(warmup, verdict, passes), True
 
 
 def _verdict(
-    target: Density, history: _History, warmup: int, quality: Quality, limits: Limits
+    target: Density,
+    history: _History,
+    warmup: int,
+    quality: Quality,
+    limits: Limits,
+    worst: tuple[str, ...],
 ) -> Convergence:
-    return diagnose(
-        history.after(warmup)[0],
-        target.names,
-        quality.log_weights,
-        limits,
-        coupled=history.runs.plan.coupled,
-        n_outside=quality.n_outside,
-    )
+    """Convergence after some rows.
+
+    `worst`: parameters that were farthest from it before. Where these are not converged yet, it is
+    theirs alone: judging thousands of parameters costs more than their draws.
+    """
+    draws = history.after(warmup)[0]
+
+    def of(names: tuple[str, ...], draws: Float) -> Convergence:
+        return diagnose(
+            draws,
+            names,
+            quality.log_weights,
+            limits,
+            coupled=history.runs.plan.coupled,
+            n_outside=quality.n_outside,
+        )
+
+    if len(worst) < len(target.names) and worst:
+        found = of(worst, draws[..., [target.names.index(name) for name in worst]])
+        if not found.converged:
+            return found
+    return of(target.names, draws)

@@ -20,6 +20,7 @@ from bayesdist.infer import Limits, OutlierMixture
 from bayesdist.infer.convergence import diagnose
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.proposal import GridProposal
+from bayesdist.infer.sampler import chains as sampling
 from bayesdist.infer.sampler import ensembles as sampler
 from bayesdist.infer.sampler.chains import Settings, run_chains
 from bayesdist.infer.sampler.move_schedule import mixing_steps
@@ -239,3 +240,26 @@ def test_a_funnel_of_many_parameters_is_given_up(caplog):
     reason, *_ = chains.verdict.reasons
     assert "given up" in reason and "120 parameters" in reason and "lower model.order" in reason
     assert reason in caplog.text
+
+
+def test_judging_the_worst_parameters_first_changes_no_decision(monkeypatch):
+    n, judged = 60, []
+    target = FakeTarget(lambda x: -0.5 * (x**2).sum(axis=1), n)
+    proposal = gaussian_proposal(np.full(n, 0.02), 1.02 * np.eye(n))
+    settings = Settings(SEEDS, 25, WALKERS, Limits(400.0, 1.002))
+
+    def counted(draws, names, *args, **options):
+        judged.append(len(names))
+        return diagnose(draws, names, *args, **options)
+
+    monkeypatch.setattr(sampling, "diagnose", counted)
+    some = run_chains(target, proposal, settings)
+    assert sampling.HARDEST in judged
+    assert judged[-1] == len(some.verdict.names) == n
+    monkeypatch.setattr(sampling, "HARDEST", 0)
+    judged.clear()
+    every = run_chains(target, proposal, settings)
+    assert set(judged) == {n}
+    assert some.steps == every.steps
+    assert some.verdict.converged and every.verdict.converged
+    assert np.array_equal(some.psi, every.psi)
