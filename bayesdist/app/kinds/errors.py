@@ -49,5 +49,14 @@ class ExposureScatter:
     def averaged(self, posterior: Posterior, rng: np.random.Generator) -> Posterior:
         """The posterior with the chips where the exposures have them on average."""
         some = self.tau[rng.integers(len(self.tau), size=len(posterior.flat))]
-        theta = self.offsets.draws(posterior.flat, some, rng).reshape(posterior.theta.shape)
-        return replace(posterior, theta=theta)
+        flat = self.offsets.draws(posterior.flat, some, rng)
+        before, after = posterior.flat.std(axis=0), flat.std(axis=0)
+        scale = np.divide(after, before, out=np.ones_like(after), where=before > 0)
+        c = posterior.convergence
+        scale = np.append(scale, np.ones(len(c.names) - len(scale)))  # hyperparameters stand last
+        return replace(
+            posterior,
+            theta=flat.reshape(posterior.theta.shape),
+            # of as many effective draws, which scatter less
+            convergence=replace(c, mcse_mean=c.mcse_mean * scale, mcse_sd=c.mcse_sd * scale),
+        )

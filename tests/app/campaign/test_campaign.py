@@ -76,6 +76,19 @@ def test_the_gauge_is_that_of_the_reference_chip(run):
     assert monomials[1, 1][0] == pytest.approx(GAP, abs=0.05)
 
 
+def test_monte_carlo_errors_are_those_of_the_parameters_that_are_kept(run):
+    """Chips stand where the exposures have them on average, which scatters less than one of them.
+
+    The error of a mean is the standard deviation of as many draws as count, by definition.
+    """
+    posterior = load_posterior(run)
+    c, n = posterior.convergence, len(posterior.mean)
+    moves = np.isfinite(c.ess_bulk[:n])
+    expected = posterior.flat.std(axis=0) / np.sqrt(c.ess_bulk[:n])
+    assert c.mcse_mean[:n][moves] == pytest.approx(expected[moves], rel=1e-6)
+    assert sum(name.endswith("WFC1.shift_v") for name in c.names) == 16
+
+
 def test_each_period_has_its_table_and_both_are_the_model(run):
     """Forward maps of the files against the posterior mean, along V2 and V3, at several dates."""
     products = {p["path"]: p for p in summary_of(run)["products"]}
