@@ -262,6 +262,7 @@ def table_nodes(r: ReportInput, filter: str) -> Plot:
             1.6 * min(min(t.step) for t in tables), float(np.quantile(length, 0.95))
         ),
         key=nice_below(length.max() / 1.5),
+        pad=20.0,
     )
     parts = []
     for t in tables:

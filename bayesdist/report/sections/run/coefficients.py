@@ -14,6 +14,7 @@ from bayesdist.report.sections.gauge import gauge_mark, gauge_note
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further
 
 _ON_SCREEN = ("68 %", "95 %", "R-hat", "ESS")
+_WIDER = 1.05  # than the sampled one: an error that rounding or few draws do not explain
 _SMALL = 1e-3  # below it a number without a unit is shown in 10^-6
 
 
@@ -35,7 +36,8 @@ def coefficient_tables(r: ReportInput) -> tuple[TextTable, ...]:
         polynomial,
         with_unit=False,
     )
-    out = [replace(legendre, note=_notes(gauge_note(r), _held_note(r, fixed)))]
+    notes = gauge_note(r), _common_note(r), _held_note(r, fixed)
+    out = [replace(legendre, note=_notes(*notes))]
     if others:
         table = _parameter_table(
             r,
@@ -51,6 +53,24 @@ def coefficient_tables(r: ReportInput) -> tuple[TextTable, ...]:
 
 def _notes(*sentences: str) -> str:
     return " ".join(s for s in sentences if s)
+
+
+def _common_note(r: ReportInput) -> str:
+    """Note on posterior errors that are wider than the draws of the sampler scatter."""
+    if r.posterior is None or "sd" not in r.coefficients.colnames:
+        return ""
+    sampled = dict(zip(r.posterior.model.names, r.posterior.sigma, strict=True))
+    wider = [
+        float(row["sd"]) > _WIDER * sampled[str(row["name"])]
+        for row in r.coefficients
+        if str(row["name"]) in sampled and row["sd"] is not np.ma.masked
+    ]
+    if not any(wider):
+        return ""
+    return (
+        "The posterior's errors include those that many stars share (structure beyond the"
+        " polynomial, variation between exposures, the catalogue); the formal σ does not."
+    )
 
 
 def _held_note(r: ReportInput, names: list[str]) -> str:

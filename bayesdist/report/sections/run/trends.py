@@ -153,7 +153,7 @@ def _against_pixels(r: ReportInput, most: int, *, points: bool) -> tuple[Plot, f
             )
             guide_lines(ax)
     for row in (0, 1):
-        axes[row, 0].set_ylabel(f"residual d{'uv'[row]} [{scale.unit}]")
+        axes[row, 0].set_ylabel(f"residual d{'uv'[row]}\n[{scale.unit}]")
     for column in (0, 1):
         axes[1, column].set_xlabel(f"{'xy'[column]} [pix]")
         axes[1, column].set_xlim(0, max(c.chip.size[column] for c in r.chips) + 1)
