@@ -6,6 +6,7 @@ contracts are in pyproject.toml.
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
 from importlib import import_module
@@ -21,11 +22,19 @@ HEAVY = (
 )
 
 
-@pytest.mark.parametrize("home", bayesdist._HOMES)
-def test_public_names_are_where_they_are_said_to_be(home):
-    for name in bayesdist._HOMES[home]:
-        assert getattr(import_module(home), name) is getattr(bayesdist, name)
-        assert name in bayesdist.__all__
+@pytest.mark.parametrize("package", ["", ".data", ".infer", ".assess", ".products"])
+def test_public_names_are_where_they_are_said_to_be(package):
+    """The stub, which type checkers read, and what is loaded."""
+    face = import_module(f"bayesdist{package}")
+    stub = ast.parse(Path(face.__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+    named = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
+    assert named
+    for node in named:
+        home = import_module(f"{face.__name__}.{node.module}")
+        for one in node.names:
+            assert one.asname == one.name
+            assert getattr(home, one.name) is getattr(face, one.name)
+            assert one.name in face.__all__ and one.name in dir(face)
 
 
 def test_importing_the_package_is_cheap():

@@ -196,8 +196,8 @@ def selfcal_results(
         for chip in model.chips:
             x, y = outline_pixels(chip.size)
             when = None if model.time is None else np.full(len(x), epoch)
-            place = {"exposure": np.full(len(x), e), "chip": chip.number, "epoch": when}
-            outlines.append(model.predict(theta, x, y, **place))
+            one = np.full(len(x), e)
+            outlines.append(model.predict(theta, x, y, exposure=one, chip=chip.number, epoch=when))
     names = model.names
     return SelfcalResults(
         words=solved.gauge_words,

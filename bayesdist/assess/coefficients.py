@@ -24,7 +24,8 @@ def coefficient_table(fit: LinearFit, posterior: Posterior | None = None) -> Tab
     form); unit.
     """
     model = fit.model
-    blocks = [_columns(fit.mean, np.sqrt(np.diag(fit.cov)), posterior and posterior.flat)]
+    sampled = None if posterior is None else posterior.flat
+    blocks = [_columns(fit.mean, np.sqrt(np.diag(fit.cov)), sampled)]
     rows = [
         (p.name, p.chip, p.axis, p.i, p.j, "legendre" if p.kind == "polynomial" else p.kind, p.unit)
         for p in model.parameters

@@ -27,7 +27,7 @@ from bayesdist.assess.units import pixel_scale_of
 from bayesdist.checks import Check, in_order, worst
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError, required
-from bayesdist.infer import LinearFit, Posterior
+from bayesdist.infer import LinearFit, Posterior, Solution
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.selfcal import gauge_free
 from bayesdist.infer.selfcal.sky_moves import gauge_free_matrix
@@ -179,29 +179,30 @@ def evaluate(
     InputError
         For a requirement that cannot be judged.
     """
-    chips = solution.model.chips
-    on_chip = [
-        {"grid": settings.grid, "epoch": settings.epoch, "chip": chip.number} for chip in chips
-    ]
+    chips, grid, epoch = solution.model.chips, settings.grid, settings.epoch
+
+    def uncertainty(of: Solution, chip: Chip) -> UncertaintyMap:
+        return uncertainty_map(of, grid=grid, epoch=epoch, chip=chip.number)
+
     own = _own_checks(errors, diagnostics, settings)
     every = in_order((*checks, *diagnostics.checks, *own))
     whole = drawn_errors(errors, diagnostics, settings, rng, files=files)
     surface = None
     if _contradiction(diagnostics, settings) is None:
-        years = _years(solution, diagnostics, settings.epoch)
-        surface = budget_surface(whole, settings.grid, epoch=settings.epoch, years=years)
+        years = _years(solution, diagnostics, epoch)
+        surface = budget_surface(whole, grid, epoch=epoch, years=years)
     maps = []
-    for chip, where in zip(chips, on_chip, strict=True):
+    for chip in chips:
         local = errors.structure_sigma(_domain(solution, chip, settings))
-        maps.append(with_local(uncertainty_map(solution, **where), local))
+        maps.append(with_local(uncertainty(solution, chip), local))
     return Evaluation(
         settings=settings,
-        formal=tuple(uncertainty_map(fit, **where) for where in on_chip),
+        formal=tuple(uncertainty(fit, chip) for chip in chips),
         maps=tuple(maps),
         relative=()
         if null is None
         else tuple(_relative(solution, diagnostics, null, chip, settings) for chip in chips),
-        areas=tuple(area_map(solution, **where) for where in on_chip),
+        areas=tuple(area_map(solution, grid=grid, epoch=epoch, chip=c.number) for c in chips),
         budget=budget_of(whole, settings.domain(errors)),
         surface=surface,
         margins=judged(errors, diagnostics, requirements, settings, rng, checks=every, drawn=whole),

@@ -166,10 +166,9 @@ def chosen_exposures(pairs: Matches) -> tuple[int, int] | None:
 def _shared(pairs: Matches, a: int, b: int) -> tuple[Int, Int]:
     """Rows of the same stars in two exposures."""
     star = pairs.column("star")
-    rows = [np.flatnonzero(pairs.exposure == code) for code in (a, b)]
-    stars = [star[r] for r in rows]
-    _, first, second = np.intersect1d(*stars, return_indices=True)
-    return rows[0][first], rows[1][second]
+    of_a, of_b = (np.flatnonzero(pairs.exposure == code) for code in (a, b))
+    _, first, second = np.intersect1d(star[of_a], star[of_b], return_indices=True)
+    return of_a[first], of_b[second]
 
 
 def _epoch(pairs: Matches, rows: Int) -> float:

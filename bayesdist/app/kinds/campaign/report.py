@@ -147,9 +147,8 @@ def _footprints(posterior: Posterior, inputs: Inputs, mirrored: bool) -> Footpri
         exposure = inputs.log[name]
         for chip in model.chips:
             x, y = outline_pixels(chip.size)
-            place = {"exposure": name, "chip": chip.number}
             when = exposure.epoch if model.time is not None else None
-            outlines.append(model.predict(theta, x, y, epoch=when, **place))
+            outlines.append(model.predict(theta, x, y, epoch=when, exposure=name, chip=chip.number))
             epochs.append(exposure.epoch)
     rows = _spread_rows(len(catalog), MAX_MARKERS // 2)
     u = -catalog.u if mirrored else catalog.u

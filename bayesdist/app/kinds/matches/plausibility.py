@@ -75,7 +75,7 @@ def _doubts_on_scale(
 def _doubts_on_errors(stars: Matches, scale: float) -> Iterator[str]:
     if not stars.has_sigma:
         return
-    sigma = np.minimum(stars.sigma_u, stars.sigma_v) / scale
+    sigma = np.minimum(stars.column("sigma_u"), stars.column("sigma_v")) / scale
     middle, least = float(np.median(sigma)), float(sigma.min())
     if middle < SMALLEST_ERROR:
         raise InputError(

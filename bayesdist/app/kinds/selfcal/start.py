@@ -145,11 +145,18 @@ def _onto_references(
     if references is None:
         return None
     index = pattern_index(np.column_stack([references.u, references.v]), references.mag)
-    given = {"source": "the first exposure", "reference_name": references.source}
+    name = references.source
     use = mag if references.mag is not None else None
 
     def found(mirrored: bool) -> Similarity:
-        return find_similarity(plane, index, mag=use, mirrored=mirrored, **given)
+        return find_similarity(
+            plane,
+            index,
+            mag=use,
+            mirrored=mirrored,
+            source="the first exposure",
+            reference_name=name,
+        )
 
     try:
         return found(False).map

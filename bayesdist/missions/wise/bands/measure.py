@@ -113,7 +113,6 @@ def _measured(
     results.close()
     order = results.posterior.model.order
     binned, rng = sums.bins.residuals(), np.random.default_rng(SEED)
-    where = {"grid": GRID, "epoch": results.epoch}
     convergence = results.posterior.convergence
     return BandResult(
         name=run.name,
@@ -130,8 +129,8 @@ def _measured(
         partition=residual_partition(binned, order=order, rng=rng),
         correlation=residual_correlation(binned, order=order, rng=rng),
         vectors=vectors,
-        formal_map=uncertainty_map(fit, **where),
-        posterior_map=uncertainty_map(results.solution, **where),
+        formal_map=uncertainty_map(fit, grid=GRID, epoch=results.epoch),
+        posterior_map=uncertainty_map(results.solution, grid=GRID, epoch=results.epoch),
         minus_optical=None if less is None else less.vectors(GRID),
         printed=_printed(run.name, field) if wise else None,
     )

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
 from bayesdist.arrays import Float
+from bayesdist.errors import required
 from bayesdist.numbers import display_scale
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
@@ -94,7 +95,11 @@ def _mixture_curves(r: ReportInput) -> tuple[MixtureCurve, MixtureCurve]:
     jitter = mixture.jitter if mixture.jitter is not None else r.sampled_mean("j")
     taken = 0.0 if r.stars.taken is None else r.stars.taken
     uniform = mixture.model == "uniform"
-    scale = float(mixture.match_radius) if uniform else r.sampled_mean("s_out")
+    scale = (
+        required(mixture.match_radius, "a uniform mixture has a match radius")
+        if uniform
+        else r.sampled_mean("s_out")
+    )
     u, v = (
         MixtureCurve(s, r.sampled_mean("f"), float(jitter), scale, mixture.model, taken)
         for s in sigmas

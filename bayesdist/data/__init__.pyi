@@ -1,0 +1,66 @@
+"""Names of the package, each with the module where it is at home; loaded when first used."""
+
+from .catalog import (
+    ReferenceCatalog as ReferenceCatalog,
+    catalog_from_table as catalog_from_table,
+    read_catalog as read_catalog,
+)
+from .detections import Detections as Detections
+from .exposures import (
+    Exposure as Exposure,
+    ExposureLog as ExposureLog,
+    read_exposures as read_exposures,
+    write_exposures as write_exposures,
+)
+from .formats.files import (
+    FORMATS as FORMATS,
+    MatchFormat as MatchFormat,
+    input_files as input_files,
+)
+from .formats.hst1pass import (
+    Hst1passList as Hst1passList,
+    read_hst1pass as read_hst1pass,
+    read_matchup as read_matchup,
+)
+from .magnitude_errors import MagnitudeErrors as MagnitudeErrors
+from .matches import Matches as Matches
+from .matching.campaign import (
+    CampaignMatches as CampaignMatches,
+    match_campaign as match_campaign,
+)
+from .matching.linear_map import LinearMap as LinearMap
+from .matching.reports import ExposureReport as ExposureReport
+from .matching.search_radius import (
+    SearchRadius as SearchRadius,
+    search_radius as search_radius,
+)
+from .matching.similarity import (
+    find_similarity as find_similarity,
+    pattern_index as pattern_index,
+)
+from .matching.table import (
+    Matching as Matching,
+    match_table as match_table,
+    match_to_catalog as match_to_catalog,
+)
+from .preparing import (
+    centroid_errors as centroid_errors,
+    motion_error_line as motion_error_line,
+    neutralise_aberration as neutralise_aberration,
+    select_motions as select_motions,
+)
+from .read import read_matches as read_matches
+from .reading.options import ReadOptions as ReadOptions
+from .reading.table import matches_from_table as matches_from_table
+from .sky.earth import velocity_aberration as velocity_aberration
+from .sky.tangent import (
+    mean_direction as mean_direction,
+    tangent_plane as tangent_plane,
+)
+from .starlists import (
+    StarCuts as StarCuts,
+    read_star_lists as read_star_lists,
+)
+from .storage.on_disk import open_matches as open_matches
+from .storage.write import write_partitioned as write_partitioned
+from .tables.units import UNITS as UNITS
