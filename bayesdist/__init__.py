@@ -8,7 +8,4 @@ Everything public is here and is loaded when it is first used::
 
 import lazy_loader
 
-from bayesdist.version import __version__
-
-__getattr__, __dir__, _public = lazy_loader.attach_stub(__name__, __file__)
-__all__ = ["__version__", *_public]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

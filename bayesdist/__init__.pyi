@@ -73,5 +73,4 @@ from .simulate import (
     simulate_matches as simulate_matches,
     simulate_partitioned as simulate_partitioned,
 )
-
-__version__: str
+from .version import __version__ as __version__
