@@ -56,12 +56,10 @@ def match_stars(stars: Matches, config: MatchesConfig) -> Matched:
     InputError for files that cannot be read, and as `set_aside`. ConfigError for settings that do
     not go with nominal positions.
     """
-    if stars.has_nominal:
-        try:  # columns may be found by their names
-            config.refuse_circle()
-        except ValueError as error:
-            cause, _, do = str(error).partition("; ")
-            raise ConfigError(cause, where=", ".join(stars.sources), do=do) from None
+    if stars.has_nominal:  # in columns that were found by their names
+        for fault in config.circle_faults():
+            cause, _, do = fault.partition("; ")
+            raise ConfigError(cause, where=", ".join(stars.sources), do=do)
     return Matched(*set_aside(config, stars))
 
 
