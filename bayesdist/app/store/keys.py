@@ -30,6 +30,11 @@ def as_json(value: Any) -> Any:
     return to_jsonable_python(value, inf_nan_mode="null", fallback=_plain)
 
 
+def attributes(one: Any, names: str) -> dict[str, Any]:
+    """Attributes of an object as a row, by their names; None each where there is no object."""
+    return {name: None if one is None else getattr(one, name) for name in names.split()}
+
+
 def _refuse_sets(value: Any) -> None:
     """TypeError for a set anywhere in a value: pydantic would list it in the order of hashes."""
     if value is None or isinstance(value, str | int | float | np.ndarray):

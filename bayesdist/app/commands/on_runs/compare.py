@@ -10,6 +10,7 @@ import numpy as np
 from astropy.table import Table, vstack
 
 from bayesdist.app.commands.on_files.calibrations import calibration_at
+from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.comparison.compare import (
@@ -49,18 +50,11 @@ def write_comparison(
 
 def comparison_summary(found: Comparison) -> dict[str, Any]:
     """Content of comparison.json for one chip."""
-    s, field = found.similarity, found.field
-    sides = {}
-    for letter, c in (("a", found.a), ("b", found.b)):
-        sides[letter] = {
-            "name": c.name,
-            "order": c.basis.order,
-            "unit": c.unit,
-            "chip": c.chip,
-            "epoch": c.epoch,
-            "errors": c.errors,
-            "notes": list(c.notes),
-        }
+    s = found.similarity
+    sides = {
+        letter: attributes(c, "name unit chip epoch errors notes") | {"order": c.basis.order}
+        for letter, c in (("a", found.a), ("b", found.b))
+    }
     return {
         **sides,
         "verdict": verdict(found),
@@ -68,49 +62,35 @@ def comparison_summary(found: Comparison) -> dict[str, Any]:
         "pixel_mas": found.frame.pixel_mas,
         "linear": {
             "taken_out": bool(found.frame.taken.shape[1]),
-            "shift": s.shift,
-            "sigma_shift": s.sigma_shift,
+            **attributes(s, "shift sigma_shift scale sigma_scale mirrored"),
             "rotation_rad": s.rotation,
             "sigma_rotation_rad": s.sigma_rotation,
-            "scale": s.scale,
-            "sigma_scale": s.sigma_scale,
-            "mirrored": s.mirrored,
             "comparable": s.alike,
         },
-        "rms": found.rms,
-        "noise_rms": found.noise_rms,
-        "largest": found.largest,
-        "sigma_of_largest": found.sigma_of_largest,
-        "position_of_largest": list(found.position_of_largest),
-        "significance_of": found.errors_of if field is not None else "none",
-        "chi2": None if field is None else field.chi2,
-        "dof": None if field is None else field.dof,
-        "p_value": None if field is None else field.p_value,
-        "largest_z": found.largest_z,
-        "p_largest_z": found.p_largest_z,
+        **attributes(found, "rms noise_rms largest sigma_of_largest position_of_largest"),
+        "significance_of": found.errors_of if found.field is not None else "none",
+        **attributes(found.field, "chi2 dof p_value"),
+        **attributes(found, "largest_z p_largest_z"),
         "p_largest_chi2_on_grid": found.p_largest_chi2,
         "untested_rms": found.unknown_rms,
     }
 
 
 def _gap_summary(gap: GapDifference) -> dict[str, Any]:
-    shift, (scale, rotation) = gap.values[:2].tolist(), gap.values[2:].tolist()
-    sigma = gap.sigma
+    sigma = (None,) * 4 if gap.sigma is None else gap.sigma.tolist()
+    shift_u, shift_v, scale, rotation = gap.values.tolist()
     return {
-        "chip": gap.chip,
-        "reference": gap.reference,
+        **attributes(gap, "chip reference"),
         "verdict": gap_verdict(gap),
         "unit": "pix",
-        "shift": shift,
-        "sigma_shift": None if sigma is None else sigma[:2].tolist(),
+        "shift": [shift_u, shift_v],
+        "sigma_shift": None if gap.sigma is None else sigma[:2],
         "scale": scale,
-        "sigma_scale": None if sigma is None else float(sigma[2]),
+        "sigma_scale": sigma[2],
         "rotation_rad": rotation,
-        "sigma_rotation_rad": None if sigma is None else float(sigma[3]),
+        "sigma_rotation_rad": sigma[3],
         "significance_of": gap.errors_of,
-        "chi2": None if gap.test is None else gap.test.chi2,
-        "dof": None if gap.test is None else gap.test.dof,
-        "p_value": None if gap.test is None else gap.test.p_value,
+        **attributes(gap.test, "chi2 dof p_value"),
     }
 
 

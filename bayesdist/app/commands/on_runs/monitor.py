@@ -15,6 +15,7 @@ from bayesdist.app.config import Config, load_config
 from bayesdist.app.kinds.fitted import load_errors
 from bayesdist.app.kinds.matches.sources import read_configured
 from bayesdist.app.results import results_of
+from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_late
@@ -252,15 +253,8 @@ def _summary(found: Monitored, facts: dict[str, Any]) -> dict[str, Any]:
     test, date, worst = found.change.test, found.date, found.worst
     since = None
     if date is not None:
-        since = {
-            "after": date.after,
-            "before": date.before,
-            "interval_95": list(date.interval),
-            "p_value": found.p_since,
-            "scatter": date.scatter,
-            "scatter_dof": date.scatter_dof,
-            "p_scatter": date.p_scatter,
-        }
+        since = attributes(date, "after before scatter scatter_dof p_scatter")
+        since |= {"interval_95": date.interval, "p_value": found.p_since}
     scale = found.pixel_mas
     return {
         "verdict": found.verdict,
@@ -270,8 +264,7 @@ def _summary(found: Monitored, facts: dict[str, Any]) -> dict[str, Any]:
         "epoch": found.change.epoch,
         "size": {
             "unit": "pix",
-            "rms": worst.rms,
-            "noise_rms": worst.noise_rms,
+            **attributes(worst, "rms noise_rms"),
             "max": worst.largest,
             "sigma_of_max": worst.sigma_of_largest,
             "position_of_max": list(worst.position_of_largest),

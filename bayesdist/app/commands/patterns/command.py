@@ -11,6 +11,7 @@ from astropy.table import Table
 
 from bayesdist.app.commands.patterns.config import PlanConfig, load_plan
 from bayesdist.app.screen import table_text
+from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.assess.planning.dithers import (
     KINDS,
@@ -131,12 +132,7 @@ def _record(one: PlannedPattern) -> dict[str, Any]:
         "n_free": one.n_free,
         "held": [one.solution.model.names[k] for k in gauge.held],
         "directions": [
-            {
-                "name": d.name,
-                "sigma_detections": d.sigma,
-                "sigma_fixed": d.sigma_fixed,
-                "unit": d.unit,
-            }
+            attributes(d, "name sigma_fixed unit") | {"sigma_detections": d.sigma}
             for d in gauge.directions
         ],
         **{
