@@ -104,12 +104,7 @@ bayesdist = click.version_option(__version__, message="bayesdist %(version)s")(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command.
-
-    `arguments`: in place of those of the process. Result: 0 good; 1 bad input; 2 usage; 3 not
-    converged under --strict; 4 requirement missed; 65 nested too deep; 70 a defect; 71 too little
-    memory; 74 refused by the system; 130 interrupted.
-    """
+    """Run a command."""
     open_streams()
     gc.set_threshold(*SELDOM)
     for name in ALGEBRA:

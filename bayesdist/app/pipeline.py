@@ -56,8 +56,7 @@ __all__ = [
 def read(config: Config, base: Path) -> Any:
     """All that a run begins with: matched stars, or star lists with what goes with them.
 
-    `base`: folder that its files are relative to. BayesdistError for files that cannot be read or
-    do not go together.
+    `base`: folder that its files are relative to.
     """
     kind = kind_of(config)
     inputs = kind.read(config, base)
@@ -73,8 +72,7 @@ def match(inputs: Any, config: Config) -> Matched:
 def fit(matched: Matched, config: Config, base: Path, reader: StarReader | None = None) -> FitData:
     """The least-squares solution with its stars.
 
-    `config`, `base`: as of `read`. `reader`: that has read the stars before. BayesdistError for
-    parameters that the stars do not determine.
+    `reader`: that has read the stars before.
     """
     reader = reader or StarReader(config.resources())
     return FitData(matched, kind_of(config).fit(matched, config, base, reader), reader)
@@ -89,14 +87,7 @@ def sample(
 ) -> Posterior:
     """The posterior of a fit.
 
-    Parameters
-    ----------
-    data : FitData
-    config : Config
-    folder : Path, optional
-        For checkpoints.
-    progress : callable, optional
-        Called with (steps made, most steps).
+    `folder`: for checkpoints. `progress`: called with (steps made, most steps).
     """
     return kind_of(config).sample(data, config, folder=folder, progress=progress)
 
@@ -114,18 +105,8 @@ def evaluate(
 ) -> assessed.Evaluation:
     """Maps, budget, margins and validity periods.
 
-    Parameters
-    ----------
-    errors : ErrorModel
-    posterior : Posterior
-    found : Diagnostics
-    data : FitData
-    config, base
-        As of `read`.
-    source : str
-        Where the solution is from, by default the detector.
-    series : mapping, optional
-        How linear terms went with time, as summary.json has it.
+    `source`: where the solution is from, by default the detector. `series`: how linear terms went
+    with time, as summary.json has it.
     """
     solution = solution_of(posterior, found, data.fitted)
     product = product_input(solution, data, config, source)
@@ -157,8 +138,7 @@ def export(
     """Write the files that a configuration asks for, and list what is known of each.
 
     `evaluation`: with whose budget the errors of the files are compared. `found`: whose errors of
-    the parameters the files have, too. `config`, `base`: as of `read`. `folder`: where the files
-    are written. `source`: as of `evaluate`.
+    the parameters the files have, too.
     """
     product = product_of(posterior, found, data, config, source)
     stars = None

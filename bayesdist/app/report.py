@@ -34,10 +34,7 @@ VECTOR_GRID = 17  # vectors along the longer side of a diagram: more would hide 
 
 
 def report(results: Results, *, pdf: bool = False) -> list[str]:
-    """Names of the figures of a report, which is written into the folder of the run.
-
-    `pdf`: whether figures are drawn as PDF, too.
-    """
+    """Names of the figures of a report, which is written into the folder of the run."""
     # figures take seconds to import
     from bayesdist.report.drawing import save_drawings
     from bayesdist.report.run_report import draw_report, write_report
@@ -184,11 +181,7 @@ def _vector_grid(size: tuple[float, float]) -> tuple[int, int]:
 def selfcal_results(
     run: RunDirectory, fitted: Fitted, posterior: Posterior, epoch: float | None
 ) -> SelfcalResults:
-    """Content that a self-calibration adds to the report of its run.
-
-    `run`: that has been assessed. `posterior`: as it was sampled. `epoch`: of the assessment,
-    decimal years.
-    """
+    """Content that a self-calibration adds to the report of its run."""
     model, theta = fitted.linear.model, posterior.mean
     solved = required(fitted.solved, "solution of detections")
     outlines = []

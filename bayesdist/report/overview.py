@@ -80,10 +80,7 @@ def _badness(row: OverviewRow) -> tuple[int, float]:
 
 
 def write_overview(path: str | os.PathLike[str], rows: Sequence[OverviewRow]) -> list[OverviewRow]:
-    """Rows as the page shows them, the worst runs first, once it is written.
-
-    InputError when the file cannot be written.
-    """
+    """Rows as the page shows them, the worst runs first, once it is written."""
     ordered = sorted(rows, key=_badness)
     text = template("overview.html.jinja").render(rows=ordered, heads=HEADS)
     with atomic_path(Path(path)) as temporary:

@@ -22,10 +22,7 @@ MIN_EXPOSURES = 8  # exposures below which nothing is said of time
 
 
 def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> None:
-    """Write series.ecsv and drift.ecsv, and a section of summary.json.
-
-    `fitted`: with exposures that were each fitted alone.
-    """
+    """Write series.ecsv and drift.ecsv, and a section of summary.json."""
     series = required(fitted.alone, "fits of single exposures")
     time, seed = fitted.linear.model.time, config.sampler.seed
     if time is None or len(series.names) < MIN_EXPOSURES:

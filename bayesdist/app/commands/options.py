@@ -37,10 +37,7 @@ class LazyGroup(click.Group):
 
 
 class CommaList(click.ParamType):
-    """Values that are separated by commas.
-
-    `kind`: of each value.
-    """
+    """Values that are separated by commas."""
 
     name = "list"
 
@@ -115,10 +112,7 @@ image_size = click.option(
 
 
 def chip_of(numbers: Sequence[int], chip: int | None, where: str) -> int:
-    """Number of the chip that --chip names, which may be left out where there is one.
-
-    InputError for none, or one that is not there, among several.
-    """
+    """Number of the chip that --chip names, which may be left out where there is one."""
     listed = ", ".join(map(str, numbers))
     if chip is None and len(numbers) == 1:
         return numbers[0]

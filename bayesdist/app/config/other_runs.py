@@ -11,26 +11,17 @@ TABLES, POSTERIOR = "tables.h5", "posterior.nc"
 
 
 def tables_file(path: Path) -> Path:
-    """File of a detector's tables: a D2IMFILE as it is named, or that of a run.
-
-    InputError for a folder that is no finished run.
-    """
+    """File of a detector's tables: a D2IMFILE as it is named, or that of a run."""
     return path if path.is_file() else _file_of_run(path, TABLES, "tables.detector")
 
 
 def rates_file(folder: Path) -> Path:
-    """File of the posterior of a run whose drift is taken over.
-
-    InputError for a folder that is no finished run.
-    """
+    """File of the posterior of a run whose drift is taken over."""
     return _file_of_run(folder, POSTERIOR, "model.tdd.rates")
 
 
 def calibration_file(path: Path) -> Path:
-    """File of an earlier calibration: one of any format as it is named, or a run's posterior.
-
-    InputError for a folder that is no finished run.
-    """
+    """File of an earlier calibration: one of any format as it is named, or a run's posterior."""
     return path if path.is_file() else _file_of_run(path, POSTERIOR, "prior_calibration.source")
 
 

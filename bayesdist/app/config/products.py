@@ -68,10 +68,7 @@ class Products(Section):
             yield f"useafter: {error.cause}; give 'Mar 01 2002 00:00:00'"
 
     def useafter_years(self) -> tuple[float, ...]:
-        """Dates from which the files are to be used, decimal years; none where none is given.
-
-        InputError for text that is no date.
-        """
+        """Dates from which the files are to be used, decimal years; none where none is given."""
         release = getattr(self, "release", None)
         files = (*self.asked().values(), *(() if release is None else release.period))
         given = (getattr(one, "useafter", None) for one in files)

@@ -93,10 +93,7 @@ def chips_of(chips: Sequence[ChipBlock]) -> tuple[Chip, ...]:
 
 
 def one_chip(detector: Detector, reference_pixel: Pair | None, number: int, name: str) -> Chip:
-    """The chip of a detector that has one; its middle where no pixel is named.
-
-    ValueError for a detector without a size.
-    """
+    """The chip of a detector that has one; its middle where no pixel is named."""
     if detector.size is None:
         raise ValueError("detector.size is missing; give columns and rows")
     nx, ny = detector.size

@@ -79,10 +79,7 @@ def write_tables(path: Path, stored: StoredLookupTables) -> None:
 
 
 def read_tables(path: Path, *, do: str) -> StoredLookupTables:
-    """Read what `write_tables` wrote; nothing where there is no file.
-
-    InputError for a damaged file, with `do` as the advice.
-    """
+    """Read what `write_tables` wrote; nothing where there is no file."""
     if not path.exists():
         return StoredLookupTables()
     arrays = read_arrays(path, "", do=do)
@@ -144,10 +141,7 @@ class Fitted:
 
 
 def load_fitted(folder: Path) -> Fitted:
-    """The fit of an earlier stage, but for the solution of detections.
-
-    `folder`: of the run. InputError for missing or damaged files.
-    """
+    """The fit of an earlier stage, but for the solution of detections."""
     tables = read_tables(folder / TABLES, do=FIT_AGAIN)
     return Fitted(load_fit(folder / FIT), tables=tables, **_read_parts(folder))
 
@@ -167,13 +161,7 @@ def _read_parts(folder: Path) -> dict[str, Any]:
 
 
 def required(part: T | None, what: str) -> T:
-    """A part of a fit that its kind of run has.
-
-    Raises
-    ------
-    InputError
-        For a fit of another kind.
-    """
+    """A part of a fit that its kind of run has."""
     if part is None:
         raise InputError(f"has no {what}", where=FIT, do=FIT_AGAIN)
     return part

@@ -31,9 +31,6 @@ def locked(folder: Path) -> Iterator[None]:
 
     The lock is that of a file, not the file itself: one that a killed process has left holds
     nobody up.
-
-    InputError while another process holds the lock, with what that process is; where the folder is
-    read-only.
     """
     made_folder(folder)
     if fcntl is None:

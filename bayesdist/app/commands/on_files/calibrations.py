@@ -35,11 +35,10 @@ def calibration_at(
 ) -> Calibration:
     """The calibration of a file or a run.
 
-    `path`: a file of any format, a run directory, posterior.nc or fit.nc. `filter`: of an IDCTAB;
-    names of both wheels may be joined by a comma. The band of WISE meta-data. `scale`: size of a
-    corrected pixel, in the unit of the calibration. `size`: columns and rows, for a SIP header that
-    does not say. InputError for a file that holds no calibration, a filter that is missing or not
-    there, or a scale that is not positive.
+    `path`: a file of any format, a run directory, posterior.nc or fit.nc. `filter`: of an IDCTAB,
+    names of both wheels joined by a comma, or the band of WISE meta-data. `scale`: size of a
+    corrected pixel in the unit of the calibration. `size`: columns and rows, for a header that does
+    not say.
     """
     path = Path(path)
     if not path.exists():
@@ -166,8 +165,7 @@ def images_of(
 ) -> dict[int, Subarray]:
     """Where pixels lie on their chips, as one of three options says; empty for whole chips.
 
-    `image`: a calibrated image. `ltv`: LTV1, LTV2. `corner`: the pixel of the chip that is the
-    subarray's first. InputError for more than one of them, or as `subarrays_of_image`.
+    `corner`: the pixel of the chip that is the subarray's first.
     """
     given = [("--image", image), ("--ltv", ltv), ("--corner", corner)]
     named = [name for name, value in given if value is not None]

@@ -95,10 +95,7 @@ def _gap_summary(gap: GapDifference) -> dict[str, Any]:
 
 
 def joined(found: Sequence[Comparison], table_of: Any) -> Table:
-    """The tables of all chips as one, with the chip in front where there are several.
-
-    `table_of` makes that of one comparison.
-    """
+    """The tables of all chips as one, with the chip in front where there are several."""
     tables = []
     for one in found:
         table = table_of(one)

@@ -37,11 +37,8 @@ def read_new_exposures(
 ) -> NewExposures:
     """Matched pairs of new exposures: those of another run, or a table.
 
-    `release`: of a campaign. `released`: its solution, with all errors. `fitted`: its fit. `new`:
-    run directory of a campaign whose stage 'match' has been run, or pairs in a file or folder as a
-    run keeps them. InputError for star lists, which have to be matched first; pairs in another unit
-    or filter, without epochs, or without a way to errors; when all exposures are those of the
-    release.
+    `new`: run directory of a campaign whose stage 'match' has been run, or pairs in a file or
+    folder as a run keeps them; star lists have to be matched first.
     """
     run = RunDirectory(new) if (new / "run.json").exists() else None
     pairs = _pairs(run, new, released.model.unit)
@@ -79,8 +76,6 @@ def fit_exposures_of(data: FitData, config: Config, new: NewExposures) -> NewFit
 
     What a star's error in the catalogue does to all its exposures is added, and where the release
     has the same catalogue, what it did to the release is taken into account.
-
-    `data`, `config`: of the release.
     """
     scatter = required(data.fitted.scatter, "joint fit of exposures")
     found = fit_new(

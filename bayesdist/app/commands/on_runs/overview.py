@@ -23,11 +23,7 @@ NO_VERDICT = "no verdict is recorded; 'bayesdist stage report' makes one"
 
 
 def overview(runs: Sequence[str | Path], output: str | Path) -> str:
-    """Text to print, once the page that compares runs by their summary.json is written.
-
-    It has a line for each run with its verdict, the worst one first.
-    InputError for a folder that holds no run.
-    """
+    """Text to print, once the page that compares runs by their summary.json is written."""
     rows = [_row(RunDirectory(run), Path(output)) for run in runs]
     table = [
         {"Status": row.level.replace("fail", "FAIL"), "Run": row.name, "Verdict": row.headline}

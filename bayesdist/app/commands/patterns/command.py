@@ -34,8 +34,7 @@ def plan_patterns(path: str | Path, output: str | Path | None = None, command: s
     """Compare the dither patterns of a file by the covariance to be expected.
 
     `path`: TOML with ``[[pattern]]`` blocks. `output`: new or empty folder for table, record and
-    figure. `command`: for the record. Result: what to print. ConfigError for a file that is not
-    sound. InputError for a pattern whose exposures do not overlap, and a folder that is in use.
+    figure.
     """
     config = load_plan(path)
     camera = config.camera()

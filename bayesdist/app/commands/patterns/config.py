@@ -227,10 +227,7 @@ def _against_first(name: str, round_: Float, rolls_deg: Float) -> DitherPattern:
 
 
 def load_plan(path: str | Path) -> PlanConfig:
-    """Read a file of patterns.
-
-    ConfigError with file, key and reason; an unknown key names the nearest known one.
-    """
+    """Read a file of patterns."""
     config: PlanConfig = validated(
         PlanConfig, load_text(path), str(path), begin="give it [[pattern]] blocks"
     )

@@ -36,11 +36,7 @@ SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
 
 
 def fit_campaign(matched: CampaignMatched) -> Fitted:
-    """Tables, errors, all exposures jointly, and every one alone.
-
-    BayesdistError for what the exposures do not determine, runs of other filters that do not fit to
-    this one, and stars that have outrun their catalogue.
-    """
+    """Tables, errors, all exposures jointly, and every one alone."""
     with frames_not_set():
         return _fitted(matched)
 

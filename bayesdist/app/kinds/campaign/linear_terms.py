@@ -33,9 +33,8 @@ def gap_priors(
 ) -> GaussianPriors:
     """Priors that leave of the constant terms' drift the steps of all chips but the first.
 
-    `model`: the reference chip comes first: its constant terms are where the exposures point.
-    `asked`: the configured drift: constant terms that it names have rates as well. `pixel`: size of
-    a pixel in the unit of u, v.
+    The reference chip comes first: its constant terms are where the exposures point. Constant terms
+    that are `asked` for have rates as well. `pixel`: its size in the unit of u, v.
     """
     reference, named = model.chips[0].number, () if asked is None else asked.terms
     held = {

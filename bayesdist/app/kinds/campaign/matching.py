@@ -29,11 +29,7 @@ log = logging.getLogger("bayesdist")
 
 
 def match_lists(inputs: Inputs) -> CampaignMatched:
-    """Star lists matched with a catalogue, exposure by exposure.
-
-    BayesdistError for files that cannot be read or do not go together, chips without matches, and
-    too few exposures.
-    """
+    """Star lists matched with a catalogue, exposure by exposure."""
     config, block, lists = inputs.config, inputs.config.campaign, inputs.star_lists
     tab = read_idctab(inputs.base / block.initial_distortion)
     parities = parities_of(block, inputs.catalog, tab)

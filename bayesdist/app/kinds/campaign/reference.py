@@ -19,8 +19,7 @@ from bayesdist.products import read_d2im
 def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tuple[LookupTable, ...]:
     """The detector's tables that a run holds; none where it has none to hold.
 
-    `chips`: all of which must have a table. InputError for a run without tables, a file that is no
-    D2IMFILE, and a chip without table.
+    All `chips` must have one.
     """
     if block.detector is None:
         return ()
@@ -44,11 +43,7 @@ def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tupl
 
 
 def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianPriors | None:
-    """Priors on the drift of a model from the posterior of another run; None where it is free.
-
-    InputError for a folder that is no finished run, a run that has not converged, and one of other
-    chips, units, drifting terms, or reference dates.
-    """
+    """Priors on the drift of a model from the posterior of another run; None where it is free."""
     tdd, chip = config.model.tdd, config.chips()[0].number
     if tdd is None or config.has_free_rates:
         return None
@@ -68,10 +63,7 @@ def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianP
 
 
 def rehearse_references(config: Config, unit: str, base: Path) -> None:
-    """Read all that a run takes over from others; nothing is fitted.
-
-    InputError as `held_tables` and `rate_priors`.
-    """
+    """Read all that a run takes over from others; nothing is fitted."""
     chips = config.chips()
     held_tables(config.tables, chips, base)
     if not config.has_free_rates:

@@ -46,11 +46,7 @@ def campaign_results(
     posterior: Posterior,
     overlap: OverlapTest | None,
 ) -> CampaignResults:
-    """Content that a campaign adds to the report of its run.
-
-    `run`: that has been assessed. `posterior`: as it was sampled. `overlap`: of stars in several
-    exposures.
-    """
+    """Content that a campaign adds to the report of its run."""
     model, fitted, matched = posterior.model, data.fitted, data.matched
     matching = read_ecsv(run / "matching.ecsv")
     return CampaignResults(
@@ -76,8 +72,6 @@ def held_parameters(fit: LinearFit, priors: GaussianPriors) -> tuple[str, ...]:
     """Coefficients and rates of which the data say nothing beside what a prior does.
 
     The deviations of single exposures are not among them: their prior is what was found.
-
-    `priors`: as the fit had them.
     """
     share = fit.sigma * np.sqrt(priors.precision)
     return tuple(

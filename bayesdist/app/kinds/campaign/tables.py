@@ -42,9 +42,6 @@ def refuse_outrun_stars(inputs: Inputs, fit: LinearFit, pairs: Matches) -> None:
     """Refuse a catalogue without motions where residuals grow with the time from its epoch.
 
     The square of the residuals of stars that move is a parabola in time.
-
-    `fit`: of every exposure by itself. `pairs`: what it was made from. InputError naming the
-    catalogue.
     """
     if inputs.catalog.pm_u is not None or pairs.epoch is None:
         return
@@ -132,10 +129,7 @@ def fit_tables(matched: CampaignMatched) -> FittedTables:
 def scatter_by_magnitude(
     pairs: Matches, model: DistortionModel, inputs: Inputs
 ) -> tuple[LinearFit, Matches, MagnitudeErrors]:
-    """Fit of every exposure by itself and scatter by magnitude, as `fit_by_magnitude`.
-
-    InputError where stars have outrun a catalogue without proper motions.
-    """
+    """Fit of every exposure by itself and scatter by magnitude, as `fit_by_magnitude`."""
     fit, _, errors = fit_by_magnitude(pairs, model)
     scattered = pairs.with_errors(errors)
     refuse_outrun_stars(inputs, fit, scattered)

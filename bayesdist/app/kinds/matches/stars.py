@@ -51,11 +51,7 @@ SAMPLING = 1  # of the random streams that follow from the one seed: that of the
 
 
 def match_stars(stars: Matches, config: MatchesConfig) -> Matched:
-    """Matched stars of a configuration, those that are fitted and those that are held out.
-
-    InputError for files that cannot be read, and as `set_aside`. ConfigError for settings that do
-    not go with nominal positions.
-    """
+    """Matched stars of a configuration, those that are fitted and those that are held out."""
     if stars.has_nominal:  # in columns that were found by their names
         for fault in config.circle_faults():
             cause, _, do = fault.partition("; ")
@@ -64,19 +60,13 @@ def match_stars(stars: Matches, config: MatchesConfig) -> Matched:
 
 
 def read_stars(config: MatchesConfig, base: Path) -> Matches:
-    """The matched stars that a configuration names.
-
-    InputError for a configuration that names none, and for files that cannot be read.
-    """
+    """The matched stars that a configuration names."""
     data = config.data
     return read_configured(data.paths(base), data, size=config.detector.size, chips=config.chip)
 
 
 def model_of(stars: Matches, config: Config) -> DistortionModel:
-    """The model that a configuration asks for, for these stars.
-
-    InputError for chips that only one side knows, and as `build_model`.
-    """
+    """The model that a configuration asks for, for these stars."""
     check_chips(config.chips(), stars.chip_numbers)
     return build_model(
         stars,
@@ -98,9 +88,8 @@ def fit_stars(
 ) -> Fitted:
     """The linear fit of matched stars, with the errors that its residuals ask for.
 
-    `base`: that the file of an earlier calibration is relative to. `reader`: has the stars in the
-    end, for the passes that follow. InputError where it cannot be made; with the frames of the
-    exposures that would help.
+    The `reader` has the stars in the end, for the passes that follow. An error names the frames of
+    the exposures that would help.
     """
     if reader is None:
         with closing(StarReader(config.resources())) as reader:
@@ -179,10 +168,7 @@ def _fitted(
 def shards_of(
     stars: Matches, model: DistortionModel, config: Config, errors: ErrorLaw, reader: StarReader
 ) -> Shards:
-    """Stars as passes go over them, none of them outside the circle in which it was matched.
-
-    InputError naming a star that is.
-    """
+    """Stars as passes go over them, none of them outside the circle in which it was matched."""
     shards = reader.shards(model, stars, errors)
     if knows_circle(config) and stars.has_nominal:
         shards.survey.check_circle(config.outliers.match_radius)
@@ -190,10 +176,7 @@ def shards_of(
 
 
 def priors_of(model: DistortionModel, config: Config) -> GaussianPriors:
-    """Priors of the parameters, as the configuration gives them.
-
-    InputError for a parameter that the model does not have.
-    """
+    """Priors of the parameters, as the configuration gives them."""
     return GaussianPriors.of(model, {p.parameter: (p.mean, p.sigma) for p in config.prior})
 
 
@@ -224,11 +207,7 @@ def sample_stars(
 def earlier_calibration(
     model: DistortionModel, config: Config, base: Path
 ) -> CalibrationPrior | None:
-    """Prior of a model by the calibration that a configuration names; None where it names none.
-
-    InputError for a file that is no calibration, a run that has not converged, and as
-    `prior_of_calibration`.
-    """
+    """Prior of a model by the calibration that a configuration names; None where it names none."""
     block = config.prior_calibration
     if block is None:
         return None

@@ -35,10 +35,7 @@ AMBIGUOUS = 0.05  # fraction of groups that may be of one star or several, worth
 
 
 def match_dithers(inputs: Inputs) -> SelfcalMatched:
-    """Detections of dithered exposures with their stars, and a first solution.
-
-    BayesdistError as `calibrated`, and for an exposure that hardly shares stars with the others.
-    """
+    """Detections of dithered exposures with their stars, and a first solution."""
     found = calibrated(inputs, lambda text: log.info("match: %s", text))
     table, facts = exposure_table(found, inputs), matching_facts(found, inputs)
     refuse_unconnected(table)
@@ -69,8 +66,8 @@ def match_dithers(inputs: Inputs) -> SelfcalMatched:
 def calibrated(inputs: Inputs, report: Callable[[str], None]) -> SelfCalibration:
     """Stars and solution of a self-calibration.
 
-    `report`: called with what happens, in words. BayesdistError as `self_calibrate`; where that
-    does not settle and one exposure lies half a turn from all the others, naming it.
+    `report`: called with what happens, in words. Where it does not settle and one exposure lies
+    half a turn from all the others, the error names it.
     """
     (model, theta), block = inputs.start, inputs.config.selfcal
     try:
@@ -153,12 +150,7 @@ def exposure_table(found: SelfCalibration, inputs: Inputs) -> Table:
 
 
 def refuse_unconnected(table: Table) -> None:
-    """Refuse an exposure that hardly shares stars with the others where they overlap.
-
-    `table` is as `exposure_table` makes it.
-
-    InputError naming it, and whether it lies half a turn from the others.
-    """
+    """Refuse an exposure that hardly shares stars with the others where they overlap."""
     share = np.asarray(table["fraction_common"], float)
     if len(share) < 3:  # of two nobody knows which one is wrong
         return
