@@ -28,6 +28,12 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
 
     Of all requirements, or of one `name`; exposures could be taken at `epochs`, decimal years.
     """
+    if str(run).endswith(".toml"):
+        raise InputError(
+            "is a file, not a run",
+            where=str(run),
+            do=f"compare dither patterns by 'bayesdist plan-dither {run}'",
+        )
     with open_results(RunDirectory.open(run)) as results:
         results.run.require("plan", ("fit", "sample", "diagnose", "evaluate"))
         solved = results.fitted.solved
