@@ -69,12 +69,7 @@ def report_input(results: Results) -> ReportInput:
         selfcal = selfcal_results(run, fitted, posterior, epoch)
     facts, folder = run.facts, run.path.resolve().name
     products = tuple(
-        Product(
-            path=p["path"],
-            what=p["kind"],
-            checks=_product_checks(p),
-        )
-        for p in run.summary.get("products", [])
+        Product(p["path"], p["kind"], _product_checks(p)) for p in run.summary.get("products", [])
     )
     return ReportInput(
         name=title_of(config) or folder,
@@ -144,8 +139,8 @@ def _chip_results(
 
 
 def _vectors(solution: Posterior, part: str, chip: Chip, epoch: float | None) -> VectorMap:
-    grid = _vector_grid(chip.size)
-    return distortion_vectors(solution, part=part, grid=grid, epoch=epoch, chip=chip.number)
+    nx, ny = (max(3, round(VECTOR_GRID * s / max(chip.size))) for s in chip.size)
+    return distortion_vectors(solution, part=part, grid=(nx, ny), epoch=epoch, chip=chip.number)
 
 
 def _product_checks(product: dict[str, Any]) -> tuple[Check, ...]:
@@ -170,12 +165,6 @@ def _product_checks(product: dict[str, Any]) -> tuple[Check, ...]:
         name = "reading by other programs"
         out.append(Check("Products", name, text, "", levels.get(level, "note")))
     return tuple(out)
-
-
-def _vector_grid(size: tuple[float, float]) -> tuple[int, int]:
-    longest = max(size)
-    nx, ny = (max(3, round(VECTOR_GRID * s / longest)) for s in size)
-    return nx, ny
 
 
 def selfcal_results(

@@ -40,18 +40,16 @@ def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> No
     outlying = [
         name for name, p in zip(series.names, posterior.outlier_probability, strict=True) if p > 0.5
     ]
-    verdicts = [_verdict(series, k, time.breaks, seed) for k in range(len(series.coefficients))]
+    verdicts = []
+    for term in series.coefficients:  # which trend each takes, by held-out exposures
+        verdict = describe(series.only(term), breaks=time.breaks, seed=seed)
+        verdicts.append({"term": term, "claim": verdict.claim, "text": verdict.text})
+    scatter = posterior.scatter_sigma.mean(axis=0).tolist()
     run.summarise(
         time_dependence={
             "converged": posterior.convergence.converged,
             "lines": _lines(posterior),
-            "scatter": dict(
-                zip(
-                    series.coefficients,
-                    posterior.scatter_sigma.mean(axis=0).tolist(),
-                    strict=True,
-                )
-            ),
+            "scatter": dict(zip(series.coefficients, scatter, strict=True)),
             "outlying_exposures": outlying,
             "warnings": list(_disagreements(fitted.facts["exposures_outlying"], outlying)),
             "breaks": _changes(posterior),
@@ -72,44 +70,27 @@ def _disagreements(known: Sequence[str], outlying: Sequence[str]) -> Iterator[st
         )
 
 
-def _verdict(series: Series, k: int, breaks: tuple[float, ...], seed: int) -> dict[str, object]:
-    """Which trend one term takes, by held-out exposures."""
-    verdict = describe(series.only(series.coefficients[k]), breaks=breaks, seed=seed)
-    return {"term": series.coefficients[k], "claim": verdict.claim, "text": verdict.text}
-
-
 def _lines(posterior: SeriesPosterior) -> list[dict[str, object]]:
-    alpha, beta = posterior.alpha, posterior.beta
-    return [
-        {
-            "segment": s,
-            "term": name,
-            "epoch0": float(posterior.reference[s]),
-            "alpha": float(alpha[:, s, k].mean()),
-            "sigma_alpha": float(alpha[:, s, k].std(ddof=1)),
-            "beta": float(beta[:, s, k].mean()),
-            "sigma_beta": float(beta[:, s, k].std(ddof=1)),
-        }
-        for s in range(alpha.shape[1])
-        for k, name in enumerate(posterior.series.coefficients)
-    ]
+    out: list[dict[str, object]] = []
+    for s, epoch0 in enumerate(posterior.reference):
+        for k, name in enumerate(posterior.series.coefficients):
+            row: dict[str, object] = {"segment": s, "term": name, "epoch0": float(epoch0)}
+            for part in ("alpha", "beta"):
+                draws = getattr(posterior, part)[:, s, k]
+                row |= {part: float(draws.mean()), f"sigma_{part}": float(draws.std(ddof=1))}
+            out.append(row)
+    return out
 
 
 def _changes(posterior: SeriesPosterior) -> list[dict[str, object]]:
     out: list[dict[str, object]] = []
-    for number in range(posterior.trend.n_breaks):
-        level, slope = posterior.change(number)
+    for number, date in enumerate(posterior.trend.breaks):
+        changes = dict(zip(("step", "slope_change"), posterior.change(number), strict=True))
         for k, name in enumerate(posterior.series.coefficients):
-            out.append(
-                {
-                    "break": posterior.trend.breaks[number],
-                    "term": name,
-                    "step": float(level.value[k]),
-                    "sigma_step": float(level.sigma[k]),
-                    "slope_change": float(slope.value[k]),
-                    "sigma_slope_change": float(slope.sigma[k]),
-                }
-            )
+            row: dict[str, object] = {"break": date, "term": name}
+            for part, found in changes.items():
+                row |= {part: float(found.value[k]), f"sigma_{part}": float(found.sigma[k])}
+            out.append(row)
     return out
 
 

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from astropy.table import Table, vstack
 
-from bayesdist.app.commands.on_files.calibrations import calibration_at
+from bayesdist.app.commands.on_files.calibrations import calibration_at, run_of
 from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import record_folder, write_table
-from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.comparison.compare import (
     Comparison,
     compare,
@@ -139,8 +138,13 @@ def compare_files(
     gaps = _gaps(both, epoch, [n for n, m in numbers if n == m])
     if output is not None:
         write_comparison(Path(output), found, gaps, command)
-    scale = _scale_of(a) or _scale_of(b)
-    return _text(found, gaps, scale, related=_home(a) == _home(b))
+    runs = [run_of(Path(one)) for one in (a, b)]
+    scales = [None if run is None else run.config.detector.scale_mas for run in runs]
+    homes = [
+        Path(one).resolve() if run is None else run.path.resolve()
+        for one, run in zip((a, b), runs, strict=True)
+    ]
+    return _text(found, gaps, scales[0] or scales[1], related=homes[0] == homes[1])
 
 
 def _read(
@@ -160,20 +164,6 @@ def _read(
         for path, one, size in zip(paths, filters, sizes, strict=True)
     )
     return a, b
-
-
-def _home(path: str | Path) -> Path:
-    """The run that a file belongs to, or the file."""
-    path = Path(path).resolve()
-    return path.parent if (path.parent / "run.json").exists() else path
-
-
-def _scale_of(path: str | Path) -> float | None:
-    """Size of a pixel in mas, as a run was told it."""
-    home = _home(path)
-    if not (home / "run.json").exists():
-        return None
-    return RunDirectory(home).config.detector.scale_mas
 
 
 def _common(both: tuple[Calibration, Calibration], chip: int | None) -> list[tuple[int, int]]:

@@ -37,11 +37,10 @@ def campaign_lines(inputs: Inputs) -> Iterator[str]:
     yield f"model        order {config.model.order}, chips {chips}, tables: {config.tables.method}"
     for number, names in _without(inputs).items():
         yield f"chip {number}       no detections that pass the cuts in {', '.join(names)}"
-    for text in [
-        *input_warnings(inputs),
-        *_unknown_rolls(rolls),
-        *shear_warnings(rolls, "PA_V3"),
-    ]:
+    warnings, unknown = input_warnings(inputs), np.count_nonzero(np.isnan(rolls))
+    if 0 < unknown < len(rolls):
+        warnings.append(f"PA_V3 is missing of {unknown} of {len(rolls)} exposures")
+    for text in (*warnings, *shear_warnings(rolls, "PA_V3")):
         yield f"WARNING      {text[0].upper() + text[1:]}"
 
 
@@ -50,14 +49,6 @@ def _rolls(rolls: np.ndarray) -> str:
     if not len(known):
         return "not known; roll angles will be those of the matches"
     return f"{known.min():.1f} to {known.max():.1f} degrees"
-
-
-def _unknown_rolls(rolls: np.ndarray) -> list[str]:
-    """Warning of exposures without a roll angle where others have one."""
-    unknown = np.count_nonzero(np.isnan(rolls))
-    if unknown in (0, len(rolls)):
-        return []
-    return [f"PA_V3 is missing of {unknown} of {len(rolls)} exposures"]
 
 
 def _without(inputs: Inputs) -> dict[int, list[str]]:
