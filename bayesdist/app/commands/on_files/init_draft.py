@@ -135,16 +135,11 @@ def _of_star_list(
     matches: str | Path, relative: str, columns: dict[str, str], size: tuple[int, int] | None
 ) -> str:
     """Text of a self-calibration, with the size of the chips by the detections."""
-    reach: dict[int, tuple[float, float]] = {}
-    for one in read_star_lists(matches, columns or None):
-        for number in one.chips:
-            x, y = reach.get(number, (0.0, 0.0))
-            rows = one.chip == number
-            reach[number] = (max(x, float(one.x[rows].max())), max(y, float(one.y[rows].max())))
-    detector = detector_lines(dict(sorted(reach.items())), {}, size, input_files(matches)[0].stem)
+    pixels = ((one.x, one.y, one.chip) for one in read_star_lists(matches, columns or None))
+    detector, _ = detector_lines(pixels, {}, size, input_files(matches)[0].stem)
     inline = ", ".join(f"{key} = {quoted(name)}" for key, name in columns.items())
     return _STAR_LIST.format(
         relative=relative,
         columns=f"columns = {{{inline}}}\n" if columns else "",
-        detector=detector.text,
+        detector=detector,
     )
