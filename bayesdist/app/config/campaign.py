@@ -16,9 +16,8 @@ from bayesdist.app.config.fit import (
     Sampler,
 )
 from bayesdist.app.config.model import CampaignModel, PriorBlock, TablesBlock
-from bayesdist.app.config.other_runs import FREE, rates_file, tables_file
 from bayesdist.app.config.products import CampaignProducts
-from bayesdist.app.config.run import RunConfig
+from bayesdist.app.config.run import FREE, RunConfig, rates_file, tables_file
 from bayesdist.app.config.section import Epoch, Section, Unit
 
 

@@ -26,9 +26,8 @@ from bayesdist.app.config.model import (
     PriorCalibrationBlock,
     TablesBlock,
 )
-from bayesdist.app.config.other_runs import calibration_file
 from bayesdist.app.config.products import MatchedProducts
-from bayesdist.app.config.run import RunConfig
+from bayesdist.app.config.run import RunConfig, calibration_file
 from bayesdist.app.config.section import Epoch, RightAscensionDeclination, Section, Unit
 from bayesdist.data import FORMATS
 from bayesdist.data.formats.files import mission_formats

@@ -24,7 +24,6 @@ from bayesdist.app.config.fit import (
     SelfcalSampler,
 )
 from bayesdist.app.config.model import CampaignModel, MatchedModel, SelfcalModel
-from bayesdist.app.config.other_runs import FREE
 from bayesdist.app.config.products import Products
 from bayesdist.app.config.section import (
     ChipBlock,
@@ -38,9 +37,13 @@ from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.terms.given import said_by_user
 from bayesdist.assess.terms.parameters import one_size_term
+from bayesdist.errors import InputError
 from bayesdist.infer import Compute, OutlierMixture
 from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, TimeDependence
+
+FREE = "free"  # rates that no other run says anything of
+TABLES, POSTERIOR = "tables.h5", "posterior.nc"
 
 
 class RunConfig(Section):
@@ -180,3 +183,31 @@ class RunConfig(Section):
     def requirements(self) -> tuple[Requirement, ...]:
         """The requirements."""
         return tuple(Requirement(**r.model_dump()) for r in self.requirement)
+
+
+# -- files of other runs that a configuration goes by ----------------------------------------------
+
+
+def tables_file(path: Path) -> Path:
+    """File of a detector's tables: a D2IMFILE as it is named, or that of a run."""
+    return path if path.is_file() else _file_of_run(path, TABLES, "tables.detector")
+
+
+def rates_file(folder: Path) -> Path:
+    """File of the posterior of a run whose drift is taken over."""
+    return _file_of_run(folder, POSTERIOR, "model.tdd.rates")
+
+
+def calibration_file(path: Path) -> Path:
+    """File of an earlier calibration: one of any format as it is named, or a run's posterior."""
+    return path if path.is_file() else _file_of_run(path, POSTERIOR, "prior_calibration.source")
+
+
+def _file_of_run(folder: Path, name: str, key: str) -> Path:
+    if not (folder / name).exists():
+        raise InputError(
+            f"has no {name}" if folder.is_dir() else "is not there",
+            where=str(folder),
+            do=f"name a finished run in {key}",
+        )
+    return folder / name

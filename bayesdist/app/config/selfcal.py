@@ -12,9 +12,8 @@ from bayesdist.app.config.campaign import StarListsBlock
 from bayesdist.app.config.data import names_nominal
 from bayesdist.app.config.fit import ComputeBlock, Fit, SelfcalOutliers, SelfcalSampler
 from bayesdist.app.config.model import PriorBlock, SelfcalModel, TablesBlock
-from bayesdist.app.config.other_runs import POSTERIOR
 from bayesdist.app.config.products import SelfcalProducts
-from bayesdist.app.config.run import RunConfig
+from bayesdist.app.config.run import POSTERIOR, RunConfig
 from bayesdist.app.config.section import Epoch, Section, Unit
 from bayesdist.infer import OutlierMixture
 

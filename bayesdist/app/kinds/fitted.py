@@ -18,7 +18,7 @@ from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.errors import InputError
-from bayesdist.infer import GaussianPriors, LinearFit, load_fit, save_fit
+from bayesdist.infer import GaussianPriors, LinearFit, Posterior, load_fit, load_posterior, save_fit
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.nodes import corrected_matches, inside_chips, on_the_chips
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
@@ -158,6 +158,18 @@ def _read_parts(folder: Path) -> dict[str, Any]:
     with restoring(folder / PARTS, "what a fit rests on", do=FIT_AGAIN):
         found = record_from_arrays(arrays, dict)
         return {name: found[name] for name in RESTS_ON}
+
+
+def converged_posterior(path: Path, use: str) -> Posterior:
+    """The posterior of another run that this one goes by; `use` is for what, as a clause."""
+    posterior: Posterior = load_posterior(path)
+    if not posterior.convergence.converged:
+        raise InputError(
+            f"the run has not converged ({'; '.join(posterior.convergence.reasons)})",
+            where=str(path.parent),
+            do=f"resume it with more steps before {use}",
+        )
+    return posterior
 
 
 def required(part: T | None, what: str) -> T:

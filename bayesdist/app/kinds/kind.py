@@ -12,8 +12,7 @@ from bayesdist.app.kinds.campaign.fit import fit_campaign
 from bayesdist.app.kinds.campaign.input_validation import refuse_campaign
 from bayesdist.app.kinds.campaign.inputs import read_campaign
 from bayesdist.app.kinds.campaign.matched import load_matched_campaign
-from bayesdist.app.kinds.campaign.matching import match_lists
-from bayesdist.app.kinds.campaign.preview import campaign_lines
+from bayesdist.app.kinds.campaign.matching import campaign_lines, match_lists
 from bayesdist.app.kinds.fit_data import StarReader
 from bayesdist.app.kinds.fitted import Fitted, load_fitted
 from bayesdist.app.kinds.matched import Matched

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from bayesdist.app.config import Config
 from bayesdist.app.config.model import TablesBlock
-from bayesdist.app.config.other_runs import TABLES, rates_file, tables_file
+from bayesdist.app.config.run import TABLES, rates_file, tables_file
 from bayesdist.app.kinds.campaign.linear_terms import with_gap
-from bayesdist.app.kinds.fitted import read_tables
+from bayesdist.app.kinds.fitted import converged_posterior, read_tables
 from bayesdist.errors import InputError
-from bayesdist.infer import GaussianPriors, Posterior, load_posterior
+from bayesdist.infer import GaussianPriors
 from bayesdist.infer.exposures.shared_drift import drift_priors
 from bayesdist.model import Chip, DistortionModel, LookupTable
 from bayesdist.products import read_d2im
@@ -48,13 +48,7 @@ def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianP
     if tdd is None or config.has_free_rates:
         return None
     path = rates_file(base / tdd.rates)
-    posterior: Posterior = load_posterior(path)
-    if not posterior.convergence.converged:
-        raise InputError(
-            f"the run has not converged ({'; '.join(posterior.convergence.reasons)})",
-            where=str(path.parent),
-            do="resume it with more steps before its rates are used",
-        )
+    posterior = converged_posterior(path, "its rates are used")
     try:
         named = drift_priors(posterior, model, chip=chip)
     except InputError as error:

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.app.config import Config, MatchesConfig
-from bayesdist.app.config.other_runs import POSTERIOR, calibration_file
+from bayesdist.app.config.run import POSTERIOR, calibration_file
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.app.kinds.fit_data import FitData, StarReader
-from bayesdist.app.kinds.fitted import FIT, Fitted
+from bayesdist.app.kinds.fitted import FIT, Fitted, converged_posterior
 from bayesdist.app.kinds.matched import Matched, set_aside
 from bayesdist.app.kinds.matches.added_errors import compared_errors, knows_circle
 from bayesdist.app.kinds.matches.plausibility import doubts_on_stars, refuse_empty_segments
@@ -27,7 +27,7 @@ from bayesdist.calibration.prior import CalibrationPrior, prior_of_calibration
 from bayesdist.data import Matches
 from bayesdist.diagnose.residuals.quoted import error_scale
 from bayesdist.diagnose.residuals.sample import SAMPLE
-from bayesdist.errors import ConfigError, DegenerateError, InputError, NotSettledError
+from bayesdist.errors import ConfigError, DegenerateError, NotSettledError
 from bayesdist.infer import (
     GaussianPriors,
     LinearFit,
@@ -37,7 +37,6 @@ from bayesdist.infer import (
     fit_by_magnitude,
     fit_linear,
     load_fit,
-    load_posterior,
     sample,
 )
 from bayesdist.infer.exposures.frame_choice import frames_that_help
@@ -227,13 +226,7 @@ def _calibration(path: Path, filter: str | None) -> Calibration:
         return read_calibration(path, filter=filter)
     if path.name == FIT:
         return calibration_of(load_fit(path), str(path))
-    posterior: Posterior = load_posterior(path)
-    if not posterior.convergence.converged:
-        raise InputError(
-            f"the run has not converged ({'; '.join(posterior.convergence.reasons)})",
-            where=str(path.parent),
-            do="resume it with more steps before it is a prior",
-        )
+    posterior = converged_posterior(path, "it is a prior")
     folder = path.parent
     if path.name == POSTERIOR and (folder / "run.json").exists():
         run = RunDirectory(folder)
