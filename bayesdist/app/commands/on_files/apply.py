@@ -84,7 +84,9 @@ def apply_to_table(
         at, lines = _back(a, found, x, y, chips, method, order, epoch)
         added = ("x", "y")
     else:
-        at, added = _forth(a, x, y, chip_numbers(rows, chip, list(chips_of), *what)), OUT
+        chips = chip_numbers(rows, chip, list(chips_of), *what)
+        parts = {n: (chips == n, a.forward(x[chips == n], y[chips == n], chip=n)) for n in a.chips}
+        at, added = _gathered(parts, x.size), OUT
         lines = _frame_lines(a, source)
     add_positions(rows, at, added, str(table))
     rows.meta = {"calibration": found.name, "scale": pixel, "unit": found.unit}
@@ -92,12 +94,6 @@ def apply_to_table(
     write_positions(rows, output)
     head = head_line(output, f"{at.x.size} positions", found, epoch)
     return "\n".join([head, *lines, *_losses(a, at, x, y, inverse)])
-
-
-def _forth(a: Application, x: Float, y: Float, chips: Int) -> Positions:
-    return _gathered(
-        {n: (chips == n, a.forward(x[chips == n], y[chips == n], chip=n)) for n in a.chips}, x.size
-    )
 
 
 def _back(

@@ -94,7 +94,9 @@ def draft_of(
         wanted = ", ".join(f'{key} = ""' for key in lacking)
         text = head + _WITHOUT_PIXELS.format(relative=relative, wanted=wanted)
         return text, f"an incomplete draft with the candidates: no columns are known as {words}"
-    text = head + _of_star_list(matches, relative, _named(layout, columns), size)
+    taken = {} if layout is None else layout.taken
+    named = {key: taken[key] for key in _LIST_KEYS if key in taken} | dict(columns or {})
+    text = head + _of_star_list(matches, relative, named, size)
     parse_config(text, str(path))
     return text, (
         "an incomplete draft: no columns are known as reference positions; as it stands it is a "
@@ -123,12 +125,6 @@ def _candidates(path: Path, matches: str | Path, layout: TableLayout) -> str:
         wanted=",".join(f"{key}=NAME" for key in keys),
         candidates=", ".join(listed) or "none",
     )
-
-
-def _named(layout: TableLayout | None, columns: Mapping[str, str] | None) -> dict[str, str]:
-    """Columns of a star list: those of the layout, and those that the user names."""
-    taken = {} if layout is None else layout.taken
-    return {key: taken[key] for key in _LIST_KEYS if key in taken} | dict(columns or {})
 
 
 def _of_star_list(

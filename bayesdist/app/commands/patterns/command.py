@@ -74,7 +74,8 @@ def _text(found: Sequence[PlannedPattern], config: PlanConfig) -> str:
     ]
     for one in found:
         lines += ["", f"{one.pattern.name}:"]
-        lines += [f"  {sentence}" for sentence in _sentences(one)]
+        said = (*lacking(one), *one.solution.gauge.sentences, nearly_free(one))
+        lines += [f"  {sentence}" for sentence in said if sentence]
     best, mas = found[0], config.detector.scale_mas
     rms, largest = best.rms("shape"), best.largest("shape")
     if np.isfinite(rms):
@@ -84,12 +85,6 @@ def _text(found: Sequence[PlannedPattern], config: PlanConfig) -> str:
         verdict = "and yet nothing bounds the shape, for want of rolls and of commanded offsets"
     lines += ["", f"Best: {best.pattern.name}, {verdict}"]
     return "\n".join(lines)
-
-
-def _sentences(one: PlannedPattern) -> list[str]:
-    said = [*lacking(one), *one.solution.gauge.sentences]
-    combinations = nearly_free(one)
-    return said + ([combinations] if combinations else [])
 
 
 def _write(output: Path, found: Sequence[PlannedPattern], config: PlanConfig, command: str) -> None:

@@ -57,7 +57,10 @@ def _fitted(matched: CampaignMatched) -> Fitted:
     facts = {
         **line_sections(joint, number),
         "tables": tables_section(config, tables),
-        "scatter": {name: _scatter(joint, name) for name in joint.tau},
+        "scatter": {
+            name: {"value": tau, "interval_68": list(joint.tau_interval(0.68)[name])}
+            for name, tau in joint.tau.items()
+        },
         "deviations": {"warnings": _trends(joint, stars)},
         "exposures_skipped": dict(alone.skipped),
         "exposures_outlying": list(joint.outlying),
@@ -124,7 +127,3 @@ def _trends(joint: HierarchicalFit, stars: Matches) -> list[str]:
         for kind, one in zip(joint.scatter.kinds, p, strict=True)
         if kind.split(".")[-1] not in RIGID and one * len(p) < TREND.value
     ]
-
-
-def _scatter(joint: HierarchicalFit, name: str) -> dict[str, object]:
-    return {"value": joint.tau[name], "interval_68": list(joint.tau_interval(0.68)[name])}

@@ -94,7 +94,10 @@ def fit_stars(
         with closing(StarReader(config.resources())) as reader:
             return fit_stars(matched, config, base, reader=reader)
     model = model_of(matched.stars, config)
-    _refuse_implausible(matched.stars, reader.sample(matched.stars), model, config)
+    doubts_on_stars(reader.sample(matched.stars), model, config)  # refuses what cannot be meant
+    if matched.stars.in_memory and matched.stars.epoch is not None:
+        # a sample may have none of a short segment
+        refuse_empty_segments(matched.stars.epoch, model.time)
     earlier = earlier_calibration(model, config, base)
     try:
         return _fitted(matched.stars, model, config, reader, earlier)
@@ -103,15 +106,6 @@ def fit_stars(
         if better is None:
             raise
         raise type(error)(error.cause, where=error.where, do=better.sentence) from error
-
-
-def _refuse_implausible(
-    stars: Matches, some: Matches, model: DistortionModel, config: Config
-) -> None:
-    """Refuse what cannot be meant; `some` are a sample of the stars."""
-    doubts_on_stars(some, model, config)
-    if stars.in_memory and stars.epoch is not None:  # a sample may have none of a short segment
-        refuse_empty_segments(stars.epoch, model.time)
 
 
 def _fitted(
