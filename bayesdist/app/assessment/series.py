@@ -40,10 +40,7 @@ def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> No
     outlying = [
         name for name, p in zip(series.names, posterior.outlier_probability, strict=True) if p > 0.5
     ]
-    verdicts = []
-    for term in series.coefficients:  # which trend each takes, by held-out exposures
-        verdict = describe(series.only(term), breaks=time.breaks, seed=seed)
-        verdicts.append({"term": term, "claim": verdict.claim, "text": verdict.text})
+    verdicts = [_verdict(series, k, time.breaks, seed) for k in range(len(series.coefficients))]
     scatter = posterior.scatter_sigma.mean(axis=0).tolist()
     run.summarise(
         time_dependence={
@@ -68,6 +65,12 @@ def _disagreements(known: Sequence[str], outlying: Sequence[str]) -> Iterator[st
             f"{', '.join(missed)}, each fitted alone, {'lie' if len(missed) > 1 else 'lies'} off "
             "the trend of the others, and the joint fit counts them as scatter"
         )
+
+
+def _verdict(series: Series, k: int, breaks: tuple[float, ...], seed: int) -> dict[str, object]:
+    """Which trend one term takes, by held-out exposures."""
+    verdict = describe(series.only(series.coefficients[k]), breaks=breaks, seed=seed)
+    return {"term": series.coefficients[k], "claim": verdict.claim, "text": verdict.text}
 
 
 def _lines(posterior: SeriesPosterior) -> list[dict[str, object]]:
