@@ -87,7 +87,7 @@ def command(
         "--quiet",
         is_flag=True,
         expose_value=False,
-        callback=lambda ctx, param, quiet: start_logging(-1 if quiet else 0),
+        callback=lambda ctx, param, quiet: start_logging(quiet=quiet),
         help="Print only warnings and errors.",
     )
 
