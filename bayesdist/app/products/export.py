@@ -56,13 +56,12 @@ def export_files(
             findings = [f"{f.level}: {f.where}: {f.message}" for f in lint(path)]
             if built.chip is not None:
                 entry["chip"] = built.chip
-                sky = None
+                closure = None
                 if stars is not None and built.kind == "SIP":
-                    sky = sky_closure(product, stars, path, built.chip)
-                if sky is not None:
-                    entry["sky"] = sky.summary
-                    log.log(sky.level, "export: %s: %s", path.name, sky.sentence)
-                    findings += sky.findings
+                    closure = sky_closure(product, stars, path, built.chip)
+                if closure is not None:
+                    entry["sky"], faults = closure
+                    findings += faults
             for warning in (*built.warnings, *left_out):
                 log.warning("export: WARNING: %s: %s", path.name, warning)
                 findings.append(f"warning: {warning}")

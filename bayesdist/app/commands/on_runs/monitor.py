@@ -10,7 +10,7 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.commands.on_runs.compare import joined
-from bayesdist.app.commands.on_runs.new_exposures import fit_exposures_of, read_new_exposures
+from bayesdist.app.commands.on_runs.new_exposures import fit_new_exposures
 from bayesdist.app.config import Config, load_config
 from bayesdist.app.kinds.fitted import load_errors
 from bayesdist.app.kinds.matches.sources import read_configured
@@ -91,9 +91,7 @@ def _fitted(
     """Release, new matches and their fit, and the exposures that the release has seen."""
     if config.campaign is not None:
         release = results_of(run)
-        exposures = read_new_exposures(run, release.solution, release.fitted, new)
-        found = fit_exposures_of(release.data, config, exposures)
-        return exposures.released, exposures.matches, found, exposures.left_out
+        return release.solution, *fit_new_exposures(release, new)
     posterior = results_of(run).solution
     matches = _new_matches(run, config, new)
     found = fit_new(
