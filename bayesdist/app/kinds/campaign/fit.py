@@ -43,10 +43,10 @@ def fit_campaign(matched: CampaignMatched) -> Fitted:
 
 def _fitted(matched: CampaignMatched) -> Fitted:
     inputs, config, affine = matched.inputs, matched.inputs.config, matched.affine_model
-    tables = fit_tables(matched)
+    tables, fit_of_tables = fit_tables(matched)
     pairs = matched.stars
-    if tables.stored.tables:
-        pairs = on_the_chips(corrected_matches(tables.stored.tables, pairs), affine)
+    if tables.tables:
+        pairs = on_the_chips(corrected_matches(tables.tables, pairs), affine)
     _, _, total = scatter_by_magnitude(pairs, affine, inputs)
     errors = ErrorLaw(by_magnitude=centroid_errors(pairs, total), with_catalogue=True)
     stars = errors.applied(pairs)
@@ -56,7 +56,7 @@ def _fitted(matched: CampaignMatched) -> Fitted:
     alone = fit_exposures(stars, affine, chip=number, rejection=rejection)
     facts = {
         **line_sections(joint, number),
-        "tables": tables_section(config, tables),
+        "tables": tables_section(config, tables, fit_of_tables),
         "scatter": {
             name: {"value": tau, "interval_68": list(joint.tau_interval(0.68)[name])}
             for name, tau in joint.tau.items()
@@ -69,7 +69,7 @@ def _fitted(matched: CampaignMatched) -> Fitted:
         joint.fit,
         errors,
         joint.priors,
-        tables=tables.stored,
+        tables=tables,
         scatter=ExposureScatter(joint.scatter.kinds, joint.tau_draws, joint.settling),
         alone=_series(alone, joint.model.chips[0]),
         facts=facts,
