@@ -30,14 +30,13 @@ from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData, StarReader
 from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matched import Matched
-from bayesdist.app.products.export import export_files
-from bayesdist.app.products.made_files import product_input, product_of, solution_of
+from bayesdist.app.products.export import export
+from bayesdist.app.products.made_files import product_input, solution_of
 from bayesdist.app.products.product_terms import file_errors
 from bayesdist.app.report import report
 from bayesdist.assess import evaluation as assessed
 from bayesdist.assess.error_model import ErrorModel
 from bayesdist.diagnose.diagnostics import Diagnostics
-from bayesdist.diagnose.residuals.sample import star_sample
 from bayesdist.infer import Posterior
 
 __all__ = [
@@ -121,38 +120,4 @@ def evaluate(
         checks=run_checks(data, posterior, found, config, series),
         files=file_errors(product, config, base),
         null=None if data.fitted.solved is None else data.fitted.solved.gauge.null,
-    )
-
-
-def export(
-    evaluation: assessed.Evaluation | None,
-    posterior: Posterior,
-    found: Diagnostics | None,
-    data: FitData,
-    config: Config,
-    base: Path,
-    folder: Path,
-    *,
-    source: str = "",
-) -> list[dict[str, Any]]:
-    """Write the files that a configuration asks for, and list what is known of each.
-
-    `evaluation`: with whose budget the errors of the files are compared. `found`: whose errors of
-    the parameters the files have, too.
-    """
-    product = product_of(posterior, found, data, config, source)
-    stars = None
-    if product.tangent_point is not None and config.products.asked():
-        if found is not None:
-            stars = found.sample
-        else:
-            stars = star_sample(data.sample, len(data.stars), data.fit, posterior)
-    return export_files(
-        product,
-        data.fitted,
-        config,
-        base,
-        folder,
-        stars=stars,
-        budget=() if evaluation is None else evaluation.budget.rows(),
     )
