@@ -29,8 +29,8 @@ CORE = {
     "run": f"{COMMANDS}.runs:run",
     "stage": f"{COMMANDS}.runs:stage",
     "report": f"{COMMANDS}.runs:report",
-    "requirements": f"{COMMANDS}.requirements:requirements",
-    "budget": f"{COMMANDS}.requirements:budget",
+    "requirements": f"{COMMANDS}.runs:requirements",
+    "budget": f"{COMMANDS}.runs:budget",
     "plan": f"{COMMANDS}.planning:plan",
     "plan-dither": f"{COMMANDS}.planning:plan_dither",
     "select-order": f"{COMMANDS}.planning:select_order",
@@ -104,12 +104,7 @@ bayesdist = click.version_option(__version__, message="bayesdist %(version)s")(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command.
-
-    `arguments`: in place of those of the process. Result: 0 good; 1 bad input; 2 usage; 3 not
-    converged under --strict; 4 requirement missed; 65 nested too deep; 70 a defect; 71 too little
-    memory; 74 refused by the system; 130 interrupted.
-    """
+    """Run a command."""
     open_streams()
     gc.set_threshold(*SELDOM)
     for name in ALGEBRA:

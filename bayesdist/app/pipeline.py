@@ -30,14 +30,13 @@ from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData, StarReader
 from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matched import Matched
-from bayesdist.app.products.export import export_files
-from bayesdist.app.products.made_files import product_input, product_of, solution_of
+from bayesdist.app.products.export import export
+from bayesdist.app.products.made_files import product_input, solution_of
 from bayesdist.app.products.product_terms import file_errors
 from bayesdist.app.report import report
 from bayesdist.assess import evaluation as assessed
 from bayesdist.assess.error_model import ErrorModel
 from bayesdist.diagnose.diagnostics import Diagnostics
-from bayesdist.diagnose.residuals.sample import star_sample
 from bayesdist.infer import Posterior
 
 __all__ = [
@@ -56,8 +55,7 @@ __all__ = [
 def read(config: Config, base: Path) -> Any:
     """All that a run begins with: matched stars, or star lists with what goes with them.
 
-    `base`: folder that its files are relative to. BayesdistError for files that cannot be read or
-    do not go together.
+    `base`: folder that its files are relative to.
     """
     kind = kind_of(config)
     inputs = kind.read(config, base)
@@ -73,8 +71,7 @@ def match(inputs: Any, config: Config) -> Matched:
 def fit(matched: Matched, config: Config, base: Path, reader: StarReader | None = None) -> FitData:
     """The least-squares solution with its stars.
 
-    `config`, `base`: as of `read`. `reader`: that has read the stars before. BayesdistError for
-    parameters that the stars do not determine.
+    `reader`: that has read the stars before.
     """
     reader = reader or StarReader(config.resources())
     return FitData(matched, kind_of(config).fit(matched, config, base, reader), reader)
@@ -89,14 +86,7 @@ def sample(
 ) -> Posterior:
     """The posterior of a fit.
 
-    Parameters
-    ----------
-    data : FitData
-    config : Config
-    folder : Path, optional
-        For checkpoints.
-    progress : callable, optional
-        Called with (steps made, most steps).
+    `folder`: for checkpoints. `progress`: called with (steps made, most steps).
     """
     return kind_of(config).sample(data, config, folder=folder, progress=progress)
 
@@ -114,18 +104,8 @@ def evaluate(
 ) -> assessed.Evaluation:
     """Maps, budget, margins and validity periods.
 
-    Parameters
-    ----------
-    errors : ErrorModel
-    posterior : Posterior
-    found : Diagnostics
-    data : FitData
-    config, base
-        As of `read`.
-    source : str
-        Where the solution is from, by default the detector.
-    series : mapping, optional
-        How linear terms went with time, as summary.json has it.
+    `source`: where the solution is from, by default the detector. `series`: how linear terms went
+    with time, as summary.json has it.
     """
     solution = solution_of(posterior, found, data.fitted)
     product = product_input(solution, data, config, source)
@@ -140,39 +120,4 @@ def evaluate(
         checks=run_checks(data, posterior, found, config, series),
         files=file_errors(product, config, base),
         null=None if data.fitted.solved is None else data.fitted.solved.gauge.null,
-    )
-
-
-def export(
-    evaluation: assessed.Evaluation | None,
-    posterior: Posterior,
-    found: Diagnostics | None,
-    data: FitData,
-    config: Config,
-    base: Path,
-    folder: Path,
-    *,
-    source: str = "",
-) -> list[dict[str, Any]]:
-    """Write the files that a configuration asks for, and list what is known of each.
-
-    `evaluation`: with whose budget the errors of the files are compared. `found`: whose errors of
-    the parameters the files have, too. `config`, `base`: as of `read`. `folder`: where the files
-    are written. `source`: as of `evaluate`.
-    """
-    product = product_of(posterior, found, data, config, source)
-    stars = None
-    if product.tangent_point is not None and config.products.asked():
-        if found is not None:
-            stars = found.sample
-        else:
-            stars = star_sample(data.sample, len(data.stars), data.fit, posterior)
-    return export_files(
-        product,
-        data.fitted,
-        config,
-        base,
-        folder,
-        stars=stars,
-        budget=() if evaluation is None else evaluation.budget.rows(),
     )

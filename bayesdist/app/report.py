@@ -34,10 +34,7 @@ VECTOR_GRID = 17  # vectors along the longer side of a diagram: more would hide 
 
 
 def report(results: Results, *, pdf: bool = False) -> list[str]:
-    """Names of the figures of a report, which is written into the folder of the run.
-
-    `pdf`: whether figures are drawn as PDF, too.
-    """
+    """Names of the figures of a report, which is written into the folder of the run."""
     # figures take seconds to import
     from bayesdist.report.drawing import save_drawings
     from bayesdist.report.run_report import draw_report, write_report
@@ -72,12 +69,7 @@ def report_input(results: Results) -> ReportInput:
         selfcal = selfcal_results(run, fitted, posterior, epoch)
     facts, folder = run.facts, run.path.resolve().name
     products = tuple(
-        Product(
-            path=p["path"],
-            what=p["kind"],
-            checks=_product_checks(p),
-        )
-        for p in run.summary.get("products", [])
+        Product(p["path"], p["kind"], _product_checks(p)) for p in run.summary.get("products", [])
     )
     return ReportInput(
         name=title_of(config) or folder,
@@ -147,8 +139,8 @@ def _chip_results(
 
 
 def _vectors(solution: Posterior, part: str, chip: Chip, epoch: float | None) -> VectorMap:
-    grid = _vector_grid(chip.size)
-    return distortion_vectors(solution, part=part, grid=grid, epoch=epoch, chip=chip.number)
+    nx, ny = (max(3, round(VECTOR_GRID * s / max(chip.size))) for s in chip.size)
+    return distortion_vectors(solution, part=part, grid=(nx, ny), epoch=epoch, chip=chip.number)
 
 
 def _product_checks(product: dict[str, Any]) -> tuple[Check, ...]:
@@ -175,20 +167,10 @@ def _product_checks(product: dict[str, Any]) -> tuple[Check, ...]:
     return tuple(out)
 
 
-def _vector_grid(size: tuple[float, float]) -> tuple[int, int]:
-    longest = max(size)
-    nx, ny = (max(3, round(VECTOR_GRID * s / longest)) for s in size)
-    return nx, ny
-
-
 def selfcal_results(
     run: RunDirectory, fitted: Fitted, posterior: Posterior, epoch: float | None
 ) -> SelfcalResults:
-    """Content that a self-calibration adds to the report of its run.
-
-    `run`: that has been assessed. `posterior`: as it was sampled. `epoch`: of the assessment,
-    decimal years.
-    """
+    """Content that a self-calibration adds to the report of its run."""
     model, theta = fitted.linear.model, posterior.mean
     solved = required(fitted.solved, "solution of detections")
     outlines = []

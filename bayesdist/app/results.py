@@ -32,17 +32,7 @@ from bayesdist.infer import LinearFit, Posterior, load_posterior
 T = TypeVar("T")
 
 # each rests on those before it
-ARTEFACTS = (
-    "inputs",
-    "matched",
-    "fitted",
-    "data",
-    "posterior",
-    "stored",
-    "evaluation",
-    "products",
-    "figures",
-)
+ARTEFACTS = "inputs matched fitted data posterior stored evaluation products figures".split()
 
 
 @dataclass(frozen=True, eq=False)

@@ -139,6 +139,10 @@ def make_stages(
         if name in stages:
             r = run.make(name, made, force=force).value or r
 
+    def fitted() -> Fitted:
+        """The fit, unless the rehearsal has made it."""
+        return r.made.get("fitted") or fit(r.matched, config, base, r.reader).fitted
+
     def evaluated() -> Evaluation:
         posterior, found, data = r.posterior, r.diagnostics, r.data
         errors = error_model(posterior, found, data, config)
@@ -153,18 +157,13 @@ def make_stages(
         )
 
     stage("match", "matched", lambda: match(r.inputs, config), save_matches)
-    stage("fit", "fitted", lambda: _fitted(r), save_fit)
+    stage("fit", "fitted", fitted, save_fit)
     stage("sample", "posterior", lambda: _sampled(r), save_sampled)
     stage("diagnose", "stored", lambda: diagnose(r.posterior, r.data, config, base), save_diagnosed)
     stage("evaluate", "evaluation", evaluated, save_evaluation)
     stage("export", "products", exported, save_products)
     stage("report", "figures", lambda: report(r, pdf=pdf), save_figures)
     return r
-
-
-def _fitted(r: Results) -> Fitted:
-    """The fit, unless the rehearsal has made it."""
-    return r.made.get("fitted") or fit(r.matched, r.config, r.base, r.reader).fitted
 
 
 def _sampled(r: Results) -> Posterior:

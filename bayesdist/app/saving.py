@@ -22,6 +22,7 @@ from bayesdist.app.kinds.matches.plausibility import doubts_on_stars
 from bayesdist.app.kinds.selfcal.stars import write_stars
 from bayesdist.app.rehearsal import rehearse_solution
 from bayesdist.app.results import Results
+from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import provenance_notes, write_table
 from bayesdist.app.store.rundir import part_files
 from bayesdist.app.store.summary import Sampler
@@ -35,7 +36,7 @@ from bayesdist.diagnose.residuals.quoted import majority_sentence
 from bayesdist.files import made_folder, remove_leftovers
 from bayesdist.infer import LinearFit, Posterior, save_posterior
 from bayesdist.infer.posterior.memberships import memberships_of
-from bayesdist.infer.skew import Skew, skew_of
+from bayesdist.infer.skew import skew_of
 from bayesdist.infer.stars.stars import in_table_order, prepare
 
 log = logging.getLogger("bayesdist")
@@ -193,12 +194,7 @@ def fit_sections(fitted: Fitted, stars: Matches, *, skew: bool = False) -> dict[
         },
         "fit": {
             "order": fit.model.order,
-            "chi2": fit.chi2,
-            "dof": fit.dof,
-            "rms_u": fit.rms_u,
-            "rms_v": fit.rms_v,
-            "unit": fit.unit,
-            "condition": fit.condition,
+            **attributes(fit, "chi2 dof rms_u rms_v unit condition"),
             "n_parameters": fit.model.n_params,
             **optional,
         },
@@ -222,20 +218,13 @@ def log_fit(fit: LinearFit, rows: str) -> None:
 
 def _skew(fit: LinearFit) -> Mapping[str, Any]:
     """Skew of the first chip and, where there are several, of each."""
+    found = {chip.number: skew_of(fit, chip=chip.number) for chip in fit.model.chips}
     rows = [
-        {"chip": chip.number, **_skew_row(skew_of(fit, chip=chip.number))}
-        for chip in fit.model.chips
+        {"value_rad": one.value, "sigma_rad": one.sigma, "significance": one.significance}
+        for one in found.values()
     ]
-    first = {key: value for key, value in rows[0].items() if key != "chip"}
-    return first | ({"chips": rows} if len(rows) > 1 else {})
-
-
-def _skew_row(skew: Skew) -> dict[str, float]:
-    return {
-        "value_rad": skew.value,
-        "sigma_rad": skew.sigma,
-        "significance": skew.significance,
-    }
+    each = [{"chip": number} | row for number, row in zip(found, rows, strict=True)]
+    return rows[0] | ({"chips": each} if len(rows) > 1 else {})
 
 
 def sample_sections(posterior: Posterior, *, in_circle: bool) -> dict[str, Any]:

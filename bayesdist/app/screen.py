@@ -34,15 +34,15 @@ def open_streams() -> None:
             setattr(sys, name, stream)
 
 
-def start_logging(verbosity: int = 0) -> None:
-    """Send the package's log to stderr: nobody else's logging is touched."""
+def start_logging(*, quiet: bool) -> None:
+    """Send the package's log to stderr, warnings alone where it is quiet."""
     log.setLevel(logging.INFO)
     log.propagate = False
     for handler in list(log.handlers):
         log.removeHandler(handler)
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("%(message)s"))
-    handler.setLevel({-1: logging.WARNING}.get(verbosity, logging.INFO))
+    handler.setLevel(logging.WARNING if quiet else logging.INFO)
     log.addHandler(handler)
 
 

@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-from bayesdist.report.context import ReportInput
 from bayesdist.report.registry import Registry, Section
-
-
-def _fit_title(r: ReportInput) -> str:
-    return "Least-squares fit" if r.selfcal is None else r.words.fit.capitalize()
-
 
 REPORT = Registry(
     "report",
@@ -28,7 +22,10 @@ REPORT = Registry(
             printed=False,  # the products have their files
         ),
         Section("selfcal", "Gauge and stars"),
-        Section("fit", _fit_title),
+        Section(
+            "fit",
+            lambda r: "Least-squares fit" if r.selfcal is None else r.words.fit.capitalize(),
+        ),
         Section("residuals", "Residuals"),
         Section(
             "outliers",

@@ -222,10 +222,7 @@ def _svg(figure: Figure, box: Bbox) -> bytes:
 
 
 def save_figures(figures: Mapping[str, Figure], folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Paths of figures, drawn and written as PNG files to a folder, which is made if need be.
-
-    InputError when the folder cannot be made or a file cannot be written.
-    """
+    """Paths of figures, drawn and written as PNG files to a folder, which is made if need be."""
     images = {f"{name}.png": png_of(figure) for name, figure in figures.items()}
     return _saved(images, made_folder(folder))
 
@@ -233,10 +230,7 @@ def save_figures(figures: Mapping[str, Figure], folder: str | os.PathLike[str]) 
 def save_drawings(
     drawings: Mapping[str, Drawing], folder: str | os.PathLike[str]
 ) -> tuple[Path, ...]:
-    """Paths of figures, written as they were drawn to a folder, which is made if need be.
-
-    InputError when the folder cannot be made or a file cannot be written.
-    """
+    """Paths of figures, written as they were drawn to a folder, which is made if need be."""
     files = {f"{name}.{one.kind}": one.file for name, one in drawings.items()}
     files |= {f"{name}.pdf": one.pdf for name, one in drawings.items() if one.pdf}
     return _saved(files, made_folder(folder))

@@ -74,17 +74,12 @@ HEADS = (
 )
 
 
-def _badness(row: OverviewRow) -> tuple[int, float]:
-    """Level, and among equal levels the worst margin; runs without one last."""
-    return row.key, math.inf if row.worst_margin is None else row.worst_margin
-
-
 def write_overview(path: str | os.PathLike[str], rows: Sequence[OverviewRow]) -> list[OverviewRow]:
-    """Rows as the page shows them, the worst runs first, once it is written.
-
-    InputError when the file cannot be written.
-    """
-    ordered = sorted(rows, key=_badness)
+    """Rows as the page shows them, the worst runs first, once it is written."""
+    never = math.inf  # runs without a margin last
+    ordered = sorted(
+        rows, key=lambda row: (row.key, never if row.worst_margin is None else row.worst_margin)
+    )
     text = template("overview.html.jinja").render(rows=ordered, heads=HEADS)
     with atomic_path(Path(path)) as temporary:
         temporary.write_text(text, encoding="utf-8")

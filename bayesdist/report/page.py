@@ -125,7 +125,8 @@ def template(name: str, package: str = REPORT) -> jinja2.Template:
     )
     environment.filters["md"] = _markdown
     environment.filters["css"] = _css
-    environment.filters["base64"] = _base64
+    # letters and digits that can end no attribute
+    environment.filters["base64"] = lambda text: base64.b64encode(text.encode()).decode("ascii")
     environment.globals["explanation_of"] = explanation_of
     environment.globals["policy"] = _policy
     environment.globals["section_of"] = section_of
@@ -188,11 +189,6 @@ def _widths(parts: Iterable[Part]) -> list[int]:
     for part in parts:
         found.update((picture.hundredths for picture in part.pictures), _widths(part.parts))
     return sorted(found)
-
-
-def _base64(value: str) -> str:
-    """Text for the address of data: letters and digits that can end no attribute."""
-    return base64.b64encode(value.encode("utf-8")).decode("ascii")
 
 
 def _css(value: object) -> Markup:

@@ -24,7 +24,7 @@ def run_checks(
     posterior: Posterior | None,
     found: Diagnostics,
     config: Config,
-    series: Mapping[str, Any] | None = None,
+    series: Mapping[str, Any] | None,
 ) -> tuple[Check, ...]:
     """Checks of a run that has been sampled, or of a fit alone, beside those of its diagnostics.
 

@@ -36,12 +36,16 @@ def predictive_of_run(
     """
     scatter = data.fitted.scatter
     if scatter is not None:
+        cell, tables = None, data.fitted.tables.tables
+        if tables:
+            across, up = tables[0].step
+            cell = TOGETHER * across, TOGETHER * up
         return replace(
             predictive_of(with_diagnosed_errors(posterior, found, data.fit)),
             deviations=ExposureDeviations(scatter.kinds, scatter.tau),
             stars=_known_stars(data),
             local=errors.local_tables(settings.grid, settings.epoch),
-            cell=_table_cell(data),
+            cell=cell,
         )
     out = predictive_of(with_diagnosed_errors(posterior, found))
     rows = None if found.correlated is None else found.correlated.facts.get("structure")
@@ -65,29 +69,9 @@ def _known_stars(data: FitData) -> StarInfluence | None:
     return star_influence(data.fit, data.stars, errors, codes)
 
 
-def _table_cell(data: FitData) -> tuple[float, float] | None:
-    """Pixels over which stars share the errors of the tables; None without tables."""
-    tables = data.fitted.tables.tables
-    if not tables:
-        return None
-    across, up = tables[0].step
-    return TOGETHER * across, TOGETHER * up
-
-
 def holdout_table(found: HoldoutValidation) -> Table:
     """All tests, the most telling first."""
-    names = (
-        "name",
-        "part",
-        "is_omnibus",
-        "where",
-        "n",
-        "value",
-        "expected",
-        "p_value",
-        "p_corrected",
-        "limit",
-    )
+    names = "name part is_omnibus where n value expected p_value p_corrected limit".split()
     table = Table({name: [getattr(t, name) for t in found.tests] for name in names})
     table["lo95"], table["hi95"] = np.array([t.interval for t in found.tests]).T
     table["limit"].description = "of tails, in sigma; scatter of deviations"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from astropy.table import Table, vstack
@@ -10,15 +10,15 @@ from astropy.time import Time
 
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.store.keys import attributes
 from bayesdist.assess import convert, pixel_scale_of
 from bayesdist.data import Matches
 from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, bins_for
 from bayesdist.diagnose.residuals.sample import SAMPLE
 from bayesdist.errors import InputError
 
-if TYPE_CHECKING:
-    from bayesdist.diagnose.residuals import PatternChange, StatisticsTable
-    from bayesdist.infer.compare.positions import PositionChange
+# of the largest difference of two models
+POSITION = "largest sigma at chip noise_median noise_95 p_value chi2 dof p_field"
 
 
 def check_pairs(raw: Matches, config: Config) -> dict[str, int]:
@@ -115,81 +115,48 @@ def periods_summary(found: TimeVariation) -> dict[str, Any]:
     """Section 'periods' of summary.json."""
     comparison = found.comparison
     chi2, dof, p = comparison.homogeneity
-    rows = []
-    for name, n in zip(comparison.names, comparison.counts, strict=True):
-        start, stop = found.spans[name]
-        change = comparison.coefficients(name)
-        rows.append(
-            {
-                "name": name,
-                "start": start,
-                "stop": stop,
-                "n_pairs": n,
-                **_position(found.changes[name]),
-                "z_max": float(np.abs(change.z).max()),
-            }
-        )
+    rows = [
+        {
+            "name": name,
+            "start": found.spans[name][0],
+            "stop": found.spans[name][1],
+            "n_pairs": n,
+            **attributes(found.changes[name], POSITION),
+            "z_max": float(np.abs(comparison.coefficients(name).z).max()),
+        }
+        for name, n in zip(comparison.names, comparison.counts, strict=True)
+    ]
+    numbers = [chip.number for chip in comparison.model.chips]
     return {
-        "verdict": found.verdict,
+        **attributes(found, "verdict significant tolerance n_outside n_repeated"),
         "pattern": found.pattern_sentence,
-        "significant": found.significant,
-        "tolerance": found.tolerance,
         "unit": comparison.model.unit,
         "error_scale": comparison.error_scale,
         "chi2": chi2,
         "dof": dof,
         "p_value": p,
-        "n_outside": found.n_outside,
-        "n_repeated": found.n_repeated,
         "periods": rows,
-        "first_vs_last": {"period": found.last, "against": found.first, **_position(found.ends)},
+        "first_vs_last": {
+            "period": found.last,
+            "against": found.first,
+            **attributes(found.ends, POSITION),
+        },
         "residuals": [
-            _statistics(table, chip.number)
-            for table, chip in zip(found.residuals, comparison.model.chips, strict=True)
+            {"chip": number, "unit": table.unit, "rows": [_statistics(row) for row in table.rows]}
+            for table, number in zip(found.residuals, numbers, strict=True)
         ],
         "patterns": [
-            _pattern(one) | {"chip": chip.number}
-            for several, chip in zip(found.patterns, comparison.model.chips, strict=True)
+            attributes(one, "period axis p_value rms correlation n_bins") | {"chip": number}
+            for several, number in zip(found.patterns, numbers, strict=True)
             for one in several
         ],
     }
 
 
-def _position(change: PositionChange) -> dict[str, Any]:
+def _statistics(row: Any) -> dict[str, Any]:
     return {
-        "largest": change.largest,
-        "sigma": change.sigma,
-        "at": list(change.at),
-        "chip": change.chip,
-        "noise_median": change.noise_median,
-        "noise_95": change.noise_95,
-        "p_value": change.p_value,
-        "chi2": change.chi2,
-        "dof": change.dof,
-        "p_field": change.p_field,
-    }
-
-
-def _statistics(table: StatisticsTable, chip: int) -> dict[str, Any]:
-    rows = [
-        {
-            "label": row.label,
-            **row.value,
-            "sigma_error": row.error["sigma"],
-            "sigma_noise_free": row.noise_free["sigma"],
-            "n_bins": row.n_bins,
-        }
-        for row in table.rows
-    ]
-    return {"chip": chip, "unit": table.unit, "rows": rows}
-
-
-def _pattern(one: PatternChange) -> dict[str, Any]:
-    return {
-        "period": one.period,
-        "axis": one.axis,
-        "p_value": one.p_value,
-        "rms": one.rms,
-        "correlation": one.correlation,
-        "n_bins": one.n_bins,
+        **attributes(row, "label n_bins"),
+        **row.value,
+        "sigma_error": row.error["sigma"],
+        "sigma_noise_free": row.noise_free["sigma"],
     }

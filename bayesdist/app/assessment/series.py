@@ -22,10 +22,7 @@ MIN_EXPOSURES = 8  # exposures below which nothing is said of time
 
 
 def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> None:
-    """Write series.ecsv and drift.ecsv, and a section of summary.json.
-
-    `fitted`: with exposures that were each fitted alone.
-    """
+    """Write series.ecsv and drift.ecsv, and a section of summary.json."""
     series = required(fitted.alone, "fits of single exposures")
     time, seed = fitted.linear.model.time, config.sampler.seed
     if time is None or len(series.names) < MIN_EXPOSURES:
@@ -44,17 +41,12 @@ def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> No
         name for name, p in zip(series.names, posterior.outlier_probability, strict=True) if p > 0.5
     ]
     verdicts = [_verdict(series, k, time.breaks, seed) for k in range(len(series.coefficients))]
+    scatter = posterior.scatter_sigma.mean(axis=0).tolist()
     run.summarise(
         time_dependence={
             "converged": posterior.convergence.converged,
             "lines": _lines(posterior),
-            "scatter": dict(
-                zip(
-                    series.coefficients,
-                    posterior.scatter_sigma.mean(axis=0).tolist(),
-                    strict=True,
-                )
-            ),
+            "scatter": dict(zip(series.coefficients, scatter, strict=True)),
             "outlying_exposures": outlying,
             "warnings": list(_disagreements(fitted.facts["exposures_outlying"], outlying)),
             "breaks": _changes(posterior),
@@ -82,37 +74,26 @@ def _verdict(series: Series, k: int, breaks: tuple[float, ...], seed: int) -> di
 
 
 def _lines(posterior: SeriesPosterior) -> list[dict[str, object]]:
-    alpha, beta = posterior.alpha, posterior.beta
-    return [
-        {
-            "segment": s,
-            "term": name,
-            "epoch0": float(posterior.reference[s]),
-            "alpha": float(alpha[:, s, k].mean()),
-            "sigma_alpha": float(alpha[:, s, k].std(ddof=1)),
-            "beta": float(beta[:, s, k].mean()),
-            "sigma_beta": float(beta[:, s, k].std(ddof=1)),
-        }
-        for s in range(alpha.shape[1])
-        for k, name in enumerate(posterior.series.coefficients)
-    ]
+    out: list[dict[str, object]] = []
+    for s, epoch0 in enumerate(posterior.reference):
+        for k, name in enumerate(posterior.series.coefficients):
+            row: dict[str, object] = {"segment": s, "term": name, "epoch0": float(epoch0)}
+            for part in ("alpha", "beta"):
+                draws = getattr(posterior, part)[:, s, k]
+                row |= {part: float(draws.mean()), f"sigma_{part}": float(draws.std(ddof=1))}
+            out.append(row)
+    return out
 
 
 def _changes(posterior: SeriesPosterior) -> list[dict[str, object]]:
     out: list[dict[str, object]] = []
-    for number in range(posterior.trend.n_breaks):
-        level, slope = posterior.change(number)
+    for number, date in enumerate(posterior.trend.breaks):
+        changes = dict(zip(("step", "slope_change"), posterior.change(number), strict=True))
         for k, name in enumerate(posterior.series.coefficients):
-            out.append(
-                {
-                    "break": posterior.trend.breaks[number],
-                    "term": name,
-                    "step": float(level.value[k]),
-                    "sigma_step": float(level.sigma[k]),
-                    "slope_change": float(slope.value[k]),
-                    "sigma_slope_change": float(slope.sigma[k]),
-                }
-            )
+            row: dict[str, object] = {"break": date, "term": name}
+            for part, found in changes.items():
+                row |= {part: float(found.value[k]), f"sigma_{part}": float(found.sigma[k])}
+            out.append(row)
     return out
 
 

@@ -7,6 +7,8 @@ from typing import Any
 import click
 
 from bayesdist.app.commands.options import (
+    ON_FILES,
+    ON_RUNS,
     command,
     epoch,
     filter_name,
@@ -17,13 +19,10 @@ from bayesdist.app.commands.options import (
 )
 
 
-@command()
-@click.argument("file", metavar="FILE")
-def inspect(file: str) -> None:
+@command(calls=f"{ON_FILES}.inspect:inspect")
+@click.argument("path", metavar="FILE")
+def inspect() -> None:
     """Describe a product, a posterior or a run, and report its faults."""
-    from bayesdist.app.commands.on_files.inspect import inspect as described
-
-    click.echo(described(file))
 
 
 @command()
@@ -98,8 +97,8 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
     click.echo(sky_to_table(file, table, output, pixel_origin=origin, **own, **kept))
 
 
-@command()
-@click.argument("file", metavar="FILE")
+@command(calls=f"{ON_FILES}.convert:convert")
+@click.argument("path", metavar="FILE")
 @click.option("--to", required=True, metavar="FORMAT", help="Format to write, a key of [products].")
 @click.option("-o", "--output", metavar="OUT", help="Folder, or file where one is made.")
 @click.option(
@@ -118,17 +117,14 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
 @click.option("--scale", type=float, metavar="S", help="Size of a pixel, arcsec.")
 @image_size
 @force
-def convert(file: str, to: str, output: str | None, **options: Any) -> None:
+def convert() -> None:
     """Write a calibration in another format, and report what is lost.
 
     FILE is a run, or a file of any format that holds a calibration.
     """
-    from bayesdist.app.commands.on_files.convert import convert as converted
-
-    click.echo(converted(file, to, output, **options))
 
 
-@command()
+@command(calls=f"{ON_RUNS}.compare:compare_files", recorded=True)
 @click.argument("a", metavar="A")
 @click.argument("b", metavar="B")
 @click.option("-o", "--output", metavar="DIR", help="Folder to create for tables and figure.")
@@ -138,7 +134,9 @@ def convert(file: str, to: str, output: str | None, **options: Any) -> None:
 @click.option("--filter", metavar="F", help="Filter of IDCTABs, or WISE band; F:G for A and B.")
 @epoch
 @image_size
-@click.option("--keep-linear", is_flag=True, help="Do not remove shift, rotation and scale.")
+@click.option(
+    "--keep-linear", "keep", is_flag=True, help="Do not remove shift, rotation and scale."
+)
 @click.option(
     "--grid",
     type=int,
@@ -147,46 +145,32 @@ def convert(file: str, to: str, output: str | None, **options: Any) -> None:
     metavar="NX NY",
     help="Number of positions along x and y.",
 )
-@click.pass_obj
-def compare(
-    line: str, a: str, b: str, output: str | None, keep_linear: bool, **options: Any
-) -> None:
+def compare() -> None:
     """Compare two calibrations: differences and their significance.
 
     A and B are each a run, a posterior, a fit, or a file of any format that holds a calibration.
     """
-    from bayesdist.app.commands.on_runs.compare import compare_files
-
-    click.echo(compare_files(a, b, output, keep=keep_linear, command=line, **options))
 
 
-@command()
+@command(calls=f"{ON_RUNS}.monitor:monitor", recorded=True)
 @click.argument("run", metavar="RUN")
 @click.argument("new", metavar="NEW")
 @click.option("-o", "--output", metavar="DIR", help="Folder to create for tables and figure.")
-@click.pass_obj
-def monitor(line: str, run: str, new: str, output: str | None) -> None:
+def monitor() -> None:
     """Test whether a released calibration still describes new matches.
 
     NEW is a table of matches, or a CONFIG.toml that names them.
     """
-    from bayesdist.app.commands.on_runs.monitor import monitor as watched
-
-    click.echo(watched(run, new, output, command=line))
 
 
-@command()
+@command(calls=f"{ON_RUNS}.release:release_runs", recorded=True)
 @click.argument("runs", nargs=-1, required=True, metavar="RUN...")
 @new_folder
 @click.option(
     "--allow-unconverged", is_flag=True, help="Release runs that have not converged, too."
 )
-@click.pass_obj
-def release(line: str, runs: tuple[str, ...], output: str, allow_unconverged: bool) -> None:
+def release() -> None:
     """Write one set of files from the runs of several filters.
 
     The first run is that of the reference filter.
     """
-    from bayesdist.app.commands.on_runs.release import release_runs
-
-    click.echo(release_runs(runs, output, allow_unconverged=allow_unconverged, command=line))

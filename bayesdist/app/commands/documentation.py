@@ -24,7 +24,8 @@ def docs(page: str | None) -> None:
     if page is None:
         width = max(map(len, pages))
         for name, path in pages.items():
-            click.echo(f"{name:{width}}  {_title(path)}")
+            title = read_text(path).partition("\n")[0].lstrip("# ")
+            click.echo(f"{name:{width}}  {title}")
         return
     name = page.removesuffix(".md")
     if name not in pages:
@@ -43,7 +44,3 @@ def _pages() -> dict[str, Path]:
         if found:
             return found
     raise InputError("the documentation is not installed", do="install the package again")
-
-
-def _title(path: Path) -> str:
-    return read_text(path).partition("\n")[0].lstrip("# ")

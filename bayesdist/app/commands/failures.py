@@ -16,11 +16,7 @@ DEFECT, NO_MEMORY, NO_SYSTEM, TOO_DEEP = 70, 71, 74, 65
 
 
 def failure(error: Exception, command: str) -> tuple[int, str]:
-    """Exit code and sentence for an exception that nobody below could say more about.
-
-    `command`: the command line. Result: `code`; `sentence`: of a defect it names the file with the
-    traceback, which is written here.
-    """
+    """Exit code and sentence for an exception that nobody below could say more about."""
     if isinstance(error, MemoryError):
         return NO_MEMORY, (
             "the memory of this machine is not enough; give fewer stars, draws or grid points, or "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
 from typing import Any
 
 import click
@@ -37,10 +38,7 @@ class LazyGroup(click.Group):
 
 
 class CommaList(click.ParamType):
-    """Values that are separated by commas.
-
-    `kind`: of each value.
-    """
+    """Values that are separated by commas."""
 
     name = "list"
 
@@ -75,23 +73,37 @@ class _ColumnNames(click.ParamType):
         return {key.strip(): name.strip() for key, _, name in pairs}
 
 
-def _begin_logging(ctx: click.Context, param: click.Parameter, quiet: bool) -> None:
-    start_logging(-1 if quiet else 0)
+def command(
+    calls: str = "", *, recorded: bool = False, **settings: Any
+) -> Callable[[Callable[..., int | None]], click.Command]:
+    """Decorator of a command, which takes --quiet.
 
-
-def command(**settings: Any) -> Callable[[Callable[..., int | None]], click.Command]:
-    """Decorator of a command, which takes --quiet; what it returns is the exit code."""
+    `calls`: as "module:function", what the command does: it is loaded when that runs, takes the
+    options (and the command line, to be `recorded`), and returns what is printed.  Without it the
+    decorated function does all by itself, and returns the exit code.
+    """
     quiet = click.option(
         "-q",
         "--quiet",
         is_flag=True,
         expose_value=False,
-        callback=_begin_logging,
+        callback=lambda ctx, param, quiet: start_logging(quiet=quiet),
         help="Print only warnings and errors.",
     )
-    return lambda function: click.command(**settings)(quiet(function))
+
+    def decorated(function: Callable[..., int | None]) -> click.Command:
+        @wraps(function)
+        def calling(**options: Any) -> None:
+            if recorded:
+                options["command"] = click.get_current_context().obj
+            click.echo(load_object(calls)(**options))
+
+        return click.command(**settings)(quiet(calling if calls else function))
+
+    return decorated
 
 
+ON_FILES, ON_RUNS = "bayesdist.app.commands.on_files", "bayesdist.app.commands.on_runs"
 column_names = _ColumnNames()
 new_folder = click.option("-o", "--output", required=True, metavar="DIR", help="Folder to create.")
 force = click.option("--force", is_flag=True, help="Replace an existing output.")
@@ -115,10 +127,7 @@ image_size = click.option(
 
 
 def chip_of(numbers: Sequence[int], chip: int | None, where: str) -> int:
-    """Number of the chip that --chip names, which may be left out where there is one.
-
-    InputError for none, or one that is not there, among several.
-    """
+    """Number of the chip that --chip names, which may be left out where there is one."""
     listed = ", ".join(map(str, numbers))
     if chip is None and len(numbers) == 1:
         return numbers[0]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import click
 
-from bayesdist.app.commands.options import CommaList, command, force
-from bayesdist.errors import InputError
+from bayesdist.app.commands.options import ON_RUNS, CommaList, command, force
 
 
-@command()
+@command(calls=f"{ON_RUNS}.plan:plan")
 @click.argument("run", metavar="RUN")
-@click.option("--requirement", metavar="NAME", show_default="all", help="Name of one requirement.")
+@click.option(
+    "--requirement", "name", metavar="NAME", show_default="all", help="Name of one requirement."
+)
 @click.option(
     "--epochs",
     type=CommaList(float),
@@ -18,34 +19,23 @@ from bayesdist.errors import InputError
     metavar="T,...",
     help="Dates of further exposures, decimal years, separated by commas.",
 )
-def plan(run: str, requirement: str | None, epochs: tuple[float, ...]) -> None:
+def plan() -> None:
     """Compute how many more exposures would meet the requirements."""
-    from bayesdist.app.commands.on_runs.plan import plan as exposures_planned
-
-    if run.endswith(".toml"):
-        raise InputError(
-            "is a file, not a run",
-            where=run,
-            do=f"compare dither patterns by 'bayesdist plan-dither {run}'",
-        )
-    click.echo(exposures_planned(run, name=requirement, epochs=epochs))
 
 
-@command(name="plan-dither")
-@click.argument("patterns", metavar="PATTERNS.toml")
+@command(
+    calls="bayesdist.app.commands.patterns.command:plan_patterns", recorded=True, name="plan-dither"
+)
+@click.argument("path", metavar="PATTERNS.toml")
 @click.option(
     "-o", "--output", metavar="DIR", help="Folder to create for table, record and figure."
 )
-@click.pass_obj
-def plan_dither(line: str, patterns: str, output: str | None) -> None:
+def plan_dither() -> None:
     """Compare dither patterns for a self-calibration, without data."""
-    from bayesdist.app.commands.patterns.command import plan_patterns
-
-    click.echo(plan_patterns(patterns, output, line))
 
 
-@command(name="select-order")
-@click.argument("config", metavar="CONFIG.toml")
+@command(calls=f"{ON_RUNS}.order:order", name="select-order")
+@click.argument("path", metavar="CONFIG.toml")
 @click.option(
     "--orders",
     nargs=2,
@@ -64,15 +54,5 @@ def plan_dither(line: str, patterns: str, output: str | None) -> None:
 @click.option("-o", "--output", metavar="orders.ecsv", help="Write the table to a file.")
 @click.option("--figure", metavar="orders.png", help="Draw the comparison into a file.")
 @force
-def select_order(
-    config: str,
-    orders: tuple[int, int],
-    chip: int | None,
-    output: str | None,
-    figure: str | None,
-    force: bool,
-) -> None:
+def select_order() -> None:
     """Select the polynomial order."""
-    from bayesdist.app.commands.on_runs.order import order
-
-    click.echo(order(config, orders, chip=chip, output=output, figure=figure, force=force))

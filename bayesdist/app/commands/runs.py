@@ -1,4 +1,4 @@
-"""A run: its configuration, what would become of it, the whole of it, and its stages."""
+"""A run: its configuration, what would become of it, all of it, its stages, and what it says."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from pathlib import Path
 
 import click
 
-from bayesdist.app.commands.options import column_names, command, force
+from bayesdist.app.commands.options import ON_RUNS, column_names, command, force
 
 STAGES = ("match", "fit", "sample", "diagnose", "evaluate", "assess", "export", "report")
+MISSED = 4  # exit code of requirements that are not all met
 
 
 @command()
@@ -51,13 +52,10 @@ def init(
     click.echo(write_configuration(config, matches, columns=columns, size=size, force=force))
 
 
-@command()
-@click.argument("config", metavar="CONFIG.toml")
-def check(config: str) -> None:
+@command(calls=f"{ON_RUNS}.check:check")
+@click.argument("path", metavar="CONFIG.toml")
+def check() -> None:
     """Check units, rank, degeneracies and cost of a configuration, without sampling."""
-    from bayesdist.app.commands.on_runs.check import check as checked
-
-    click.echo(checked(config))
 
 
 @command()
@@ -115,6 +113,42 @@ def stage(name: str, run: str, strict: bool, pdf: bool) -> None:
     from bayesdist.app.run import continue_stage
 
     continue_stage(run, name, strict=strict, pdf=pdf)
+
+
+@command()
+@click.argument("run", metavar="RUN")
+@click.option(
+    "--requirements", required=True, metavar="REQ.toml", help="File of [[requirement]] blocks."
+)
+def requirements(run: str, requirements: str) -> int:
+    """Judge a run by requirements; exit with 4 unless all are met."""
+    from bayesdist.app.commands.on_runs.validate import validate
+
+    text, met = validate(run, requirements)
+    click.echo(text)
+    return 0 if met else MISSED
+
+
+@command(calls=f"{ON_RUNS}.budget:budget_at")
+@click.argument("run", metavar="RUN")
+@click.option("--at", required=True, nargs=2, type=float, metavar="X Y", help="FITS 1-based pixel.")
+@click.option(
+    "--to",
+    multiple=True,
+    nargs=2,
+    type=float,
+    metavar="X Y",
+    help="Budget of the separation from this pixel; may be repeated.",
+)
+@click.option(
+    "--chip", type=int, metavar="N", show_default="the only one", help="Chip of the positions."
+)
+@click.option("--epoch", type=float, metavar="T", help="Date in decimal years.")
+@click.option(
+    "--magnitude", type=float, metavar="M", help="Add the centroid error at this magnitude."
+)
+def budget() -> None:
+    """Print the error budget of a position, or of a separation."""
 
 
 @command()

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
-from pydantic import Field, PositiveFloat, field_validator, model_validator
+from pydantic import Field, PositiveFloat, field_validator
 from pydantic_core import PydanticCustomError
 
 from bayesdist.app.config.section import Epoch, Section, Unit
@@ -29,16 +29,6 @@ MEASURED_TERMS = (
     *(COEFFICIENTS, TIME_DEPENDENCE, EXPOSURE_FRAME),
     *("total", "model", STRUCTURE, STRUCTURE_IN_FIT, DEVIATIONS, "look-up tables"),
 )
-
-
-def require_own_names(block: str, names: Sequence[str]) -> None:
-    """Refuse blocks of one name.
-
-    ValueError as validators raise it.
-    """
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise ValueError(f"two [[{block}]] blocks have the name {twice!r}; give each its own")
 
 
 class Assess(Section):
@@ -92,32 +82,26 @@ class BudgetBlock(Section):
         sizes = (self.sigma_u, self.sigma_v, self.sigma)
         return any(sizes) or self.source != GIVEN
 
-    @model_validator(mode="after")
-    def _sigma_of_its_kind(self) -> BudgetBlock:
+    def faults(self) -> Iterator[str]:
+        """A sigma that is not as the kind has it."""
         axes = self.sigma_u is not None and self.sigma_v is not None
         neither = self.sigma_u is None and self.sigma_v is None
+        of_kind = f"a budget term of kind {self.kind!r} has"
         if self.kind not in TERM_KINDS:
             if self.sigma is None or not neither:
-                raise ValueError(
-                    f"a budget term of kind {self.kind!r} has one sigma; give sigma, in the "
-                    "unit of its kind, and neither sigma_u nor sigma_v"
+                yield (
+                    f"{of_kind} one sigma; give sigma, in the unit of its kind, and neither "
+                    "sigma_u nor sigma_v"
                 )
             if self.unit is not None:
-                raise ValueError(
-                    f"a budget term of kind {self.kind!r} has a unit of its own, and unit is "
-                    f"{self.unit!r}; leave unit out"
-                )
+                yield f"{of_kind} a unit of its own, and unit is {self.unit!r}; leave unit out"
         elif not axes or self.sigma is not None:
-            raise ValueError(
-                f"a budget term of kind {self.kind!r} has a sigma on each axis; give sigma_u and "
-                "sigma_v, and no sigma"
-            )
+            yield f"{of_kind} a sigma on each axis; give sigma_u and sigma_v, and no sigma"
         if self.included_in_scatter and self.kind != "random":
-            raise ValueError(
+            yield (
                 "included_in_scatter is of a random budget term, which scatters from star to star; "
                 "leave it out"
             )
-        return self
 
 
 class RequirementBlock(Section):

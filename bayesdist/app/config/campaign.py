@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from pydantic import PositiveFloat, model_validator
+from pydantic import PositiveFloat
 
 from bayesdist.app.config.fit import (
     CampaignFit,
@@ -15,9 +16,8 @@ from bayesdist.app.config.fit import (
     Sampler,
 )
 from bayesdist.app.config.model import CampaignModel, PriorBlock, TablesBlock
-from bayesdist.app.config.other_runs import FREE, rates_file, tables_file
 from bayesdist.app.config.products import CampaignProducts
-from bayesdist.app.config.run import RunConfig
+from bayesdist.app.config.run import FREE, RunConfig, rates_file, tables_file
 from bayesdist.app.config.section import Epoch, Section, Unit
 
 
@@ -72,11 +72,11 @@ class CampaignConfig(RunConfig):
     holdout: HoldoutBlock | None = None
     products: CampaignProducts = CampaignProducts()
 
-    @model_validator(mode="after")
-    def _has_chips(self) -> CampaignConfig:
+    def faults(self) -> Iterator[str]:
+        """Those of every run, and no chips."""
+        yield from super().faults()
         if not self.chip:
-            raise ValueError("a [campaign] has no [[chip]] blocks; give them, one as the reference")
-        return self
+            yield "a [campaign] has no [[chip]] blocks; give them, one as the reference"
 
     def named_files(self, base: Path) -> list[Path]:
         """Lists, catalogue and log, and what is taken over from other runs."""

@@ -6,7 +6,7 @@ A format that a mission adds may have keys of its own: its section is a subclass
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -17,7 +17,6 @@ from pydantic import (
     ValidationInfo,
     WrapValidator,
     field_validator,
-    model_validator,
 )
 
 from bayesdist.app.config.fit import ComputeBlock, Fit, HoldoutBlock, Outliers, Sampler
@@ -27,9 +26,8 @@ from bayesdist.app.config.model import (
     PriorCalibrationBlock,
     TablesBlock,
 )
-from bayesdist.app.config.other_runs import calibration_file
 from bayesdist.app.config.products import MatchedProducts
-from bayesdist.app.config.run import RunConfig
+from bayesdist.app.config.run import RunConfig, calibration_file
 from bayesdist.app.config.section import Epoch, RightAscensionDeclination, Section, Unit
 from bayesdist.data import FORMATS
 from bayesdist.data.formats.files import mission_formats
@@ -77,14 +75,13 @@ class Data(Section):
             )
         return unit
 
-    @model_validator(mode="after")
-    def _nominal_positions_of_tables(self) -> Data:
+    def faults(self) -> Iterator[str]:
+        """Nominal positions of what is no table."""
         if self.has_nominal and self.format not in ("auto", "table"):
-            raise ValueError(
+            yield (
                 f"nominal positions are columns of tables, and data.format is {self.format!r}; "
                 "leave u_nominal and v_nominal out"
             )
-        return self
 
 
 def names_nominal(columns: Mapping[str, str] | None) -> bool:
@@ -111,7 +108,10 @@ def _of_its_format(raw: Any, handler: Any, info: ValidationInfo) -> Data:
     kind = Data
     if format not in FORMATS or raw.keys() - Data.model_fields.keys():
         sections = data_sections()
-        _require_known(format, (*FORMATS, *mission_formats(), *sections))
+        known = (*FORMATS, *mission_formats(), *sections)
+        if format not in known:
+            listed = ", ".join(map(repr, known))
+            raise ValueError(f"data.format is {format!r}, which is no format; give one of {listed}")
         kind = sections.get(format, Data)
         for name, other in sections.items():
             for key in raw.keys() & other.model_fields.keys() - kind.model_fields.keys():
@@ -122,14 +122,6 @@ def _of_its_format(raw: Any, handler: Any, info: ValidationInfo) -> Data:
     if info.mode == "json":  # there arrays may become tuples
         return kind.model_validate_json(json.dumps(raw), strict=True)
     return kind.model_validate(raw)
-
-
-def _require_known(format: str, known: tuple[str, ...]) -> None:
-    if format not in known:
-        raise ValueError(
-            f"data.format is {format!r}, which is no format; give one of "
-            f"{', '.join(map(repr, known))}"
-        )
 
 
 DataOfFormat = Annotated[SerializeAsAny[Data], WrapValidator(_of_its_format)]
@@ -182,69 +174,49 @@ class MatchesConfig(RunConfig):
             .model_copy(update={"prior": [], "prior_calibration": None, "fit": fit})
         )
 
-    @model_validator(mode="after")
-    def _one_prior_each(self) -> MatchesConfig:
+    def faults(self) -> Iterator[str]:
+        """Those of every run, and settings of matched stars that do not go together."""
+        yield from super().faults()
         names = [one.parameter for one in self.prior]
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
-            raise ValueError(f"two [[prior]] blocks are of {twice!r}; give each parameter one")
-        return self
-
-    @model_validator(mode="after")
-    def _one_array(self) -> MatchesConfig:
+            yield f"two [[prior]] blocks are of {twice!r}; give each parameter one"
         if self.data.one_array and self.chip:
-            raise ValueError(
+            yield (
                 f"matches of the format {self.data.format!r} are of one array; give "
                 "detector.size in place of [[chip]] blocks"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _jitter_beyond_quoted_errors(self) -> MatchesConfig:
         by = self.outliers.jitter_by
         if by != "auto" and self.data.sigma == "by_magnitude":
-            raise ValueError(
+            yield (
                 f"outliers.jitter_by is {by!r}, which is of quoted errors, and data.sigma = "
                 "'by_magnitude' takes errors of both axes from the residuals; leave it out, or "
                 "give columns of errors or a number"
             )
         if by == "chip" and not self.chip:
-            raise ValueError(
+            yield (
                 "outliers.jitter_by is 'chip', and there is one chip; leave it out, or give "
                 "[[chip]] blocks"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _matched_in_a_circle(self) -> MatchesConfig:
         if self.data.has_nominal:
-            self.refuse_circle()
-        return self
-
-    @model_validator(mode="after")
-    def _priors_with_plain_weights(self) -> MatchesConfig:
+            yield from self.circle_faults()
         if self.prior_calibration is not None and self.fit.radial_weight != 1.0:
-            raise ValueError(
+            yield (
                 "fit.radial_weight counts stars for more than they are, and the calibration of "
                 "[prior_calibration] for what it is; leave one of the two out"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _periods_of_polynomials(self) -> MatchesConfig:
         if self.periods is None:
-            return self
+            return
         if self.model.frames != "none" or self.model.tdd is not None:
             key = "tdd" if self.model.tdd is not None else "frames"
-            raise ValueError(
+            yield (
                 f"[periods] compares polynomials alone, and model.{key} is given; drop one of them"
             )
         if (self.data.columns or {}).get("epoch") == "":
-            raise ValueError(
+            yield (
                 "[periods] needs an epoch for every pair, and data.columns leaves the epoch out; "
                 "name its column there"
             )
-        return self
 
     @property
     def compares_jitters(self) -> bool:
@@ -252,33 +224,30 @@ class MatchesConfig(RunConfig):
         quoted = self.data.sigma != "by_magnitude"
         return quoted and self.outliers.jitter == "fit" and self.outliers.jitter_by != "one"
 
-    def refuse_circle(self) -> None:
-        """Refuse what cannot go with matches in a circle about their nominal positions.
-
-        ValueError as validators raise it.
-        """
+    def circle_faults(self) -> Iterator[str]:
+        """What cannot go with matches in a circle about their nominal positions."""
         if self.outliers.match_radius is None:
             return
-        head = "matches with nominal positions and outliers.match_radius are"
+        cut = "matches with nominal positions and outliers.match_radius are cut by the match circle"
         if self.data.sigma == "by_magnitude":
-            raise ValueError(
-                f"{head} cut by the match circle, and so are residuals, from which data.sigma = "
-                "'by_magnitude' takes the errors; give columns of errors, or a number"
+            yield (
+                f"{cut}, and so are residuals, from which data.sigma = 'by_magnitude' takes the "
+                "errors; give columns of errors, or a number"
             )
         if self.outliers.jitter_by not in ("auto", "one"):
-            raise ValueError(
-                f"{head} cut by the match circle, and so are residuals, from which "
-                "outliers.jitter_by takes the jitters of groups; leave it out"
+            yield (
+                f"{cut}, and so are residuals, from which outliers.jitter_by takes the jitters of "
+                "groups; leave it out"
             )
         if self.holdout is not None:
-            raise ValueError(
-                f"{head} cut by the match circle, which the prediction of [holdout] does not "
-                "know; leave [holdout] out, or the nominal positions"
+            yield (
+                f"{cut}, which the prediction of [holdout] does not know; leave [holdout] out, or "
+                "the nominal positions"
             )
         if self.periods is not None:
-            raise ValueError(
-                f"{head} cut by the match circle, which draws the least-squares fits of [periods] "
-                "to the nominal solution; leave [periods] out, or the nominal positions"
+            yield (
+                f"{cut}, which draws the least-squares fits of [periods] to the nominal solution; "
+                "leave [periods] out, or the nominal positions"
             )
 
     def spans(self) -> dict[str, tuple[float, float]]:

@@ -61,8 +61,7 @@ def as_config_error(
 ) -> ConfigError:
     """The first thing that is wrong, with its key.
 
-    `kinds`: what the file was validated against: by the section that says which one of several.
-    `where`: the file.
+    `kinds`: what the file was validated against, or that by the section that says which one.
     """
     # an unknown key is usually the cause of a missing one
     details = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")

@@ -5,9 +5,10 @@ What a kind does not have is a constant of its class, so that nobody has to ask 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from pydantic import Field, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, PositiveFloat, PositiveInt
 
 from bayesdist.app.config.section import Pair, Section
 from bayesdist.diagnose.correlated import DiscrepancyPriors
@@ -20,13 +21,10 @@ class HoldoutBlock(Section):
     fraction: Annotated[float, Field(ge=0, le=0.9)] = 0.0
     exposures: list[str] | PositiveInt = Field(default_factory=list)
 
-    @model_validator(mode="after")
-    def _something(self) -> HoldoutBlock:
+    def faults(self) -> Iterator[str]:
+        """Nothing that is set aside."""
         if not self.fraction and not self.exposures:
-            raise ValueError(
-                "[holdout] sets nothing aside; give a fraction of the stars, or exposures"
-            )
-        return self
+            yield "[holdout] sets nothing aside; give a fraction of the stars, or exposures"
 
 
 class _Fit(Section):
@@ -100,14 +98,13 @@ class Outliers(_Mixture):
 
     jitter_by: Literal["auto", "one", "chip", "exposure", "filter"] = "auto"
 
-    @model_validator(mode="after")
-    def _groups_of_what_is_fitted(self) -> Outliers:
+    def faults(self) -> Iterator[str]:
+        """Jitters of groups beside the one that is given."""
         if self.jitter_by not in ("auto", "one") and self.jitter != "fit":
-            raise ValueError(
+            yield (
                 f"outliers.jitter_by is {self.jitter_by!r}, and outliers.jitter gives the one "
                 "jitter of all stars; leave one of the two out"
             )
-        return self
 
 
 class _Sampler(Section):
@@ -143,20 +140,19 @@ class ComputeBlock(Section):
     workers: PositiveInt | None = None
     memory_mb: PositiveFloat = 1000.0
 
-    @model_validator(mode="after")
-    def _only_of_a_cluster(self) -> ComputeBlock:
+    def faults(self) -> Iterator[str]:
+        """Settings of a cluster where there is none, or another's."""
         for key in ("scheduler", "workers"):
             if self.engine != "dask" and getattr(self, key) is not None:
-                raise ValueError(
+                yield (
                     f"compute.{key} is given, but compute.engine is {self.engine!r}; set the "
                     f"engine to 'dask', or leave {key} out"
                 )
         if self.scheduler is not None and self.workers is not None:
-            raise ValueError(
+            yield (
                 "compute.workers is given, but the cluster of compute.scheduler has its own; "
                 "leave one of the two out"
             )
-        return self
 
     def resources(self) -> Compute:
         """Where the work is done."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from datetime import datetime
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import AfterValidator, Field, PositiveFloat, create_model, model_validator
+from pydantic import AfterValidator, Field, PositiveFloat, create_model
 
 from bayesdist.app.config.section import Section
 from bayesdist.data.tables.column import year_of
@@ -59,19 +60,15 @@ class Products(Section):
         def release(self) -> ReleaseBlock | None:
             """What a release is made of, where the kind of run has one."""
 
-    @model_validator(mode="after")
-    def _dates_of_use(self) -> Products:
+    def faults(self) -> Iterator[str]:
+        """A date of use that is none."""
         try:
             self.useafter_years()
         except InputError as error:
-            raise ValueError(f"useafter: {error.cause}; give 'Mar 01 2002 00:00:00'") from None
-        return self
+            yield f"useafter: {error.cause}; give 'Mar 01 2002 00:00:00'"
 
     def useafter_years(self) -> tuple[float, ...]:
-        """Dates from which the files are to be used, decimal years; none where none is given.
-
-        InputError for text that is no date.
-        """
+        """Dates from which the files are to be used, decimal years; none where none is given."""
         release = getattr(self, "release", None)
         files = (*self.asked().values(), *(() if release is None else release.period))
         given = (getattr(one, "useafter", None) for one in files)

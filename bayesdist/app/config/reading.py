@@ -66,8 +66,7 @@ class _RequirementFile(Section):
 def load_config(path: str | Path) -> tuple[Config, str]:
     """Read a configuration file.
 
-    Result: `config`; `text`: the file as it stands. ConfigError with file, key and reason; an
-    unknown key names the nearest known one, or the kind of run that has it.
+    The text is the file as it stands.
     """
     text = load_text(path)
     return parse_config(text, str(path)), text
@@ -89,10 +88,7 @@ def parse_config(text: str, where: str) -> Config:
 
 
 def config_of_record(settings: Mapping[str, Any], where: str) -> Config:
-    """A configuration as the record of a run holds it.
-
-    ConfigError for settings that another version allowed.
-    """
+    """A configuration as the record of a run holds it."""
     try:
         return CONFIG.validate_python(settings)
     except ValidationError as error:
@@ -118,10 +114,7 @@ def load_text(path: str | Path) -> str:
 
 
 def validated(kind: type[Section], text: str, where: str, *, begin: str) -> Any:
-    """A file of sections from its text.
-
-    `where`: the file, for errors. `begin`: what to do about an empty one.
-    """
+    """A file of sections from its text."""
     return _validated(TypeAdapter(kind), kind, _settings(text, where, begin=begin), where)
 
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from bayesdist.app.config.assess import (
     MEASURED_TERMS,
     Assess,
     BudgetBlock,
     RequirementBlock,
-    require_own_names,
 )
 from bayesdist.app.config.fit import (
     CampaignOutliers,
@@ -24,16 +24,26 @@ from bayesdist.app.config.fit import (
     SelfcalSampler,
 )
 from bayesdist.app.config.model import CampaignModel, MatchedModel, SelfcalModel
-from bayesdist.app.config.other_runs import FREE
 from bayesdist.app.config.products import Products
-from bayesdist.app.config.section import ChipBlock, Detector, Section, chips_of, require_detector
+from bayesdist.app.config.section import (
+    ChipBlock,
+    Detector,
+    Section,
+    chips_of,
+    detector_faults,
+    same_names,
+)
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.terms.given import said_by_user
 from bayesdist.assess.terms.parameters import one_size_term
+from bayesdist.errors import InputError
 from bayesdist.infer import Compute, OutlierMixture
 from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, TimeDependence
+
+FREE = "free"  # rates that no other run says anything of
+TABLES, POSTERIOR = "tables.h5", "posterior.nc"
 
 
 class RunConfig(Section):
@@ -55,28 +65,19 @@ class RunConfig(Section):
     requirement: list[RequirementBlock] = Field(default_factory=list)
     discrepancy: DiscrepancyBlock = DiscrepancyBlock()
 
-    @model_validator(mode="after")
-    def _names_of_their_own(self) -> RunConfig:
-        require_own_names("budget", [b.name for b in self.budget])
-        require_own_names("requirement", [r.name for r in self.requirement])
+    def faults(self) -> Iterator[str]:
+        """Names that are taken, chips or a detector that cannot be, files that are not for it."""
+        yield from same_names("budget", [b.name for b in self.budget])
+        yield from same_names("requirement", [r.name for r in self.requirement])
         taken = next((b.name for b in self.budget if b.name in MEASURED_TERMS), None)
         if taken is not None:
-            raise ValueError(
+            yield (
                 f"a [[budget]] block has the name {taken!r}, which is that of a measured row; "
                 "give it another"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _chips_or_detector(self) -> RunConfig:
-        require_detector(self.chip, self.detector, self.model.reference_pixel)
-        return self
-
-    @model_validator(mode="after")
-    def _files_of_this_detector(self) -> RunConfig:
+        yield from detector_faults(self.chip, self.detector, self.model.reference_pixel)
         for settings in self.products.asked().values():
             settings.check(self.named_detector, self.detector.size, self.model.reference_pixel)
-        return self
 
     @property
     def named_detector(self) -> str:
@@ -182,3 +183,31 @@ class RunConfig(Section):
     def requirements(self) -> tuple[Requirement, ...]:
         """The requirements."""
         return tuple(Requirement(**r.model_dump()) for r in self.requirement)
+
+
+# -- files of other runs that a configuration goes by ----------------------------------------------
+
+
+def tables_file(path: Path) -> Path:
+    """File of a detector's tables: a D2IMFILE as it is named, or that of a run."""
+    return path if path.is_file() else _file_of_run(path, TABLES, "tables.detector")
+
+
+def rates_file(folder: Path) -> Path:
+    """File of the posterior of a run whose drift is taken over."""
+    return _file_of_run(folder, POSTERIOR, "model.tdd.rates")
+
+
+def calibration_file(path: Path) -> Path:
+    """File of an earlier calibration: one of any format as it is named, or a run's posterior."""
+    return path if path.is_file() else _file_of_run(path, POSTERIOR, "prior_calibration.source")
+
+
+def _file_of_run(folder: Path, name: str, key: str) -> Path:
+    if not (folder / name).exists():
+        raise InputError(
+            f"has no {name}" if folder.is_dir() else "is not there",
+            where=str(folder),
+            do=f"name a finished run in {key}",
+        )
+    return folder / name

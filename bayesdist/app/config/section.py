@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Annotated, Literal, TypeVar
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
 from bayesdist.model import Chip
 
@@ -20,6 +20,16 @@ class Section(BaseModel):
     """A table of the file; keys that it does not know are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    def faults(self) -> Iterator[str]:
+        """What is wrong with the table as a whole, as 'cause; advice': the first is reported."""
+        yield from ()
+
+    @model_validator(mode="after")
+    def _without_faults(self) -> Self:
+        for fault in self.faults():
+            raise ValueError(fault)
+        return self
 
 
 Pair = tuple[PositiveFloat, PositiveFloat]
@@ -47,27 +57,28 @@ class ChipBlock(Section):
     reference: bool = False
 
 
-def require_detector(
+def detector_faults(
     chips: Sequence[ChipBlock], detector: Detector, reference_pixel: Pair | None
-) -> None:
-    """Refuse chips that contradict each other, or no detector at all.
-
-    ValueError as validators raise it.
-    """
+) -> Iterator[str]:
+    """Chips that contradict each other, or no detector at all."""
     if sum(c.reference for c in chips) > 1:
-        raise ValueError("reference = true stands in several [[chip]] blocks; keep it in one")
+        yield "reference = true stands in several [[chip]] blocks; keep it in one"
     for key in ("number", "name"):
-        values = [getattr(c, key) for c in chips]
-        twice = next((v for v in values if values.count(v) > 1), None)
-        if twice is not None:
-            raise ValueError(f"two [[chip]] blocks have the {key} {twice!r}; give each its own")
+        yield from same_names("chip", [getattr(c, key) for c in chips], key)
     if chips and (detector.size or reference_pixel):
-        raise ValueError(
+        yield (
             "[[chip]] blocks stand in place of detector.size and model.reference_pixel; "
             "give one of the two"
         )
     if not chips and detector.size is None:
-        raise ValueError("detector.size is missing; give it, or [[chip]] blocks")
+        yield "detector.size is missing; give it, or [[chip]] blocks"
+
+
+def same_names(block: str, names: Sequence[object], key: str = "name") -> Iterator[str]:
+    """Blocks of one name, or of another key that each has to itself."""
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        yield f"two [[{block}]] blocks have the {key} {twice!r}; give each its own"
 
 
 def reference_first(chips: Sequence[Block]) -> list[Block]:
@@ -82,10 +93,7 @@ def chips_of(chips: Sequence[ChipBlock]) -> tuple[Chip, ...]:
 
 
 def one_chip(detector: Detector, reference_pixel: Pair | None, number: int, name: str) -> Chip:
-    """The chip of a detector that has one; its middle where no pixel is named.
-
-    ValueError for a detector without a size.
-    """
+    """The chip of a detector that has one; its middle where no pixel is named."""
     if detector.size is None:
         raise ValueError("detector.size is missing; give columns and rows")
     nx, ny = detector.size

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, PositiveFloat, model_validator
+from pydantic import Field, PositiveFloat
 
 from bayesdist.app.config.campaign import StarListsBlock
 from bayesdist.app.config.data import names_nominal
 from bayesdist.app.config.fit import ComputeBlock, Fit, SelfcalOutliers, SelfcalSampler
 from bayesdist.app.config.model import PriorBlock, SelfcalModel, TablesBlock
-from bayesdist.app.config.other_runs import POSTERIOR
 from bayesdist.app.config.products import SelfcalProducts
-from bayesdist.app.config.run import RunConfig
+from bayesdist.app.config.run import POSTERIOR, RunConfig
 from bayesdist.app.config.section import Epoch, Section, Unit
 from bayesdist.infer import OutlierMixture
 
@@ -21,13 +21,10 @@ Frames = Literal["shift", "shift_rotation", "shift_rotation_scale"]
 MinDetections = Annotated[int, Field(ge=2)]
 
 
-def require_scales(sigma: float | None, frames: Frames) -> None:
-    """Refuse a scatter of the scales of exposures that have none.
-
-    ValueError as validators raise it.
-    """
+def scale_faults(sigma: float | None, frames: Frames) -> Iterator[str]:
+    """A scatter of the scales of exposures that have none."""
     if sigma is not None and "scale" not in frames:
-        raise ValueError(
+        yield (
             "gauge.exposure_scale_sigma is given, and the exposures have no scales; set "
             "selfcal.frames to 'shift_rotation_scale'"
         )
@@ -47,14 +44,13 @@ class SelfcalBlock(StarListsBlock):
     max_iterations: Annotated[int, Field(ge=2)] = 12
     motion: Literal["none", "proper_motion", "parallax"] = "none"
 
-    @model_validator(mode="after")
-    def _radii_in_order(self) -> SelfcalBlock:
+    def faults(self) -> Iterator[str]:
+        """A radius that would grow."""
         if self.start_radius is not None and self.start_radius < self.match_radius:
-            raise ValueError(
+            yield (
                 "selfcal.start_radius is smaller than selfcal.match_radius; begin with the larger "
                 "one"
             )
-        return self
 
 
 class ScaleTie(Section):
@@ -86,15 +82,14 @@ class GaugeBlock(Section):
     scale: ScaleTie | None = None
     reference: ReferenceBlock | None = None
 
-    @model_validator(mode="after")
-    def _errors_of_something(self) -> GaugeBlock:
+    def faults(self) -> Iterator[str]:
+        """Errors of offsets that are not given."""
         for key in ("offset_sigma", "roll_sigma_deg"):
             if getattr(self, key) is not None and self.offsets is None:
-                raise ValueError(
+                yield (
                     f"gauge.{key} is given without gauge.offsets; name the file of the commanded "
                     f"offsets, or leave {key} out"
                 )
-        return self
 
 
 class SelfcalConfig(RunConfig):
@@ -117,33 +112,23 @@ class SelfcalConfig(RunConfig):
     prior: list[PriorBlock] = Field(default_factory=list)
     products: SelfcalProducts = SelfcalProducts()
 
-    @model_validator(mode="after")
-    def _no_nominal_positions(self) -> SelfcalConfig:
+    def faults(self) -> Iterator[str]:
+        """Those of every run, and settings that go with other frames, or without a scale."""
+        yield from super().faults()
         if names_nominal(self.selfcal.columns):
-            raise ValueError(
+            yield (
                 "nominal positions are of matches in [data], and a [selfcal] finds its matches "
                 "itself; leave u_nominal and v_nominal out"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _errors_of_frames_that_are_fitted(self) -> SelfcalConfig:
-        require_scales(self.gauge.exposure_scale_sigma, self.selfcal.frames)
+        yield from scale_faults(self.gauge.exposure_scale_sigma, self.selfcal.frames)
         if self.gauge.roll_sigma_deg is not None and "rotation" not in self.selfcal.frames:
-            raise ValueError(
+            yield (
                 "gauge.roll_sigma_deg is given, and the exposures have no rotations; set "
                 "selfcal.frames to 'shift_rotation'"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _size_of_a_pixel(self) -> SelfcalConfig:
         angles = self.gauge.scale is not None or self.gauge.reference is not None
         if (angles or self.selfcal.unit != "pix") and self.detector.scale_mas is None:
-            raise ValueError(
-                "detector.scale_mas is missing, which turns pixels into seconds of arc; give it"
-            )
-        return self
+            yield "detector.scale_mas is missing, which turns pixels into seconds of arc; give it"
 
     def named_files(self, base: Path) -> list[Path]:
         """Lists, the first solution, and what is known beside the detections."""

@@ -21,10 +21,7 @@ from bayesdist.model import DistortionModel
 
 
 class StarReader:
-    """Reads stars, and remembers those that it was asked for last.
-
-    `compute`: where the work is done.
-    """
+    """Reads stars, and remembers those that it was asked for last."""
 
     def __init__(self, compute: Compute | None = None) -> None:
         self.compute = compute or Compute()

@@ -18,7 +18,7 @@ from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.errors import InputError
-from bayesdist.infer import GaussianPriors, LinearFit, load_fit, save_fit
+from bayesdist.infer import GaussianPriors, LinearFit, Posterior, load_fit, load_posterior, save_fit
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.nodes import corrected_matches, inside_chips, on_the_chips
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
@@ -79,10 +79,7 @@ def write_tables(path: Path, stored: StoredLookupTables) -> None:
 
 
 def read_tables(path: Path, *, do: str) -> StoredLookupTables:
-    """Read what `write_tables` wrote; nothing where there is no file.
-
-    InputError for a damaged file, with `do` as the advice.
-    """
+    """Read what `write_tables` wrote; nothing where there is no file."""
     if not path.exists():
         return StoredLookupTables()
     arrays = read_arrays(path, "", do=do)
@@ -144,10 +141,7 @@ class Fitted:
 
 
 def load_fitted(folder: Path) -> Fitted:
-    """The fit of an earlier stage, but for the solution of detections.
-
-    `folder`: of the run. InputError for missing or damaged files.
-    """
+    """The fit of an earlier stage, but for the solution of detections."""
     tables = read_tables(folder / TABLES, do=FIT_AGAIN)
     return Fitted(load_fit(folder / FIT), tables=tables, **_read_parts(folder))
 
@@ -166,14 +160,20 @@ def _read_parts(folder: Path) -> dict[str, Any]:
         return {name: found[name] for name in RESTS_ON}
 
 
-def required(part: T | None, what: str) -> T:
-    """A part of a fit that its kind of run has.
+def converged_posterior(path: Path, use: str) -> Posterior:
+    """The posterior of another run that this one goes by; `use` is for what, as a clause."""
+    posterior: Posterior = load_posterior(path)
+    if not posterior.convergence.converged:
+        raise InputError(
+            f"the run has not converged ({'; '.join(posterior.convergence.reasons)})",
+            where=str(path.parent),
+            do=f"resume it with more steps before {use}",
+        )
+    return posterior
 
-    Raises
-    ------
-    InputError
-        For a fit of another kind.
-    """
+
+def required(part: T | None, what: str) -> T:
+    """A part of a fit that its kind of run has."""
     if part is None:
         raise InputError(f"has no {what}", where=FIT, do=FIT_AGAIN)
     return part

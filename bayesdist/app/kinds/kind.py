@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.campaign.fit import fit_campaign
 from bayesdist.app.kinds.campaign.input_validation import refuse_campaign
 from bayesdist.app.kinds.campaign.inputs import read_campaign
 from bayesdist.app.kinds.campaign.matched import load_matched_campaign
-from bayesdist.app.kinds.campaign.matching import match_lists
-from bayesdist.app.kinds.campaign.preview import campaign_lines
-from bayesdist.app.kinds.fit_data import FitData, StarReader
+from bayesdist.app.kinds.campaign.matching import campaign_lines, match_lists
+from bayesdist.app.kinds.fit_data import StarReader
 from bayesdist.app.kinds.fitted import Fitted, load_fitted
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.matches.stars import (
@@ -30,20 +29,6 @@ from bayesdist.app.kinds.selfcal.matching import match_dithers, selfcal_lines
 from bayesdist.infer import Posterior
 
 
-class Sampler(Protocol):
-    """The posterior of a fit; checkpoints are in the folder."""
-
-    def __call__(
-        self,
-        data: FitData,
-        config: Config,
-        *,
-        folder: Path | None = None,
-        progress: Callable[[int, int], None] | None = None,
-    ) -> Posterior:
-        """Posterior of the stars of a fit."""
-
-
 @dataclass(frozen=True)
 class Kind:
     """Matched stars, a campaign, or a self-calibration.
@@ -57,7 +42,8 @@ class Kind:
     match: Callable[[Any, Any], Matched]
     # of (matched, config, base, reader): the least-squares solution
     fit: Callable[[Any, Any, Path, StarReader], Fitted]
-    sample: Sampler = sample_stars  # the posterior of the fit
+    # of (data, config, folder=, progress=): the posterior of the fit; checkpoints are in the folder
+    sample: Callable[..., Posterior] = sample_stars
     # of (folder, inputs, summary): the matches of an earlier stage, from a run's folder and its
     # summary.json; without it they are matched again
     load_matched: Callable[[Path, Any, Mapping[str, Any]], Matched] | None = None

@@ -32,40 +32,17 @@ MATCHING = "matching.ecsv"
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """Matches of a run, in two parts, as they were read or found.
+    """Matches of a run, in two parts, as they were read or found."""
 
-    Parameters
-    ----------
-    stars : Matches
-        Those that are fitted.
-    held : Matches or None
-        Those that are held out; None where none are.
-    whole : tuple of str
-        Exposures that are held out whole.
-    facts : mapping
-        Section of summary.json; empty for stars that were given as matches.
-    table : astropy.table.Table or None
-        One row for each exposure; None for stars that were given as matches.
-    catalogue : ReferenceCatalog or None
-        That the stars were matched with; None where only the matches are known.
+    section: ClassVar[str] = ""  # of summary.json, that has the facts
+    has_catalogue: ClassVar[bool] = True  # positions of stars come from a reference catalogue
 
-    Attributes
-    ----------
-    section : str
-        Name of the section of summary.json that has the facts.
-    has_catalogue : bool
-        The positions of stars come from a reference catalogue.
-    """
-
-    section: ClassVar[str] = ""
-    has_catalogue: ClassVar[bool] = True
-
-    stars: Matches
-    held: Matches | None = None
-    whole: tuple[str, ...] = ()
+    stars: Matches  # that are fitted
+    held: Matches | None = None  # that are held out
+    whole: tuple[str, ...] = ()  # exposures that are held out whole
     facts: Mapping[str, Any] = field(default_factory=dict)
-    table: Table | None = None
-    catalogue: ReferenceCatalog | None = None
+    table: Table | None = None  # one row for each exposure of star lists
+    catalogue: ReferenceCatalog | None = None  # where more than the matches is known
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -151,9 +128,7 @@ def set_aside(
 ) -> tuple[Matches, Matches | None, tuple[str, ...]]:
     """Matches that are fitted, those that are held out, and exposures that are so as a whole.
 
-    `needed`: so many of the first exposures define the gauge and cannot be held out. Result:
-    `fitted`; `held`: none where the configuration holds nothing out; `whole`. InputError for an
-    unknown exposure or one that is needed, and when nothing would be left, or too little set aside.
+    `needed`: so many of the first exposures define the gauge and cannot be held out.
     """
     block = config.holdout
     if block is None:

@@ -82,10 +82,7 @@ def lists_of(block: StarListsBlock, base: Path, *, errors: bool = False) -> Star
 def refuse_other_chips(lists: Sequence[Detections], chips: Sequence[Chip], key: str) -> None:
     """Refuse detections off the chips of a configuration, and chips without any.
 
-    Nothing is checked without [[chip]] blocks.  `key` is the one of the configuration that names
-    the lists.
-
-    InputError naming the list.
+    Nothing is checked without [[chip]] blocks. `key`: of the configuration, names the lists.
     """
     known = {chip.number: chip for chip in chips}
     if not known:

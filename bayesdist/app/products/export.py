@@ -10,39 +10,58 @@ from typing import Any
 
 from bayesdist.app.assessment.error_terms import published_tables
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.app.products.made_files import ProductInput, further_errors, made_files, write_files
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.products.made_files import (
+    ProductInput,
+    further_errors,
+    made_files,
+    product_of,
+    write_files,
+)
 from bayesdist.app.products.sky_closure import sky_closure
 from bayesdist.assess.budget.budget import with_product
+from bayesdist.assess.evaluation import Evaluation
 from bayesdist.assess.terms.forms import PRODUCT
-from bayesdist.diagnose.residuals.sample import StarSample
+from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.diagnose.residuals.sample import star_sample
 from bayesdist.files import atomic_path, path_within
+from bayesdist.infer import Posterior
 from bayesdist.limits import FILE_ERROR
 from bayesdist.products.registry import format_of, lint
 
 log = logging.getLogger("bayesdist")
 
 
-def export_files(
-    product: ProductInput,
-    fitted: Fitted,
+def export(
+    evaluation: Evaluation | None,
+    posterior: Posterior,
+    found: Diagnostics | None,
+    data: FitData,
     config: Config,
     base: Path,
     folder: Path,
     *,
-    stars: StarSample | None,
-    budget: Sequence[dict[str, Any]],
+    source: str = "",
 ) -> list[dict[str, Any]]:
     """Write the files that a configuration asks for, and list what is known of each.
 
-    Headers are compared on the sky with `stars`, the errors of files with rows of the error
-    `budget`.  Each entry has path, kind, findings, and what else is known of the file.
+    Their errors are compared with the budget of the `evaluation`, headers on the sky with the
+    stars.  `found`: whose errors of the parameters the files have, too.  Each entry has path, kind,
+    findings, and what else is known of the file.
     """
+    product = product_of(posterior, found, data, config, source)
+    budget = [] if evaluation is None else evaluation.budget.rows()
+    stars = None
+    if product.tangent_point is not None and config.products.asked():
+        if found is not None:
+            stars = found.sample
+        else:
+            stars = star_sample(data.sample, len(data.stars), data.fit, posterior)
     products: list[dict[str, Any]] = []
     release = config.products.release
     if release is not None:
         held = config.tables.detector is not None
-        tables = published_tables(fitted.tables, held=held)
+        tables = published_tables(data.fitted.tables, held=held)
         number, solutions = config.chips()[0].number, {product.filter: product.solution}
         products += write_files(release, number, base, folder, solutions, tables)
     product = replace(product, further=further_errors(budget))
@@ -56,13 +75,12 @@ def export_files(
             findings = [f"{f.level}: {f.where}: {f.message}" for f in lint(path)]
             if built.chip is not None:
                 entry["chip"] = built.chip
-                sky = None
+                closure = None
                 if stars is not None and built.kind == "SIP":
-                    sky = sky_closure(product, stars, path, built.chip)
-                if sky is not None:
-                    entry["sky"] = sky.summary
-                    log.log(sky.level, "export: %s: %s", path.name, sky.sentence)
-                    findings += sky.findings
+                    closure = sky_closure(product, stars, path, built.chip)
+                if closure is not None:
+                    entry["sky"], faults = closure
+                    findings += faults
             for warning in (*built.warnings, *left_out):
                 log.warning("export: WARNING: %s: %s", path.name, warning)
                 findings.append(f"warning: {warning}")

@@ -152,11 +152,9 @@ def write_files(
 ) -> list[dict[str, Any]]:
     """Write the files of one filter or several, as the configuration of one run says.
 
-    `block`: its section [products.release]. `chip`: number of the chip whose axes and zero point
-    define the gauge. `base`: folder that its files are relative to. `solutions`: the
-    configuration's own first: V2 and V3 lie as the reference says of it. `tables`: the detector's,
-    and those of filters. `history`: lines for HISTORY of all files. Result: one entry for each
-    file: path, kind, findings, and of an IDCTAB period and lost.
+    `chip`: whose axes and zero point define the gauge. `solutions`: the configuration's own first:
+    V2 and V3 lie as the reference says of it. `history`: lines for HISTORY of all files. An entry
+    is path, kind, findings, and of an IDCTAB period and lost.
     """
     calibrations = {
         filter: calibration_of(

@@ -30,6 +30,11 @@ def as_json(value: Any) -> Any:
     return to_jsonable_python(value, inf_nan_mode="null", fallback=_plain)
 
 
+def attributes(one: Any, names: str) -> dict[str, Any]:
+    """Attributes of an object as a row, by their names; None each where there is no object."""
+    return {name: None if one is None else getattr(one, name) for name in names.split()}
+
+
 def _refuse_sets(value: Any) -> None:
     """TypeError for a set anywhere in a value: pydantic would list it in the order of hashes."""
     if value is None or isinstance(value, str | int | float | np.ndarray):
@@ -91,9 +96,7 @@ def _rows(value: Any) -> bool:
     return isinstance(value, list) and all(isinstance(one, Mapping) for one in value)
 
 
-def shown(value: Any, longest: int = 60) -> str:
+def shown(value: Any) -> str:
     """A value as text that is not too long for a line."""
-    if value is None:
-        return "none"
-    text = json.dumps(value, ensure_ascii=False)
-    return text if len(text) <= longest else f"{text[: longest - 3]}..."
+    text = "none" if value is None else json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 60 else f"{text[:57]}..."

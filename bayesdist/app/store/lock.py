@@ -31,9 +31,6 @@ def locked(folder: Path) -> Iterator[None]:
 
     The lock is that of a file, not the file itself: one that a killed process has left holds
     nobody up.
-
-    InputError while another process holds the lock, with what that process is; where the folder is
-    read-only.
     """
     made_folder(folder)
     if fcntl is None:
@@ -44,7 +41,9 @@ def locked(folder: Path) -> Iterator[None]:
     try:
         with suppress(OSError):  # a full disk
             os.ftruncate(held, 0)
-            os.pwrite(held, _holder().encode(), 0)
+            since = datetime.now(UTC).isoformat(timespec="seconds")
+            holder = f"process {os.getpid()} on {socket.gethostname()} since {since}"
+            os.pwrite(held, holder.encode(), 0)
         yield
     finally:
         with suppress(OSError):
@@ -86,12 +85,6 @@ def _is_at(held: int, path: Path) -> bool:
     with suppress(FileNotFoundError):
         return os.path.samestat(os.fstat(held), path.stat())
     return False
-
-
-def _holder() -> str:
-    """This process, in words."""
-    since = datetime.now(UTC).isoformat(timespec="seconds")
-    return f"process {os.getpid()} on {socket.gethostname()} since {since}"
 
 
 def _read(held: int) -> str:

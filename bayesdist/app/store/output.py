@@ -45,10 +45,7 @@ SCHEMA = 1  # of records of commands
 
 @contextmanager
 def record_folder(path: Path, name: str, command: str) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """A new folder, and a record to be filled, which is written when the block succeeds.
-
-    `name` is the file of the record, `command` that by which the folder is made.
-    """
+    """A new folder, and a record to be filled, which is written when the block succeeds."""
     with atomic_directory(path) as folder:
         record: dict[str, Any] = {"schema": SCHEMA, "command": command, "versions": versions()}
         yield folder, record
@@ -59,8 +56,7 @@ def record_folder(path: Path, name: str, command: str) -> Iterator[tuple[Path, d
 def atomic_directory(path: Path) -> Iterator[Path]:
     """A folder that takes its name when the block succeeds, and else is removed.
 
-    `path`: new, or empty. Result: where to write. InputError for a folder that holds something, or
-    that cannot be made.
+    `path`: new, or empty. Result: where to write.
     """
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise InputError(

@@ -157,10 +157,7 @@ class Record:
 
     @classmethod
     def read(cls, path: Path) -> Record:
-        """Content of a run.json.
-
-        InputError where it cannot be read, has another schema, or is not as it was written.
-        """
+        """Content of a run.json."""
         do = "restore it, or choose another folder"
         facts = read_json(path, do=do)
         head = model_of(_HEAD, facts, str(path), do=do)

@@ -55,8 +55,8 @@ def refuse_another_solution(
 ) -> None:
     """Refuse to resume with inputs or settings that the solution was not made from.
 
-    `known` is the configuration that the run began with, `facts` are those of its record, `inputs`
-    the SHA-256 of the inputs now, `seed` that of the command line.
+    `known`: the configuration that the run began with, whose `record` has the facts. `seed`: that
+    of the command line.
     """
     path = folder / "config.toml"
     if seed is not None and seed != known.sampler.seed:

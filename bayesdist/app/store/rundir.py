@@ -73,10 +73,8 @@ class RunDirectory(ArtefactStore):
     ) -> RunDirectory:
         """A run that may be resumed in a folder, or may begin there; nothing is written yet.
 
-        `text`: the configuration as written by the user. `base`: folder that relative inputs are
-        relative to. `resume`, `force`: resume the run that is there, or replace it. `seed`: in
-        place of the configured one. `command`: for the record. InputError when the folder holds
-        another run or foreign files, or a resumed run was made from other inputs or settings.
+        `text`: the configuration as written by the user. `base`: folder that inputs are relative
+        to. `resume`, `force`: resume the run that is there, or replace it.
         """
         run = cls(path)
         if run.path.exists() and not run.path.is_dir():

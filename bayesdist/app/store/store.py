@@ -58,8 +58,7 @@ class ArtefactStore:
     were.  What a stage writes is noted in run.json before it takes its name, so that all of it is
     known at whatever moment a process is killed.
 
-    `path`: a folder with a run.json, or one that will have it. `stages`: by name, in order. `head`:
-    what summary.json says of the run as a whole, from the facts of run.json.
+    `head`: what summary.json says of the run as a whole, from the facts of run.json.
     """
 
     def __init__(

@@ -380,10 +380,7 @@ class Summary(Sections):
 
 
 def head_of(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """What summary.json says of the run as a whole.
-
-    `facts`: of run.json.
-    """
+    """What summary.json says of the run as a whole."""
     config = facts["config"]
     kind = next(one for one in ("data", "campaign", "selfcal") if one in config)
     chips = " and ".join(chip["name"] for chip in config["chip"])

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.diagnose.correlated.result import discrepancy_from_arrays, discrepancy_to_arrays
 from bayesdist.diagnose.diagnostics import Diagnostics
@@ -96,6 +97,5 @@ def _misfit_summary(found: Diagnostics) -> dict[str, Any]:
 
 
 def _misfit_row(m: Misfit) -> dict[str, Any]:
-    row = {"p_value": m.p_value, "partition": m.partition, "structure": m.structure}
-    row["power"] = m.power
+    row = attributes(m, "p_value partition structure power")
     return row if m.chip is None else row | {"chip": m.chip.number}

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import provenance_notes, write_table
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import ValidityRow
@@ -154,14 +155,10 @@ def _map_summary(found: Evaluation) -> dict[str, Any]:
     """The worst of all chips, and each chip."""
     chips: list[dict[str, Any]] = [
         {
-            "chip": m.chip,
-            "sigma_u_max": m.sigma_u_max,
-            "sigma_v_max": m.sigma_v_max,
+            **attributes(m, "chip sigma_u_max sigma_v_max radius_max position_of_max"),
             "sigma_max": float(m.per_axis.max()),
             "ce68_max": float(m.circular_error(0.68).max()),
             "ce95_max": float(m.circular_error(0.95).max()),
-            "radius_max": m.radius_max,
-            "position_of_max": list(m.position_of_max),
             "radius_max_least_squares": least_squares.radius_max,
         }
         for m, least_squares in zip(found.maps, found.formal, strict=True)

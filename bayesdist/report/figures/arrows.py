@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -166,49 +166,35 @@ def vector_map(
 def _draw(
     ax: Axes, arrows: Arrows, offset: tuple[float, float], magnification: float, *, fine: bool
 ) -> None:
+    """Arrows from (x, y) to (x + M du, y + M dv), in the axes' own pixels; pale unless clear."""
     x, y = arrows.x + offset[0], arrows.y + offset[1]
-    if arrows.clear is None:
-        _arrows(ax, x, y, arrows.du, arrows.dv, magnification, INK, fine=fine)
-    else:
-        for some, color in ((~arrows.clear, PALE), (arrows.clear, INK)):
-            vectors = arrows.du[some], arrows.dv[some]
-            _arrows(ax, x[some], y[some], *vectors, magnification, color, fine=fine)
+    parts: list[tuple[Any, str]] = [(slice(None), INK)]
+    if arrows.clear is not None:
+        parts = [(~arrows.clear, PALE), (arrows.clear, INK)]
         ax.plot(x, y, ".", ms=1.2, color=PALE, zorder=2)
+    heads = (3.2, 4.0, 3.6) if fine else (4.0, 5.0, 4.5)
+    head: dict[str, Any] = dict(
+        zip(("headwidth", "headlength", "headaxislength"), heads, strict=True)
+    )
+    for some, color in parts:
+        ax.quiver(
+            x[some],
+            y[some],
+            arrows.du[some],
+            arrows.dv[some],
+            angles="xy",
+            scale_units="xy",
+            scale=1.0 / magnification,
+            units="inches",
+            width=0.007 if fine else 0.011,
+            minlength=0.3,
+            color=color,
+            zorder=3,
+            **head,
+        )
     if arrows.ring is not None:
         at = np.add(arrows.ring, offset)
         ax.plot(*at, "o", ms=5, mfc="none", mec=PALETTE["vermilion"], mew=1.3, zorder=5)
-
-
-def _arrows(
-    ax: Axes,
-    x: Float,
-    y: Float,
-    du: Float,
-    dv: Float,
-    magnification: float,
-    color: str,
-    *,
-    fine: bool,
-) -> None:
-    """Arrows from (x, y) to (x + M du, y + M dv), in the axes' own pixels."""
-    head = (3.2, 4.0, 3.6) if fine else (4.0, 5.0, 4.5)
-    ax.quiver(
-        x,
-        y,
-        du,
-        dv,
-        angles="xy",
-        scale_units="xy",
-        scale=1.0 / magnification,
-        units="inches",
-        width=0.007 if fine else 0.011,
-        headwidth=head[0],
-        headlength=head[1],
-        headaxislength=head[2],
-        minlength=0.3,
-        color=color,
-        zorder=3,
-    )
 
 
 def _key(ax: Axes, length: float, *, magnification: float, unit: str) -> None:

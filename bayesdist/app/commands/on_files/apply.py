@@ -7,14 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.app.commands.on_files.calibrations import calibration_at, images_of, notes_of
+from bayesdist.app.commands.on_files.calibrations import calibration_at, images_of
 from bayesdist.app.commands.on_files.position_table import (
     OUT,
     add_positions,
     check_output,
     chip_numbers,
+    closing_lines,
+    head_line,
     position_column,
-    refuse_no_rows,
+    read_positions,
     write_positions,
 )
 from bayesdist.app.screen import number
@@ -29,7 +31,6 @@ from bayesdist.calibration.apply import (
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.inverse import fitted_inverse
 from bayesdist.errors import InputError
-from bayesdist.reading.tables import read_table
 
 METHODS = ("newton", "polynomial", "table")
 
@@ -74,8 +75,7 @@ def apply_to_table(
     images = images_of(found, image=image, ltv=ltv, corner=corner)
     a = Application(chips_of, frame, images)
     names = tuple(columns or (OUT if inverse else ("x", "y")))
-    rows = read_table(Path(table))
-    refuse_no_rows(rows, str(table))
+    rows = read_positions(Path(table))
     x, y = (position_column(rows, name, str(table)) for name in names)
     what = found.name, str(table)
     if inverse:
@@ -84,19 +84,16 @@ def apply_to_table(
         at, lines = _back(a, found, x, y, chips, method, order, epoch)
         added = ("x", "y")
     else:
-        at, added = _forth(a, x, y, chip_numbers(rows, chip, list(chips_of), *what)), OUT
+        chips = chip_numbers(rows, chip, list(chips_of), *what)
+        parts = {n: (chips == n, a.forward(x[chips == n], y[chips == n], chip=n)) for n in a.chips}
+        at, added = _gathered(parts, x.size), OUT
         lines = _frame_lines(a, source)
     add_positions(rows, at, added, str(table))
     rows.meta = {"calibration": found.name, "scale": pixel, "unit": found.unit}
     rows.meta |= {"origin": [ox, oy], "vafactor": vafactor}
     write_positions(rows, output)
-    return "\n".join([_head(output, at, found, epoch), *lines, *_losses(a, at, x, y, inverse)])
-
-
-def _forth(a: Application, x: Float, y: Float, chips: Int) -> Positions:
-    return _gathered(
-        {n: (chips == n, a.forward(x[chips == n], y[chips == n], chip=n)) for n in a.chips}, x.size
-    )
+    head = head_line(output, f"{at.x.size} positions", found, epoch)
+    return "\n".join([head, *lines, *_losses(a, at, x, y, inverse)])
 
 
 def _back(
@@ -157,11 +154,6 @@ def _gathered(parts: dict[int, tuple[Bool, Positions]], n: int) -> Positions:
     return Positions(at[0], at[1], cov, number)
 
 
-def _head(output: Path, at: Positions, found: Calibration, epoch: float | None) -> str:
-    notes = "".join(f"; {note}" for note in notes_of(found, epoch))
-    return f"{output}: {at.x.size} positions, by {found.name}{notes}"
-
-
 def _frame_lines(a: Application, source: str) -> list[str]:
     frame, size = frame_that_holds(a.chips, a.frame.scale, a.frame.vafactor)
     unit = next(iter(a.chips.values())).unit
@@ -187,11 +179,5 @@ def _losses(a: Application, at: Positions, x: Float, y: Float, inverse: bool) ->
         image = a.images.get(n)
         px, py = (x, y) if image is None else image.to_chip(x, y)
         outside += int((mine & ~on_chip(c, px, py)).sum())
-    if outside:
-        out.append(
-            f"  positions outside of their chip, where polynomials are extrapolated: {outside}"
-        )
-    if at.cov is not None and np.isfinite(at.sigma_x).any():
-        largest = np.nanmax([at.sigma_x, at.sigma_y])
-        out.append(f"  largest standard deviation of a coordinate {number(float(largest), 3)} pix")
-    return out
+    sigma = None if at.cov is None else (at.sigma_x, at.sigma_y)
+    return out + closing_lines(outside, sigma, "pix")

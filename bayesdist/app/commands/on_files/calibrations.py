@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from pydantic import TypeAdapter
 
-from bayesdist.app.config.section import Detector
 from bayesdist.app.products.made_files import further_errors
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
@@ -35,11 +34,10 @@ def calibration_at(
 ) -> Calibration:
     """The calibration of a file or a run.
 
-    `path`: a file of any format, a run directory, posterior.nc or fit.nc. `filter`: of an IDCTAB;
-    names of both wheels may be joined by a comma. The band of WISE meta-data. `scale`: size of a
-    corrected pixel, in the unit of the calibration. `size`: columns and rows, for a SIP header that
-    does not say. InputError for a file that holds no calibration, a filter that is missing or not
-    there, or a scale that is not positive.
+    `path`: a file of any format, a run directory, posterior.nc or fit.nc. `filter`: of an IDCTAB,
+    names of both wheels joined by a comma, or the band of WISE meta-data. `scale`: size of a
+    corrected pixel in the unit of the calibration. `size`: columns and rows, for a header that does
+    not say.
     """
     path = Path(path)
     if not path.exists():
@@ -48,11 +46,13 @@ def calibration_at(
     if solution is None:
         found = read_calibration(path, filter=filter, size=size)
     else:
-        detector = _detector_of_run(path)
-        found = calibration_of(
-            solution, str(path), detector=detector.name, scale=_scale(detector, solution)
-        )
-        summary = _summary_of(path)
+        detector, scale_of, summary = "", None, _summary_of(path)
+        if (run := run_of(path)) is not None:
+            detector = run.config.detector.name
+            unit, pixel = solution.model.unit, pixel_of_run(path)
+            if unit != "pix" and pixel is not None:
+                scale_of = pixel / ARCSEC[unit], "detector.scale_mas"
+        found = calibration_of(solution, str(path), detector=detector, scale=scale_of)
         budget = [] if summary is None else summary.budget or []
         found = replace(found, further=further_errors([row.model_dump() for row in budget]))
     if scale is None:
@@ -114,36 +114,25 @@ def on_the_sky(path: Path, found: Calibration) -> Calibration:
     return replace(found, plane=Plane("sky", point=(point[0], point[1])))
 
 
+def run_of(path: Path) -> RunDirectory | None:
+    """The run that a folder is, or that a file is of; None where it is of none."""
+    home = path if path.is_dir() else path.parent
+    return RunDirectory(home) if (home / "run.json").exists() else None
+
+
 def _summary_of(path: Path) -> Summary | None:
-    """Summary of the run that a file or folder is of; None where it is of none."""
-    home = path if path.is_dir() else path.parent
-    summary = home / "summary.json"
-    if not (home / "run.json").exists() or not summary.exists():
+    """Summary of the run that a file or folder is of; None where there is none."""
+    run = run_of(path)
+    if run is None or not (run / "summary.json").exists():
         return None
-    return read_json_as(_SUMMARY, summary, do="resume the run, which writes it again")
-
-
-def _detector_of_run(path: Path) -> Detector:
-    """The section [detector] of the run that a file or folder is of; empty where it is of none."""
-    home = path if path.is_dir() else path.parent
-    return RunDirectory(home).config.detector if (home / "run.json").exists() else Detector()
+    return read_json_as(_SUMMARY, run / "summary.json", do="resume the run, which writes it again")
 
 
 def pixel_of_run(path: Path) -> float | None:
     """Arcseconds in a pixel as a run was configured; None where nothing says it."""
-    return _pixel(_detector_of_run(path))
-
-
-def _pixel(detector: Detector) -> float | None:
-    return None if detector.scale_mas is None else 1e-3 * detector.scale_mas
-
-
-def _scale(detector: Detector, solution: Solution) -> tuple[float, str] | None:
-    """Size of a corrected pixel in the unit of a solution; None where nothing says it."""
-    unit, pixel = solution.model.unit, _pixel(detector)
-    if unit == "pix" or pixel is None:
-        return None
-    return pixel / ARCSEC[unit], "detector.scale_mas"
+    run = run_of(path)
+    mas = None if run is None else run.config.detector.scale_mas
+    return None if mas is None else 1e-3 * mas
 
 
 def notes_of(found: Calibration, epoch: float | None) -> tuple[str, ...]:
@@ -166,8 +155,7 @@ def images_of(
 ) -> dict[int, Subarray]:
     """Where pixels lie on their chips, as one of three options says; empty for whole chips.
 
-    `image`: a calibrated image. `ltv`: LTV1, LTV2. `corner`: the pixel of the chip that is the
-    subarray's first. InputError for more than one of them, or as `subarrays_of_image`.
+    `corner`: the pixel of the chip that is the subarray's first.
     """
     given = [("--image", image), ("--ltv", ltv), ("--corner", corner)]
     named = [name for name, value in given if value is not None]

@@ -155,10 +155,15 @@ def _of_matches(
         log.warning("%s: left out %d rows: %s", matches, count, reason)
     layout = table_layout(matches, columns, read_sigma=read_sigma)
     _warn_of_pixels(table, str(matches))
-    names = dict(zip(table.chip_numbers, _chip_names(table), strict=True))
-    detector = detector_lines(_reach(table), names, size, Path(matches).stem)
-    cx, cy = detector.middle
-    nx, ny = detector.size
+    chips = table.chip_names or tuple(f"chip {number}" for number in table.chip_numbers)
+    detector, sizes = detector_lines(
+        ((batch.x, batch.y, batch.chip_number) for batch in table.batches()),
+        dict(zip(table.chip_numbers, chips, strict=True)),
+        size,
+        Path(matches).stem,
+    )
+    nx, ny = next(iter(sizes.values()))
+    centre = _CENTRE.format(cx=(nx + 1) / 2, cy=(ny + 1) / 2)
     return len(table), {
         "format": _AUTO.format(
             formats=" | ".join((*FORMATS, *mission_formats(), *data_sections()))
@@ -167,17 +172,12 @@ def _of_matches(
         "unit_line": unit_line,
         "sigma": sigma,
         "not_finite": not_finite,
-        "detector": detector.text,
-        "reference": "" if detector.several else _CENTRE.format(cx=cx, cy=cy),
+        "detector": detector,
+        "reference": "" if len(sizes) > 1 else centre,
         "frames": "shift_rotation_scale" if len(table.exposure_names) > 1 else "none",
         "grid_y": max(3, round(32 * ny / nx) + 1),
         "unit": table.unit,
     }
-
-
-def _chip_names(matches: Matches) -> tuple[str, ...]:
-    """Names of the chips, in the order of their numbers."""
-    return matches.chip_names or tuple(f"chip {number}" for number in matches.chip_numbers)
 
 
 def _read(
@@ -243,18 +243,3 @@ def _warn_of_pixels(matches: Matches, where: str) -> None:
             "%.1f, y from %.1f; if they count from elsewhere on the detector, add its pixel there",
             *(where, n, len(matches), *least),
         )
-
-
-def _reach(matches: Matches) -> dict[int, tuple[float, float]]:
-    """Largest x and y on each chip, by its number."""
-    out: dict[int, tuple[float, float]] = {}
-    for table in matches.batches():
-        for code, number in enumerate(table.chip_numbers):
-            rows = table.chip == code
-            if rows.any():
-                x, y = out.get(number, (0.0, 0.0))
-                out[number] = (
-                    max(x, float(table.x[rows].max())),
-                    max(y, float(table.y[rows].max())),
-                )
-    return dict(sorted(out.items()))

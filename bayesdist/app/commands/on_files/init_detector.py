@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from bayesdist.arrays import Float, Int
 from bayesdist.errors import InputError
 
 _DETECTOR = """\
@@ -28,47 +28,36 @@ reference_pixel = [{cx}, {cy}]  # zero point of the polynomial
 """
 
 
-@dataclass(frozen=True)
-class DetectorLines:
-    """Lines of a configuration on the detector, or on its chips."""
-
-    text: str
-    size: tuple[int, int]  # columns and rows of the first chip
-    several: bool  # true of several chips
-
-    @property
-    def middle(self) -> tuple[float, float]:
-        """Middle of the first chip."""
-        nx, ny = self.size
-        return (nx + 1) / 2, (ny + 1) / 2
+Size = tuple[int, int]
 
 
 def detector_lines(
-    reach: Mapping[int, tuple[float, float]],
+    pixels: Iterable[tuple[Float, Float, Int]],
     names: Mapping[int, str],
-    given: tuple[int, int] | None,
+    given: Size | None,
     name: str,
-) -> DetectorLines:
-    """Lines on one detector, or on several chips.
+) -> tuple[str, dict[int, Size]]:
+    """Lines on one detector, or on several chips; and columns and rows of each, by its number.
 
-    `reach` has largest x and y of the stars on each chip, by its number, `names` the chips' names;
-    `given` is the size of each where the user knows it, and `name` that of a detector of one chip.
+    `pixels` are x, y and chips of some tables, `names` the chips' names; `given` is the size of
+    each where the user knows it, and `name` that of a detector of one chip.
     """
-    sizes = {number: given or (_guess(x), _guess(y)) for number, (x, y) in reach.items()}
-    values = []
-    for number, (nx, ny) in sizes.items():
-        x, y = reach[number]
-        how = "as given" if given else f"guessed from x up to {x:.1f}, y up to {y:.1f}"
+    reach: dict[int, tuple[float, float]] = {}
+    for x, y, chips in pixels:
+        for number in np.unique(chips).tolist():
+            rows, (far_x, far_y) = chips == number, reach.get(number, (0.0, 0.0))
+            reach[number] = max(far_x, float(x[rows].max())), max(far_y, float(y[rows].max()))
+    sizes, values = {}, []
+    for number, (far_x, far_y) in sorted(reach.items()):
+        nx, ny = sizes[number] = given or (_guess(far_x), _guess(far_y))
+        how = "as given" if given else f"guessed from x up to {far_x:.1f}, y up to {far_y:.1f}"
         values.append(
             {"number": number, "name": quoted(names.get(number, f"chip {number}")), "nx": nx,
              "ny": ny, "how": how, "cx": (nx + 1) / 2, "cy": (ny + 1) / 2}
         )  # fmt: skip
-    several = len(sizes) > 1
-    if several:
-        text = "\n".join(_CHIP.format(**one) for one in values)
-    else:
-        text = _DETECTOR.format(**values[0] | {"name": quoted(name)})
-    return DetectorLines(text, next(iter(sizes.values())), several)
+    if len(sizes) > 1:
+        return "\n".join(_CHIP.format(**one) for one in values), sizes
+    return _DETECTOR.format(**values[0] | {"name": quoted(name)}), sizes
 
 
 def quoted(text: str) -> str:

@@ -94,7 +94,9 @@ def draft_of(
         wanted = ", ".join(f'{key} = ""' for key in lacking)
         text = head + _WITHOUT_PIXELS.format(relative=relative, wanted=wanted)
         return text, f"an incomplete draft with the candidates: no columns are known as {words}"
-    text = head + _of_star_list(matches, relative, _named(layout, columns), size)
+    taken = {} if layout is None else layout.taken
+    named = {key: taken[key] for key in _LIST_KEYS if key in taken} | dict(columns or {})
+    text = head + _of_star_list(matches, relative, named, size)
     parse_config(text, str(path))
     return text, (
         "an incomplete draft: no columns are known as reference positions; as it stands it is a "
@@ -125,26 +127,15 @@ def _candidates(path: Path, matches: str | Path, layout: TableLayout) -> str:
     )
 
 
-def _named(layout: TableLayout | None, columns: Mapping[str, str] | None) -> dict[str, str]:
-    """Columns of a star list: those of the layout, and those that the user names."""
-    taken = {} if layout is None else layout.taken
-    return {key: taken[key] for key in _LIST_KEYS if key in taken} | dict(columns or {})
-
-
 def _of_star_list(
     matches: str | Path, relative: str, columns: dict[str, str], size: tuple[int, int] | None
 ) -> str:
     """Text of a self-calibration, with the size of the chips by the detections."""
-    reach: dict[int, tuple[float, float]] = {}
-    for one in read_star_lists(matches, columns or None):
-        for number in one.chips:
-            x, y = reach.get(number, (0.0, 0.0))
-            rows = one.chip == number
-            reach[number] = (max(x, float(one.x[rows].max())), max(y, float(one.y[rows].max())))
-    detector = detector_lines(dict(sorted(reach.items())), {}, size, input_files(matches)[0].stem)
+    pixels = ((one.x, one.y, one.chip) for one in read_star_lists(matches, columns or None))
+    detector, _ = detector_lines(pixels, {}, size, input_files(matches)[0].stem)
     inline = ", ".join(f"{key} = {quoted(name)}" for key, name in columns.items())
     return _STAR_LIST.format(
         relative=relative,
         columns=f"columns = {{{inline}}}\n" if columns else "",
-        detector=detector.text,
+        detector=detector,
     )

@@ -1,4 +1,4 @@
-"""Tables of positions that `bayesdist apply` reads, adds to and writes."""
+"""Tables of positions that `bayesdist apply` reads, adds to, writes and describes."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
+from bayesdist.app.commands.on_files.calibrations import notes_of
+from bayesdist.app.screen import number
 from bayesdist.app.store.output import refuse_existing
 from bayesdist.arrays import Float, Int
 from bayesdist.calibration.apply import Positions
+from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
+from bayesdist.reading.tables import read_table
 
 log = logging.getLogger("bayesdist")
 
@@ -34,10 +38,12 @@ def check_output(output: Path, force: bool) -> None:
     refuse_existing(output, force)
 
 
-def refuse_no_rows(table: Table, where: str) -> None:
-    """Refuse a table without positions."""
+def read_positions(path: Path) -> Table:
+    """A table of positions, of which there have to be some."""
+    table = read_table(path)
     if not len(table):
-        raise InputError("has no rows", where=where, do="give a table of positions")
+        raise InputError("has no rows", where=str(path), do="give a table of positions")
+    return table
 
 
 def position_column(table: Table, name: str, where: str) -> Float:
@@ -132,3 +138,22 @@ def write_positions(table: Table, output: Path) -> None:
                 where=str(output),
                 do=f"choose another of {', '.join(_FORMATS)}, or drop columns that hold arrays",
             ) from error
+
+
+def head_line(output: Path, positions: str, found: Calibration, epoch: float | None) -> str:
+    """What was written, and by which calibration."""
+    notes = "".join(f"; {note}" for note in notes_of(found, epoch))
+    return f"{output}: {positions}, by {found.name}{notes}"
+
+
+def closing_lines(outside: int, sigma: Sequence[Float] | None, unit: str) -> list[str]:
+    """Lines on positions beyond the detector, and on the largest error."""
+    out = []
+    if outside:
+        out.append(
+            f"  positions outside of their chip, where polynomials are extrapolated: {outside}"
+        )
+    if sigma is not None and np.isfinite(sigma).any():
+        worst = number(float(np.nanmax(sigma)), 3)
+        out.append(f"  largest standard deviation of a coordinate {worst} {unit}")
+    return out

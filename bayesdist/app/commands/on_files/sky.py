@@ -11,24 +11,24 @@ from astropy import units
 from astropy.io import fits
 from astropy.table import QTable, Table
 
-from bayesdist.app.commands.on_files.calibrations import calibration_at, notes_of, on_the_sky
+from bayesdist.app.commands.on_files.calibrations import calibration_at, on_the_sky
 from bayesdist.app.commands.on_files.position_table import (
     check_output,
     chip_numbers,
+    closing_lines,
+    head_line,
     position_column,
+    read_positions,
     refuse_columns,
-    refuse_no_rows,
     write_positions,
 )
-from bayesdist.app.screen import number
 from bayesdist.arrays import Float
 from bayesdist.calibration.apply import on_chip
 from bayesdist.calibration.calibration import Calibration, calibration_of
-from bayesdist.calibration.sky_positions import SkyPositions, sky_positions
+from bayesdist.calibration.sky_positions import sky_positions
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 from bayesdist.infer.solution import Solution
-from bayesdist.reading.tables import read_table
 
 if TYPE_CHECKING:
     import pandas
@@ -110,9 +110,37 @@ def apply_to_sky(
     """
     found = _calibration(source, filter, size)
     rows, name = _rows(table)
-    rows, _ = _with_sky(
-        found, rows, name, columns, centroids, pixel_origin, chip, epoch, point, covariance
+    plain = Table(rows)
+    x, y = (position_column(plain, c, name) + (1.0 - pixel_origin) for c in columns)
+    sigma = None
+    if centroids is not None:
+        a, b = (position_column(plain, c, name) for c in centroids)
+        sigma = a, b
+    numbers = chip_numbers(plain, chip, list(found.numbers), found.name, name)
+    at = sky_positions(
+        found, x, y, numbers, epoch=epoch, point=point, centroids=sigma, joint=covariance
     )
+    new = COLUMNS if at.sigma is not None else COLUMNS[:2]
+    refuse_columns(rows, new, name)
+    rows["ra"], rows["dec"] = at.ra * units.deg, at.dec * units.deg
+    if at.cov is not None and at.sigma is not None:
+        east, north = at.sigma
+        rows["sigma_ra"], rows["sigma_dec"] = east * units.mas, north * units.mas
+        product = east * north
+        rows["corr_ra_dec"] = np.divide(
+            at.cov[:, 0, 1], product, out=np.zeros_like(product), where=product > 0
+        )
+    outside = sum(
+        int((~on_chip(m, x[numbers == n], y[numbers == n]) & np.isfinite(x[numbers == n])).sum())
+        for n, m in found.at(epoch).items()
+    )
+    rows.meta = {
+        "calibration": found.name,
+        "errors": [e for e, _ in _known(found, centroids)],
+        "outside": outside,
+    }
+    if at.joint is not None:
+        rows.meta[COVARIANCE] = at.joint
     return rows
 
 
@@ -145,10 +173,16 @@ def sky_to_table(
             do="name a .fits file",
         )
     found = _calibration(path, filter, size)
-    rows, name = _rows(table)
-    refuse_no_rows(rows, name)
-    rows, at = _with_sky(
-        found, rows, name, columns or ("x", "y"), centroids, pixel_origin, chip, epoch, point, joint
+    rows = apply_to_sky(
+        found,
+        table,
+        columns=columns or ("x", "y"),
+        centroids=centroids,
+        pixel_origin=pixel_origin,
+        chip=chip,
+        epoch=epoch,
+        point=point,
+        covariance=joint,
     )
     matrix = rows.meta.pop(COVARIANCE, None)
     plain = Table(rows)  # units as text, which all formats have
@@ -156,7 +190,7 @@ def sky_to_table(
         write_positions(plain, output)
     else:
         _write_joint(plain, matrix, output)
-    return "\n".join(_lines(output, found, rows, at, epoch, centroids))
+    return "\n".join(_lines(output, found, rows, epoch, centroids))
 
 
 def _calibration(
@@ -174,55 +208,10 @@ def _calibration(
 def _rows(table: Any) -> tuple[QTable, str]:
     """Rows of a table, and what to call it."""
     if isinstance(table, str | Path):
-        return QTable(read_table(Path(table))), str(table)
+        return QTable(read_positions(Path(table))), str(table)
     if hasattr(table, "to_parquet"):  # a DataFrame
         return QTable(Table.from_pandas(table)), "table"
     return QTable(table), "table"
-
-
-def _with_sky(
-    found: Calibration,
-    rows: QTable,
-    name: str,
-    columns: Sequence[str],
-    centroids: Sequence[str] | None,
-    pixel_origin: float,
-    chip: int | None,
-    epoch: float | None,
-    point: tuple[float, float] | None,
-    joint: bool,
-) -> tuple[QTable, SkyPositions]:
-    """Rows with the columns of their positions, and these."""
-    plain = Table(rows)
-    x, y = (position_column(plain, c, name) + (1.0 - pixel_origin) for c in columns)
-    sigma = None
-    if centroids is not None:
-        a, b = (position_column(plain, c, name) for c in centroids)
-        sigma = a, b
-    numbers = chip_numbers(plain, chip, list(found.numbers), found.name, name)
-    at = sky_positions(found, x, y, numbers, epoch=epoch, point=point, centroids=sigma, joint=joint)
-    new = COLUMNS if at.sigma is not None else COLUMNS[:2]
-    refuse_columns(rows, new, name)
-    rows["ra"], rows["dec"] = at.ra * units.deg, at.dec * units.deg
-    if at.cov is not None and at.sigma is not None:
-        east, north = at.sigma
-        rows["sigma_ra"], rows["sigma_dec"] = east * units.mas, north * units.mas
-        product = east * north
-        rows["corr_ra_dec"] = np.divide(
-            at.cov[:, 0, 1], product, out=np.zeros_like(product), where=product > 0
-        )
-    outside = sum(
-        int((~on_chip(m, x[numbers == n], y[numbers == n]) & np.isfinite(x[numbers == n])).sum())
-        for n, m in found.at(epoch).items()
-    )
-    rows.meta = {
-        "calibration": found.name,
-        "errors": [e for e, _ in _known(found, centroids)],
-        "outside": outside,
-    }
-    if at.joint is not None:
-        rows.meta[COVARIANCE] = at.joint
-    return rows, at
 
 
 def _known(found: Calibration, centroids: Sequence[str] | None) -> list[tuple[str, str]]:
@@ -244,26 +233,18 @@ def _lines(
     output: Path,
     found: Calibration,
     rows: QTable,
-    at: SkyPositions,
     epoch: float | None,
     centroids: Sequence[str] | None,
 ) -> list[str]:
-    notes = "".join(f"; {note}" for note in notes_of(found, epoch))
-    lines = [f"{output}: {len(rows)} positions on the sky, by {found.name}{notes}"]
+    lines = [head_line(output, f"{len(rows)} positions on the sky", found, epoch)]
     lines += [f"  in the errors: {name} ({shared})" for name, shared in _known(found, centroids)]
     if not found.further and found.errors != "none":
         lines.append("  of further errors (structure, catalogue, yours) the file says nothing")
     if centroids is None:
         lines.append("  not in them: centroids of the stars; give --centroids SX SY")
-    if rows.meta["outside"]:
-        lines.append(
-            "  positions outside of their chip, where polynomials are extrapolated: "
-            f"{rows.meta['outside']}"
-        )
-    if at.sigma is not None and np.isfinite(at.sigma).any():
-        worst = number(float(np.nanmax(at.sigma)), 3)
-        lines.append(f"  largest standard deviation of a coordinate {worst} mas")
-    return lines
+    names = [name for name in ("sigma_ra", "sigma_dec") if name in rows.colnames]
+    sigma = [np.asarray(rows[name].to_value("mas"), float) for name in names] or None
+    return lines + closing_lines(rows.meta["outside"], sigma, "mas")
 
 
 def _write_joint(table: Table, matrix: Float, output: Path) -> None:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from astropy.table import Table, vstack
 
-from bayesdist.app.commands.on_files.calibrations import calibration_at
+from bayesdist.app.commands.on_files.calibrations import calibration_at, run_of
+from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import record_folder, write_table
-from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.comparison.compare import (
     Comparison,
     compare,
@@ -49,18 +49,11 @@ def write_comparison(
 
 def comparison_summary(found: Comparison) -> dict[str, Any]:
     """Content of comparison.json for one chip."""
-    s, field = found.similarity, found.field
-    sides = {}
-    for letter, c in (("a", found.a), ("b", found.b)):
-        sides[letter] = {
-            "name": c.name,
-            "order": c.basis.order,
-            "unit": c.unit,
-            "chip": c.chip,
-            "epoch": c.epoch,
-            "errors": c.errors,
-            "notes": list(c.notes),
-        }
+    s = found.similarity
+    sides = {
+        letter: attributes(c, "name unit chip epoch errors notes") | {"order": c.basis.order}
+        for letter, c in (("a", found.a), ("b", found.b))
+    }
     return {
         **sides,
         "verdict": verdict(found),
@@ -68,57 +61,40 @@ def comparison_summary(found: Comparison) -> dict[str, Any]:
         "pixel_mas": found.frame.pixel_mas,
         "linear": {
             "taken_out": bool(found.frame.taken.shape[1]),
-            "shift": s.shift,
-            "sigma_shift": s.sigma_shift,
+            **attributes(s, "shift sigma_shift scale sigma_scale mirrored"),
             "rotation_rad": s.rotation,
             "sigma_rotation_rad": s.sigma_rotation,
-            "scale": s.scale,
-            "sigma_scale": s.sigma_scale,
-            "mirrored": s.mirrored,
             "comparable": s.alike,
         },
-        "rms": found.rms,
-        "noise_rms": found.noise_rms,
-        "largest": found.largest,
-        "sigma_of_largest": found.sigma_of_largest,
-        "position_of_largest": list(found.position_of_largest),
-        "significance_of": found.errors_of if field is not None else "none",
-        "chi2": None if field is None else field.chi2,
-        "dof": None if field is None else field.dof,
-        "p_value": None if field is None else field.p_value,
-        "largest_z": found.largest_z,
-        "p_largest_z": found.p_largest_z,
+        **attributes(found, "rms noise_rms largest sigma_of_largest position_of_largest"),
+        "significance_of": found.errors_of if found.field is not None else "none",
+        **attributes(found.field, "chi2 dof p_value"),
+        **attributes(found, "largest_z p_largest_z"),
         "p_largest_chi2_on_grid": found.p_largest_chi2,
         "untested_rms": found.unknown_rms,
     }
 
 
 def _gap_summary(gap: GapDifference) -> dict[str, Any]:
-    shift, (scale, rotation) = gap.values[:2].tolist(), gap.values[2:].tolist()
-    sigma = gap.sigma
+    sigma = (None,) * 4 if gap.sigma is None else gap.sigma.tolist()
+    shift_u, shift_v, scale, rotation = gap.values.tolist()
     return {
-        "chip": gap.chip,
-        "reference": gap.reference,
+        **attributes(gap, "chip reference"),
         "verdict": gap_verdict(gap),
         "unit": "pix",
-        "shift": shift,
-        "sigma_shift": None if sigma is None else sigma[:2].tolist(),
+        "shift": [shift_u, shift_v],
+        "sigma_shift": None if gap.sigma is None else sigma[:2],
         "scale": scale,
-        "sigma_scale": None if sigma is None else float(sigma[2]),
+        "sigma_scale": sigma[2],
         "rotation_rad": rotation,
-        "sigma_rotation_rad": None if sigma is None else float(sigma[3]),
+        "sigma_rotation_rad": sigma[3],
         "significance_of": gap.errors_of,
-        "chi2": None if gap.test is None else gap.test.chi2,
-        "dof": None if gap.test is None else gap.test.dof,
-        "p_value": None if gap.test is None else gap.test.p_value,
+        **attributes(gap.test, "chi2 dof p_value"),
     }
 
 
 def joined(found: Sequence[Comparison], table_of: Any) -> Table:
-    """The tables of all chips as one, with the chip in front where there are several.
-
-    `table_of` makes that of one comparison.
-    """
+    """The tables of all chips as one, with the chip in front where there are several."""
     tables = []
     for one in found:
         table = table_of(one)
@@ -162,8 +138,13 @@ def compare_files(
     gaps = _gaps(both, epoch, [n for n, m in numbers if n == m])
     if output is not None:
         write_comparison(Path(output), found, gaps, command)
-    scale = _scale_of(a) or _scale_of(b)
-    return _text(found, gaps, scale, related=_home(a) == _home(b))
+    runs = [run_of(Path(one)) for one in (a, b)]
+    scales = [None if run is None else run.config.detector.scale_mas for run in runs]
+    homes = [
+        Path(one).resolve() if run is None else run.path.resolve()
+        for one, run in zip((a, b), runs, strict=True)
+    ]
+    return _text(found, gaps, scales[0] or scales[1], related=homes[0] == homes[1])
 
 
 def _read(
@@ -183,20 +164,6 @@ def _read(
         for path, one, size in zip(paths, filters, sizes, strict=True)
     )
     return a, b
-
-
-def _home(path: str | Path) -> Path:
-    """The run that a file belongs to, or the file."""
-    path = Path(path).resolve()
-    return path.parent if (path.parent / "run.json").exists() else path
-
-
-def _scale_of(path: str | Path) -> float | None:
-    """Size of a pixel in mas, as a run was told it."""
-    home = _home(path)
-    if not (home / "run.json").exists():
-        return None
-    return RunDirectory(home).config.detector.scale_mas
 
 
 def _common(both: tuple[Calibration, Calibration], chip: int | None) -> list[tuple[int, int]]:

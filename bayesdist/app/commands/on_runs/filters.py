@@ -65,9 +65,8 @@ def compare_filters(
 ) -> FilterComparison:
     """Compare the drifting terms of exposures in several filters, chip by chip.
 
-    `series`: the reference filter first. `time`: what drifts. InputError for one filter only, and
-    where nothing drifts or no term is known in all filters. DegenerateError for a filter whose
-    exposures do not determine rates of its own.
+    `series`: the reference filter first. `time`: what drifts. InputError where nothing can be
+    compared.
     """
     if time is None:
         raise InputError("nothing drifts", where="model.tdd", do="give the terms that do")
@@ -138,23 +137,9 @@ def comparison_table(
 ) -> Table:
     """Linear terms of each filter with the drift taken out, and how they differ.
 
-    Parameters
-    ----------
-    solutions : mapping of filter to Solution
-        The reference filter first.
-    comparison : FilterComparison or None
-        None where the exposures could not be compared: offsets are then those of the solutions,
-        and rates have no rows.
-    chip : int
-        Number of the reference chip.
-
-    Returns
-    -------
-    astropy.table.Table
-        One row for each filter, chip and term A_2, A_3, B_2, B_3 that the gauge does not fix: value
-        and sigma at the reference date (`epoch` in the header), offset against the reference filter
-        with its sigma, both in u, v per pixel, and as what it does at half the chip, in the unit of
-        u, v; and the difference of rates, where it was looked for.
+    `solutions`: the reference filter first; without a `comparison` offsets are theirs. A row is a
+    filter, chip and term A_2, A_3, B_2, B_3 that the gauge does not fix, at the reference date: per
+    pixel of u, v, and as what it does at half the chip, in the unit of u, v.
     """
     reference = next(iter(solutions))
     offsets = {} if comparison is None else comparison.offsets
@@ -217,10 +202,7 @@ def draw_filters(
     fits: Mapping[str, Fitted],
     solutions: Mapping[str, Solution],
 ) -> tuple[str, ...]:
-    """Write filters_A_2.png and the like, and return their names.
-
-    `fits`: the reference filter first. `solutions`: as they are released.
-    """
+    """Write filters_A_2.png and the like, and return their names."""
     # figures take seconds to import
     from bayesdist.report.drawing import save_figures
     from bayesdist.report.figures.filters import FilterTerm, filters_figure

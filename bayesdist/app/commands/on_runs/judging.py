@@ -18,38 +18,23 @@ from bayesdist.infer.solution import Solution
 
 def errors_of(results: Results) -> DrawnErrors:
     """Draws of all errors of a position, as budget and margins have them, and of files."""
-    return drawn_errors(
-        results.errors,
-        results.diagnostics,
-        results.settings,
-        assessment_rng(results.config),
-        files=file_errors(results.product, results.config, results.base),
-    )
+    files = file_errors(results.product, results.config, results.base)
+    given = results.errors, results.diagnostics, results.settings
+    return drawn_errors(*given, assessment_rng(results.config), files=files)
 
 
 def margins_of(results: Results, requirements: Sequence[Requirement]) -> tuple[Margin, ...]:
     """Margins of a run against requirements."""
-    return judged(
-        results.errors,
-        results.diagnostics,
-        requirements,
-        results.settings,
-        assessment_rng(results.config),
-        checks=results.checks,
-    )
+    given = results.errors, results.diagnostics, requirements, results.settings
+    return judged(*given, assessment_rng(results.config), checks=results.checks)
 
 
 def validity_periods_of(
     results: Results, requirements: Sequence[Requirement]
 ) -> tuple[ValidityPeriod, ...]:
     """Until when requirements are met by a run, where something depends on time."""
-    return validity_of(
-        results.errors,
-        results.diagnostics,
-        requirements,
-        results.settings,
-        assessment_rng(results.config),
-    )
+    given = results.errors, results.diagnostics, requirements, results.settings
+    return validity_of(*given, assessment_rng(results.config))
 
 
 def probability_met(

@@ -10,11 +10,12 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.commands.on_runs.compare import joined
-from bayesdist.app.commands.on_runs.new_exposures import fit_exposures_of, read_new_exposures
+from bayesdist.app.commands.on_runs.new_exposures import fit_new_exposures
 from bayesdist.app.config import Config, load_config
 from bayesdist.app.kinds.fitted import load_errors
 from bayesdist.app.kinds.matches.sources import read_configured
 from bayesdist.app.results import results_of
+from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_late
@@ -90,9 +91,7 @@ def _fitted(
     """Release, new matches and their fit, and the exposures that the release has seen."""
     if config.campaign is not None:
         release = results_of(run)
-        exposures = read_new_exposures(run, release.solution, release.fitted, new)
-        found = fit_exposures_of(release.data, config, exposures)
-        return exposures.released, exposures.matches, found, exposures.left_out
+        return release.solution, *fit_new_exposures(release, new)
     posterior = results_of(run).solution
     matches = _new_matches(run, config, new)
     found = fit_new(
@@ -252,15 +251,8 @@ def _summary(found: Monitored, facts: dict[str, Any]) -> dict[str, Any]:
     test, date, worst = found.change.test, found.date, found.worst
     since = None
     if date is not None:
-        since = {
-            "after": date.after,
-            "before": date.before,
-            "interval_95": list(date.interval),
-            "p_value": found.p_since,
-            "scatter": date.scatter,
-            "scatter_dof": date.scatter_dof,
-            "p_scatter": date.p_scatter,
-        }
+        since = attributes(date, "after before scatter scatter_dof p_scatter")
+        since |= {"interval_95": date.interval, "p_value": found.p_since}
     scale = found.pixel_mas
     return {
         "verdict": found.verdict,
@@ -270,8 +262,7 @@ def _summary(found: Monitored, facts: dict[str, Any]) -> dict[str, Any]:
         "epoch": found.change.epoch,
         "size": {
             "unit": "pix",
-            "rms": worst.rms,
-            "noise_rms": worst.noise_rms,
+            **attributes(worst, "rms noise_rms"),
             "max": worst.largest,
             "sigma_of_max": worst.sigma_of_largest,
             "position_of_max": list(worst.position_of_largest),

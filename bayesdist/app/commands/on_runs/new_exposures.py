@@ -2,53 +2,39 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.fitted import Fitted, load_errors, required
+from bayesdist.app.kinds.fitted import load_errors, required
+from bayesdist.app.results import Results
 from bayesdist.app.store.made_from import input_name
 from bayesdist.app.store.rundir import PAIRS, RunDirectory, part_files
 from bayesdist.data import Matches, read_matches
 from bayesdist.errors import InputError
-from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.compare.monitoring import NewFit, fit_new, with_star_errors_of
 from bayesdist.infer.linear import Rejection
 
 
-@dataclass(frozen=True, eq=False)
-class NewExposures:
-    """Pairs of exposures that a release has not seen, and what is known of them."""
+def fit_new_exposures(release: Results, new: Path) -> tuple[Matches, NewFit, tuple[str, ...]]:
+    """New exposures of a campaign by themselves, deviating as those of the release scatter.
 
-    released: Posterior  # with the errors of the catalogue, and those that its stars share
-    matches: Matches  # at the pixels that the release's tables have corrected, with errors
-    # of the catalogue; None where stars have no codes, or pairs no errors of it
-    errors: StarErrors | None
-    same_catalogue: bool  # whether it is that of the release, with the same codes of stars
-    left_out: tuple[str, ...]  # exposures that the release has been made from
+    `new`: run directory of a campaign whose stage 'match' has been run, or pairs in a file or
+    folder as a run keeps them; star lists have to be matched first.  What a star's error in the
+    catalogue does to all its exposures is added, and where the release has the same catalogue, what
+    it did to the release is taken into account.
 
-
-def read_new_exposures(
-    release: RunDirectory, released: Posterior, fitted: Fitted, new: Path
-) -> NewExposures:
-    """Matched pairs of new exposures: those of another run, or a table.
-
-    `release`: of a campaign. `released`: its solution, with all errors. `fitted`: its fit. `new`:
-    run directory of a campaign whose stage 'match' has been run, or pairs in a file or folder as a
-    run keeps them. InputError for star lists, which have to be matched first; pairs in another unit
-    or filter, without epochs, or without a way to errors; when all exposures are those of the
-    release.
+    Result: pairs with errors, at the pixels that the release's tables have corrected; their fit;
+    and exposures that are left out, as the release has been made from them.
     """
     run = RunDirectory(new) if (new / "run.json").exists() else None
+    released, fitted, config = release.solution, release.fitted, release.config
     pairs = _pairs(run, new, released.model.unit)
-    where = ", ".join(pairs.sources)
     if not pairs.has_epoch:
         raise InputError("has no epochs", where=str(new), do="give a column 'epoch'")
-    _refuse_other_filters(release.config, pairs, where)
+    _refuse_other_filters(config, pairs, ", ".join(pairs.sources))
     seen = np.isin(pairs.exposure_names, released.model.exposures)
     left_out = tuple(np.asarray(pairs.exposure_names)[seen].tolist())
     fresh = ~seen[pairs.exposure]
@@ -65,37 +51,20 @@ def read_new_exposures(
         errors = load_errors(run.path).by_magnitude or errors
     if placed.mag is not None and errors is not None:
         placed = placed.with_errors(errors, in_quadrature=True)
-    return NewExposures(
+    scatter = required(fitted.scatter, "joint fit of exposures")
+    found = fit_new(
         released,
         placed,
-        _catalogue_errors(pairs),
-        run is not None and _catalogue_of(run) == _catalogue_of(release),
-        left_out,
-    )
-
-
-def fit_exposures_of(data: FitData, config: Config, new: NewExposures) -> NewFit:
-    """The new exposures fitted by themselves, deviating as those of the release scatter.
-
-    What a star's error in the catalogue does to all its exposures is added, and where the release
-    has the same catalogue, what it did to the release is taken into account.
-
-    `data`, `config`: of the release.
-    """
-    scatter = required(data.fitted.scatter, "joint fit of exposures")
-    found = fit_new(
-        new.released,
-        new.matches,
         rejection=Rejection(config.fit.clip_chi2, config.fit.clip_abs),
         compute=config.resources(),
         scatter=dict(zip(scatter.kinds, np.sqrt((scatter.tau**2).mean(axis=0)), strict=True)),
     )
-    if new.errors is None:
-        return found
-    released = None
-    if new.same_catalogue:
-        released = (data.fit, data.stars)
-    return with_star_errors_of(new.errors, found, new.matches, released)
+    of_catalogue = _catalogue_errors(pairs)
+    if of_catalogue is not None:
+        same = run is not None and _catalogue_of(run) == _catalogue_of(release.run)
+        made_from = (release.data.fit, release.data.stars) if same else None
+        found = with_star_errors_of(of_catalogue, found, placed, made_from)
+    return placed, found, left_out
 
 
 def _pairs(run: RunDirectory | None, new: Path, unit: str) -> Matches:

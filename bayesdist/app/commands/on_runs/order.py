@@ -11,7 +11,7 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.commands.options import chip_of
-from bayesdist.app.config import Config, load_config
+from bayesdist.app.config import load_config
 from bayesdist.app.kinds.errors import QUOTED
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.matched import Matched
@@ -106,9 +106,10 @@ def _compared(
     matched = matched.of_order(max(orders))
     rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs)
     stars: Matches | Shards
-    if _is_one_map(config):
+    one_frame = config.model.frames == "none" and config.time() is None
+    if config.data is not None and len(config.chips()) < 2 and one_frame:  # one map at any date
         errors = QUOTED
-        if config.data is not None and config.data.sigma == "by_magnitude":
+        if config.data.sigma == "by_magnitude":
             errors = fit_stars(matched, config, reader=reader).errors
         model = model_of(matched.stars, config)
         stars = shards_of(matched.stars, model, config, errors, reader)
@@ -118,12 +119,6 @@ def _compared(
         model = DistortionModel(max(orders), (one,), unit=data.model.unit)
         stars = in_one_frame(data.fit, data.stars, one.number)
     return select_order(stars, model, orders=orders, rejection=rejection)
-
-
-def _is_one_map(config: Config) -> bool:
-    """Boolean: all matches are on one chip, in one frame, at any date."""
-    single = len(config.chips()) < 2 and config.model.frames == "none" and config.time() is None
-    return single and config.data is not None
 
 
 def _rows(found: OrderSelection, failed: dict[int, str]) -> list[dict[str, Any]]:

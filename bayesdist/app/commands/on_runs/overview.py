@@ -23,11 +23,7 @@ NO_VERDICT = "no verdict is recorded; 'bayesdist stage report' makes one"
 
 
 def overview(runs: Sequence[str | Path], output: str | Path) -> str:
-    """Text to print, once the page that compares runs by their summary.json is written.
-
-    It has a line for each run with its verdict, the worst one first.
-    InputError for a folder that holds no run.
-    """
+    """Text to print, once the page that compares runs by their summary.json is written."""
     rows = [_row(RunDirectory(run), Path(output)) for run in runs]
     table = [
         {"Status": row.level.replace("fail", "FAIL"), "Run": row.name, "Verdict": row.headline}
@@ -50,9 +46,12 @@ def _row(run: RunDirectory, output: Path) -> OverviewRow:
     if damage is not None:  # what is recorded is of other files
         verdict = {"level": "fail", "headline": " ".join(damage)}
         log.warning("%s: WARNING: %s %s", run.path, *damage)
+    report, link = run / "report.html", ""
+    if report.exists():  # its address as seen from the page
+        link = quote(os.path.relpath(report.resolve(), output.resolve().parent))
     return OverviewRow(
         name=run.path.as_posix(),
-        link=_link(run / "report.html", output),
+        link=link,
         detector=title_of(config),
         simulated=bool(head["simulated"]),
         level=verdict["level"],
@@ -77,10 +76,3 @@ def _validity(rows: Sequence[Mapping[str, Any]]) -> tuple[float | None, bool]:
     if dates:
         return min(dates), False
     return (min(row["until"] for row in rows), True) if rows else (None, False)
-
-
-def _link(report: Path, output: Path) -> str:
-    """Address of a report as seen from the page; empty where there is none."""
-    if not report.exists():
-        return ""
-    return quote(os.path.relpath(report.resolve(), output.resolve().parent))

@@ -16,7 +16,6 @@ from bayesdist.assess.planning.exposures import Schedule, exposures_needed
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.planning import ExposureContent, exposure_content, exposure_information
-from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.solution import Solution
 
 DRAWS = 1000
@@ -28,6 +27,12 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
 
     Of all requirements, or of one `name`; exposures could be taken at `epochs`, decimal years.
     """
+    if str(run).endswith(".toml"):
+        raise InputError(
+            "is a file, not a run",
+            where=str(run),
+            do=f"compare dither patterns by 'bayesdist plan-dither {run}'",
+        )
     with open_results(RunDirectory.open(run)) as results:
         results.run.require("plan", ("fit", "sample", "diagnose", "evaluate"))
         solved = results.fitted.solved
@@ -54,21 +59,16 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
             ]
             schedules = [_schedules(results, one, content, epochs) for one in chosen]
         else:
-            lines, alike = _dithered_alike(solved.mode)
-            schedules = [[alike]] * len(chosen)
+            # an exposure by itself says nothing: as many as these, over other stars, say as much
+            n = len(solved.mode.problem.model.exposures)
+            lines = [
+                f"Exposures are taken to be dithered as these {n} are, over as many other stars."
+            ]
+            information = solved.mode.distortion_information / n
+            schedules = [[Schedule("dithered like these", information)]] * len(chosen)
         for requirement, several in zip(chosen, schedules, strict=True):
             lines += ["", *_lines(results, requirement, several)]
         return "\n".join(lines)
-
-
-def _dithered_alike(mode: SelfCalibrationMode) -> tuple[list[str], Schedule]:
-    """What further exposures of a self-calibration are taken to be, in words and as a schedule.
-
-    An exposure by itself says nothing: as many as these, over other stars, say as much again.
-    """
-    n = len(mode.problem.model.exposures)
-    line = f"Exposures are taken to be dithered as these {n} are, over as many other stars."
-    return [line], Schedule("dithered like these", mode.distortion_information / n)
 
 
 def _content(results: Results) -> ExposureContent:

@@ -81,7 +81,8 @@ def release_runs(
                 "products": files,
                 "figures": list(figures),
             }
-    rows = [dict(zip(table.colnames, row, strict=True)) for row in table]
+    columns = {name: table[name].tolist() for name in table.colnames}
+    rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     return _text(Path(output), files, rows, str(table["at_edge"].unit), why_not or None, comparison)
 
 
@@ -253,12 +254,8 @@ def _text(
     if different:
         reference = rows[0]["filter"]
         lines += ["", f"Against {reference}, at half the chip ({unit}), the drift taken out:"]
-        lines.append(table_text([{k: _plain(row[k]) for k in PRINTED} for row in different]))
+        lines.append(table_text([{k: row[k] for k in PRINTED} for row in different]))
     lines += ["", f"Drift: {comparison.sentence if comparison else why_not}"]
     if comparison is not None and not comparison.alike:
         lines.append("WARNING: the files hold one drift for all filters")
     return "\n".join(lines)
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value

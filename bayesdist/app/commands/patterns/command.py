@@ -11,6 +11,7 @@ from astropy.table import Table
 
 from bayesdist.app.commands.patterns.config import PlanConfig, load_plan
 from bayesdist.app.screen import table_text
+from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.assess.planning.dithers import (
     KINDS,
@@ -33,8 +34,7 @@ def plan_patterns(path: str | Path, output: str | Path | None = None, command: s
     """Compare the dither patterns of a file by the covariance to be expected.
 
     `path`: TOML with ``[[pattern]]`` blocks. `output`: new or empty folder for table, record and
-    figure. `command`: for the record. Result: what to print. ConfigError for a file that is not
-    sound. InputError for a pattern whose exposures do not overlap, and a folder that is in use.
+    figure.
     """
     config = load_plan(path)
     camera = config.camera()
@@ -74,7 +74,8 @@ def _text(found: Sequence[PlannedPattern], config: PlanConfig) -> str:
     ]
     for one in found:
         lines += ["", f"{one.pattern.name}:"]
-        lines += [f"  {sentence}" for sentence in _sentences(one)]
+        said = (*lacking(one), *one.solution.gauge.sentences, nearly_free(one))
+        lines += [f"  {sentence}" for sentence in said if sentence]
     best, mas = found[0], config.detector.scale_mas
     rms, largest = best.rms("shape"), best.largest("shape")
     if np.isfinite(rms):
@@ -84,12 +85,6 @@ def _text(found: Sequence[PlannedPattern], config: PlanConfig) -> str:
         verdict = "and yet nothing bounds the shape, for want of rolls and of commanded offsets"
     lines += ["", f"Best: {best.pattern.name}, {verdict}"]
     return "\n".join(lines)
-
-
-def _sentences(one: PlannedPattern) -> list[str]:
-    said = [*lacking(one), *one.solution.gauge.sentences]
-    combinations = nearly_free(one)
-    return said + ([combinations] if combinations else [])
 
 
 def _write(output: Path, found: Sequence[PlannedPattern], config: PlanConfig, command: str) -> None:
@@ -131,12 +126,7 @@ def _record(one: PlannedPattern) -> dict[str, Any]:
         "n_free": one.n_free,
         "held": [one.solution.model.names[k] for k in gauge.held],
         "directions": [
-            {
-                "name": d.name,
-                "sigma_detections": d.sigma,
-                "sigma_fixed": d.sigma_fixed,
-                "unit": d.unit,
-            }
+            attributes(d, "name sigma_fixed unit") | {"sigma_detections": d.sigma}
             for d in gauge.directions
         ],
         **{

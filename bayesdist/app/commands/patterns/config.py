@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, PositiveFloat, model_validator
+from pydantic import Field, PositiveFloat
 
-from bayesdist.app.config.assess import require_own_names
 from bayesdist.app.config.model import Polynomials
 from bayesdist.app.config.reading import load_text, validated
 from bayesdist.app.config.section import (
@@ -16,11 +16,12 @@ from bayesdist.app.config.section import (
     Detector,
     Section,
     chips_of,
+    detector_faults,
     one_chip,
     reference_first,
-    require_detector,
+    same_names,
 )
-from bayesdist.app.config.selfcal import Frames, MinDetections, require_scales
+from bayesdist.app.config.selfcal import Frames, MinDetections, scale_faults
 from bayesdist.arrays import Float
 from bayesdist.assess.planning.dithers import Camera, PlannedStars, PriorInformation
 from bayesdist.model import Chip
@@ -100,33 +101,30 @@ class PatternBlock(Section):
     rolls: list[float] | None = None
     exposures: Count | None = None
 
-    @model_validator(mode="after")
-    def _one_kind(self) -> PatternBlock:
+    def faults(self) -> Iterator[str]:
+        """Anything but one kind of offsets, and what does not go with them."""
         where = f"pattern {self.name!r}"
         if sum(one is not None for one in (self.offsets, self.grid, self.scales)) != 1:
-            raise ValueError(f"{where} has offsets, a grid, or scales; give one of the three")
+            yield f"{where} has offsets, a grid, or scales; give one of the three"
         on_grid = 0 if self.grid is None else self.grid.n[0] * self.grid.n[1]
         if on_grid > MOST_EXPOSURES:
-            raise ValueError(
+            yield (
                 f"{where} has {on_grid} exposures, and {MOST_EXPOSURES} are the most; "
                 "give a smaller grid"
             )
         if self.offsets == [] or self.rolls == []:
             key = "offsets" if self.offsets == [] else "rolls"
-            raise ValueError(f"{where} has an empty list of {key}; fill it or leave it out")
+            yield f"{where} has an empty list of {key}; fill it or leave it out"
         if self.rolls is not None and any(len(one) == 3 for one in self.offsets or []):
-            raise ValueError(
-                f"{where} has rolls in its offsets and a list of rolls; give one of the two"
-            )
+            yield f"{where} has rolls in its offsets and a list of rolls; give one of the two"
         if self.scales is not None:
             if self.exposures is None:
-                raise ValueError(f"{where} has scales without a number of exposures; give it")
+                yield f"{where} has scales without a number of exposures; give it"
             if self.unit != "pix":
-                raise ValueError(
+                yield (
                     f"{where} has a unit, and scales go from least, in pixels, to largest, a part "
                     "of the detector; leave the unit out"
                 )
-        return self
 
 
 class PlanConfig(Section):
@@ -140,34 +138,27 @@ class PlanConfig(Section):
     stars: StarsBlock
     pattern: list[PatternBlock] = Field(default_factory=list)
 
-    @model_validator(mode="after")
-    def _sound(self) -> PlanConfig:
-        require_detector(self.chip, self.detector, self.model.reference_pixel)
+    def faults(self) -> Iterator[str]:
+        """Chips, frames and patterns that do not go together."""
+        yield from detector_faults(self.chip, self.detector, self.model.reference_pixel)
         given = sum(c.place is not None for c in self.chip)
         if 0 < given < len(self.chip):
-            raise ValueError(
-                "some [[chip]] blocks have the key place and some do not; give all or none"
-            )
-        require_scales(self.gauge.exposure_scale_sigma, self.selfcal.frames)
-        return self
-
-    @model_validator(mode="after")
-    def _patterns(self) -> PlanConfig:
+            yield "some [[chip]] blocks have the key place and some do not; give all or none"
+        yield from scale_faults(self.gauge.exposure_scale_sigma, self.selfcal.frames)
         if not self.pattern:
-            raise ValueError("there is no pattern; give [[pattern]] blocks, each with a name")
-        require_own_names("pattern", [p.name for p in self.pattern])
+            yield "there is no pattern; give [[pattern]] blocks, each with a name"
+        yield from same_names("pattern", [p.name for p in self.pattern])
         for pattern in self.patterns():
             if len(pattern) < 2:
-                raise ValueError(
+                yield (
                     f"pattern {pattern.name!r} has one exposure, which says nothing of the "
                     "distortion; give at least two"
                 )
             if self.selfcal.frames == "shift" and np.ptp(pattern.rolls) > 0:
-                raise ValueError(
+                yield (
                     f"pattern {pattern.name!r} has rolls, and selfcal.frames is 'shift'; set it to "
                     "'shift_rotation'"
                 )
-        return self
 
     def chips(self) -> tuple[Chip, ...]:
         """Chips of the model, also for a detector of one."""
@@ -236,10 +227,7 @@ def _against_first(name: str, round_: Float, rolls_deg: Float) -> DitherPattern:
 
 
 def load_plan(path: str | Path) -> PlanConfig:
-    """Read a file of patterns.
-
-    ConfigError with file, key and reason; an unknown key names the nearest known one.
-    """
+    """Read a file of patterns."""
     config: PlanConfig = validated(
         PlanConfig, load_text(path), str(path), begin="give it [[pattern]] blocks"
     )

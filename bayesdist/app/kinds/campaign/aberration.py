@@ -29,16 +29,9 @@ PUBLISHED = "published: 5e-5 in an orbit (Cox & Gilliland 2002)"
 def scale_error(exptime: float | None) -> float:
     """Relative standard deviation of the scale.
 
-    Parameters
-    ----------
-    exptime : float or None
-        Seconds of exposure, over which the instant of VAFACTOR is uniform; None where the factor
-        lacks the orbit.
-
-    Notes
-    -----
-    Of a sine of amplitude SWING / 2 at any phase: its standard deviation is the amplitude by the
-    root of 2, that of its rate 2 pi / PERIOD times as large.
+    Over `exptime` seconds the instant of VAFACTOR is uniform; None where the factor lacks the
+    orbit. A sine of amplitude SWING / 2 at any phase has the standard deviation of its amplitude by
+    the root of 2, and its rate 2 pi / PERIOD times as much.
     """
     spread = SWING / 2 / math.sqrt(2)
     if exptime is None:
@@ -47,10 +40,7 @@ def scale_error(exptime: float | None) -> float:
 
 
 def aberration_term(scatter: ExposureScatter, inputs: Inputs, solution: Solution) -> ScaleError:
-    """The error of the scale that VAFACTOR leaves, at most as large as exposures scatter.
-
-    `inputs`: of the campaign. `solution`: whose positions it moves.
-    """
+    """The error of the scale that VAFACTOR leaves, at most as large as exposures scatter."""
     source = PUBLISHED
     if inputs.config.campaign.vafactor_source == "earth":
         sigma = scale_error(None)

@@ -24,9 +24,6 @@ def read_campaign_catalog(
 
     The plane touches the sky in the middle of the exposures of all filters, where the log says
     where they point and that lies among the stars; else in the middle of these.
-
-    InputError as `catalog_from_table`, and for proper motions without an epoch, in the
-    configuration's words.
     """
     path = base / block.catalog
     table = read_table(path)
@@ -84,8 +81,6 @@ def parities_of(block: CampaignBlock, catalog: ReferenceCatalog, tab: IdcTab) ->
 
     V2 and V3 lie on the sky as east and north do but for a rotation, and the table says how its
     axes lie along V2 and V3.
-
-    `tab`: the known distortion.
     """
     if block.parity != "auto":
         return (block.parity == "mirrored",)

@@ -22,10 +22,7 @@ WARNING = {
 
 
 def campaign_checks(summary: Mapping[str, Any]) -> tuple[Check, ...]:
-    """Criteria of matching, tables and series, and what their stages found odd.
-
-    `summary`: as summary.json.
-    """
+    """Criteria of matching, tables and series, and what their stages found odd."""
     m, tables, time = (summary.get(k) or {} for k in ("matching", "tables", "time_dependence"))
     least = float(m["completeness"]["least"])
     false = float(m["false_fraction"])

@@ -36,21 +36,17 @@ SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
 
 
 def fit_campaign(matched: CampaignMatched) -> Fitted:
-    """Tables, errors, all exposures jointly, and every one alone.
-
-    BayesdistError for what the exposures do not determine, runs of other filters that do not fit to
-    this one, and stars that have outrun their catalogue.
-    """
+    """Tables, errors, all exposures jointly, and every one alone."""
     with frames_not_set():
         return _fitted(matched)
 
 
 def _fitted(matched: CampaignMatched) -> Fitted:
     inputs, config, affine = matched.inputs, matched.inputs.config, matched.affine_model
-    tables = fit_tables(matched)
+    tables, fit_of_tables = fit_tables(matched)
     pairs = matched.stars
-    if tables.stored.tables:
-        pairs = on_the_chips(corrected_matches(tables.stored.tables, pairs), affine)
+    if tables.tables:
+        pairs = on_the_chips(corrected_matches(tables.tables, pairs), affine)
     _, _, total = scatter_by_magnitude(pairs, affine, inputs)
     errors = ErrorLaw(by_magnitude=centroid_errors(pairs, total), with_catalogue=True)
     stars = errors.applied(pairs)
@@ -60,8 +56,11 @@ def _fitted(matched: CampaignMatched) -> Fitted:
     alone = fit_exposures(stars, affine, chip=number, rejection=rejection)
     facts = {
         **line_sections(joint, number),
-        "tables": tables_section(config, tables),
-        "scatter": {name: _scatter(joint, name) for name in joint.tau},
+        "tables": tables_section(config, tables, fit_of_tables),
+        "scatter": {
+            name: {"value": tau, "interval_68": list(joint.tau_interval(0.68)[name])}
+            for name, tau in joint.tau.items()
+        },
         "deviations": {"warnings": _trends(joint, stars)},
         "exposures_skipped": dict(alone.skipped),
         "exposures_outlying": list(joint.outlying),
@@ -70,7 +69,7 @@ def _fitted(matched: CampaignMatched) -> Fitted:
         joint.fit,
         errors,
         joint.priors,
-        tables=tables.stored,
+        tables=tables,
         scatter=ExposureScatter(joint.scatter.kinds, joint.tau_draws, joint.settling),
         alone=_series(alone, joint.model.chips[0]),
         facts=facts,
@@ -128,7 +127,3 @@ def _trends(joint: HierarchicalFit, stars: Matches) -> list[str]:
         for kind, one in zip(joint.scatter.kinds, p, strict=True)
         if kind.split(".")[-1] not in RIGID and one * len(p) < TREND.value
     ]
-
-
-def _scatter(joint: HierarchicalFit, name: str) -> dict[str, object]:
-    return {"value": joint.tau[name], "interval_68": list(joint.tau_interval(0.68)[name])}

@@ -28,10 +28,7 @@ YEARS_AT_REST = 1.0  # years over which stars may stand still
 
 
 def refuse_campaign(inputs: Inputs) -> None:
-    """Refuse inputs that do not go together, and files of others that cannot be used.
-
-    BayesdistError as `refuse_unsound`, `rehearse_references` and `read_idctab`.
-    """
+    """Refuse inputs that do not go together, and files of others that cannot be used."""
     config, base = inputs.config, inputs.base
     refuse_unsound(inputs)
     read_idctab(base / config.campaign.initial_distortion)
@@ -41,14 +38,7 @@ def refuse_campaign(inputs: Inputs) -> None:
 
 
 def refuse_unsound(inputs: Inputs) -> None:
-    """Refuse exposures, lists and catalogue that a run could not use; nothing is matched.
-
-    InputError for chips that only one side knows, detections off their chip, lists that stand
-    twice, a catalogue without errors, cuts that leave nothing in any exposure, and exposures to be
-    held out that there are not. DegenerateError for too few exposures, and for segments of the
-    drift without exposures or with one epoch. ConfigError for periods of the release outside the
-    segment that they are to hold.
-    """
+    """Refuse exposures, lists and catalogue that a run could not use; nothing is matched."""
     config, lists = inputs.config, inputs.star_lists
     refuse_other_chips(lists.lists, config.chips(), "campaign.lists")
     check_campaign(lists.lists, inputs.log, inputs.catalog)
@@ -172,10 +162,7 @@ def segment_text(time: TimeDependence, number: int) -> str:
 
 
 def refuse_few(epochs: Float, time: TimeDependence | None) -> None:
-    """Refuse exposures at these epochs (E,) that cannot carry the scatter or the drift.
-
-    DegenerateError naming the segment and its dates.
-    """
+    """Refuse exposures at these epochs (E,) that cannot carry the scatter or the drift."""
     n = len(epochs)
     if n < MIN_EXPOSURES:
         few = "one exposure tells" if n == 1 else f"{n} exposures tell"

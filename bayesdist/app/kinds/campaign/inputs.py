@@ -51,11 +51,7 @@ class Inputs:
 
 
 def read_campaign(config: CampaignConfig, base: Path) -> Inputs:
-    """Read catalogue, exposures and star lists.
-
-    InputError for files that cannot be read, lists without an entry in the log, a filter without
-    exposures, and exposures without VAFACTOR.
-    """
+    """Read catalogue, exposures and star lists."""
     block = config.campaign
     whole_log = read_exposures(base / block.exposures)
     whole, plane = read_campaign_catalog(block, base, whole_log)

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from bayesdist.app.store.keys import attributes
 from bayesdist.infer import GaussianPriors
-from bayesdist.infer.solution import ReferenceGauge, Solution, TransformedSolution
-from bayesdist.infer.transforms import LinearTerms, lines, reference_gauge, without_frames
+from bayesdist.infer.solution import Solution, TransformedSolution
+from bayesdist.infer.transforms import lines, reference_gauge, without_frames
 from bayesdist.model import DistortionModel, TimeDependence
 
 CONSTANTS = (("u", 0, 0), ("v", 0, 0))
@@ -32,9 +33,8 @@ def gap_priors(
 ) -> GaussianPriors:
     """Priors that leave of the constant terms' drift the steps of all chips but the first.
 
-    `model`: the reference chip comes first: its constant terms are where the exposures point.
-    `asked`: the configured drift: constant terms that it names have rates as well. `pixel`: size of
-    a pixel in the unit of u, v.
+    The reference chip comes first: its constant terms are where the exposures point. Constant terms
+    that are `asked` for have rates as well. `pixel`: its size in the unit of u, v.
     """
     reference, named = model.chips[0].number, () if asked is None else asked.terms
     held = {
@@ -53,45 +53,21 @@ FIXED = ("A_1", "B_1", "A_3")  # by the gauge, on the reference chip
 def line_sections(solution: Solution, chip: int) -> dict[str, object]:
     """Sections 'gauge' and 'lines' of summary.json: alpha and beta of each term."""
     view = reference_gauge(without_frames(solution), chip)
-    return {"gauge": _gauge(view.gauge), "lines": _lines(view)}
-
-
-def _gauge(gauge: ReferenceGauge) -> dict[str, object]:
-    """Section 'gauge'."""
-    return {
-        "chip": gauge.chip,
-        "fixed": list(FIXED),
-        "epoch": gauge.epoch,
-        "rotation": gauge.rotation,
-        "sigma_rotation": gauge.sigma_rotation,
-        "shift": list(gauge.shift),
-        "sigma_shift": list(gauge.sigma_shift),
-    }
+    gauge = attributes(view.gauge, "chip epoch rotation sigma_rotation shift sigma_shift")
+    return {"gauge": gauge | {"fixed": FIXED}, "lines": _lines(view)}
 
 
 def _lines(view: TransformedSolution) -> list[dict[str, object]]:
     """alpha and beta of the joint fit in the reference gauge, as Tables 1 to 3 of the report."""
-    time = view.model.time
-    if time is None:
-        return []
-    return [
-        {"segment": s, "chip": chip.number, "epoch0": time.epoch0[s]} | row
-        for s in range(time.n_segments)
-        for chip in view.model.chips
-        for row in _rows(lines(view, s, chip=chip.number))
-    ]
-
-
-def _rows(found: LinearTerms) -> list[dict[str, object]]:
-    values = dict(zip(found.labels, zip(found.values, found.sigma, strict=True), strict=True))
-    names = dict.fromkeys(label.split(".")[0] for label in found.labels)
-    return [
-        {
-            "term": name,
-            "alpha": float(values[f"{name}.alpha"][0]),
-            "sigma_alpha": float(values[f"{name}.alpha"][1]),
-            "beta": float(values[f"{name}.beta"][0]),
-            "sigma_beta": float(values[f"{name}.beta"][1]),
-        }
-        for name in names
-    ]
+    time, out = view.model.time, []
+    for s, epoch0 in enumerate(() if time is None else time.epoch0):
+        for chip in view.model.chips:
+            found = lines(view, s, chip=chip.number)
+            for term in dict.fromkeys(label.split(".")[0] for label in found.labels):
+                row: dict[str, object] = {"segment": s, "chip": chip.number, "epoch0": epoch0}
+                row["term"] = term
+                for part in ("alpha", "beta"):
+                    one = found.select(f"{term}.{part}")
+                    row |= {part: float(one.values[0]), f"sigma_{part}": float(one.sigma[0])}
+                out.append(row)
+    return out

@@ -90,10 +90,7 @@ class CampaignMatched(Matched):
 
 
 def matched_campaign(pairs: Matches, inputs: Inputs, **more: Any) -> CampaignMatched:
-    """Matches of a campaign, with what the configuration holds out set aside.
-
-    InputError as `set_aside`.
-    """
+    """Matches of a campaign, with what the configuration holds out set aside."""
     parts = set_aside(inputs.config, pairs, GAUGE_EXPOSURES)
     return CampaignMatched(*parts, catalogue=inputs.catalog, inputs=inputs, pairs=pairs, **more)
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from bayesdist.app.config import Config
 from bayesdist.app.config.model import TablesBlock
-from bayesdist.app.config.other_runs import TABLES, rates_file, tables_file
+from bayesdist.app.config.run import TABLES, rates_file, tables_file
 from bayesdist.app.kinds.campaign.linear_terms import with_gap
-from bayesdist.app.kinds.fitted import read_tables
+from bayesdist.app.kinds.fitted import converged_posterior, read_tables
 from bayesdist.errors import InputError
-from bayesdist.infer import GaussianPriors, Posterior, load_posterior
+from bayesdist.infer import GaussianPriors
 from bayesdist.infer.exposures.shared_drift import drift_priors
 from bayesdist.model import Chip, DistortionModel, LookupTable
 from bayesdist.products import read_d2im
@@ -19,8 +19,7 @@ from bayesdist.products import read_d2im
 def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tuple[LookupTable, ...]:
     """The detector's tables that a run holds; none where it has none to hold.
 
-    `chips`: all of which must have a table. InputError for a run without tables, a file that is no
-    D2IMFILE, and a chip without table.
+    All `chips` must have one.
     """
     if block.detector is None:
         return ()
@@ -44,22 +43,12 @@ def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tupl
 
 
 def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianPriors | None:
-    """Priors on the drift of a model from the posterior of another run; None where it is free.
-
-    InputError for a folder that is no finished run, a run that has not converged, and one of other
-    chips, units, drifting terms, or reference dates.
-    """
+    """Priors on the drift of a model from the posterior of another run; None where it is free."""
     tdd, chip = config.model.tdd, config.chips()[0].number
     if tdd is None or config.has_free_rates:
         return None
     path = rates_file(base / tdd.rates)
-    posterior: Posterior = load_posterior(path)
-    if not posterior.convergence.converged:
-        raise InputError(
-            f"the run has not converged ({'; '.join(posterior.convergence.reasons)})",
-            where=str(path.parent),
-            do="resume it with more steps before its rates are used",
-        )
+    posterior = converged_posterior(path, "its rates are used")
     try:
         named = drift_priors(posterior, model, chip=chip)
     except InputError as error:
@@ -68,10 +57,7 @@ def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianP
 
 
 def rehearse_references(config: Config, unit: str, base: Path) -> None:
-    """Read all that a run takes over from others; nothing is fitted.
-
-    InputError as `held_tables` and `rate_priors`.
-    """
+    """Read all that a run takes over from others; nothing is fitted."""
     chips = config.chips()
     held_tables(config.tables, chips, base)
     if not config.has_free_rates:

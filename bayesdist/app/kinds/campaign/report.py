@@ -11,11 +11,9 @@ from bayesdist.app.kinds.campaign.matched import affine_model_of
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.arrays import Bool, Float
-from bayesdist.data import Matches
 from bayesdist.data.preparing import motion_error_line
 from bayesdist.diagnose.overlap import OverlapTest
-from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
+from bayesdist.diagnose.residuals.binned import binned_residuals
 from bayesdist.infer import GaussianPriors, LinearFit, Posterior, fit_linear
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import Rejection
@@ -46,11 +44,7 @@ def campaign_results(
     posterior: Posterior,
     overlap: OverlapTest | None,
 ) -> CampaignResults:
-    """Content that a campaign adds to the report of its run.
-
-    `run`: that has been assessed. `posterior`: as it was sampled. `overlap`: of stars in several
-    exposures.
-    """
+    """Content that a campaign adds to the report of its run."""
     model, fitted, matched = posterior.model, data.fitted, data.matched
     matching = read_ecsv(run / "matching.ecsv")
     return CampaignResults(
@@ -76,8 +70,6 @@ def held_parameters(fit: LinearFit, priors: GaussianPriors) -> tuple[str, ...]:
     """Coefficients and rates of which the data say nothing beside what a prior does.
 
     The deviations of single exposures are not among them: their prior is what was found.
-
-    `priors`: as the fit had them.
     """
     share = fit.sigma * np.sqrt(priors.precision)
     return tuple(
@@ -183,7 +175,11 @@ def _residuals(data: FitData, config: CampaignConfig) -> tuple[ChipResiduals, ..
     for chip in model.chips:
         here = good & (numbers == chip.number)
         bins = _cells(chip.size, int(here.sum()))
-        binned = [_binned(pairs, r, here, bins, chip.size) for r in left]
+        x, y = (
+            np.clip(a[here], 0.5, n + 0.5)
+            for a, n in zip((pairs.x, pairs.y), chip.size, strict=True)
+        )
+        binned = [binned_residuals(x, y, *r[here].T, bins=bins, size=chip.size) for r in left]
         rows = _spread_rows(int(here.sum()), MAX_MARKERS // (2 * len(model.chips)))
         points = [r[here][rows] for r in left]
         again = (points[-1], binned[-1]) if tables else (None, None)
@@ -198,17 +194,6 @@ def _cells(size: tuple[float, float], n: int) -> tuple[int, int]:
         if n >= MIN_STARS_PER_CELL * nx * ny:
             break
     return nx, ny
-
-
-def _binned(
-    pairs: Matches,
-    residual: Float,
-    rows: Bool,
-    bins: tuple[int, int],
-    size: tuple[float, float],
-) -> BinnedResiduals:
-    x, y = (np.clip(a[rows], 0.5, n + 0.5) for a, n in zip((pairs.x, pairs.y), size, strict=True))
-    return binned_residuals(x, y, *residual[rows].T, bins=bins, size=size)
 
 
 def _series(run: RunDirectory, model: DistortionModel, matching: Table) -> LinearSeries | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -42,9 +41,6 @@ def refuse_outrun_stars(inputs: Inputs, fit: LinearFit, pairs: Matches) -> None:
     """Refuse a catalogue without motions where residuals grow with the time from its epoch.
 
     The square of the residuals of stars that move is a parabola in time.
-
-    `fit`: of every exposure by itself. `pairs`: what it was made from. InputError naming the
-    catalogue.
     """
     if inputs.catalog.pm_u is not None or pairs.epoch is None:
         return
@@ -78,16 +74,8 @@ log = logging.getLogger("bayesdist")
 ROUGH_ITERATIONS = 1  # of the tables from whose residuals the errors of the stars are taken
 
 
-@dataclass(frozen=True, eq=False)
-class FittedTables:
-    """Look-up tables of a fit."""
-
-    stored: StoredLookupTables  # with their errors, as other stages take them
-    fit: TableFit | None = None  # none where none were fitted
-
-
-def fit_tables(matched: CampaignMatched) -> FittedTables:
-    """The look-up tables that are asked for, and those that are held.
+def fit_tables(matched: CampaignMatched) -> tuple[StoredLookupTables, TableFit | None]:
+    """The look-up tables that are asked for, and those that are held; and their fit, if any.
 
     Fitted are the detector's, unless these are taken from another run: then the filter's.  The
     linear part of each exposure is free.
@@ -97,13 +85,13 @@ def fit_tables(matched: CampaignMatched) -> FittedTables:
     held = held_tables(block, config.chips(), matched.inputs.base)
     if block.method == "none":
         if not held:
-            return FittedTables(StoredLookupTables())
+            return StoredLookupTables(), None
         placed = on_the_chips(corrected_matches(held, matched.stars), model)
         fit, _, errors = scatter_by_magnitude(placed, model, matched.inputs)
         pairs = matched.stars.with_errors(errors)
         between = measured_between(pairs, fit, held, filter=filter, fitted=False)
         of_nodes = _on_the_grid(held, fit, "", grid, partial(_held_variance, held))
-        return FittedTables(_stored(held, of_nodes, between))
+        return _stored(held, of_nodes, between), None
     pairs = _with_errors(matched, held)
     found = fit_with_tables(
         pairs,
@@ -126,16 +114,13 @@ def fit_tables(matched: CampaignMatched) -> FittedTables:
         mixture=found.mixture,
     )
     of_nodes = _on_the_grid(found.tables, found.solution, found.filter, grid, variance)
-    return FittedTables(_stored(found.tables, of_nodes, between), found)
+    return _stored(found.tables, of_nodes, between), found
 
 
 def scatter_by_magnitude(
     pairs: Matches, model: DistortionModel, inputs: Inputs
 ) -> tuple[LinearFit, Matches, MagnitudeErrors]:
-    """Fit of every exposure by itself and scatter by magnitude, as `fit_by_magnitude`.
-
-    InputError where stars have outrun a catalogue without proper motions.
-    """
+    """Fit of every exposure by itself and scatter by magnitude, as `fit_by_magnitude`."""
     fit, _, errors = fit_by_magnitude(pairs, model)
     scattered = pairs.with_errors(errors)
     refuse_outrun_stars(inputs, fit, scattered)
@@ -209,9 +194,9 @@ def _held_variance(tables: Sequence[LookupTable], x: Float, y: Float, *, chip: i
     return held_sigma(tables, x, y, chip=chip) ** 2
 
 
-def _warnings(config: Config, found: FittedTables) -> Iterator[str]:
+def _warnings(config: Config, stored: StoredLookupTables, fit: TableFit | None) -> Iterator[str]:
     """Warnings of the tables' errors, each as a clause."""
-    block, stored, fit = config.tables, found.stored, found.fit
+    block = config.tables
     if block.detector is not None and any(t.sigma is None for t in stored.tables if not t.filter):
         yield "the detector's tables have no errors, and none are counted"
     if stored.tables and len(stored.between) < len(config.chips()):
@@ -233,20 +218,22 @@ def _warnings(config: Config, found: FittedTables) -> Iterator[str]:
         )
 
 
-def tables_section(config: Config, found: FittedTables) -> dict[str, object]:
+def tables_section(
+    config: Config, stored: StoredLookupTables, fit: TableFit | None
+) -> dict[str, object]:
     """Section 'tables' of summary.json."""
     out: dict[str, object] = {
         "method": config.tables.method,
         "detector": config.tables.detector,
-        "chips": [_row(table) for table in found.stored.tables],
-        "between_nodes": [_between(one) for one in found.stored.between.values()],
-        "warnings": list(_warnings(config, found)),
+        "chips": [_row(table) for table in stored.tables],
+        "between_nodes": [_between(one) for one in stored.between.values()],
+        "warnings": list(_warnings(config, stored, fit)),
     }
-    if found.fit is not None:
+    if fit is not None:
         out |= {
-            "converged": found.fit.converged,
-            "rms_before": found.fit.progress[0].rms,
-            "rms_after": found.fit.progress[-1].rms,
+            "converged": fit.converged,
+            "rms_before": fit.progress[0].rms,
+            "rms_after": fit.progress[-1].rms,
         }
     return out
 

@@ -22,10 +22,7 @@ YEARS = (1950.0, 2100.0)
 
 
 def doubts_on_stars(stars: Matches, model: DistortionModel, config: Config) -> list[str]:
-    """Sentences on what is odd about matched stars, by all of them or a sample, in memory.
-
-    InputError for a scale of u and v, quoted errors or epochs that cannot be meant.
-    """
+    """Sentences on what is odd about matched stars, by all of them or a sample, in memory."""
     return list(_doubts(stars, model.unit, config.detector.scale_mas))
 
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.app.config import Config, MatchesConfig
-from bayesdist.app.config.other_runs import POSTERIOR, calibration_file
+from bayesdist.app.config.run import POSTERIOR, calibration_file
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.app.kinds.fit_data import FitData, StarReader
-from bayesdist.app.kinds.fitted import FIT, Fitted
+from bayesdist.app.kinds.fitted import FIT, Fitted, converged_posterior
 from bayesdist.app.kinds.matched import Matched, set_aside
 from bayesdist.app.kinds.matches.added_errors import compared_errors, knows_circle
 from bayesdist.app.kinds.matches.plausibility import doubts_on_stars, refuse_empty_segments
@@ -27,7 +27,7 @@ from bayesdist.calibration.prior import CalibrationPrior, prior_of_calibration
 from bayesdist.data import Matches
 from bayesdist.diagnose.residuals.quoted import error_scale
 from bayesdist.diagnose.residuals.sample import SAMPLE
-from bayesdist.errors import ConfigError, DegenerateError, InputError, NotSettledError
+from bayesdist.errors import ConfigError, DegenerateError, NotSettledError
 from bayesdist.infer import (
     GaussianPriors,
     LinearFit,
@@ -37,7 +37,6 @@ from bayesdist.infer import (
     fit_by_magnitude,
     fit_linear,
     load_fit,
-    load_posterior,
     sample,
 )
 from bayesdist.infer.exposures.frame_choice import frames_that_help
@@ -51,34 +50,22 @@ SAMPLING = 1  # of the random streams that follow from the one seed: that of the
 
 
 def match_stars(stars: Matches, config: MatchesConfig) -> Matched:
-    """Matched stars of a configuration, those that are fitted and those that are held out.
-
-    InputError for files that cannot be read, and as `set_aside`. ConfigError for settings that do
-    not go with nominal positions.
-    """
-    if stars.has_nominal:
-        try:  # columns may be found by their names
-            config.refuse_circle()
-        except ValueError as error:
-            cause, _, do = str(error).partition("; ")
-            raise ConfigError(cause, where=", ".join(stars.sources), do=do) from None
+    """Matched stars of a configuration, those that are fitted and those that are held out."""
+    if stars.has_nominal:  # in columns that were found by their names
+        for fault in config.circle_faults():
+            cause, _, do = fault.partition("; ")
+            raise ConfigError(cause, where=", ".join(stars.sources), do=do)
     return Matched(*set_aside(config, stars))
 
 
 def read_stars(config: MatchesConfig, base: Path) -> Matches:
-    """The matched stars that a configuration names.
-
-    InputError for a configuration that names none, and for files that cannot be read.
-    """
+    """The matched stars that a configuration names."""
     data = config.data
     return read_configured(data.paths(base), data, size=config.detector.size, chips=config.chip)
 
 
 def model_of(stars: Matches, config: Config) -> DistortionModel:
-    """The model that a configuration asks for, for these stars.
-
-    InputError for chips that only one side knows, and as `build_model`.
-    """
+    """The model that a configuration asks for, for these stars."""
     check_chips(config.chips(), stars.chip_numbers)
     return build_model(
         stars,
@@ -100,15 +87,17 @@ def fit_stars(
 ) -> Fitted:
     """The linear fit of matched stars, with the errors that its residuals ask for.
 
-    `base`: that the file of an earlier calibration is relative to. `reader`: has the stars in the
-    end, for the passes that follow. InputError where it cannot be made; with the frames of the
-    exposures that would help.
+    The `reader` has the stars in the end, for the passes that follow. An error names the frames of
+    the exposures that would help.
     """
     if reader is None:
         with closing(StarReader(config.resources())) as reader:
             return fit_stars(matched, config, base, reader=reader)
     model = model_of(matched.stars, config)
-    _refuse_implausible(matched.stars, reader.sample(matched.stars), model, config)
+    doubts_on_stars(reader.sample(matched.stars), model, config)  # refuses what cannot be meant
+    if matched.stars.in_memory and matched.stars.epoch is not None:
+        # a sample may have none of a short segment
+        refuse_empty_segments(matched.stars.epoch, model.time)
     earlier = earlier_calibration(model, config, base)
     try:
         return _fitted(matched.stars, model, config, reader, earlier)
@@ -117,15 +106,6 @@ def fit_stars(
         if better is None:
             raise
         raise type(error)(error.cause, where=error.where, do=better.sentence) from error
-
-
-def _refuse_implausible(
-    stars: Matches, some: Matches, model: DistortionModel, config: Config
-) -> None:
-    """Refuse what cannot be meant; `some` are a sample of the stars."""
-    doubts_on_stars(some, model, config)
-    if stars.in_memory and stars.epoch is not None:  # a sample may have none of a short segment
-        refuse_empty_segments(stars.epoch, model.time)
 
 
 def _fitted(
@@ -181,10 +161,7 @@ def _fitted(
 def shards_of(
     stars: Matches, model: DistortionModel, config: Config, errors: ErrorLaw, reader: StarReader
 ) -> Shards:
-    """Stars as passes go over them, none of them outside the circle in which it was matched.
-
-    InputError naming a star that is.
-    """
+    """Stars as passes go over them, none of them outside the circle in which it was matched."""
     shards = reader.shards(model, stars, errors)
     if knows_circle(config) and stars.has_nominal:
         shards.survey.check_circle(config.outliers.match_radius)
@@ -192,10 +169,7 @@ def shards_of(
 
 
 def priors_of(model: DistortionModel, config: Config) -> GaussianPriors:
-    """Priors of the parameters, as the configuration gives them.
-
-    InputError for a parameter that the model does not have.
-    """
+    """Priors of the parameters, as the configuration gives them."""
     return GaussianPriors.of(model, {p.parameter: (p.mean, p.sigma) for p in config.prior})
 
 
@@ -226,11 +200,7 @@ def sample_stars(
 def earlier_calibration(
     model: DistortionModel, config: Config, base: Path
 ) -> CalibrationPrior | None:
-    """Prior of a model by the calibration that a configuration names; None where it names none.
-
-    InputError for a file that is no calibration, a run that has not converged, and as
-    `prior_of_calibration`.
-    """
+    """Prior of a model by the calibration that a configuration names; None where it names none."""
     block = config.prior_calibration
     if block is None:
         return None
@@ -250,13 +220,7 @@ def _calibration(path: Path, filter: str | None) -> Calibration:
         return read_calibration(path, filter=filter)
     if path.name == FIT:
         return calibration_of(load_fit(path), str(path))
-    posterior: Posterior = load_posterior(path)
-    if not posterior.convergence.converged:
-        raise InputError(
-            f"the run has not converged ({'; '.join(posterior.convergence.reasons)})",
-            where=str(path.parent),
-            do="resume it with more steps before it is a prior",
-        )
+    posterior = converged_posterior(path, "it is a prior")
     folder = path.parent
     if path.name == POSTERIOR and (folder / "run.json").exists():
         run = RunDirectory(folder)

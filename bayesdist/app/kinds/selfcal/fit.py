@@ -53,10 +53,7 @@ def arrays_of(solution: SelfCalibrationMode, reference: Float) -> dict[str, NDAr
 
 
 def load_selfcal(folder: Path, matched: Callable[[], SelfcalMatched]) -> Fitted:
-    """The fit of an earlier stage, with its solution.
-
-    InputError for missing or damaged files.
-    """
+    """The fit of an earlier stage, with its solution."""
     fitted = load_fitted(folder)
     found = matched()
     compute = found.inputs.config.resources()
@@ -105,10 +102,7 @@ def solved_of(
 
 
 def fit_selfcal(matched: SelfcalMatched) -> Fitted:
-    """Mode and gauge of a self-calibration, in one decision.
-
-    DegenerateError, NotSettledError as `solve_in_gauge`.
-    """
+    """Mode and gauge of a self-calibration, in one decision."""
     inputs, model = matched.inputs, matched.problem.model
     with one_cluster(inputs.config.resources()) as compute:
         mode = solve_in_gauge(

@@ -71,10 +71,7 @@ class Inputs:
 
     @cached_property
     def parallax_factors(self) -> Float | None:
-        """Parallax factors (E, 2) of exposures along u and v; None where stars have no parallax.
-
-        InputError where the field's place on the sky is not known, or the exposures have no dates.
-        """
+        """Parallax factors (E, 2) of exposures along u and v; None where stars have no parallax."""
         if self.config.selfcal.motion != "parallax":
             return None
         epoch = self.detections.epoch
@@ -94,18 +91,12 @@ class Inputs:
 
     @cached_property
     def start(self) -> tuple[DistortionModel, Float]:
-        """Model, and parameters (D,) by which the detections of a star lie near each other.
-
-        InputError as `started`.
-        """
+        """Model, and parameters (D,) by which the detections of a star lie near each other."""
         given = self.detections, self.unit_arcsec, self.catalog, self.commanded
         return started(self.config, self.base, *given)
 
     def known_for(self, model: DistortionModel) -> GaugeConstraints:
-        """Constraints on the gauge beside the detections.
-
-        InputError as `GaugeConstraints.of`.
-        """
+        """Constraints on the gauge beside the detections."""
         return GaugeConstraints.of(self.config, model, self.commanded, self.unit_arcsec)
 
     def problem(
@@ -113,8 +104,7 @@ class Inputs:
     ) -> Problem:
         """Detections of stars, linearised at parameters (D,) near the solution.
 
-        `detections`: with codes of stars and errors. `theta`: (D,). `first` (D,): by which
-        reference stars are found among the detected ones.
+        By the parameters `first` reference stars are found among the detected ones.
         """
         block = self.config.selfcal
         problem = prepare(
@@ -134,12 +124,7 @@ class Inputs:
 
 
 def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
-    """Read all that a self-calibration begins with; paths are relative to `base`.
-
-    InputError for files that cannot be read, a list of which nothing passes the cuts, a single
-    exposure, one that stands there twice, detections off the chips, exposures that the log does not
-    have, and as `read_commanded`.
-    """
+    """Read all that a self-calibration begins with; paths are relative to `base`."""
     block, gauge = config.selfcal, config.gauge
     found = lists_of(block, base, errors=block.sigma == "columns")
     names = found.names
@@ -215,10 +200,7 @@ def _of_log(
 
 
 def _read_references(config: SelfcalConfig, base: Path) -> ReferenceCatalog | None:
-    """The reference stars, in the unit of u and v; None where there are none.
-
-    InputError as `read_catalog`, and for stars without errors.
-    """
+    """The reference stars, in the unit of u and v; None where there are none."""
     block, unit_arcsec = config.gauge.reference, _unit_arcsec(config)
     if block is None or unit_arcsec is None:  # the configuration asks for a scale with references
         return None

@@ -48,11 +48,8 @@ def read_commanded(
 ) -> Commanded:
     """Commanded offsets and rolls of exposures from a table.
 
-    `path`: columns exposure, du and dv along u and v, sigma, roll in degrees from u to v, group.
-    `names`: exposures, in their order. `unit`: of u and v, for columns without one. `scale_mas`:
-    size of a pixel, where units have to be converted. `sigma`: of the offsets, where the table has
-    no such column. InputError for files that cannot be read, missing columns or values, and units
-    that do not go together.
+    Columns are exposure, du and dv along u and v, sigma, roll in degrees from u to v, group.
+    `unit`: of columns without one. `sigma`: of offsets without such a column.
     """
     table = read_table(path)
     found = find_columns(table.colnames, None, _COLUMNS, source=str(path))
@@ -161,11 +158,7 @@ class GaugeConstraints:
         commanded: Commanded | None,
         unit_arcsec: float | None,
     ) -> GaugeConstraints:
-        """Constraints that a configuration gives.
-
-        InputError for a prior on a parameter that the model does not have, and errors of rolls
-        without rolls.
-        """
+        """Constraints that a configuration gives."""
         block, pieces = config.gauge, dict[str, Piece]()
         if commanded is not None and commanded.offsets is not None:
             offsets, errors, groups = commanded.offsets, commanded.sigma, commanded.group

@@ -40,8 +40,8 @@ def matches_of(
 ) -> Matches:
     """Detections of the stars beside these, in the frame of each exposure's own VAFACTOR.
 
-    `problem`: linearised at a solution. `stars` (S, q): of the solution. `detections`: of which the
-    problem has some. `unused`: detections that are of no star, by reason.
+    `problem`: linearised at a solution with these `stars` (S, q). `unused`: detections that are of
+    no star, by reason.
     """
     p, d = problem, detections
     rows, model = p.rows, p.model
@@ -139,10 +139,7 @@ class SelfcalMatched(Matched):
 def load_matched_selfcal(
     folder: Path, inputs: Inputs, summary: Mapping[str, Any]
 ) -> SelfcalMatched:
-    """The detections of an earlier stage.
-
-    InputError for a missing or damaged file.
-    """
+    """The detections of an earlier stage."""
     arrays = read_arrays(folder / DETECTIONS, "", ARRAYS, do="run the stage 'match' again")
     path = folder / DETECTIONS
     with restoring(path, "a file of detections", do="run the stage 'match' again"):

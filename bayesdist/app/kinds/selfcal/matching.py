@@ -14,7 +14,7 @@ from bayesdist.app.kinds.selfcal.inputs import Inputs
 from bayesdist.app.kinds.selfcal.matched import SelfcalMatched, selfcal_matched
 from bayesdist.app.screen import number
 from bayesdist.arrays import Bool, Float, Int
-from bayesdist.data.detections import NO_STAR, Detections
+from bayesdist.data.detections import NO_STAR
 from bayesdist.data.matching.pairs import hull_of, inside_hull
 from bayesdist.errors import DegenerateError, InputError, NotSettledError
 from bayesdist.infer.selfcal import SelfCalibration
@@ -35,10 +35,7 @@ AMBIGUOUS = 0.05  # fraction of groups that may be of one star or several, worth
 
 
 def match_dithers(inputs: Inputs) -> SelfcalMatched:
-    """Detections of dithered exposures with their stars, and a first solution.
-
-    BayesdistError as `calibrated`, and for an exposure that hardly shares stars with the others.
-    """
+    """Detections of dithered exposures with their stars, and a first solution."""
     found = calibrated(inputs, lambda text: log.info("match: %s", text))
     table, facts = exposure_table(found, inputs), matching_facts(found, inputs)
     refuse_unconnected(table)
@@ -69,8 +66,8 @@ def match_dithers(inputs: Inputs) -> SelfcalMatched:
 def calibrated(inputs: Inputs, report: Callable[[str], None]) -> SelfCalibration:
     """Stars and solution of a self-calibration.
 
-    `report`: called with what happens, in words. BayesdistError as `self_calibrate`; where that
-    does not settle and one exposure lies half a turn from all the others, naming it.
+    `report`: called with what happens, in words. Where it does not settle and one exposure lies
+    half a turn from all the others, the error names it.
     """
     (model, theta), block = inputs.start, inputs.config.selfcal
     try:
@@ -153,12 +150,7 @@ def exposure_table(found: SelfCalibration, inputs: Inputs) -> Table:
 
 
 def refuse_unconnected(table: Table) -> None:
-    """Refuse an exposure that hardly shares stars with the others where they overlap.
-
-    `table` is as `exposure_table` makes it.
-
-    InputError naming it, and whether it lies half a turn from the others.
-    """
+    """Refuse an exposure that hardly shares stars with the others where they overlap."""
     share = np.asarray(table["fraction_common"], float)
     if len(share) < 3:  # of two nobody knows which one is wrong
         return
@@ -183,6 +175,7 @@ def refuse_unconnected(table: Table) -> None:
 def matching_facts(found: SelfCalibration, inputs: Inputs) -> dict[str, Any]:
     """Section 'selfcal' of summary.json: how detections became stars."""
     d, friends, p = found.detections, found.friends, found.mode.problem
+    raw = inputs.detections  # as they were before they lay on one tangent plane
     counts = np.bincount(d.star[d.star != NO_STAR], minlength=friends.n_stars)
     few = (counts > 1) & (counts < inputs.config.selfcal.min_detections)
     unused = {
@@ -205,7 +198,7 @@ def matching_facts(found: SelfCalibration, inputs: Inputs) -> dict[str, Any]:
         "n_chains": friends.n_chains,
         "iterations": found.iterations,
         "match_radius": p.match_radius,
-        "tangent_planes_pix": _moved(d, inputs.detections),
+        "tangent_planes_pix": float(np.hypot(d.x - raw.x, d.y - raw.y).max()),
         "detections": {
             "read": inputs.n_read,
             "cut": dict(inputs.rejected),
@@ -215,11 +208,6 @@ def matching_facts(found: SelfCalibration, inputs: Inputs) -> dict[str, Any]:
         "per_star": {"median": float(np.median(p.counts)), "most": int(p.counts.max())},
         "warnings": warnings,
     }
-
-
-def _moved(detections: Detections, raw: Detections) -> float:
-    """Largest distance, in pixels, by which a detection was moved onto the common tangent plane."""
-    return float(np.hypot(detections.x - raw.x, detections.y - raw.y).max())
 
 
 def _seen_by_others(model: DistortionModel, theta: Float, places: Float, exposure: Int) -> Bool:

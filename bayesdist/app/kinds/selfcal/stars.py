@@ -40,8 +40,7 @@ def write_stars(
 ) -> dict[str, Any]:
     """Write stars.ecsv, and of many stars stars.parquet.
 
-    `correlated`: whose covariance of the parameters the stars share. `notes`: meta data of the
-    table. `compute`: where the passes over the detections are made. Result: for summary.json.
+    `correlated`: whose covariance of the parameters the stars share. Result: for summary.json.
     """
     solution, references = solved.mode, solved.references
     cov = None if correlated is None else correlated.covariance
@@ -81,8 +80,6 @@ def star_table(
     Columns u, v (and pm_u, pm_v), sigma_u and so on with the errors of distortion and frames in
     the gauge of the run, cov_u_v and so on, sigma_own_u, sigma_own_v of the star's detections
     alone, n, n_members, mag (the median), flags.
-
-    `solution`: with its stars. `mag` (N,): magnitudes of the detections.
     """
     names = NAMES[: found.values.shape[1]]
     units = [f"{found.unit} / yr" if name.startswith("pm") else found.unit for name in names]

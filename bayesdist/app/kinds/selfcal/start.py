@@ -41,9 +41,7 @@ def started(
     The sky lies as the reference stars do, or else as the commanded offsets, or else as the first
     exposure.
 
-    `base`: folder that its files are relative to. `unit_arcsec`: size of the unit of u, v, where it
-    is known. InputError naming exposures that have no stars in common; for a start that cannot be
-    read, and reference stars that are not found again.
+    The error for exposures that have no stars in common names them.
     """
     block, number = config.selfcal, int(d.chip[0])  # of a detector of one chip, as in the data
     chips = config.chips()

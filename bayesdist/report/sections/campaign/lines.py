@@ -94,7 +94,7 @@ def _line_table(
 ) -> TextTable:
     """Table of alpha and beta of a term: joint, exposure by exposure, and published."""
     factor, unit = _scale(term, c.unit)
-    own = [row for row in (*joint, *alone.values()) if _is_of(row, term)]
+    own = [row for row in (*joint, *alone.values()) if row["term"].rpartition(".")[2] == term]
     # as many digits for all of this run's, so that they can be compared; others as printed
     digits = {
         key: min((row[key] for row in own if row[key] * factor > FIXED), default=0.0)
@@ -150,10 +150,6 @@ def _scale(term: str, unit: str) -> tuple[float, str]:
 def _is_free(row: Mapping[str, Any], unit: str) -> bool:
     """True where the data constrain the term: the gauge fixes terms of the reference chip."""
     return bool(row["sigma_alpha"] * _scale(row["term"], unit)[0] > FIXED)
-
-
-def _is_of(row: Mapping[str, Any], term: str) -> bool:
-    return str(row["term"]).rpartition(".")[2] == term
 
 
 def _numbers(row: Mapping[str, Any], factor: float, digits: Mapping[str, Any]) -> Row:

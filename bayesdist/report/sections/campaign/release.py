@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from bayesdist.diagnose.overlap import OverlapTest
@@ -60,16 +62,8 @@ def overlap(r: ReportInput) -> Plot:
     for which, (binned, found) in states.items():
         one = Arrows.of_cells(binned, MIN_STARS_PER_CELL)
         largest[which] = float(one.length.max(initial=0.0))
-        arrows.append(
-            Arrows(
-                one.x - 0.5 + t.corner[0],
-                one.y - 0.5 + t.corner[1],
-                one.du,
-                one.dv,
-                one.step,
-                np.ones(one.x.size, bool),
-            )
-        )
+        x, y = one.x - 0.5 + t.corner[0], one.y - 0.5 + t.corner[1]
+        arrows.append(replace(one, x=x, y=y, clear=np.ones(one.x.size, bool)))
         name = "known distortion" if which == "old" else "this run"
         rms = float(np.sqrt(np.mean(found.rms**2)))
         titles.append(f"{name}: largest {largest[which]:.3f}, rms {rms:.3f} pix")

@@ -212,8 +212,10 @@ def budget_dominating(r: ReportInput) -> Plot:
         cmap=ListedColormap(colors),
     )
     handles = [
-        Patch(color=c, label=f"{_shortened(budget.names[k])} ({100 * share[k]:.0f} %)")
-        for c, k in zip(colors, present, strict=True)
+        Patch(color=c, label=f"{name if len(name) <= 40 else name[:39] + '…'} ({part:.0f} %)")
+        for c, name, part in zip(
+            colors, (budget.names[k] for k in present), 100 * share[present], strict=True
+        )
     ]
     longest = max(len(str(handle.get_label())) for handle in handles)
     narrow = panels.figure.get_figwidth() < WIDTH
@@ -228,7 +230,3 @@ def budget_dominating(r: ReportInput) -> Plot:
         " the model leads.",
         f"Map of the dominant term, mostly {budget.names[top]}.",
     )
-
-
-def _shortened(name: str) -> str:
-    return name if len(name) <= 40 else name[:39] + "…"

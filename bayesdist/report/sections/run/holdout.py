@@ -30,11 +30,7 @@ _MOST_TESTS = 12
 _KEY = 3.0  # length of the arrow in the key, in sigma
 
 
-def _with_coverage(r: ReportInput) -> bool:
-    return r.held_out is not None and bool(r.held_out.coverage)
-
-
-@REPORT.table("holdout", needs=("held_out",), when=_with_coverage)
+@REPORT.table("holdout", needs=("held_out.coverage",))
 def holdout_coverage(r: ReportInput) -> TextTable:
     """Table of the coverage of the held-out stars along each axis."""
     found = needed(r.held_out)

@@ -127,12 +127,13 @@ def distortion(r: ReportInput) -> Plot:
     note = v.part_note
     if len(set(notes.values())) > 1:
         note = "; ".join(f"{name} {text}" for name, text in notes.items())
+    own = " Each chip is compared with its own array: gap and rotation between chips are not shown."
     return Plot(
         _flow(r, [c.displacement for c in r.chips]),
         "Distortion, zeroth order suppressed",
         f"Vectors run from the array position to where the distortion puts it, {note}; the"
         f" largest is {r.length(v.length_max)} at {where}, ringed."
-        f"{_suppressed(r)}",
+        f"{own if r.several else ''}",
         f"Vector-flow diagram of the distortion, largest vector {r.length(v.length_max)}.",
     )
 
@@ -173,14 +174,6 @@ def _longest(r: ReportInput, which: str) -> tuple[VectorMap, str]:
     worst = max(r.chips, key=lambda c: getattr(c, which).length_max)
     vectors: VectorMap = getattr(worst, which)
     return vectors, f"pixel {r.position(vectors.position_of_max, worst.chip.number)}"
-
-
-def _suppressed(r: ReportInput) -> str:
-    if not r.several:
-        return ""
-    return (
-        " Each chip is compared with its own array: gap and rotation between chips are not shown."
-    )
 
 
 @REPORT.figure("maps")

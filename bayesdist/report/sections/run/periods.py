@@ -27,7 +27,6 @@ from bayesdist.report.texttable import TextTable, listing
 if TYPE_CHECKING:
     from bayesdist.diagnose.periods import TimeVariation
     from bayesdist.diagnose.residuals import StatisticsTable
-    from bayesdist.model import Chip
 
 GRID = 17  # vectors along the longer side
 _CLEAR = 3.0  # sigmas beyond which a coefficient counts
@@ -178,7 +177,8 @@ def period_differences(r: ReportInput) -> Plot:
     longest = r.mosaic.longest_side
     chips, lengths = [], []
     for chip in comparison.model.chips:
-        f = comparison.field(found.last, found.first, chip=chip, grid=_grid(chip, longest))
+        nx, ny = (max(3, round(GRID * side / longest)) for side in chip.size)
+        f = comparison.field(found.last, found.first, chip=chip, grid=(nx, ny))
         gx, gy = (a.ravel() for a in np.meshgrid(f.x, f.y))
         clear = (f.p_value < CHANCE).ravel()
         chips.append(Arrows(gx, gy, f.du.ravel(), f.dv.ravel(), spacing(f.x, f.y), clear))
@@ -205,8 +205,3 @@ def period_differences(r: ReportInput) -> Plot:
         f" ({probability(change.p_value)}).",
         f"Map of difference vectors between two periods; the largest is {size}.",
     )
-
-
-def _grid(chip: Chip, longest: float) -> tuple[int, int]:
-    nx, ny = (max(3, round(GRID * side / longest)) for side in chip.size)
-    return nx, ny

@@ -50,10 +50,6 @@ _INDEPENDENCE = (
 )
 
 
-def _with_mixture(r: ReportInput) -> bool:
-    return r.posterior is not None and bool(r.posterior.hyper)
-
-
 @REPORT.table("outliers", needs=("posterior",))
 def outlier_table(r: ReportInput) -> TextTable:
     """Table of the mixture's own parameters, and of the number of stars or detections it flags."""
@@ -135,12 +131,12 @@ def added_errors_table(r: ReportInput) -> TextTable:
     return TextTable("Errors beyond the quoted ones", heads, tuple(rows), words=(0, 1), note=note)
 
 
-@REPORT.figure("outliers", needs=("posterior",), when=_with_mixture)
+@REPORT.figure("outliers", needs=("posterior.hyper",))
 def outliers_corner(r: ReportInput) -> Plot:
     """Corner plot of the outlier fraction, jitter and outlier scale, of those that were sampled."""
     posterior = needed(r.posterior)
     columns = [
-        Column(label, unit, _thinned(draws.ravel()))
+        Column(label, unit, draws.ravel()[:: max(1, draws.size // _MAX_POINTS)])
         for label, unit, draws in _mixture_draws(posterior)
     ]
     text = "Joint posterior of the mixture's parameters; dashed lines hold 68 %."
@@ -208,10 +204,6 @@ def _mixture_draws(posterior: Posterior) -> list[tuple[str, str, Float]]:
         for key, label in _MIXTURE_LABELS.items()
         if key in hyper
     ]
-
-
-def _thinned(draws: Float) -> Float:
-    return draws[:: max(1, len(draws) // _MAX_POINTS)]
 
 
 @REPORT.figure("coefficients", needs=("posterior",))
