@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 from scipy.stats import binned_statistic_2d
 
-from bayesdist.diagnose.residuals import pair_statistics
 from bayesdist.diagnose.residuals.binned import binned_residuals
-from bayesdist.diagnose.residuals.rows import residual_statistics
+from bayesdist.diagnose.residuals.rows import pair_statistics, residual_statistics
 from bayesdist.errors import InputError
 
 SIZE = (1016.0, 508.0)

@@ -17,7 +17,8 @@ from bayesdist.diagnose.residuals.sample import SAMPLE
 from bayesdist.errors import InputError
 
 if TYPE_CHECKING:
-    from bayesdist.diagnose.residuals import PatternChange, StatisticsTable
+    from bayesdist.diagnose.residuals.changes import PatternChange
+    from bayesdist.diagnose.residuals.tables import StatisticsTable
     from bayesdist.infer.compare.positions import PositionChange
 
 

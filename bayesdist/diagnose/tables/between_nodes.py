@@ -87,11 +87,12 @@ def between_nodes(
     common = _of_stars(*stars[2:5])
     square, error = np.empty(2), np.empty(2)
     for a in (0, 1):
-        of_fine, of_coarse = (s.axis(a, seen) for s in (fine, coarse))
-        each = (AREA_RATIO * of_fine.mean - of_coarse.mean) / (AREA_RATIO - 1)
+        near, far = fine.weight[seen, a], coarse.weight[seen, a]
+        each = AREA_RATIO * (fine.product[seen, a] / near) - coarse.product[seen, a] / far
+        each /= AREA_RATIO - 1
         # pairs in a fine cell are among those of the coarse one around it
-        noise = AREA_RATIO**2 * of_fine.noise - 2 * AREA_RATIO * of_fine.noise_among(of_coarse)
-        noise = (noise + of_coarse.noise) / (AREA_RATIO - 1) ** 2
+        noise = AREA_RATIO**2 * (fine.scatter[a] / near) - 2 * AREA_RATIO * (fine.scatter[a] / far)
+        noise = (noise + coarse.scatter[a] / far) / (AREA_RATIO - 1) ** 2
         size = max(float(np.average(each, weights=1 / noise)), 0.0)
         for _ in range(MAX_ITERATIONS):
             # squares differ by about what they hold: where that is well known, area counts
@@ -112,45 +113,18 @@ def _of_stars(residual: Float, precision: Float, star: Int) -> Float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Axis:
-    """Sums over pairs along one axis, by square (S,): products, weights, noise of the products."""
-
-    product: Float
-    weight: Float
-    scatter: float
-
-    @property
-    def mean(self) -> Float:
-        """Mean products (S,)."""
-        return self.product / self.weight
-
-    @property
-    def noise(self) -> Float:
-        """Variances (S,) of these by what single stars have for themselves."""
-        return self.scatter / self.weight
-
-    def noise_among(self, others: _Axis) -> Float:
-        """Covariances (S,) with mean products of which these pairs are a part."""
-        return self.scatter / others.weight
-
-
-@dataclass(frozen=True, eq=False)
 class _Pairs:
     """Sums over ordered pairs of different stars in different exposures of the same cell."""
 
     cells: _NodeCells
     by_cell: Float  # (cells, 2) weights
-    # product, weight, spread (squares, 2): products and weights by square; variance of the former
-    # as far as stars err by themselves
+    # product, weight (squares, 2): products and weights by square
     product: Float
     weight: Float
-    spread: Float
+    # (2,) variance of the products as far as stars err by themselves, over their weight: noise of
+    # mean products goes with one over the weight
+    scatter: Float
     number: Float  # (squares,)
-
-    def axis(self, a: int, seen: Bool) -> _Axis:
-        """Sums along one axis, in some of the squares; noise goes with one over the weight."""
-        scatter = self.spread[:, a].sum() / self.weight[:, a].sum()
-        return _Axis(self.product[seen, a], self.weight[seen, a], float(scatter))
 
     def average(
         self,
@@ -190,7 +164,9 @@ def _pairs(
     sums += squares_over(np.arange(len(cell)), each, cell, n)
     squares = cells.squares()
     whole = sums_over(squares, sums)
-    return _Pairs(cells, sums[:, 2:4], whole[:, :2], whole[:, 2:4], 2 * whole[:, 4:6], whole[:, 6])
+    product, weight, spread, number = np.split(whole, (2, 4, 6), axis=1)
+    scatter = [2 * s.sum() / w.sum() for s, w in zip(spread.T, weight.T, strict=True)]
+    return _Pairs(cells, sums[:, 2:4], product, weight, np.array(scatter), number.ravel())
 
 
 @dataclass(frozen=True)
