@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from bayesdist.diagnose.residuals.binned import BinValues, band_bins, residual_statistics
+from bayesdist.diagnose.residuals.binned import BinValues, band_bins
 from bayesdist.diagnose.residuals.changes import pattern_changes
-from bayesdist.diagnose.residuals.rows import STATISTICS, bin_row, pair_row, pair_statistics
+from bayesdist.diagnose.residuals.rows import (
+    STATISTICS,
+    bin_row,
+    pair_row,
+    pair_statistics,
+    residual_statistics,
+)
 from bayesdist.diagnose.residuals.tables import period_table
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import build_model, fit_linear, residuals
