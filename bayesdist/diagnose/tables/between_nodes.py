@@ -91,8 +91,9 @@ def between_nodes(
         each = AREA_RATIO * (fine.product[seen, a] / near) - coarse.product[seen, a] / far
         each /= AREA_RATIO - 1
         # pairs in a fine cell are among those of the coarse one around it
-        noise = AREA_RATIO**2 * (fine.scatter[a] / near) - 2 * AREA_RATIO * (fine.scatter[a] / far)
-        noise = (noise + coarse.scatter[a] / far) / (AREA_RATIO - 1) ** 2
+        own = fine.scatter(a)
+        noise = AREA_RATIO**2 * (own / near) - 2 * AREA_RATIO * (own / far)
+        noise = (noise + coarse.scatter(a) / far) / (AREA_RATIO - 1) ** 2
         size = max(float(np.average(each, weights=1 / noise)), 0.0)
         for _ in range(MAX_ITERATIONS):
             # squares differ by about what they hold: where that is well known, area counts
@@ -118,13 +119,16 @@ class _Pairs:
 
     cells: _NodeCells
     by_cell: Float  # (cells, 2) weights
-    # product, weight (squares, 2): products and weights by square
+    # product, weight, spread (squares, 2): products and weights by square; variance of the former
+    # as far as stars err by themselves
     product: Float
     weight: Float
-    # (2,) variance of the products as far as stars err by themselves, over their weight: noise of
-    # mean products goes with one over the weight
-    scatter: Float
+    spread: Float
     number: Float  # (squares,)
+
+    def scatter(self, a: int) -> float:
+        """Noise of mean products along one axis, times their weight."""
+        return float(self.spread[:, a].sum() / self.weight[:, a].sum())
 
     def average(
         self,
@@ -164,9 +168,7 @@ def _pairs(
     sums += squares_over(np.arange(len(cell)), each, cell, n)
     squares = cells.squares()
     whole = sums_over(squares, sums)
-    product, weight, spread, number = np.split(whole, (2, 4, 6), axis=1)
-    scatter = [2 * s.sum() / w.sum() for s, w in zip(spread.T, weight.T, strict=True)]
-    return _Pairs(cells, sums[:, 2:4], product, weight, np.array(scatter), number.ravel())
+    return _Pairs(cells, sums[:, 2:4], whole[:, :2], whole[:, 2:4], 2 * whole[:, 4:6], whole[:, 6])
 
 
 @dataclass(frozen=True)
