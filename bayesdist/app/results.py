@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from bayesdist.app.assessment.checks import run_checks
-from bayesdist.app.assessment.diagnosing import diagnose_fit_of_run, diagnose_run
+from bayesdist.app.assessment.diagnosing import diagnose_residuals, diagnose_run
 from bayesdist.app.assessment.error_terms import errors_of_run
 from bayesdist.app.assessment.settings import assessment_epoch, evaluation_settings
 from bayesdist.app.config import Config
@@ -147,7 +147,7 @@ class Results:
     def diagnostics(self) -> Diagnostics:
         """Diagnostics as the run has them, or made now; fewer of a fit alone."""
         if not self.is_sampled:
-            return diagnose_fit_of_run(self.data, self.config)
+            return diagnose_residuals(None, self.data, self.config)
         return self.stored or diagnose_run(self.posterior, self.data, self.config, self.base)
 
     @cached_property

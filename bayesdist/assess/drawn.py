@@ -8,16 +8,18 @@ draws.
 from __future__ import annotations
 
 import math
+import os
 import zlib
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain, WorstPosition
-from bayesdist.assess.statistics import ErrorsOf, drawn_statistics
+from bayesdist.assess.statistics import extent, of_sizes, sizes
 from bayesdist.assess.terms.forms import (
     PRODUCT,
     DrawnField,
@@ -25,10 +27,12 @@ from bayesdist.assess.terms.forms import (
     ErrorField,
     ErrorTerm,
     Image,
-    Noise,
+    NoiseField,
 )
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.solution import Solution
 
+ROWS = 16  # draws whose noise comes from one generator: so that blocks do not change it
 BLOCK = 200_000  # positions times draws whose errors a thread holds at once
 MOST_PAIRS = 5000  # pairs of positions that stand for all: percentiles over them to about 1 %
 
@@ -128,6 +132,7 @@ class DrawnErrors:
         (found,) = self.over_epochs(domain, (domain.epoch,), names, scale=scale, n_draws=n_draws)
         return found
 
+    @one_thread  # of each thread that it starts
     def over_epochs(
         self,
         domain: EvaluationDomain,
@@ -146,15 +151,37 @@ class DrawnErrors:
         if pairs is not None and pairs.shape[1] > MOST_PAIRS:
             rng = np.random.default_rng(self.seed)
             pairs = pairs[:, rng.choice(pairs.shape[1], MOST_PAIRS, replace=False)]
-        return drawn_statistics(
-            [self.errors(domain.positions.at(epoch), scale) for epoch in epochs],
-            names,
-            n_draws=n_draws or self.n_draws,
-            n_positions=domain.size,
-            block=BLOCK,
-            seed=self.seed,
-            pairs=pairs,
-            over_all=domain.relative == "pairs" and domain.separation is None,
+        errors = [self.errors(domain.positions.at(epoch), scale) for epoch in epochs]
+        noisy = any(one.noises for one in errors)
+        by_axis = [tuple(name.rpartition("_")[::2]) for name in names]
+        # largest differences are those of all positions, not of pairs that stand for them
+        over_all = domain.relative == "pairs" and domain.separation is None
+        n = n_draws or self.n_draws
+        width = max(domain.size, 0 if pairs is None else pairs.shape[1])
+        step = ROWS * max(1, BLOCK // (ROWS * width))
+
+        def found(start: int) -> list[list[Float]]:
+            rows, out = slice(start, min(start + step, n)), []
+            normal = _normal(self.seed, rows, domain.size) if noisy else np.zeros(1)
+            for error_of in errors:
+                error = error_of(rows, normal)
+                seen = error if pairs is None else error[:, pairs[0]] - error[:, pairs[1]]
+                size = {axis: sizes(axis, seen) for axis, _ in by_axis}
+                out.append(
+                    [
+                        extent(name, error)
+                        if over_all and base == "max"
+                        else of_sizes(base, size[axis])
+                        for name, (axis, base) in zip(names, by_axis, strict=True)
+                    ]
+                )
+            return out
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            blocks = list(pool.map(found, range(0, n, step)))
+        return tuple(
+            {name: np.concatenate([b[e][k] for b in blocks]) for k, name in enumerate(names)}
+            for e in range(len(errors))
         )
 
     def worst(self, domain: EvaluationDomain, axis: str = "") -> WorstPosition:
@@ -182,56 +209,64 @@ class DrawnErrors:
 
     def errors(
         self, domain: EvaluationDomain, scale: Mapping[str, float] | None = None
-    ) -> ErrorsOf:
-        """Errors (d, N, 2) of some draws, given normal numbers for what is independent.
+    ) -> SummedErrors:
+        """Errors of all terms, by draws.
 
         `domain`: of positions, not of differences. `scale`: factors by which rows are multiplied.
         """
-        scale = scale or {}
-        fields = self.at(domain)
-        noises = [one for f in fields for one in f.noise(scale)]
-        noisy = any(np.any(one.sigma) for one in noises)
-        drawn = tuple(f for f in fields if isinstance(f, DrawnField))
-        return _Sum(domain.size, drawn, scale, _together(noises, domain) if noisy else None)
+        fields, scale = self.at(domain), scale or {}
+        noises = [
+            (scale.get(f.of.row.name, 1.0) * f.sigma, f.of.sizes)
+            for f in fields
+            if isinstance(f, NoiseField) and f.sigma is not None
+        ]
+        return SummedErrors(
+            domain,
+            tuple(f for f in fields if isinstance(f, DrawnField)),
+            scale,
+            # nothing is drawn where all of them are zero
+            tuple(noises) if any(np.any(sigma) for sigma, _ in noises) else (),
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class _Sum:
+class SummedErrors:
     """Errors at the positions of a domain, summed over all terms."""
 
-    n_positions: int
+    domain: EvaluationDomain
     drawn: tuple[DrawnField, ...]
-    scale: Mapping[str, float]
-    noise: Callable[[slice, Float], Float] | None
-
-    @property
-    def noisy(self) -> bool:
-        return self.noise is not None
+    scale: Mapping[str, float]  # factors by which rows are multiplied
+    # standard deviations (N, 2) of independent errors, and sizes as of `Independent`
+    noises: tuple[tuple[Float, Mapping[int, Float]], ...]
 
     def __call__(self, rows: slice, normal: Float) -> Float:
+        """Errors (d, N, 2) of some draws, given as many normal numbers for the noise."""
         # in memory axis by axis, as the terms evaluate their errors
-        out = np.zeros((rows.stop - rows.start, 2, self.n_positions)).swapaxes(1, 2)
-        if self.noise is not None:
-            out += self.noise(rows, normal)
+        out = np.zeros((rows.stop - rows.start, 2, self.domain.size)).swapaxes(1, 2)
+        if self.noises:
+            out += normal * np.sqrt(self._variance(rows))
         for one in self.drawn:
             out += one.errors(rows, self.scale)
         return out
 
-
-def _together(noises: Sequence[Noise], domain: EvaluationDomain) -> Callable[[slice, Float], Float]:
-    """All independent errors: normal numbers times the root of the sum of variances."""
-    variance = sum((one.sigma**2 for one in noises), np.zeros((domain.size, 2)))
-    sized = [one for one in noises if one.sizes]
-
-    def noise_of(rows: slice, normal: Float) -> Float:
-        if not sized:
-            return normal * np.sqrt(variance)
+    def _variance(self, rows: slice) -> Float:
+        """Variance (N, 2) of all independent errors, or (d, N, 2) where it differs by draw."""
+        variance = np.zeros((self.domain.size, 2))
+        for sigma, _ in self.noises:
+            variance = variance + sigma**2
+        if not any(size for _, size in self.noises):
+            return variance
         drawn = np.tile(variance, (rows.stop - rows.start, 1, 1))
-        for one in sized:
-            for chip, here in domain.by_chip():
-                if chip in one.sizes:
-                    more = one.sizes[chip][rows, None] - 1.0
-                    drawn[:, here] += more * one.sigma[here] ** 2
-        return normal * np.sqrt(np.maximum(drawn, 0.0))
+        for sigma, size in self.noises:
+            for chip, here in self.domain.by_chip():
+                if chip in size:
+                    drawn[:, here] += (size[chip][rows, None] - 1.0) * sigma[here] ** 2
+        return np.maximum(drawn, 0.0)
 
-    return noise_of
+
+def _normal(seed: int, rows: slice, n_positions: int) -> Float:
+    """Standard normal numbers (rows, N, 2), those of a draw the same in any block."""
+    shape = ROWS, n_positions, 2
+    starts = range(rows.start, rows.stop, ROWS)
+    out = [np.random.default_rng((seed, k)).standard_normal(shape) for k in starts]
+    return np.concatenate(out)[: rows.stop - rows.start]

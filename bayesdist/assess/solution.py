@@ -48,10 +48,6 @@ class Place:
         cov = np.asarray(solution.cov, float)[np.ix_(columns, columns)]
         return (d @ cov @ d.T).reshape(2, K, 2, K)
 
-    def gradient(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
-        """Derivatives of the basis functions by the pixel: see `PolynomialBasis.gradient`."""
-        return self.basis.gradient(x, y)
-
 
 def place_of(
     model: DistortionModel,
@@ -88,7 +84,7 @@ def chip_places(solution: Solution, *, epoch: float | None = None) -> tuple[tupl
         polynomial = place.polynomial(solution.mean)
         middle = (np.array(chip.size) + 1) / 2
         centres.append(polynomial @ place.basis.evaluate(*middle[:, None])[0])
-        px, py = place.gradient(*middle[:, None])
+        px, py = place.basis.gradient(*middle[:, None])
         gradients.append(np.column_stack([polynomial @ px[0], polynomial @ py[0]]))
     x, y = np.linalg.lstsq(gradients[0], np.transpose(centres), rcond=None)[0]
     half = np.array([c.size for c in chips]).min(axis=0) / 2

@@ -144,7 +144,7 @@ def distortion_vectors(
 
 def _linear_part(place: Place, polynomial: Float) -> Float:
     """Matrix d(u, v) / d(x, y) at the reference pixel."""
-    px, py = place.gradient(*np.array(place.chip.reference_pixel)[:, None])
+    px, py = place.basis.gradient(*np.array(place.chip.reference_pixel)[:, None])
     return np.concatenate([polynomial @ px.T, polynomial @ py.T], axis=1)
 
 

@@ -21,8 +21,7 @@ from bayesdist.diagnose.checks import (
 )
 from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors, estimate_discrepancy
 from bayesdist.diagnose.correlated.result import as_stored
-from bayesdist.diagnose.holdout.predictive import Predictive
-from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_validation
+from bayesdist.diagnose.holdout.validation import HoldoutValidation
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, time_variation
 from bayesdist.diagnose.residuals.binned import BinnedSums
@@ -128,6 +127,7 @@ class Diagnostics:
         return tuple(out)
 
 
+@one_thread
 def diagnose_fit(
     fit: LinearFit,
     posterior: Posterior | None,
@@ -140,31 +140,13 @@ def diagnose_fit(
     things: str = "pairs",
     known: bool = False,
 ) -> Diagnostics:
-    """Diagnostics of a fit, and of a posterior where there is one; nothing is estimated.
+    """Diagnostics by residuals alone, of a posterior where there is one; nothing is estimated.
 
-    Parameters
-    ----------
-    fit : LinearFit
-    posterior : Posterior or None
-    stars : Matches
-        With errors: those that were fitted.
-    shards : Shards
-        The same, as passes go over them.
-    table : Matches
-        Evenly spread ones of them, or all.
-    eliminated : infer.selfcal.SelfCalibrationMode, optional
-        The solution with its stars, where places of stars were fitted too.
-    centroid : MagnitudeErrors, 'residuals' or None
-        Errors of the centroids where the fit has found them; else they are the scatter of the
-        residuals.
-    things : str
-        What is true or false.
-    known : bool
-        Whether an earlier calibration says where no stars are.
-
-    Returns
-    -------
-    Diagnostics
+    `stars`: those that were fitted, with errors. `shards`: the same, as passes go over them.
+    `table`: evenly spread ones of them, or all. `eliminated`: the solution with its stars, where
+    places of stars were fitted too. `centroid`: errors of the centroids where the fit has found
+    them; else they are the scatter of the residuals. `things`: what is true or false. `known`:
+    whether an earlier calibration says where no stars are.
     """
     model, survey = fit.model, shards.survey
     shown = likelihood_shown(fit, posterior)
@@ -245,75 +227,38 @@ def _taken(eliminated: SelfCalibrationMode, rows: Int) -> Float:
 
 @one_thread
 def diagnose(
+    found: Diagnostics,
     fit: LinearFit,
     posterior: Posterior,
     stars: Matches,
     shards: Shards,
-    table: Matches,
     *,
     rng: np.random.Generator,
-    tested: Matches | None = None,
-    discrepancy: DiscrepancyPriors | None = None,
-    priors: GaussianPriors | None = None,
-    match_radius: float | None = None,
-    structure: bool = True,
-    exposures: bool = True,
-    settling: Settling | None = None,
-    catalogue: StarErrors | None = None,
-    eliminated: SelfCalibrationMode | None = None,
-    centroid: MagnitudeErrors | Literal["residuals"] | None = "residuals",
-    periods: PeriodSettings | None = None,
-    things: str = "pairs",
+    tested: Matches,
+    discrepancy: DiscrepancyPriors,
+    priors: GaussianPriors | None,
+    match_radius: float | None,
+    structure: bool,
+    exposures: bool,
+    settling: Settling | None,
+    catalogue: StarErrors | None,
+    eliminated: SelfCalibrationMode | None,
+    periods: PeriodSettings | None,
 ) -> Diagnostics:
-    """Diagnostics of a posterior.
+    """Diagnostics of a posterior, with what is estimated and tested.
 
-    Parameters
-    ----------
-    fit, posterior, stars, shards, table, eliminated, centroid, things
-        As `diagnose_fit`.
-    rng : numpy.random.Generator
-        Each result is made from its numbers from their beginning.
-    tested : Matches, optional
-        Those that the score tests look at, where they have more columns than `table`.
-    discrepancy : DiscrepancyPriors, optional
-        Of the size of correlated errors.
-    priors : GaussianPriors, optional
-        Those of the parameters that the posterior has.
-    match_radius : float, optional
-        Within which the stars were matched, in the unit of u and v.
-    structure : bool
-        Whether there is structure beyond the model; not where look-up tables were fitted to it.
-    exposures : bool
-        Whether single exposures deviate; not where a hierarchy of them was fitted.
-    settling : Settling, optional
-        What was done to the shifts of single chips after sampling.
-    catalogue : StarErrors, optional
-        Errors of the catalogue by code of the star.
-    periods : PeriodSettings, optional
-        Periods that are compared.
+    `found`: those by residuals, of `diagnose_fit`, and `stars`, `shards` and `eliminated` as there.
+    `rng`: each result is made from its numbers from their beginning. `tested`: matches that the
+    score tests look at. `discrepancy`: of the size of correlated errors. `priors`: those of the
+    parameters that the posterior has. `match_radius`: within which the stars were matched, in the
+    unit of u and v. `structure`: whether there is structure beyond the model; not where look-up
+    tables were fitted to it. `exposures`: whether single exposures deviate; not where a hierarchy
+    of them was fitted. `settling`: what was done to the shifts of single chips after sampling.
+    `catalogue`: errors of the catalogue by code of the star. `periods`: that are compared.
 
-    Returns
-    -------
-    Diagnostics
-
-    Raises
-    ------
-    InputError
-        Where correlated errors cannot be estimated: no verdict could rest on anything then.
-    DegenerateError
-        For a period with too few pairs.
+    InputError where correlated errors cannot be estimated: no verdict could rest on anything then;
+    DegenerateError for a period with too few pairs.
     """
-    found = diagnose_fit(
-        fit,
-        posterior,
-        stars,
-        shards,
-        table,
-        eliminated=eliminated,
-        centroid=centroid,
-        things=things,
-        known=priors is not None and priors.joint is not None,
-    )
     in_memory = stars if stars.in_memory else None
     shared = None
     if eliminated is not None:
@@ -328,18 +273,13 @@ def diagnose(
             rng=restarted(rng),
             priors=discrepancy,
             parameter_priors=priors,
-            sample=table,
+            sample=found.sample.table,
             stars=in_memory if catalogue is None else None,
             structure=structure,
             exposures=exposures,
             settling=settling,
         )
-        tests = score_tests(
-            table if tested is None else tested,
-            posterior,
-            priors=priors,
-            match_radius=match_radius,
-        )
+        tests = score_tests(tested, posterior, priors=priors, match_radius=match_radius)
         shared = catalogue_covariance(fit, in_memory, catalogue)
     return replace(
         found,
@@ -369,15 +309,3 @@ def catalogue_covariance(
         return None
     log.info("diagnose: errors of the catalogue, one for each star in all of its exposures")
     return star_covariance(fit, stars, errors, frames=False)
-
-
-def hold_out(
-    diagnostics: Diagnostics, predictive: Predictive, held: Matches, whole: tuple[str, ...] = ()
-) -> Diagnostics:
-    """Diagnostics with what stars say that were set aside.
-
-    `predictive`: the solution with its correlated errors, as it predicts. `held`: stars that were
-    set aside, with errors. `whole`: exposures all of whose stars were. InputError for too few
-    stars.
-    """
-    return replace(diagnostics, holdout=holdout_validation(predictive, held, whole=whole))

@@ -14,15 +14,10 @@ import numpy as np
 
 from bayesdist.arrays import Int
 from bayesdist.data import Matches
-from bayesdist.diagnose.residuals import (
-    BinnedSums,
-    PatternChange,
-    StatisticsTable,
-    band_bins,
-    pattern_changes,
-    period_table,
-)
+from bayesdist.diagnose.residuals.binned import BinnedSums, band_bins
+from bayesdist.diagnose.residuals.changes import PatternChange, pattern_changes
 from bayesdist.diagnose.residuals.misfit import STARS_PER_BIN
+from bayesdist.diagnose.residuals.tables import StatisticsTable, period_table
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import LinearFit
 from bayesdist.infer.compare.period_dates import sum_by_period

@@ -244,7 +244,9 @@ def test_terms_and_draws_are_kept_in_files(name):
 def test_two_terms_of_one_name_are_two_chances():
     term = UserTerm("catalogue", "systematic", 0.01, 0.01)
     errors = drawn(term, term)
-    a, b = (one.on(domain_of(), errors.image).errors(slice(0, DRAWS)) for one in errors.draws[1:3])
+    a, b = (
+        one.on(domain_of(), errors.image).errors(slice(0, DRAWS), {}) for one in errors.draws[1:3]
+    )
     correlation = np.corrcoef(a[:, 0, 0], b[:, 0, 0])[0, 1]
     assert abs(correlation) < 5 / np.sqrt(DRAWS)
 

@@ -170,10 +170,10 @@ def _drawn(
         for field in errors.at(domain):
             for part in getattr(field, "parts", (field,)):
                 if isinstance(part, PolynomialField):
-                    parts.setdefault(part.rows[0].name, []).append(part.errors(every))
+                    parts.setdefault(part.rows[0].name, []).append(part.errors(every, {}))
             for one in getattr(field, "summed", (field,)):
                 if isinstance(one, PolynomialField):
-                    joint = joint + one.errors(every)
+                    joint = joint + one.errors(every, {})
         parts.setdefault(MODEL, []).append(joint)
     out = {part: np.concatenate(found, axis=1) for part, found in parts.items()}
     out[COEFFICIENTS] = out[COEFFICIENTS] + out.pop(STRUCTURE_IN_FIT)

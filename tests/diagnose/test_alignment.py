@@ -8,17 +8,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from bayesdist.diagnose.residuals import (
+from bayesdist.diagnose.residuals.binned import BinValues, band_bins
+from bayesdist.diagnose.residuals.changes import pattern_changes
+from bayesdist.diagnose.residuals.rows import (
     STATISTICS,
-    BinValues,
-    band_bins,
     bin_row,
     pair_row,
     pair_statistics,
-    pattern_changes,
-    period_table,
+    residual_statistics,
 )
-from bayesdist.diagnose.residuals.binned import residual_statistics
+from bayesdist.diagnose.residuals.tables import period_table
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import build_model, fit_linear, residuals
 from bayesdist.infer.stars.likelihood import Clip

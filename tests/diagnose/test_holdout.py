@@ -344,11 +344,11 @@ def test_scores_are_derivatives_of_the_log_density(kind):
 
 def test_scores_of_the_spread_scatter_as_expected():
     """Without false matches w (q - 2) is 2 (t - 1), t exponential: moments 4 and 16."""
-    second, third = SpreadMoments(MIXTURES["none"]).of(COV)
+    (second, third), of_axis = SpreadMoments(MIXTURES["none"]).of(COV)
     assert second[0] == pytest.approx(4.0, rel=1e-3)
     assert third[0] == pytest.approx(16.0, rel=1e-3)
     # of one axis they are those of chi-square with one degree of freedom
-    second, third = SpreadMoments(MIXTURES["none"]).of_axis(COV)
+    second, third = of_axis
     assert second[0] == pytest.approx(2.0, rel=1e-3)
     assert third[0] == pytest.approx(8.0, rel=1e-3)
     one = MIXTURES["gaussian"]
@@ -360,11 +360,11 @@ def test_scores_of_the_spread_scatter_as_expected():
         np.random.default_rng(3).normal(size=(n, 2)) * np.sqrt(cov[0, 0]),
     )
     same = np.repeat(cov[:, [0, 0, 2]], n, axis=0)
-    scores, moments = scores_of(one, r, same), SpreadMoments(one)
+    scores, (of_both, of_axis) = scores_of(one, r, same), SpreadMoments(one).of(same[:1])
     for score, (second, third) in (
-        (scores.one, moments.of(same[:1])),
-        (scores.axes[:, 0], moments.of_axis(same[:1])),
-        (scores.axes[:, 1], moments.of_axis(same[:1])),
+        (scores.one, of_both),
+        (scores.axes[:, 0], of_axis),
+        (scores.axes[:, 1], of_axis),
     ):
         for power, value in ((1, 0.0), (2, second[0]), (3, third[0])):
             error = np.std(score**power) / np.sqrt(n)

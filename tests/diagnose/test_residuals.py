@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.stats import binned_statistic_2d
 
-from bayesdist.diagnose.residuals import pair_statistics
-from bayesdist.diagnose.residuals.binned import binned_residuals, residual_statistics
+from bayesdist.diagnose.residuals.binned import binned_residuals
+from bayesdist.diagnose.residuals.rows import pair_statistics, residual_statistics
 from bayesdist.errors import InputError
 
 SIZE = (1016.0, 508.0)
@@ -31,29 +31,6 @@ def test_bins_are_those_of_scipy(stars):
     np.testing.assert_allclose(np.diff(b.x), SIZE[0] / 31, rtol=1e-12)
     assert b.x[0] == pytest.approx(0.5 + SIZE[0] / 62) and b.y.size == 15
     assert b.n_outside == 0
-
-
-def test_a_star_of_weight_two_counts_in_the_mean_as_two_stars(stars):
-    x, y, ru, rv = stars
-    twice = np.arange(x.size) % 3 == 0
-    weighted = binned_residuals(x, y, ru, rv, bins=7, size=SIZE, weights=1.0 + twice)
-    rows = np.concatenate([np.arange(x.size), np.flatnonzero(twice)])
-    repeated = binned_residuals(x[rows], y[rows], ru[rows], rv[rows], bins=7, size=SIZE)
-    np.testing.assert_allclose(weighted.mean_u, repeated.mean_u, rtol=1e-10)
-    np.testing.assert_allclose(weighted.mean_v, repeated.mean_v, rtol=1e-10)
-    np.testing.assert_array_equal(
-        weighted.count, binned_residuals(x, y, ru, rv, bins=7, size=SIZE).count
-    )
-
-
-def test_a_star_of_weight_zero_is_not_there(stars):
-    x, y, ru, rv = (a.copy() for a in stars)
-    keep = np.arange(x.size) % 4 != 0
-    ru[~keep] = np.nan
-    with_zero = binned_residuals(x, y, ru, rv, bins=9, size=SIZE, weights=keep * 2.0)
-    without = binned_residuals(x[keep], y[keep], ru[keep], rv[keep], bins=9, size=SIZE)
-    for name in ("mean_u", "mean_v", "count", "sem_u", "sem_v"):
-        np.testing.assert_allclose(getattr(with_zero, name), getattr(without, name), rtol=1e-12)
 
 
 def test_edges_empty_bins_and_strays():
@@ -84,15 +61,13 @@ def test_standard_errors_cover_the_truth():
     ("change", "message"),
     [
         (dict(ru=[np.nan, 0.0]), "not finite"),
-        (dict(weights=[-1.0, 1.0]), "not negative"),
-        (dict(weights=[np.nan, 1.0]), "not negative"),
         (dict(rv=[0.0]), "differ in length"),
         (dict(bins=0), "number of bins is 0"),
         (dict(bins=(3, 2.5)), "number of bins"),
     ],
 )
 def test_what_cannot_be_binned_is_refused(change, message):
-    given = dict(ru=[0.0, 0.0], rv=[0.0, 0.0], bins=2, weights=None) | change
+    given = dict(ru=[0.0, 0.0], rv=[0.0, 0.0], bins=2) | change
     with pytest.raises(InputError, match=message):
         binned_residuals(
             [1.0, 2.0], [1.0, 2.0], given.pop("ru"), given.pop("rv"), size=SIZE, **given

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from bayesdist.app.assessment.error_terms import errors_of_run
 from bayesdist.app.assessment.holdout import predictive_of_run
@@ -13,23 +12,25 @@ from bayesdist.app.assessment.settings import assessment_rng, evaluation_setting
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.kind import kind_of
-from bayesdist.diagnose.diagnostics import Diagnostics, diagnose, diagnose_fit, hold_out
+from bayesdist.diagnose.diagnostics import Diagnostics, diagnose, diagnose_fit
+from bayesdist.diagnose.holdout.validation import holdout_validation
 from bayesdist.infer import Posterior
 
 
 def diagnose_run(posterior: Posterior, data: FitData, config: Config, base: Path) -> Diagnostics:
     """Diagnostics of a posterior, and of the stars that were held out."""
-    scatter, tables = data.fitted.scatter, data.fitted.tables.tables
+    fitted = data.fitted
+    scatter, tables = fitted.scatter, fitted.tables.tables
     found = diagnose(
+        diagnose_residuals(posterior, data, config),
         data.fit,
         posterior,
         data.stars,
         data.shards,
-        data.sample,
         rng=assessment_rng(config),
         tested=data.matched.with_motions(data.sample),
         discrepancy=config.discrepancy.priors(),
-        priors=data.fitted.priors,
+        priors=fitted.priors,
         match_radius=config.outliers.match_radius,
         # tables that were fitted have taken it; their errors, and what they leave between their
         # nodes, are terms of the budget
@@ -37,31 +38,32 @@ def diagnose_run(posterior: Posterior, data: FitData, config: Config, base: Path
         exposures=scatter is None,
         settling=None if scatter is None else scatter.offsets,
         catalogue=data.matched.star_errors,
+        eliminated=None if fitted.solved is None else fitted.solved.mode,
         periods=period_settings(data, config),
-        **_of_kind(data, config),
     )
-    overlap = data.matched.overlap(posterior, tables)
-    found = replace(found, overlap=overlap)
+    found = replace(found, overlap=data.matched.overlap(posterior, tables))
     if data.held is None:
         return found
     errors = errors_of_run(posterior, found, data, config)
     settings = evaluation_settings(data, config)
     predictive = predictive_of_run(posterior, found, errors, data, settings)
-    return hold_out(found, predictive, data.held, data.matched.whole)
+    held = holdout_validation(predictive, data.held, whole=data.matched.whole)
+    return replace(found, holdout=held)
 
 
-def diagnose_fit_of_run(data: FitData, config: Config) -> Diagnostics:
-    """Diagnostics of a fit alone."""
-    options = _of_kind(data, config) | {"known": data.fitted.priors.joint is not None}
-    return diagnose_fit(data.fit, None, data.stars, data.shards, data.sample, **options)
-
-
-def _of_kind(data: FitData, config: Config) -> dict[str, Any]:
-    """Options of `diagnose_fit`: errors of centroids that the fit has found, and words."""
-    rows, fitted = kind_of(config).rows, data.fitted
-    options: dict[str, Any] = {"things": "pairs" if rows == "stars" else rows}
-    if fitted.scatter is not None or fitted.solved is not None:
-        options["centroid"] = fitted.errors.by_magnitude
-    if fitted.solved is not None:
-        options["eliminated"] = fitted.solved.mode
-    return options
+def diagnose_residuals(posterior: Posterior | None, data: FitData, config: Config) -> Diagnostics:
+    """Diagnostics by residuals, of a posterior or of a fit alone."""
+    fitted, rows = data.fitted, kind_of(config).rows
+    # errors of centroids that the fit has found
+    measured = fitted.scatter is not None or fitted.solved is not None
+    return diagnose_fit(
+        data.fit,
+        posterior,
+        data.stars,
+        data.shards,
+        data.sample,
+        eliminated=None if fitted.solved is None else fitted.solved.mode,
+        centroid=fitted.errors.by_magnitude if measured else "residuals",
+        things="pairs" if rows == "stars" else rows,
+        known=fitted.priors.joint is not None,
+    )

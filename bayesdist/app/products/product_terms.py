@@ -146,7 +146,7 @@ def _in_unit(product: ProductInput, missed: Positions) -> Positions:
     def shift(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
         place = place_of(solution.model, epoch=epoch, chip=chip)
         P = place.polynomial(solution.mean)
-        J = np.stack([d @ P.T for d in place.gradient(x, y)], axis=-1)
+        J = np.stack([d @ P.T for d in place.basis.gradient(x, y)], axis=-1)
         return np.asarray(np.einsum("nab,nb->na", J, missed(x, y, chip, epoch)))
 
     return shift

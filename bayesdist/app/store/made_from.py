@@ -54,12 +54,12 @@ def base_of(facts: Mapping[str, Any], run: Path) -> Path:
     return beside if names and all((beside / name).exists() for name in names) else recorded
 
 
-# stages in order; `revision` is raised when the numbers of a stage change
+# stages in order; `revision` is raised when the numbers of a stage, or its files, change
 STAGES = {
     "match": Stage(),
     "fit": Stage(),
     "sample": Stage(checkpoints=("chain-*.h5",)),
-    "diagnose": Stage(revision=2),
+    "diagnose": Stage(revision=3),
     "evaluate": Stage(revision=2),
     "export": Stage(),
     "report": Stage(),

@@ -199,7 +199,9 @@ def compare(
         unknown = float(np.sqrt(frame.norm[rest] @ d.ravel()[rest] ** 2))
         sigma = term_sigmas(frame)
         noise = rng.standard_normal((n_draws, 2 * K)) @ _root(frame.cov).T
-        z_max, p_z = _largest(d.ravel()[None], noise, sigma)
+        known = sigma > 0
+        z_max = float(np.abs(d.ravel()[known] / sigma[known]).max(initial=0.0))
+        p_z = _share(np.abs(noise[:, known] / sigma[known]).max(axis=1, initial=0.0), z_max)
         fields = (n.reshape(2, K) @ phi.T for n in noise)
         others = np.array([_of_two(along_x, along_y, uu, vv, uv) for along_x, along_y in fields])
         top = float(np.nanmax(chi2, initial=0.0))
@@ -246,14 +248,8 @@ def _root(cov: Float) -> Float:
     return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def _largest(difference: Float, noise: Float, sigma: Float) -> tuple[float, float]:
-    """Largest |z|, and the fraction of noise that has one as large."""
-    known = sigma > 0
-    z = [np.abs(d[:, known] / sigma[known]).max(axis=1, initial=0.0) for d in (difference, noise)]
-    return float(z[0][0]), _share(z[1], float(z[0][0]))
-
-
 def _share(noise: Float, value: float) -> float:
+    """Fraction of noise that is as large as a value."""
     return float((1 + (noise >= value).sum()) / (len(noise) + 1))
 
 

@@ -98,29 +98,26 @@ class Deviations:
         rows = rng.integers(len(linear.theta), size=n)
         theta = _moved(found, linear.theta[rows], self.frames)
         seed = int(rng.integers(2**63)) if self.single else None
-        more = _Bending(linear, np.asarray(found.mean, float), rows, seed)
+        more = partial(_bending, linear, np.asarray(found.mean, float), rows, seed)
         return Polynomials(
-            self.rows[0], found.model, found.mean, theta, frames=self.frames, more=(more,)
+            self.rows[0], found.model, found.mean, theta, frames=self.frames, more=more
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Bending:
-    """Curvature of the drift, and the deviation of a new exposure: draws of a posterior."""
-
-    linear: LinearDeviations
-    mean: Float
-    rows: Int
-    seed: int | None
-
-    def polynomials(self, epoch: float | None, chip: int) -> Float:
-        """Legendre coefficients (n, 2, K)."""
-        out = self.linear.polynomials(epoch, chip)[self.rows]
-        if self.seed is not None:
-            # one exposure has the same deviation on all chips, at all epochs
-            rng = np.random.default_rng(self.seed)
-            out = out + self.linear.of_single_exposures(self.mean, chip, rng)[self.rows]
+def _bending(
+    linear: LinearDeviations,
+    mean: Float,
+    rows: Int,
+    seed: int | None,
+    epoch: float | None,
+    chip: int,
+) -> Float:
+    """Curvature of the drift (n, 2, K), and with a seed the deviation of a new exposure."""
+    out = linear.polynomials(epoch, chip)[rows]
+    if seed is None:
         return out
+    # one exposure has the same deviation on all chips, at all epochs
+    return out + linear.of_single_exposures(mean, chip, np.random.default_rng(seed))[rows]
 
 
 def _moved(discrepancy: Discrepancy, shift: Float, frames: bool) -> Float:

@@ -118,7 +118,7 @@ def interpolation_term(
     for chip in chips:
         place = place_of(solution.model, epoch=epoch, chip=chip.number)
         P = place.polynomial(solution.mean)
-        by_x, by_y = place.gradient(*mesh(*grid_pixels(chip.size, grid)))
+        by_x, by_y = place.basis.gradient(*mesh(*grid_pixels(chip.size, grid)))
         J = np.stack([by_x @ P.T, by_y @ P.T], axis=-1)
         found, into = between[chip.number], np.mean(J**2, axis=0)
         variance = J**2 @ found.left.mean

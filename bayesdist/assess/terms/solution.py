@@ -95,7 +95,7 @@ class SolutionDraws:
 
         whole = PolynomialField.of((), domain, image, joint)
         fields += [c.on(domain, image) for c in self.catalogue]
-        return TogetherField(domain, tuple(fields), whole)
+        return TogetherField.of(domain, tuple(fields), whole)
 
 
 def _parts(

@@ -2,8 +2,7 @@
 
 Axes and chips with independent likelihoods have posteriors of their own (`chip_structure`, whose
 density this is).  Where they are coupled, as by the stars of a self-calibration, they have one,
-with amplitudes and a length in common.  In the eigenvectors of the sines' information, in units of
-their prior at one length, every amplitude is a sum.
+with amplitudes and a length in common.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ import numpy as np
 from bayesdist.arrays import Float
 from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions
 from bayesdist.diagnose.correlated.priors import AmplitudeGrid, log_half_cauchy, log_widths
+from bayesdist.diagnose.correlated.structure import Field, SizedField
 
 # of the field, in longer half sides; all equally probable beforehand
 LENGTHS = np.geomspace(0.08, 0.6, 5)
@@ -26,32 +26,12 @@ NEGLIGIBLE = 12.0  # in log density, below the largest
 
 
 @dataclass(frozen=True, eq=False)
-class _Field:
-    """Likelihood of the sines, in units of their prior at one length and unit amplitude."""
-
-    length: float
-    scale: Float  # standard deviations (n,) of the sines' coefficients
-    values: Float  # eigenvalues (n,) of their information
-    vectors: Float  # eigenvectors (n, n)
-    score: Float  # along the eigenvectors (n,)
-    tied: Float  # coupling (n, T) to the terms
-
-
-@dataclass(frozen=True, eq=False)
 class _Point:
     """One length and amplitude of the field, and the likelihood of all amplitudes of the terms."""
 
-    field: _Field
-    amplitude: float
-    values: Float  # eigenvalues of the terms' information without the sines
-    vectors: Float
-    score: Float  # of the terms, along these
+    length: float
+    sized: SizedField
     log_density: Float  # (TERM_STEPS,), by amplitude of the terms
-
-    @property
-    def precision(self) -> Float:
-        """Precision of the sines, along their eigenvectors."""
-        return np.asarray(self.field.values + self.amplitude**-2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,19 +53,12 @@ class StructurePosterior:
             if not m:
                 continue
             amplitude = np.repeat(self.terms_amplitude, by_terms)
-            precision = point.values + amplitude[:, None] ** -2
-            # noise through symmetric roots, which signs and order of eigenvectors do not change
-            noise = rng.standard_normal((m, len(point.values))) @ point.vectors
-            drawn = (point.score / precision + noise / np.sqrt(precision)) @ point.vectors.T
-            terms.append(drawn * decline)
-            field, precision = point.field, point.precision
-            along = (field.score - drawn @ field.tied.T) / precision
-            noise = rng.standard_normal(along.shape) @ field.vectors
-            along += noise / np.sqrt(precision)
-            sines.append(field.scale * (along @ field.vectors.T))
-            fine = [np.sqrt(one.finer(field.length)) for one in self.blocks]
+            of_terms, of_sines = point.sized.draws(amplitude, rng)
+            terms.append(of_terms * decline)
+            sines.append(of_sines)
+            fine = [np.sqrt(one.finer(point.length)) for one in self.blocks]
             wave = rng.standard_normal((m, len(self.blocks), 2 * FINE))
-            waves.append(point.amplitude * np.array(fine)[:, None] * wave)
+            waves.append(point.sized.amplitude * np.array(fine)[:, None] * wave)
         order = rng.permutation(n)
         by_terms, by_sines, by_waves = (np.concatenate(a)[order] for a in (terms, sines, waves))
         ends = np.cumsum([(one.n_terms, one.n_sines) for one in self.blocks], axis=0)[:-1]
@@ -100,8 +73,8 @@ class StructurePosterior:
     @property
     def length(self) -> float:
         """Posterior mean correlation length of the field, weighted by variance, in half sides."""
-        by_point = self.weight.sum(axis=1) * [p.amplitude**2 for p in self.points]
-        return float(by_point @ [p.field.length for p in self.points] / by_point.sum())
+        by_point = self.weight.sum(axis=1) * [p.sized.amplitude**2 for p in self.points]
+        return float(by_point @ [p.length for p in self.points] / by_point.sum())
 
 
 def structure_posterior(
@@ -122,53 +95,30 @@ def structure_posterior(
     prior medians of the amplitudes, in the unit of the positions.
     """
     is_term = np.concatenate([np.arange(one.n_known) < one.n_terms for one in blocks])
-    at, of = np.flatnonzero(is_term), np.flatnonzero(~is_term)
-    decline = np.concatenate([one.decline() for one in blocks])
-    tied = information[np.ix_(of, at)] * decline
-    terms = (information[np.ix_(at, at)] * np.outer(decline, decline), score[at] * decline)
+    order = np.argsort(~is_term, kind="stable")  # terms first
+    information, score = information[np.ix_(order, order)], score[order]
     sizes = AmplitudeGrid.of(
-        np.diag(information)[at], noise=noise, higher_order=higher_order, structure=structure
+        np.diag(information)[: is_term.sum()],
+        noise=noise,
+        higher_order=higher_order,
+        structure=structure,
     )
-    amplitudes = sizes.terms
 
-    def at_length(length: float) -> _Field:
-        scale = np.sqrt(np.concatenate([one.spectrum(length) for one in blocks]))
-        matrix = information[np.ix_(of, of)] * np.outer(scale, scale)
-        values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-        return _Field(
-            length,
-            scale,
-            np.maximum(values, 0.0),
-            vectors,
-            vectors.T @ (scale * score[of]),
-            vectors.T @ (scale[:, None] * tied),
-        )
-
-    def at_point(field: _Field, log_amplitude: float) -> _Point:
+    def at_point(length: float, field: Field, log_amplitude: float) -> _Point:
         amplitude = float(np.exp(log_amplitude))
-        precision = field.values + amplitude**-2
-        through = field.tied / precision[:, None]
-        values, vectors = np.linalg.eigh(terms[0] - field.tied.T @ through)
-        values = np.maximum(values, 0.0)
-        left = vectors.T @ (terms[1] - through.T @ field.score)
-        evidence = 0.5 * float(np.sum(field.score**2 / precision))
-        evidence -= 0.5 * float(np.log1p(field.values * amplitude**2).sum())
-        by_terms = 0.5 * (left**2 / (values + amplitudes[:, None] ** -2)).sum(axis=1)
-        by_terms -= 0.5 * np.log1p(values * amplitudes[:, None] ** 2).sum(axis=1)
-        density = (
-            by_terms + sizes.log_prior + evidence + log_half_cauchy(np.array(amplitude), structure)
-        )
-        return _Point(field, amplitude, values, vectors, left, density)
+        sized = field.at(amplitude)
+        prior = sizes.log_prior + log_half_cauchy(np.array(amplitude), structure)
+        return _Point(length, sized, sized.log_evidence(sizes.terms) + prior)
 
     found: list[tuple[_Point, float]] = []
     for length in LENGTHS:
-        field = at_length(length)
+        at = partial(at_point, length, Field.of(blocks, length, information, score))
         grid = list(np.linspace(np.log(sizes.low), np.log(sizes.high), STEPS))
-        points = [at_point(field, a) for a in grid]
+        points = [at(a) for a in grid]
         for _ in range(HALVINGS):
             tops = [float(p.log_density.max()) for p in points]
             best = max([*tops, *(p.log_density.max() for p, _ in found)])
-            grid, points = _refined(grid, points, tops, best - NEGLIGIBLE, partial(at_point, field))
+            grid, points = _refined(grid, points, tops, best - NEGLIGIBLE, at)
         widths = log_widths(np.exp(grid))
         found += [
             (p, w)
@@ -178,7 +128,7 @@ def structure_posterior(
     log_weight = np.array([p.log_density + w for p, w in found])
     weight = np.exp(log_weight - log_weight.max())
     points_of = tuple(p for p, _ in found)
-    return StructurePosterior(tuple(blocks), amplitudes, points_of, weight / weight.sum())
+    return StructurePosterior(tuple(blocks), sizes.terms, points_of, weight / weight.sum())
 
 
 def _refined(

@@ -37,8 +37,8 @@ UNLIKE = 0.2  # prior probability that the field differs on the two axes, by abo
 
 
 @dataclass(frozen=True, eq=False)
-class _Field:
-    """What the data say along one axis of a field of one length, before its amplitude is known.
+class Field:
+    """What the data say of a field of one length, along one axis or more, before its amplitude.
 
     The sines are seen along the eigenvectors of the information of coefficients that have unit
     variance where the field has: these serve every amplitude.
@@ -53,10 +53,11 @@ class _Field:
     terms_score: Float
 
     @classmethod
-    def of(cls, functions: StructureFunctions, length: float, S: Float, s: Float) -> _Field:
-        """From information and score of terms and sines."""
-        T, scale = functions.n_terms, functions.decline()
-        root = np.sqrt(functions.spectrum(length))
+    def of(cls, blocks: Sequence[StructureFunctions], length: float, S: Float, s: Float) -> Field:
+        """From information and score of the terms of all blocks, then of their sines."""
+        scale = np.concatenate([one.decline() for one in blocks])
+        root = np.sqrt(np.concatenate([one.spectrum(length) for one in blocks]))
+        T = len(scale)
         values, vectors = np.linalg.eigh(S[T:, T:] * np.outer(root, root))
         along = vectors.T * root
         return cls(
@@ -69,20 +70,20 @@ class _Field:
             s[:T] * scale,
         )
 
-    def at(self, amplitude: float) -> _Axis:
+    def at(self, amplitude: float) -> SizedField:
         """The likelihood for an amplitude."""
         variance = 1 / (self.values + amplitude**-2)
         weighted = self.tied.T * variance
         values, vectors = np.linalg.eigh(self.terms - weighted @ self.tied)
         along = vectors.T @ (self.terms_score - weighted @ self.score)
-        return _Axis(self, amplitude, variance, np.maximum(values, 0.0), vectors, along)
+        return SizedField(self, amplitude, variance, np.maximum(values, 0.0), vectors, along)
 
 
 @dataclass(frozen=True, eq=False)
-class _Axis:
-    """Likelihood along one axis, given length and amplitude of the field."""
+class SizedField:
+    """Likelihood of the terms, given length and amplitude of the field."""
 
-    field: _Field
+    field: Field
     amplitude: float
     variance: Float  # of the sines along their eigenvectors, given the terms
     values: Float  # eigenvalues of the terms' information without the sines
@@ -115,7 +116,7 @@ class _Point:
 
     length: float
     amplitudes: tuple[float, float]
-    axes: tuple[_Axis, _Axis]
+    axes: tuple[SizedField, SizedField]
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +184,7 @@ def chip_structure(
     by_length = list[tuple[float, list[_Sized], Float]]()
     for length in LENGTHS:
         fields = [
-            _Field.of(functions, length, S, s) for S, s in zip(information, score, strict=True)
+            Field.of([functions], length, S, s) for S, s in zip(information, score, strict=True)
         ]
         shared = [None if p is None else p.of_field(length) for p in pairs]
         sized = _refined(
@@ -206,13 +207,13 @@ class _Sized:
     """One amplitude of the field, and the evidence (2, TERM_STEPS) of each axis for it."""
 
     amplitude: float
-    axes: tuple[_Axis, _Axis]
+    axes: tuple[SizedField, SizedField]
     evidence: Float
 
     @classmethod
     def of(
         cls,
-        fields: Sequence[_Field],
+        fields: Sequence[Field],
         shared: Sequence[Callable[[float], float] | None],
         of_terms: Float,
         log_amplitude: float,

@@ -46,15 +46,6 @@ class Frame:
     n: int  # stars
 
 
-@dataclass(frozen=True, eq=False)
-class FramedPrediction:
-    """Stars of one exposure and chip under a frame that belongs to no solution."""
-
-    prediction: Prediction
-    by_solution: Float  # derivatives (n, 2, n_distortion) by polynomials and drift
-    by_frame: Float  # (n, 2, q)
-
-
 def _alone(model: DistortionModel) -> DistortionModel:
     """Model of one exposure, behind another one that defines the gauge and has no stars."""
     return replace(model, exposures=("(release)", "(held out)"))
@@ -62,8 +53,11 @@ def _alone(model: DistortionModel) -> DistortionModel:
 
 def framed(
     predictive: Predictive, table: Matches, index: Int, values: Float
-) -> Iterator[FramedPrediction]:
-    """Iterator over rows (n,) of one exposure under a frame of its own, by its parameters (q,)."""
+) -> Iterator[tuple[Prediction, Float, Float]]:
+    """Iterator over rows (n,) of one exposure under a frame of its own, by its parameters (q,).
+
+    With derivatives (n, 2, n_distortion) by polynomials and drift, and (n, 2, q) by the frame.
+    """
     model, n = _alone(predictive.model), predictive.model.n_distortion
     theta = np.zeros(model.n_params)
     theta[:n] = predictive.mean[:n]
@@ -72,7 +66,7 @@ def framed(
     for one in predictions(model, theta, table, index, 1):
         derivative = np.zeros((len(one.index), 2, model.n_params))
         derivative[:, :, one.columns] = one.jacobian
-        yield FramedPrediction(one, derivative[:, :, :n], derivative[:, :, own])
+        yield one, derivative[:, :, :n], derivative[:, :, own]
 
 
 def frames_for(predictive: Predictive, held: Matches, names: Sequence[str]) -> dict[str, Frame]:
@@ -177,9 +171,8 @@ def _frame_sums(
     out = {name: [np.zeros(shape) for shape in shapes] for name in values}
     count = dict.fromkeys(values, 0)
     for name, table, index in _of_exposures(held, list(values)):
-        for one in framed(predictive, table, index, values[name]):
-            residual, A = one.prediction.residual, one.by_frame
-            noise = noise_of(predictive, table, one.prediction.index)
+        for one, by_solution, A in framed(predictive, table, index, values[name]):
+            residual, noise = one.residual, noise_of(predictive, table, one.index)
             var = noise[:, :2]
             chi2 = (residual**2 / var).sum(axis=1)
             if soft:
@@ -194,6 +187,6 @@ def _frame_sums(
             gradient += along.sum(axis=0)
             curvature += np.einsum("n,na,nam,nak->mk", share, 1 / var, A, A)
             information += along.T @ along
-            shared += along.T @ np.einsum("na,nam->nm", score, one.by_solution)
+            shared += along.T @ np.einsum("na,nam->nm", score, by_solution)
             count[name] += len(residual)
     return {name: (a, b, c, d, count[name]) for name, (a, b, c, d) in out.items()}

@@ -115,11 +115,14 @@ class ScaleSums:
         self,
         member: csr_matrix,
         score: Float,
-        moments: tuple[Float, Float],
+        moments: Float,
         free: Float,
         scales: Float,
     ) -> None:
-        """Add stars by their membership (G, n), with scores (n,), (n, h) and (n, SCALES)."""
+        """Add stars by their membership (G, n).
+
+        Their scores are (n,), (n, h) and (n, SCALES), second and third moments (2, n).
+        """
         self.score += member @ score
         self.second += member @ moments[0]
         self.third += member @ moments[1]

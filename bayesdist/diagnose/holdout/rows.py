@@ -99,12 +99,12 @@ def _framed(
     """Iterator over rows (n,) of an exposure with a frame of its own."""
     n = predictive.model.n_distortion
     C = predictive.cov[:n, :n]
-    for one in framed(predictive, table, rows, frame.values):
-        index = one.prediction.index
+    for one, by_solution, by_frame in framed(predictive, table, rows, frame.values):
+        index = one.index
         # what the frame takes up of the solution's errors is no error of the prediction
-        own = one.by_solution - one.by_frame @ (frame.spent @ frame.shared)
+        own = by_solution - by_frame @ (frame.spent @ frame.shared)
         noise = noise_of(predictive, table, index)
-        cov = noise + _squares(own, C) - _squares(one.by_frame, frame.spent)
+        cov = noise + _squares(own, C) - _squares(by_frame, frame.spent)
         common = None
         if predictive.stars is not None and table.star is not None:
             epoch = None if table.epoch is None else table.epoch[index]
@@ -113,19 +113,9 @@ def _framed(
             both = (both + np.swapaxes(both, 1, 2)).reshape(-1, 4)
             cov -= both[:, [0, 3, 1]]
         cov[:, :2] = np.maximum(cov[:, :2], 0.05 * noise[:, :2])
-        found = HeldRows(
-            index,
-            one.prediction.residual,
-            cov,
-            np.arange(n),
-            own,
-            name,
-            frame,
-            one.by_frame,
-            common,
-        )
-        held = predictive.model.gauge == "held"
-        yield found.turned_back(one.prediction.frame) if held else found
+        residual, columns = one.residual, np.arange(n)
+        found = HeldRows(index, residual, cov, columns, own, name, frame, by_frame, common)
+        yield found.turned_back(one.frame) if predictive.model.gauge == "held" else found
 
 
 def _squares(J: Float, C: Float) -> Float:

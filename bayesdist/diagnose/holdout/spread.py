@@ -36,34 +36,20 @@ class SpreadMoments:
         w = core / np.maximum(core + far, 1e-300)
         score = w * (2 * t - 2)
         density = core + far
-        self._second = np.trapezoid(score**2 * density, t, axis=1)
-        self._third = np.trapezoid(score**3 * density, t, axis=1)
         # q_u = 2 t cos^2 of an angle of which nothing is known: means of its powers
         square, cube = 1.5 * t**2 - 2 * t + 1, 2.5 * t**3 - 4.5 * t**2 + 3 * t - 1
-        self._axis_second = np.trapezoid(w**2 * square * density, t, axis=1)
-        self._axis_third = np.trapezoid(w**3 * cube * density, t, axis=1)
+        self._tables = [
+            np.trapezoid(values * density, t, axis=1)
+            for values in (score**2, score**3, w**2 * square, w**3 * cube)
+        ]
 
-    def of(self, cov: Float) -> tuple[Float, Float]:
-        """Moments (n,) of stars with covariances uu, vv, uv (n, 3)."""
-        log_k = self._ratio(cov)
-        return (
-            np.interp(log_k, self._log_k, self._second),
-            np.interp(log_k, self._log_k, self._third),
-        )
-
-    def of_axis(self, cov: Float) -> tuple[Float, Float]:
-        """Moments (n,) of the score of an axis: both axes have the same."""
-        log_k = self._ratio(cov)
-        return (
-            np.interp(log_k, self._log_k, self._axis_second),
-            np.interp(log_k, self._log_k, self._axis_third),
-        )
-
-    def _ratio(self, cov: Float) -> Float:
-        """Logarithm of k (n,)."""
+    def of(self, cov: Float) -> Float:
+        """Moments (2, 2, n) of stars with covariances uu, vv, uv (n, 3): of both axes, of one."""
         var = np.sqrt(cov[:, 0] * cov[:, 1] - cov[:, 2] ** 2)
         factor = 2.0 if self._predictive.outliers == "uniform" else 1.0
-        return np.log(factor * var / self._predictive.scale**2)
+        log_k = np.log(factor * var / self._predictive.scale**2)
+        found = [np.interp(log_k, self._log_k, table) for table in self._tables]
+        return np.array(found).reshape(2, 2, -1)
 
 
 def sum_tails(value: float, variance: float, third: float) -> float:

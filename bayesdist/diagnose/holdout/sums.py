@@ -176,7 +176,7 @@ def _add(
         place = place * np.sqrt(1 + taken / rows.cov[:, :2])
     squares = (place[:, :, None] * place[:, None, :]).reshape(-1, 4)
     codes = {p.kind: p.codes(table, rows.index) for p in partitions}
-    of_spread = moments.of(rows.cov)
+    of_spread, of_axis = moments.of(rows.cov)
     for kind, code in codes.items():
         sums = out.bins[kind]
         n = len(sums.n)
@@ -187,7 +187,6 @@ def _add(
         sums.weight += member @ weight
         sums.scale.add(member, scores.one, of_spread, scores.free, scores.spread)
     every = csr_matrix(np.ones((1, len(rows.index))))
-    of_axis = moments.of_axis(rows.cov)
     for a, axis in enumerate(out.axes):
         axis.add(every, scores.axes[:, a], of_axis, scores.free, scores.axes_spread[:, a])
     aside = np.abs(2 * marginals_of(predictive, rows.residual, rows.cov) - 1)

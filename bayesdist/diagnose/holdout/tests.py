@@ -107,8 +107,12 @@ def all_tests(
     for partition in partitions:
         found = sums.bins[partition.kind]
         out += _offsets(found, sums, predictive, partition)
-        out += _spreads(found, predictive, partition)
-    out += _axes(sums, predictive)
+        for b, bin_ in enumerate(partition.bins):
+            if found.n[b] >= MIN_STARS:
+                stars = partition.kind, bin_.words, b, int(found.n[b])
+                out.append(_spread(found.scale, b, predictive, stars))
+    for a, axis in enumerate(sums.axes):
+        out.append(_spread(axis, 0, predictive, (AXIS, f"along {'uv'[a]}", a, sums.n)))
     return [*out, *_distributions(sums, predictive), *_tails(sums, predictive)]
 
 
@@ -151,29 +155,12 @@ def _offsets(
     return out
 
 
-def _spreads(found: BinSums, predictive: Predictive, partition: Partition) -> list[HeldTest]:
-    """Tests of the scatter of true matches, in each bin."""
-    return [
-        _spread(found.scale, b, predictive, (partition.kind, bin_.words, b, int(found.n[b])))
-        for b, bin_ in enumerate(partition.bins)
-        if found.n[b] >= MIN_STARS
-    ]
-
-
 def _spread(
     sums: ScaleSums, k: int, predictive: Predictive, stars: tuple[str, str, int, int]
 ) -> HeldTest:
-    """Test of the scatter of one group: part, words, index and number of its stars."""
+    """Test of the scatter of true matches of one group: part, words, index, number of stars."""
     p = sums.p_value(k, predictive.free_cov)
     return HeldTest("spread", *stars, sums.factor(k), 1.0, p)
-
-
-def _axes(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
-    """Tests of the scatter of true matches along each axis by itself."""
-    return [
-        _spread(axis, 0, predictive, (AXIS, f"along {'uv'[a]}", a, sums.n))
-        for a, axis in enumerate(sums.axes)
-    ]
 
 
 def _distributions(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:

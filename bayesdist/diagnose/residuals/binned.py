@@ -23,15 +23,15 @@ class BinnedResiduals:
 
     x: Float  # (nx,)
     y: Float  # (ny,), centres of the bins, FITS 1-based pixels
-    # mean_u, mean_v (ny, nx): weighted means; NaN in an empty bin
+    # mean_u, mean_v (ny, nx): NaN in an empty bin
     mean_u: Float
     mean_v: Float
-    count: Int  # (ny, nx), stars of positive weight
+    count: Int  # (ny, nx), stars
     # sem_u, sem_v (ny, nx): standard errors of the means from the scatter inside the bin; NaN below
     # two stars
     sem_u: Float
     sem_v: Float
-    # stars of positive weight that lie on no pixel of the detector and went into no bin
+    # stars that lie on no pixel of the detector and went into no bin
     n_outside: int = 0
 
 
@@ -68,23 +68,18 @@ class BinnedSums:
     """Sums of residuals in equal bins that cover the detector; sums of pieces of the data add."""
 
     size: tuple[float, float]  # columns and rows of the detector
-    count: Int  # (ny, nx), stars of positive weight
-    # weight, weight_2 (ny, nx): sums of the weights and of their squares
-    weight: Float
-    weight_2: Float
-    # first, first_2, second_2 (q, ny, nx): of u, of v and of further quantities: sums of the
-    # residual times its weight and times its squared weight, and of the squared residual times the
-    # squared weight
+    count: Int  # (ny, nx), stars
+    # first, second (q, ny, nx): of u, of v and of further quantities: sums of the residuals, and of
+    # their squares
     first: Float
-    first_2: Float
-    second_2: Float
-    # stars of positive weight that lie on no pixel of the detector and went into no bin
+    second: Float
+    # stars that lie on no pixel of the detector and went into no bin
     n_outside: int = 0
 
     def __add__(self, other: BinnedSums) -> BinnedSums:
         if self.size != other.size or self.count.shape != other.count.shape:
             raise ValueError("sums over different bins do not add")
-        names = ("count", "weight", "weight_2", "first", "first_2", "second_2", "n_outside")
+        names = ("count", "first", "second", "n_outside")
         return BinnedSums(self.size, *(getattr(self, n) + getattr(other, n) for n in names))
 
     @property
@@ -95,13 +90,12 @@ class BinnedSums:
     @property
     def means(self) -> tuple[Float, Float]:
         """Means (q, ny, nx), and their standard errors from the scatter inside the bins."""
-        mean = _ratio(self.first, self.weight)
-        about = np.nan_to_num(mean)
-        spread = self.second_2 - 2 * about * self.first_2 + about**2 * self.weight_2
-        # rounding may leave a spread of zero slightly below it; with equal weights this is the
-        # sample variance over n
-        variance = _ratio(np.maximum(spread, 0.0), self.weight**2)
         count = self.count.astype(np.float64)
+        mean = _ratio(self.first, count)
+        about = np.nan_to_num(mean)
+        spread = self.second - 2 * about * self.first + about**2 * count
+        # rounding may leave a spread of zero slightly below it
+        variance = _ratio(np.maximum(spread, 0.0), count**2)
         return mean, np.sqrt(variance * _ratio(count, count - 1.0))
 
     def residuals(self) -> BinnedResiduals:
@@ -139,13 +133,9 @@ def binned_residuals(
     *,
     bins: int | tuple[int, int],
     size: tuple[float, float],
-    weights: ArrayLike | None = None,
 ) -> BinnedResiduals:
-    """Residuals averaged in bins of the detector.
-
-    `x`, `y`, `ru`, `rv`, `bins`, `size`, `weights`: as `binned_sums`. InputError as `binned_sums`.
-    """
-    return binned_sums(x, y, ru, rv, bins=bins, size=size, weights=weights).residuals()
+    """Residuals averaged in bins of the detector; parameters and errors as of `binned_sums`."""
+    return binned_sums(x, y, ru, rv, bins=bins, size=size).residuals()
 
 
 def binned_sums(
@@ -156,58 +146,27 @@ def binned_sums(
     *more: ArrayLike,
     bins: int | tuple[int, int],
     size: tuple[float, float],
-    weights: ArrayLike | None = None,
 ) -> BinnedSums:
     """Sums of residuals in bins of the detector.
 
-    Parameters
-    ----------
-    x, y : array_like, shape (N,)
-        FITS 1-based pixels.
-    ru, rv : array_like, shape (N,)
-        Residuals, data minus model.
-    *more : array_like, shape (N,)
-        Further quantities of each star.
-    bins : int or tuple of int
-        Number of bins on x and on y (WSDC D-T033 uses 31 on each).
-    size : tuple of float
-        Columns and rows of the detector; the bins run from 0.5 to size + 0.5.
-    weights : array_like, shape (N,), optional
-        Not negative; a star of weight 0 (one that was rejected, say) is left out.
-
-    Returns
-    -------
-    BinnedSums
-
-    Raises
-    ------
-    InputError
-        For lengths that differ, values that are not finite where the weight is positive, negative
-        weights, or a bad number of bins.
+    `x`, `y`: (N,), FITS 1-based pixels. `ru`, `rv`: (N,), residuals, data minus model. `more`:
+    (N,), further quantities of each star. `bins`: on x and on y. `size`: columns and rows of the
+    detector; the bins run from 0.5 to size + 0.5. InputError for lengths that differ, values that
+    are not finite, or a bad number of bins.
     """
     nx, ny = (bins, bins) if isinstance(bins, int | np.integer) else bins
     if min(nx, ny) < 1 or int(nx) != nx or int(ny) != ny:
         raise InputError(f"the number of bins is {bins}", do="give whole numbers of at least 1")
     columns = [np.asarray(a, float) for a in (x, y, ru, rv, *more)]
-    w = None if weights is None else np.asarray(weights, float)
-    shapes = {a.shape for a in (*columns, *(() if w is None else (w,)))}
-    if columns[0].ndim != 1 or len(shapes) != 1:
-        raise InputError("positions, residuals and weights differ in length")
-    if w is not None and (not (w >= 0).all() or not np.isfinite(w).all()):
-        raise InputError("weights must be finite and not negative", where="weights")
+    if columns[0].ndim != 1 or len({a.shape for a in columns}) != 1:
+        raise InputError("positions and residuals differ in length")
 
     def sums_from(start: int) -> BinnedSums:
         """Sums of one block: its scratch arrays stay in the cache, however many stars there are."""
-        rows = slice(start, start + _BLOCK)
-        block = [a[rows] for a in columns]
-        here = None if w is None else w[rows]
-        if here is not None and not (here > 0).all():
-            block, here = [a[here > 0] for a in block], here[here > 0]
+        block = [a[start : start + _BLOCK] for a in columns]
         if not all(np.isfinite(a).all() for a in block):
-            raise InputError(
-                "a position or residual is not finite", do="give that star the weight 0"
-            )
-        return _block_sums(block, here, int(nx), int(ny), (float(size[0]), float(size[1])))
+            raise InputError("a position or residual is not finite", do="leave that star out")
+        return _block_sums(block, int(nx), int(ny), (float(size[0]), float(size[1])))
 
     out = sums_from(0)
     for start in range(_BLOCK, len(columns[0]), _BLOCK):
@@ -215,33 +174,21 @@ def binned_sums(
     return out
 
 
-def _block_sums(
-    block: Sequence[Float], w: Float | None, nx: int, ny: int, size: tuple[float, float]
-) -> BinnedSums:
-    """Sums over some stars of positive weights."""
+def _block_sums(block: Sequence[Float], nx: int, ny: int, size: tuple[float, float]) -> BinnedSums:
+    """Sums over some stars."""
     x, y, *residuals = block
     edges_x, edges_y = _edges(size[0], nx), _edges(size[1], ny)
     inside = (x >= edges_x[0]) & (x <= edges_x[-1]) & (y >= edges_y[0]) & (y <= edges_y[-1])
     n_outside = int(inside.size - inside.sum())
     if n_outside:
         x, y, *residuals = (a[inside] for a in block)
-        w = None if w is None else w[inside]
     index = _bin(y, edges_y) * nx + _bin(x, edges_x)
 
     def total(values: Float | None = None) -> NDArray[Any]:
         return np.bincount(index, values, minlength=nx * ny).reshape(ny, nx)
 
-    count = total().astype(np.int64)
-    if w is None:
-        weight = weight_2 = count.astype(float)
-        first = first_2 = np.stack([total(r) for r in residuals])
-        second_2 = np.stack([total(r * r) for r in residuals])
-    else:
-        weight, weight_2 = total(w), total(w * w)
-        first = np.stack([total(w * r) for r in residuals])
-        first_2 = np.stack([total(w * w * r) for r in residuals])
-        second_2 = np.stack([total((w * r) ** 2) for r in residuals])
-    return BinnedSums(size, count, weight, weight_2, first, first_2, second_2, n_outside)
+    first, second = (np.stack([total(r**k) for r in residuals]) for k in (1, 2))
+    return BinnedSums(size, total().astype(np.int64), first, second, n_outside)
 
 
 def band_bins(
@@ -250,15 +197,15 @@ def band_bins(
     ru: ArrayLike,
     rv: ArrayLike,
     *,
-    bins: int | tuple[int, int] = 31,
+    bins: int | tuple[int, int],
     size: tuple[float, float],
 ) -> BinnedSums:
     """Sums of residuals and of their lengths in bins, as section 5 of WSDC D-T033.
 
     The mean length of a bin is that of single stars, not the length of the mean residual.
 
-    Parameters are those of `binned_sums`, residuals in pixels of the band; `bins` are 31 in section
-    5 of WSDC D-T033 and 45 in its Appendix C.
+    Parameters as of `binned_sums`; `bins` are 31 in section 5 of WSDC D-T033 and 45 in its
+    Appendix C.
     """
     length = np.hypot(np.asarray(ru, float), np.asarray(rv, float))
     return binned_sums(x, y, ru, rv, length, bins=bins, size=size)
@@ -284,27 +231,3 @@ def _ratio(a: Float, b: Float) -> Float:
     """Ratios, NaN where the denominator is not positive."""
     b = np.broadcast_to(b, a.shape)
     return np.divide(a, b, out=np.full(a.shape, np.nan), where=b > 0)
-
-
-def residual_statistics(values: ArrayLike) -> dict[str, float]:
-    """Statistics of residuals: the columns of Table 5-1 of WSDC D-T033.
-
-    `values`: residuals of stars or means of bins, any shape; NaN (empty bins) is left out. Result:
-    mean, sigma (about the mean, over n), min, max, median, p01, p99 (percentiles), and n, the
-    number of values. InputError when there is no value or one is infinite.
-    """
-    r = np.asarray(values, float).ravel()
-    r = r[~np.isnan(r)]
-    if not r.size or np.isinf(r).any():
-        raise InputError("there are no residuals, or infinite ones", do="check the fit")
-    p01, median, p99 = np.percentile(r, [1, 50, 99])
-    return {
-        "mean": float(r.mean()),
-        "sigma": float(r.std()),
-        "min": float(r.min()),
-        "max": float(r.max()),
-        "median": float(median),
-        "p01": float(p01),
-        "p99": float(p99),
-        "n": int(r.size),
-    }

@@ -15,10 +15,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Bool, Float
+from bayesdist.arrays import Float
 from bayesdist.diagnose.residuals.binned import BinValues
-from bayesdist.errors import DegenerateError
+from bayesdist.errors import DegenerateError, InputError
 
 STATISTICS = ("mean", "sigma", "min", "max", "median", "p01", "p99")
 DRAWS = 300  # of bins with fresh noise: errors to 4 %
@@ -62,7 +63,7 @@ def bin_row(
     """
     some = _Bins.of(label, bins, absorbed)
     drawn, calm = _along_last(some.draws(rng)), _along_last(some.centre)
-    return _row(label, some.value, drawn, calm, some.variance, some.variance_error, bins.good)
+    return _row(label, some, some.value, drawn, calm, 1)
 
 
 def pair_row(
@@ -70,16 +71,14 @@ def pair_row(
 ) -> StatisticsRow:
     """A row of Table 5-3 of WSDC D-T033: differences over all pairs of bins.
 
-    `absorbed` and `rng` as of `bin_row`. Raises `DegenerateError` as `bin_row`.
+    Parameters and errors as of `bin_row`.
     """
     some = _Bins.of(label, bins, absorbed)
     coarse = _COARSE * float(np.hypot(some.value["sigma"], some.value["sigma"]))
     rows = [pair_statistics(one, tolerance=coarse) for one in some.draws(rng)]
     drawn = {name: np.array([row[name] for row in rows]) for name in STATISTICS}
     calm = pair_statistics(some.centre, tolerance=coarse)
-    value = pair_statistics(some.mean)
-    variance, error = 2 * some.variance, 2 * some.variance_error
-    return _row(label, value, drawn, calm, variance, error, bins.good)
+    return _row(label, some, pair_statistics(some.mean), drawn, calm, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +90,7 @@ class _Bins:
     value: Mapping[str, float]
     variance: float
     variance_error: float
+    n_left_out: int
 
     @classmethod
     def of(cls, label: str, bins: BinValues, absorbed: int) -> _Bins:
@@ -107,7 +107,8 @@ class _Bins:
         sem = sem * np.sqrt((n - absorbed) / (n - 1))
         value = {name: float(x) for name, x in _along_last(mean).items()}
         variance = value["sigma"] ** 2 - (1 - 1 / n) * float(np.mean(sem**2))
-        return cls(mean, sem, value, variance, _variance_error(mean, sem, dof))
+        error = _variance_error(mean, sem, dof)
+        return cls(mean, sem, value, variance, error, good.size - n)
 
     @property
     def centre(self) -> Float:
@@ -150,13 +151,14 @@ def _along_last(values: Float) -> dict[str, Float]:
 
 def _row(
     label: str,
+    some: _Bins,
     value: Mapping[str, float],
     drawn: Mapping[str, Float],
     calm: Mapping[str, Float | float],
-    variance: float,
-    variance_error: float,
-    good: Bool,
+    times: int,
 ) -> StatisticsRow:
+    """A row of statistics whose variance is that of the bins, so many times."""
+    variance = times * some.variance
     error = {name: float(drawn[name].std()) for name in STATISTICS}
     added = {name: float(drawn[name].mean() - calm[name]) for name in STATISTICS}
     # noise adds nothing to a mean, and to a variance what is known in closed form
@@ -169,10 +171,29 @@ def _row(
     free["min"] = min(free["min"], free["p01"])
     free["p99"] = max(free["p99"], free["median"])
     free["max"] = max(free["max"], free["p99"])
-    n = int(good.sum())
     return StatisticsRow(
-        label, dict(value), error, free, variance, variance_error, n, good.size - n
+        label,
+        dict(value),
+        error,
+        free,
+        variance,
+        times * some.variance_error,
+        some.mean.size,
+        some.n_left_out,
     )
+
+
+def residual_statistics(values: ArrayLike) -> dict[str, float]:
+    """Statistics of residuals of stars or of means of bins by name, and their number `n`.
+
+    They are the columns of Table 5-1 of WSDC D-T033, sigma about the mean and over n. NaN (empty
+    bins) is left out; InputError when there is no value or one is infinite.
+    """
+    r = np.asarray(values, float).ravel()
+    r = r[~np.isnan(r)]
+    if not r.size or np.isinf(r).any():
+        raise InputError("there are no residuals, or infinite ones", do="check the fit")
+    return {name: float(x) for name, x in _along_last(r).items()} | {"n": r.size}
 
 
 def pair_statistics(values: Float, *, tolerance: float = 0.0) -> dict[str, float]:
@@ -186,7 +207,11 @@ def pair_statistics(values: Float, *, tolerance: float = 0.0) -> dict[str, float
     percentiles interpolate between neighbours as `numpy.percentile` does.
     """
     a = np.sort(values)
-    extent, p99 = float(a[-1] - a[0]), _percentile(a, 99, tolerance)
+    extent = float(a[-1] - a[0])
+    whole, part = divmod((a.size**2 - 1) * 99, 100)
+    p99 = _order_statistic(a, whole, tolerance)
+    if part:
+        p99 += (_order_statistic(a, whole + 1, tolerance) - p99) * part / 100
     return {
         "mean": 0.0,
         "sigma": float(np.hypot(a.std(), a.std())),
@@ -196,14 +221,6 @@ def pair_statistics(values: Float, *, tolerance: float = 0.0) -> dict[str, float
         "p01": -p99,
         "p99": p99,
     }
-
-
-def _percentile(a: Float, percent: int, tolerance: float) -> float:
-    whole, part = divmod((a.size**2 - 1) * percent, 100)
-    low = _order_statistic(a, whole, tolerance)
-    if not part:
-        return low
-    return low + (_order_statistic(a, whole + 1, tolerance) - low) * part / 100
 
 
 def _order_statistic(a: Float, rank: int, tolerance: float) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
@@ -105,34 +105,6 @@ class Outcome:
         """Name of the test."""
         return self.family.name
 
-    def unless(self, clause: str) -> Outcome:
-        """Outcome with another explanation of the finding, as a clause: 'it is not ...'."""
-        present = f"{self.family.present}, if {clause}"
-        return replace(self, family=replace(self.family, present=present))
-
-    def judged(self, significant: bool, level: float) -> ScoreTest:
-        """Result of the test among others, by whether it is significant and by its level."""
-        smallest = self.smallest(level)
-        if significant:
-            size = f"{self.size:.2g} {self.unit} rms, {p_words(self.p_value)}"
-            finding = f"{self.family.present} ({size})"
-        else:
-            finding = f"{self.family.absent} ({smallest:.2g} {self.unit} rms would have been found)"
-        return ScoreTest(
-            name=self.name,
-            statistic=self.statistic,
-            dof=self.dof,
-            dof_residual=self.dof_residual,
-            p_value=self.p_value,
-            size=self.size,
-            smallest=smallest,
-            unit=self.unit,
-            remedy=self.family.remedy,
-            finding=finding,
-            significant=significant,
-            held_by=self.family.held_by,
-        )
-
 
 def outcome(
     family: Family,
@@ -163,8 +135,6 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
 
     Findings that others explain as well say so.
     """
-    n = len(outcomes)
-    outcomes = [_with_explanation(one, outcomes) for one in outcomes]
     significant = holm([one.p_value for one in outcomes]) <= SCORE_TESTS.value
     # of a group the last finding has the remedy of all: a higher order holds the lower ones
     remedies = {
@@ -172,27 +142,43 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
         for one, found in zip(outcomes, significant, strict=True)
         if found
     }
-    outcomes = [
-        replace(one, family=replace(one.family, remedy=remedies[one.family.group or one.name]))
-        if found
-        else one
-        for one, found in zip(outcomes, significant, strict=True)
-    ]
-    # what is alone has to pass the first step
-    return tuple(
-        one.judged(bool(found), SCORE_TESTS.value / n)
-        for one, found in zip(outcomes, significant, strict=True)
-    )
+    out = []
+    for one, found in zip(outcomes, significant, strict=True):
+        family, remedy = one.family, one.family.remedy
+        # what is alone has to pass the first step
+        smallest = one.smallest(SCORE_TESTS.value / len(outcomes))
+        finding = f"{family.absent} ({smallest:.2g} {one.unit} rms would have been found)"
+        if found:
+            remedy = remedies[family.group or one.name]
+            size = f"{one.size:.2g} {one.unit} rms, {p_words(one.p_value)}"
+            finding = f"{family.present}{_explanation(one, outcomes)} ({size})"
+        out.append(
+            ScoreTest(
+                one.name,
+                one.statistic,
+                one.dof,
+                one.dof_residual,
+                one.p_value,
+                one.size,
+                smallest,
+                one.unit,
+                remedy,
+                finding,
+                bool(found),
+                family.held_by,
+            )
+        )
+    return tuple(out)
 
 
-def _with_explanation(one: Outcome, outcomes: Sequence[Outcome]) -> Outcome:
-    """Outcome that names the finding of another test that may explain it."""
+def _explanation(one: Outcome, outcomes: Sequence[Outcome]) -> str:
+    """Clause that denies the finding of another test that may explain this one; may be empty."""
     if one.family.explained_by:
         for other in outcomes:
             names = (other.family.name, other.family.group)
             if one.family.explained_by in names and other.p_value < SCORE_TESTS.value:
-                return one.unless(other.family.denial)
-    return one
+                return f", if {other.family.denial}"
+    return ""
 
 
 def noncentrality(level: float, dof: float, dof_residual: float | None = None) -> float:

@@ -87,11 +87,13 @@ def between_nodes(
     common = _of_stars(*stars[2:5])
     square, error = np.empty(2), np.empty(2)
     for a in (0, 1):
-        of_fine, of_coarse = (s.axis(a, seen) for s in (fine, coarse))
-        each = (AREA_RATIO * of_fine.mean - of_coarse.mean) / (AREA_RATIO - 1)
+        near, far = fine.weight[seen, a], coarse.weight[seen, a]
+        each = AREA_RATIO * (fine.product[seen, a] / near) - coarse.product[seen, a] / far
+        each /= AREA_RATIO - 1
         # pairs in a fine cell are among those of the coarse one around it
-        noise = AREA_RATIO**2 * of_fine.noise - 2 * AREA_RATIO * of_fine.noise_among(of_coarse)
-        noise = (noise + of_coarse.noise) / (AREA_RATIO - 1) ** 2
+        own = fine.scatter(a)
+        noise = AREA_RATIO**2 * (own / near) - 2 * AREA_RATIO * (own / far)
+        noise = (noise + coarse.scatter(a) / far) / (AREA_RATIO - 1) ** 2
         size = max(float(np.average(each, weights=1 / noise)), 0.0)
         for _ in range(MAX_ITERATIONS):
             # squares differ by about what they hold: where that is well known, area counts
@@ -112,29 +114,6 @@ def _of_stars(residual: Float, precision: Float, star: Int) -> Float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Axis:
-    """Sums over pairs along one axis, by square (S,): products, weights, noise of the products."""
-
-    product: Float
-    weight: Float
-    scatter: float
-
-    @property
-    def mean(self) -> Float:
-        """Mean products (S,)."""
-        return self.product / self.weight
-
-    @property
-    def noise(self) -> Float:
-        """Variances (S,) of these by what single stars have for themselves."""
-        return self.scatter / self.weight
-
-    def noise_among(self, others: _Axis) -> Float:
-        """Covariances (S,) with mean products of which these pairs are a part."""
-        return self.scatter / others.weight
-
-
-@dataclass(frozen=True, eq=False)
 class _Pairs:
     """Sums over ordered pairs of different stars in different exposures of the same cell."""
 
@@ -147,10 +126,9 @@ class _Pairs:
     spread: Float
     number: Float  # (squares,)
 
-    def axis(self, a: int, seen: Bool) -> _Axis:
-        """Sums along one axis, in some of the squares; noise goes with one over the weight."""
-        scatter = self.spread[:, a].sum() / self.weight[:, a].sum()
-        return _Axis(self.product[seen, a], self.weight[seen, a], float(scatter))
+    def scatter(self, a: int) -> float:
+        """Noise of mean products along one axis, times their weight."""
+        return float(self.spread[:, a].sum() / self.weight[:, a].sum())
 
     def average(
         self,

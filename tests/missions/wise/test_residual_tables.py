@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from bayesdist.diagnose.residuals import (
-    band_bins,
-    pattern_changes,
-    period_table,
-)
+from bayesdist.diagnose.residuals.binned import band_bins
+from bayesdist.diagnose.residuals.changes import pattern_changes
+from bayesdist.diagnose.residuals.tables import period_table
 from bayesdist.infer import Rejection, fit_linear, load
 from bayesdist.missions.wise.assess.histograms import band_sums
 from bayesdist.missions.wise.assess.tables import (

@@ -18,7 +18,6 @@ from bayesdist.assess.terms.forms.rows import (
     ErrorField,
     ErrorTerm,
     Image,
-    Noise,
     Row,
 )
 from bayesdist.assess.terms.forms.together import Together, TogetherField
@@ -39,7 +38,6 @@ __all__ = [
     "Independent",
     "Known",
     "KnownField",
-    "Noise",
     "NoiseField",
     "PolynomialField",
     "Polynomials",

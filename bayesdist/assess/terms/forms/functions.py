@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +17,6 @@ from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 MANY = 64  # functions from which on their values are kept, not their coefficients alone
 
 
-class OfPosition(Protocol):
-    """Functions of the position on a chip."""
-
-    def __call__(self, chip: int, x: Float, y: Float) -> NDArray[np.floating]:
-        """Values (N, m) at pixels (N,)."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class Functions:
     """Errors that are sums of functions of the position: draw k is row k mod n' of coefficients."""
@@ -34,7 +25,8 @@ class Functions:
     # (n', 2, m), by chip number; a chip that is not there has no such error. Under None, those of
     # all chips
     coefficients: Mapping[int | None, NDArray[np.floating]]
-    functions: OfPosition  # of chip number, x and y
+    # take a chip number and pixels x, y (N,) to values (N, m)
+    functions: Callable[[int, Float, Float], NDArray[np.floating]]
     n_draws: int
     uniform: bool = False  # whether the error is the same at all positions
     # (2, m, m), of the coefficients, where it is stated: mean squares are exact then, and it is not
@@ -47,7 +39,7 @@ class Functions:
         key = domain.at(None)
         if key not in self._cache:
             self._cache.clear()
-            self._cache[key] = FunctionField(self, key)
+            self._cache[key] = FunctionField((self.row,), key, self)
         return self._cache[key]
 
     def of(self, chip: int) -> NDArray[np.floating] | None:
@@ -70,12 +62,6 @@ class FunctionField(DrawnField):
     """Sums of functions at the positions of a domain."""
 
     of: Functions
-    domain: EvaluationDomain
-
-    @property
-    def rows(self) -> tuple[Row, ...]:
-        """The row."""
-        return (self.of.row,)
 
     @property
     def n_draws(self) -> int:
@@ -106,7 +92,7 @@ class FunctionField(DrawnField):
                 out.append((own, self.of.functions(chip, x, y)))
         return out
 
-    def errors(self, draws: slice, scale: Scale = {}) -> Float:  # noqa: B006
+    def errors(self, draws: slice, scale: Scale) -> Float:
         """Errors (d, N, 2) of some draws."""
         number, parts = np.arange(draws.start, draws.stop), []
         for values, phi in self._parts:

@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 
 from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.terms.forms.rows import ErrorField, Image, Noise, Row, Scale
-
-
-class SigmaAt(Protocol):
-    """Standard deviations at the positions of a domain."""
-
-    def __call__(self, domain: EvaluationDomain) -> Float | None:
-        """Values (N, 2); None where there is no such error, as of stars of no stated magnitude."""
-        ...
+from bayesdist.assess.terms.forms.rows import ErrorField, Image, Row
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +17,12 @@ class Independent:
     """Errors that are independent from position to position."""
 
     row: Row
-    sigma: SigmaAt  # of a domain
-    sizes: Mapping[int, Float] = field(default_factory=dict)  # (n, 2), as of `Noise`
+    # standard deviations (N, 2) at the positions of a domain; None where there is no such error, as
+    # of stars of no stated magnitude
+    sigma: Callable[[EvaluationDomain], Float | None]
+    # (n, 2), by chip number, what the variances of each draw are multiplied by; 1 where it is not
+    # there
+    sizes: Mapping[int, Float] = field(default_factory=dict)
     # by chip number: how well the size is known, relative to it
     known: Mapping[int, float | None] = field(default_factory=dict)
 
@@ -41,8 +36,6 @@ class Independent:
 class NoiseField(ErrorField):
     """Independent errors at the positions of a domain: no row where there are none."""
 
-    rows: tuple[Row, ...]
-    domain: EvaluationDomain
     of: Independent
     sigma: Float | None
 
@@ -57,12 +50,6 @@ class NoiseField(ErrorField):
             return np.zeros((self.domain.size if pairs is None else pairs.shape[1], 2))
         square = self.sigma**2
         return square if pairs is None else square[pairs[0]] + square[pairs[1]]
-
-    def noise(self, scale: Scale) -> Iterator[Noise]:
-        """The standard deviations themselves."""
-        if self.sigma is not None:
-            name = self.of.row.name
-            yield Noise(name, scale.get(name, 1.0) * self.sigma, self.of.sizes)
 
     def relative_error(self, name: str, chip: int, monte_carlo: float) -> float | None:
         """As it was stated."""
@@ -99,8 +86,6 @@ class Known:
 class KnownField(ErrorField):
     """Displacements (N, 2) at the positions of a domain."""
 
-    rows: tuple[Row, ...]
-    domain: EvaluationDomain
     shift: Float
 
     def squares(self) -> dict[str, Float]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -79,14 +78,6 @@ def without_rigid(
     return {chip.number: rest[:, c] for c, chip in enumerate(chips)}
 
 
-class AddedPolynomials(Protocol):
-    """Coefficients that are added to those of the parameters."""
-
-    def polynomials(self, epoch: float | None, chip: int) -> Float:
-        """Legendre coefficients (n, 2, K)."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class Polynomials:
     """Errors of parameters: on any chip at any epoch a polynomial."""
@@ -98,7 +89,8 @@ class Polynomials:
     # code of an exposure whose frame errs, and takes the place of any new one
     exposure: int | None = None
     frames: bool = False  # whether the frame of the exposure of each draw's star errs
-    more: tuple[AddedPolynomials, ...] = ()  # what is added to these polynomials
+    # takes an epoch and a chip number to what is added to these polynomials, (n, 2, K)
+    more: Callable[[float | None, int], Float] | None = None
 
     def on(self, domain: EvaluationDomain, image: Image) -> PolynomialField:
         """The errors at the positions of a domain, less what an alignment takes up."""
@@ -108,19 +100,15 @@ class Polynomials:
             out = polynomial_errors(
                 self.model, self.mean, self.theta, epoch=domain.epoch, chip=chip, exposure=exposure
             )
-            for one in self.more:
-                out = out + one.polynomials(domain.epoch, chip)
-            return out
+            return out if self.more is None else out + self.more(domain.epoch, chip)
 
         return PolynomialField.of((self.row,), domain, image, coefficients)
 
 
 @dataclass(frozen=True, eq=False)
 class PolynomialField(DrawnField):
-    """Errors that are polynomials of the pixel."""
+    """Errors that are polynomials of the pixel: one row, or none for a sum of rows."""
 
-    rows: tuple[Row, ...]  # one, or none for a sum of rows
-    domain: EvaluationDomain
     coefficients: dict[int, Float]  # (n, 2, K), by chip number
 
     @classmethod
@@ -146,7 +134,7 @@ class PolynomialField(DrawnField):
         """Number of draws."""
         return len(next(iter(self.coefficients.values())))
 
-    def errors(self, draws: slice, scale: Scale = {}) -> Float:  # noqa: B006
+    def errors(self, draws: slice, scale: Scale) -> Float:
         """Errors (d, N, 2) of some draws."""
         size = scale.get(self.rows[0].name, 1.0) if self.rows else 1.0
         parts = []

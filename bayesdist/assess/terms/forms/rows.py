@@ -8,9 +8,9 @@ correlated is one term with several rows.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -72,25 +72,11 @@ class ErrorDraws(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Noise:
-    """Errors that are independent from position to position."""
-
-    name: str  # of the row
-    sigma: Float  # (N, 2)
-    # (n, 2), by chip number, what the variances of each draw are multiplied by; 1 where it is not
-    # there
-    sizes: Mapping[int, Float] = field(default_factory=dict)
-
-
 class ErrorField(ABC):
     """Errors of a term at the N positions of a domain."""
 
+    rows: tuple[Row, ...]
     domain: EvaluationDomain
-
-    if TYPE_CHECKING:  # read-only: fields of some subclasses, computed by others
-
-        @property
-        def rows(self) -> tuple[Row, ...]: ...
 
     @property
     def uniform(self) -> bool:
@@ -106,10 +92,6 @@ class ErrorField(ABC):
     def total(self) -> Float:
         """Mean squares (P, 2) of all rows together."""
 
-    def noise(self, scale: Scale) -> Iterator[Noise]:
-        """Parts that are independent from position to position, rows multiplied by factors."""
-        yield from ()
-
     def relative_error(self, name: str, chip: int, monte_carlo: float) -> float | None:
         """Relative error of the size of a row on a chip; None where it is not known."""
         return monte_carlo
@@ -122,10 +104,10 @@ class ErrorField(ABC):
 class DrawnField(ErrorField):
     """Errors that are the same at all positions of a draw, or vary over them as it says."""
 
-    if TYPE_CHECKING:
-
-        @property
-        def n_draws(self) -> int: ...
+    @property
+    @abstractmethod
+    def n_draws(self) -> int:
+        """Number of draws."""
 
     @property
     def n_different(self) -> int:

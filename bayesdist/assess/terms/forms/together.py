@@ -11,7 +11,7 @@ from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms.functions import Functions
 from bayesdist.assess.terms.forms.polynomials import Polynomials
-from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
+from bayesdist.assess.terms.forms.rows import DrawnField, Image, Scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,22 +30,29 @@ class Together:
     def on(self, domain: EvaluationDomain, image: Image) -> TogetherField:
         """The errors at the positions of a domain."""
         parts = tuple(one.on(domain, image) for one in self.draws)
-        return TogetherField(domain, parts, remainder=self.remainder)
+        return TogetherField.of(domain, parts, remainder=self.remainder)
 
 
 @dataclass(frozen=True, eq=False)
 class TogetherField(DrawnField):
     """Rows of one term at the positions of a domain."""
 
-    domain: EvaluationDomain
     parts: tuple[DrawnField, ...]
     whole: DrawnField | None = None  # the joint error, where it is more than the sum of the rows
     remainder: bool = False  # as of `Together`
 
-    @property
-    def rows(self) -> tuple[Row, ...]:
-        """Rows of all parts."""
-        return tuple(row for part in self.parts for row in part.rows)
+    @classmethod
+    def of(
+        cls,
+        domain: EvaluationDomain,
+        parts: tuple[DrawnField, ...],
+        whole: DrawnField | None = None,
+        *,
+        remainder: bool = False,
+    ) -> TogetherField:
+        """The field with the rows of all parts."""
+        rows = tuple(row for part in parts for row in part.rows)
+        return cls(rows, domain, parts, whole, remainder)
 
     @property
     def n_draws(self) -> int:
@@ -62,7 +69,7 @@ class TogetherField(DrawnField):
         """Parts that are in the total."""
         return tuple(p for p in self.parts if all(row.in_total for row in p.rows))
 
-    def errors(self, draws: slice, scale: Scale = {}) -> Float:  # noqa: B006
+    def errors(self, draws: slice, scale: Scale) -> Float:
         """The joint error (d, N, 2), each row multiplied by its factor."""
         if self.whole is None:
             out = reduce(np.add, (part.errors(draws, scale) for part in self._added))

@@ -7,14 +7,9 @@ from itertools import combinations, product
 
 import numpy as np
 
-from bayesdist.diagnose.residuals import (
-    BAND_AXES,
-    BinnedSums,
-    BinValues,
-    StatisticsTable,
-    bin_row,
-    pair_row,
-)
+from bayesdist.diagnose.residuals.binned import BAND_AXES, BinnedSums, BinValues
+from bayesdist.diagnose.residuals.rows import bin_row, pair_row
+from bayesdist.diagnose.residuals.tables import StatisticsTable
 from bayesdist.missions.wise.published import WISE_ARRAYS
 
 _AXES = BAND_AXES[:2]

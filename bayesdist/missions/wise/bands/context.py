@@ -10,7 +10,7 @@ from bayesdist.report.registry import Registry, Section
 
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap
-    from bayesdist.diagnose.residuals import StatisticsTable
+    from bayesdist.diagnose.residuals.tables import StatisticsTable
     from bayesdist.missions.wise.assess.account import RowAccount
     from bayesdist.missions.wise.assess.histograms import BandSums
     from bayesdist.missions.wise.assess.residual_correlation import ResidualCorrelation

@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from bayesdist.assess import uncertainty_map
-from bayesdist.diagnose.residuals import BinnedSums, StatisticsTable
+from bayesdist.diagnose.residuals.binned import BinnedSums
+from bayesdist.diagnose.residuals.tables import StatisticsTable
 from bayesdist.missions.wise.assess.account import PRINTED_BINS, accounts, partition_parts
 from bayesdist.missions.wise.assess.distortion_field import DistortionField, field_of_solution
 from bayesdist.missions.wise.assess.histograms import band_sums

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bayesdist.arrays import Bool
-from bayesdist.diagnose.residuals.binned import residual_statistics
+from bayesdist.diagnose.residuals.rows import residual_statistics
 from bayesdist.diagnose.score.result import POWER
 from bayesdist.infer.skew import skew_of
 from bayesdist.limits import SCORE_TESTS

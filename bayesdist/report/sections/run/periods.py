@@ -26,7 +26,7 @@ from bayesdist.report.texttable import TextTable, listing
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.periods import TimeVariation
-    from bayesdist.diagnose.residuals import StatisticsTable
+    from bayesdist.diagnose.residuals.tables import StatisticsTable
 
 GRID = 17  # vectors along the longer side
 _CLEAR = 3.0  # sigmas beyond which a coefficient counts
