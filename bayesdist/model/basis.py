@@ -7,11 +7,11 @@ pixel offsets, with their covariance, only where a product is written.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from math import comb
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -65,19 +65,11 @@ def _legendre_derivatives(order: int) -> Float:
     return out
 
 
-def _legendre_to_powers(order: int) -> Float:
-    """Matrix whose row i holds the power coefficients of P_i."""
+def _converted(order: int, convert: Callable[..., Any]) -> Float:
+    """Matrix whose row i holds the coefficients in another basis of the i-th function of one."""
     out = np.zeros((order + 1, order + 1))
     for i in range(order + 1):
-        out[i, : i + 1] = legendre.leg2poly(np.eye(order + 1)[i, : i + 1])
-    return out
-
-
-def _powers_to_legendre(order: int) -> Float:
-    """Matrix whose row i holds the Legendre coefficients of X^i."""
-    out = np.zeros((order + 1, order + 1))
-    for i in range(order + 1):
-        out[i, : i + 1] = legendre.poly2leg(np.eye(order + 1)[i, : i + 1])
+        out[i, : i + 1] = convert(np.eye(order + 1)[i, : i + 1])
     return out
 
 
@@ -249,13 +241,13 @@ class PolynomialBasis:
 
     @cached_property
     def _to_scaled_powers(self) -> Float:
-        to_powers = _legendre_to_powers(self.order)
+        to_powers = _converted(self.order, legendre.leg2poly)
         return _product_matrix(self.terms, to_powers, to_powers)
 
     @cached_property
     def monomial_matrix(self) -> Float:
         """Matrix (n_terms, n_terms) from Legendre to monomial coefficients of pixel offsets."""
-        to_powers = _legendre_to_powers(self.order)
+        to_powers = _converted(self.order, legendre.leg2poly)
         axes = [
             # X = (x' - c) / s with the centre c measured from the reference pixel
             to_powers @ _substitute(self.order, 2.0 / n, -((n + 1.0) - 2.0 * ref) / n)
@@ -265,7 +257,7 @@ class PolynomialBasis:
 
     @cached_property
     def _inverse_monomial_matrix(self) -> Float:
-        to_legendre = _powers_to_legendre(self.order)
+        to_legendre = _converted(self.order, legendre.poly2leg)
         axes = [
             _substitute(self.order, n / 2.0, ((n + 1.0) - 2.0 * ref) / 2.0) @ to_legendre
             for n, ref in zip(self.size, self.reference_pixel, strict=True)

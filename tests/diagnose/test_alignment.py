@@ -35,12 +35,8 @@ from bayesdist.missions.wise.assess.published import (
     noise_of_bins,
     printed_rows,
 )
-from bayesdist.missions.wise.assess.tables import (
-    band_to_band_table,
-    fitting_table,
-    multiframe_table,
-)
-from bayesdist.missions.wise.published import SAMPLE_SIZES
+from bayesdist.missions.wise.assess.tables import residual_tables
+from bayesdist.missions.wise.published import SAMPLE_SIZES, WISE_ARCSEC
 from bayesdist.missions.wise.simulate import simulate_wise
 from tests.reduced import only_in_full
 
@@ -224,10 +220,14 @@ def _band(rng, *, n=4000, sigma=0.1, shape=0.0, size=SIZE, bins=6):
     return band_bins(x, y, ru, rv, bins=bins, size=size)
 
 
+def _tables(bands, rng):
+    return residual_tables(bands, rng=rng, arcsec=WISE_ARCSEC, absorbed=dict.fromkeys(bands, 1))
+
+
 def test_radial_is_the_mean_length_of_single_residuals():
     """sqrt(pi / 2) sigma for normal residuals, not the length of the mean residual."""
     rng = np.random.default_rng(6)
-    row = fitting_table({"W1": _band(rng, n=20000)}, rng=rng)["W1/radial"]
+    row = _tables({"W1": _band(rng, n=20000)}, rng)["5-1"]["W1/radial"]
     expected = 0.1 * np.sqrt(np.pi / 2)
     assert abs(row.value["mean"] - expected) < 4 * row.error["mean"]
     assert row.error["mean"] == pytest.approx(0.1 * np.sqrt((2 - np.pi / 2) / 20000), rel=0.2)
@@ -270,10 +270,11 @@ def test_tables_have_the_rows_and_columns_of_the_report():
     bands = {name: _band(rng, shape=0.05) for name in ("W1", "W2", "W3")}
     bands["W4"] = _band(rng, shape=0.02, size=(30.0, 30.0))
     heads = ["Mean", "Sigma", "Min", "Max", "Median", "1%-tile", "99%-tile"]
+    tables = _tables(bands, rng)
     cases = (
-        (fitting_table(bands, rng=rng), TABLE_5_1, "Band/Axis", "pix"),
-        (band_to_band_table(bands, rng=rng), TABLE_5_2, "Bands/Axis", "arcsec"),
-        (multiframe_table(bands, rng=rng), TABLE_5_3, "Band/Axis", "arcsec"),
+        (tables["5-1"], TABLE_5_1, "Band/Axis", "pix"),
+        (tables["5-2"], TABLE_5_2, "Bands/Axis", "arcsec"),
+        (tables["5-3"], TABLE_5_3, "Band/Axis", "arcsec"),
     )
     for ours, printed, first, unit in cases:
         table = ours.to_table()
@@ -364,7 +365,7 @@ def test_noise_explains_table_5_1_in_w4_only():
 def test_noise_of_bins_is_what_simulated_bins_show():
     rng = np.random.default_rng(15)
     band = _band(rng, n=50000, bins=20)
-    row = fitting_table({"W1": band}, rng=rng)
+    row = _tables({"W1": band}, rng)["5-1"]
     implied = noise_of_bins(row["W1/radial"].value["mean"], 50000, 400)
     assert row["W1/X"].value["sigma"] == pytest.approx(implied, rel=0.15)
     assert row["W1/Y"].sigma_noise == pytest.approx(implied, rel=0.02)
@@ -403,7 +404,7 @@ def test_tables_of_real_numbers_contradict_nothing():
 def test_what_makes_no_table_is_refused():
     rng = np.random.default_rng(14)
     with pytest.raises(DegenerateError, match="W1/X: only 0 bins hold two stars"):
-        fitting_table({"W1": _band(rng, n=1)}, rng=rng)
+        _tables({"W1": _band(rng, n=1)}, rng)
     for bad in ("W1/X 1 2 3", "W1/X 1 2 3 4 5 6 seven", "W1/X 1 2 3 4 5 6 nan"):
         with pytest.raises(InputError, match="row 1"):
             printed_rows(bad)

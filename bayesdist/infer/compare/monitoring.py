@@ -195,7 +195,7 @@ def fit_new(
         scattering = np.array([scatter[k] ** -2.0 if k in scatter else 0.0 for k in names])
     shards = load(model, matches, compute)
     mixture = mixture or released.mixture or OutlierMixture()
-    priors = _with_scatter(_held_drift(bare, model), model, scatter or {})
+    priors = _priors(bare, model, scatter or {})
     fit = fit_linear(shards, model, rejection=rejection, priors=priors)
     target = Target(shards, mixture, priors)
     proposal = build_proposal(target, fit)
@@ -306,8 +306,10 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
     )
 
 
-def _held_drift(released: TransformedSolution, model: DistortionModel) -> GaussianPriors:
-    """Priors that fix the drift at its released values."""
+def _priors(
+    released: TransformedSolution, model: DistortionModel, scatter: Mapping[str, float]
+) -> GaussianPriors:
+    """Priors that fix the drift at its released values, and those of exposures' deviations."""
     priors = GaussianPriors.none(model)
     rows = slice(released.model.n_polynomial, released.model.n_distortion)
     centre, precision = priors.centre.copy(), priors.precision.copy()
@@ -315,20 +317,12 @@ def _held_drift(released: TransformedSolution, model: DistortionModel) -> Gaussi
     sigma = np.sqrt(np.maximum(np.diag(released.cov)[rows], 0.0))
     least = 1e-12 * np.abs(released.mean).max(initial=1.0)
     precision[rows] = np.maximum(HELD * sigma, least) ** -2.0
-    return GaussianPriors(centre, precision)
-
-
-def _with_scatter(
-    priors: GaussianPriors, model: DistortionModel, scatter: Mapping[str, float]
-) -> GaussianPriors:
-    """Priors extended by those of the deviations of all exposures."""
-    precision = priors.precision.copy()
     for code in range(len(model.exposures)):
         first = model.frame_slice(code).start
         for k, name in enumerate(model.free_frame_names(code)):
             if name in scatter:
                 precision[first + k] = scatter[name] ** -2.0
-    return GaussianPriors(priors.centre, precision)
+    return GaussianPriors(centre, precision)
 
 
 def _at_epoch(model: DistortionModel, epoch: float | None) -> Float:

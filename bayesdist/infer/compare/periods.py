@@ -12,7 +12,7 @@ whose covariance for weights that are the inverse variances is C_p - C, not C_p 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -86,17 +86,6 @@ def sums_of_stars(stars: Stars, fit: LinearFit, radial_weight: float = 1.0) -> P
     return PeriodSums(equations, squares, int(equations.scalars[0]))
 
 
-def _check_model(model: DistortionModel) -> None:
-    if model.n_frame or model.time is not None:
-        raise InputError(
-            "periods are compared by polynomials alone, and the model has "
-            + ("frames of exposures" if model.n_frame else "time-dependent terms"),
-            where="model",
-            do="set model.frames = 'none' (refer the pairs to common solutions first) and drop the "
-            "time-dependent terms",
-        )
-
-
 def compare_periods(
     fit: LinearFit, sums: Mapping[str, PeriodSums], *, rescale: bool = True
 ) -> PeriodComparison:
@@ -130,11 +119,15 @@ def compare_periods(
     if len(sums) < 2:
         raise InputError(f"{len(sums)} periods are given", do="give two or more")
     model = fit.model
-    _check_model(model)
-    rights: list[Float] = []
-    steps: list[Float] = []
-    covs: list[Float] = []
-    normals: list[Float] = []
+    if model.n_frame or model.time is not None:
+        raise InputError(
+            "periods are compared by polynomials alone, and the model has "
+            + ("frames of exposures" if model.n_frame else "time-dependent terms"),
+            where="model",
+            do="set model.frames = 'none' (refer the pairs to common solutions first) and drop the "
+            "time-dependent terms",
+        )
+    steps, covs, normals, chi2, dof = [], [], [], 0.0, 0
     for name, one in sums.items():
         arrow, right = one.equations.assemble(model, fit.mean)
         try:
@@ -147,17 +140,22 @@ def compare_periods(
             ) from error
         normal = arrow.dense()
         inverse = scaled_inverse(normal)
-        rights.append(right)
-        steps.append(inverse @ right)
-        if one.squares is not None:
-            meat, _ = one.squares.assemble(model, fit.mean)
-            covs.append(inverse @ meat.dense() @ inverse)
+        step, cov = inverse @ right, inverse
+        chi2 += float(one.equations.scalars[2])
+        dof += 2 * one.n
+        if one.squares is None:
+            # with extra weights chi-square stays that about the fit of all data
+            chi2 -= float(right @ step)
+            dof -= len(step)
         else:
-            covs.append(inverse)
+            meat, _ = one.squares.assemble(model, fit.mean)
+            cov = inverse @ meat.dense() @ inverse
+        steps.append(step)
+        covs.append(cov)
         normals.append(normal)
     all_inverse = scaled_inverse(np.sum(normals, axis=0))
     fractions = np.array([all_inverse @ normal for normal in normals])
-    scale = _error_scale(sums.values(), rights, steps) if rescale else 1.0
+    scale = float(np.sqrt(chi2 / dof)) if rescale else 1.0
     return PeriodComparison(
         model=model,
         names=tuple(sums),
@@ -167,21 +165,6 @@ def compare_periods(
         counts=tuple(one.n for one in sums.values()),
         error_scale=scale,
     )
-
-
-def _error_scale(
-    sums: Collection[PeriodSums], rights: Sequence[Float], steps: Sequence[Float]
-) -> float:
-    """Root of chi-square per degree of freedom, of all periods about their own models."""
-    chi2, dof = 0.0, 0
-    for one, right, step in zip(sums, rights, steps, strict=True):
-        chi2 += float(one.equations.scalars[2])
-        dof += 2 * one.n
-        if one.squares is None:
-            # with extra weights chi-square stays that about the fit of all data
-            chi2 -= float(right @ step)
-            dof -= len(step)
-    return float(np.sqrt(chi2 / dof))
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,9 +19,7 @@ from numpy.typing import ArrayLike
 from bayesdist.arrays import Float, Int
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.series.series import Series
-from bayesdist.infer.series.trend import MIN_EXPOSURES, MIN_EXPOSURES_FOUND, TrendModel
-
-KNOTS = {"spline": 8, "random_walk": 16}
+from bayesdist.infer.series.trend import MIN_EXPOSURES_FOUND, TrendModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +130,7 @@ class Design:
         limits = (-np.inf, *trend.breaks, np.inf)
         for s, (first, last) in enumerate(pairwise(limits)):
             epoch = series.epoch[segment == s]
-            need = MIN_EXPOSURES.get(trend.kind, 1)
+            need = trend.form.least
             if len(epoch) < need or (need > 1 and np.ptp(epoch) == 0):
                 raise DegenerateError(
                     f"the segment from {first:g} to {last:g} has {len(epoch)} exposures of "
@@ -162,10 +160,10 @@ class Design:
     @cached_property
     def drift(self) -> Drift | None:
         """Random part of the trend, or None."""
-        if self.trend.kind not in KNOTS:
+        form = self.trend.form
+        if not form.knots:
             return None
-        knots = KNOTS[self.trend.kind]
-        return Drift.over(self.series.epoch, knots, smooth=self.trend.kind == "spline")
+        return Drift.over(self.series.epoch, form.knots, smooth=form.smooth)
 
     @property
     def n_groups(self) -> int:
@@ -216,21 +214,16 @@ class Design:
         inside = (segment[..., None] == np.arange(n)).astype(float)
         one = np.ones((*segment.shape, 1))
         since = ((t - self.reference[segment]) / self.years)[..., None]
-        kind = self.trend.kind
-        if kind in ("constant", "random_walk"):
-            parts = [one]
-        elif kind in ("line", "spline"):
-            parts = [one, since]
-        elif kind == "step":
-            parts = [inside]
-        elif kind == "line+step":
-            parts = [inside, since]
-        elif kind == "lines":
-            parts = [inside, inside * since]
-        else:
+        form = self.trend.form
+        parts = [inside if form.levels else one]
+        if form.slopes == "one":
+            parts.append(since)
+        elif form.slopes == "each":
+            parts.append(inside * since)
+        elif form.slopes == "kinks":
             after = np.maximum(t[:, None] - rows[..., None, :], 0.0) / self.years
             whole = ((t - self.reference[0]) / self.years)[:, None] * one
-            parts = [one, whole, after]
+            parts += [whole, after]
         if self.n_groups > 1:
             member = (group[:, None] == np.arange(1, self.n_groups)).astype(float)
             parts.append(member * one)
@@ -255,18 +248,14 @@ class Design:
         level, slope : ndarray, shape (n, S, k)
             Of the first group; of a trend with a random part, without it.
         """
-        s = self.trend.n_segments
-        kind = self.trend.kind
+        s, n, slopes = self.trend.n_segments, self.trend.n_levels, self.trend.form.slopes
         rows = np.swapaxes(b, 1, 2)  # (n, p, k)
         flat = np.zeros((len(b), s, b.shape[1]))
-        if kind in ("constant", "random_walk", "step"):
-            return rows[:, :s].copy(), flat
-        if kind in ("line", "spline"):
-            return rows[:, :1].copy(), rows[:, 1:2] / self.years
-        if kind == "line+step":
-            return rows[:, :s].copy(), flat + rows[:, s : s + 1] / self.years
-        if kind == "lines":
-            return rows[:, :s].copy(), rows[:, s : 2 * s] / self.years
+        if slopes == "none":
+            return rows[:, :n].copy(), flat
+        if slopes != "kinks":
+            own = rows[:, n : n + (s if slopes == "each" else 1)]
+            return rows[:, :n].copy(), flat + own / self.years
         slope = np.cumsum(rows[:, 1 : s + 1], axis=1) / self.years
         level = flat + rows[:, :1]
         # the first segment's line at each reference date, then each kink's part from its date on

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -90,24 +90,7 @@ class State:
 
     def take(self, chains: Int) -> State:
         """State of some of the chains, possibly several times."""
-        return State(
-            self.b[chains],
-            self.sigma[chains],
-            self.off[chains],
-            self.probability[chains],
-            self.fraction[chains],
-            self.kappa2[chains],
-            self.breaks[chains],
-            self.drift[chains],
-        )
-
-
-def prior_precision(problem: Problem, drift: Float) -> Float:
-    """Prior precision (C, k, p) of the columns' parameters."""
-    design = problem.design
-    out = np.full((len(drift), drift.shape[1], design.n_columns), WIDE**-2)
-    out[..., design.n_fixed :] = drift[..., None] ** -2
-    return out
+        return State(**{one.name: getattr(self, one.name)[chains] for one in fields(self)})
 
 
 def normal_equations(precision: Float, y: Float, columns: Float) -> tuple[Float, Float]:
@@ -144,8 +127,11 @@ def trend_equations(
     `drift` (C, k).
     """
     matrix, right = normal_equations(precision, problem.y, columns)
-    prior = prior_precision(problem, drift).reshape(len(drift), -1)
-    return matrix + prior[:, :, None] * np.eye(prior.shape[1]), right
+    design = problem.design
+    prior = np.full((*drift.shape, design.n_columns), WIDE**-2)
+    prior[..., design.n_fixed :] = drift[..., None] ** -2
+    flat = prior.reshape(len(drift), -1)
+    return matrix + flat[:, :, None] * np.eye(flat.shape[1]), right
 
 
 def break_likelihood(problem: Problem, precision: Float) -> Likelihood:

@@ -22,13 +22,36 @@ import numpy as np
 
 from bayesdist.errors import InputError
 
-PLAIN = ("constant", "line", "spline", "random_walk")
-BROKEN = ("step", "line+step", "piecewise", "lines")
-KINDS = ("constant", "line", "step", "line+step", "piecewise", "lines", "spline", "random_walk")
-SLOPED = ("line", "line+step", "piecewise", "lines", "spline")
-# fewest exposures of a segment: with given breaks, and where the breaks are to be found
-MIN_EXPOSURES = {"step": 1, "line+step": 1, "piecewise": 2, "lines": 3}
-MIN_EXPOSURES_FOUND = 5
+MIN_EXPOSURES_FOUND = 5  # of a segment at least, where the breaks are to be found
+
+
+@dataclass(frozen=True)
+class Form:
+    """Parameters of one kind of trend."""
+
+    levels: bool = False  # a level in each segment; else one for all
+    slopes: str = "none"  # 'one', 'each' segment its own, or 'kinks' between them
+    knots: int = 0  # of the random part, if any
+    smooth: bool = False  # of that part
+    least: int = 1  # exposures of a segment, where the breaks are given
+
+    @property
+    def broken(self) -> bool:
+        """True if segments differ."""
+        return self.levels or self.slopes == "kinks"
+
+
+FORMS = {
+    "constant": Form(),
+    "line": Form(slopes="one"),
+    "step": Form(levels=True),
+    "line+step": Form(levels=True, slopes="one"),
+    "piecewise": Form(slopes="kinks", least=2),
+    "lines": Form(levels=True, slopes="each", least=3),
+    "spline": Form(slopes="one", knots=8, smooth=True),
+    "random_walk": Form(knots=16),
+}
+KINDS = tuple(FORMS)
 
 
 @dataclass(frozen=True)
@@ -78,9 +101,10 @@ class TrendModel:
                 where=where,
                 do="sort them and name each once",
             )
-        if self.kind in PLAIN and (self.breaks or self.find):
-            raise InputError("has no breaks", where=where, do=f"choose among {', '.join(BROKEN)}")
-        if self.kind in BROKEN and bool(self.breaks) == bool(self.find):
+        if not self.form.broken and (self.breaks or self.find):
+            broken = [kind for kind, form in FORMS.items() if form.broken]
+            raise InputError("has no breaks", where=where, do=f"choose among {', '.join(broken)}")
+        if self.form.broken and bool(self.breaks) == bool(self.find):
             raise InputError(
                 "needs the dates of its breaks, or how many are to be found",
                 where=where,
@@ -96,6 +120,11 @@ class TrendModel:
             )
 
     @property
+    def form(self) -> Form:
+        """What parameters it has."""
+        return FORMS[self.kind]
+
+    @property
     def n_breaks(self) -> int:
         """Number of breaks, given or to be found."""
         return self.find or len(self.breaks)
@@ -109,8 +138,12 @@ class TrendModel:
     def n_columns(self) -> int:
         """Number of columns, without groups and random part."""
         s = self.n_segments
-        sizes = {"constant": 1, "line": 2, "spline": 2, "random_walk": 1, "step": s}
-        return {**sizes, "line+step": s + 1, "piecewise": s + 1, "lines": 2 * s}[self.kind]
+        return self.n_levels + {"none": 0, "one": 1, "each": s, "kinks": s}[self.form.slopes]
+
+    @property
+    def n_levels(self) -> int:
+        """Number of levels, the first of the columns."""
+        return self.n_segments if self.form.levels else 1
 
     @property
     def name(self) -> str:
@@ -125,9 +158,9 @@ class TrendModel:
     @property
     def drifts(self) -> bool:
         """True if it has a random part that can follow any drift."""
-        return self.kind in ("spline", "random_walk")
+        return self.form.knots > 0
 
     @property
     def has_slope(self) -> bool:
         """True if it claims a drift that goes on."""
-        return self.kind in SLOPED
+        return self.form.slopes != "none"

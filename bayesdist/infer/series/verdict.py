@@ -13,6 +13,16 @@ from bayesdist.infer.series.series import Series
 from bayesdist.infer.series.trend import TrendModel
 
 MIN_SIGNIFICANCE = 3.0  # sigma from which a coefficient's own slope or step is named
+CLAIMS = {
+    "constant": "no line",
+    "line": "line",
+    "step": "no line",
+    "line+step": "one slope throughout",
+    "piecewise": "its slope changes there",
+    "lines": "a line in each segment",
+    "spline": "no line: a smooth drift",
+    "random_walk": "no line: an irregular drift",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,22 +116,10 @@ def _break_dates(posterior: SeriesPosterior) -> Float:
 
 
 def _claim(trend: TrendModel, dates: Float) -> str:
-    if trend.kind == "constant":
-        return "no line"
-    if trend.kind == "line":
-        return "line"
-    if trend.kind == "spline":
-        return "no line: a smooth drift"
-    if trend.kind == "random_walk":
-        return "no line: an irregular drift"
-    at = "break at " + ", ".join(f"{d[0]:.2f}" for d in dates)
-    segments = {
-        "step": "no line",
-        "line+step": "one slope throughout",
-        "piecewise": "its slope changes there",
-        "lines": "a line in each segment",
-    }
-    return f"{at}: {segments[trend.kind]}"
+    claim = CLAIMS[trend.kind]
+    if not trend.n_breaks:
+        return claim
+    return f"break at {', '.join(f'{d[0]:.2f}' for d in dates)}: {claim}"
 
 
 def _text(
@@ -177,18 +175,19 @@ def _plain(names: str) -> str:
 def _named_slopes(posterior: SeriesPosterior) -> list[str]:
     """Names of the coefficients that drift, for a trend that claims a drift."""
     trend = posterior.trend
-    if not trend.has_slope or trend.kind == "spline":
+    if not trend.has_slope or trend.drifts:
         return []
     slope = posterior.beta
     mean, sigma = slope.mean(axis=0), slope.std(axis=0, ddof=1)
     names = posterior.series.coefficients
     out = []
-    for s in range(1 if trend.kind in ("line", "line+step") else trend.n_segments):
+    several = trend.form.slopes != "one"
+    for s in range(trend.n_segments if several else 1):
         named = [
             f"{names[j]} {mean[s, j]:.3g} +- {sigma[s, j]:.1g}"
             for j in range(len(names))
             if abs(mean[s, j]) > MIN_SIGNIFICANCE * sigma[s, j]
         ]
-        label = f" in segment {s + 1}" if trend.kind in ("piecewise", "lines") else ""
+        label = f" in segment {s + 1}" if several else ""
         out.append(f"Slopes per year{label}: {', '.join(named) if named else 'none significant'}.")
     return out

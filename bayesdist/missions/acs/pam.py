@@ -19,19 +19,16 @@ def write_area_maps(
     path: str | Path,
     output: str | Path,
     *,
-    chip: int | None = None,
-    filter: str | None = None,
-    epoch: float | None = None,
-    scale: float | None = None,
-    image: str | Path | None = None,
-    force: bool = False,
+    chip: int | None,
+    filter: str | None,
+    epoch: float | None,
+    scale: float | None,
+    image: str | Path | None,
+    force: bool,
 ) -> str:
-    """Write the pixel area maps of a calibration.
+    """Text to print, once the pixel area maps of a calibration are written.
 
-    `path`: as of `calibration_at`. `output`: a FITS file. `chip`: all by default. `filter`,
-    `scale`: as of `calibration_at`. `epoch`: decimal years, for what depends on time. `image`: a
-    calibrated image: maps are of its chips, in its order, and of its subarrays. `force`: replace a
-    file that is there. Returns the text to print. InputError for what cannot be read or written.
+    With an image, maps are of its chips, in its order, and of its subarrays.
     """
     output = Path(output)
     if output.suffix.lower() != ".fits":

@@ -93,25 +93,18 @@ segment = 1
 def simulate_campaign(
     output: str | Path,
     *,
-    seed: int = 1,
-    force: bool = False,
-    exposures: int = 110,
-    stars: int = 53_900,
-    filters: Sequence[str] = (REFERENCE,),
-    secondary_exposures: int = 15,
-    false: float = 0.05,
-    outlying: float = 0.0,
-    cte: bool = False,
-    no_tables: bool = False,
+    seed: int,
+    force: bool,
+    exposures: int,
+    stars: int,
+    filters: Sequence[str],
+    secondary_exposures: int,
+    false: float,
+    outlying: float,
+    cte: bool,
+    no_tables: bool,
 ) -> str:
-    """Simulate, and write into a folder.
-
-    `output`: folder. `force`: replace a campaign that is there. `exposures`, `stars`: in the first
-    filter, and of the catalogue. `secondary_exposures`: of each further filter. `false`,
-    `outlying`: fractions of detections that are none, and of outlying exposures. `cte`: trailed
-    charge moves the stars. `no_tables`: a distortion without look-up tables. Returns the text to
-    print. InputError for options that cannot be used, and a folder in use.
-    """
+    """Text to print, once a campaign is simulated and written into a folder."""
     folder = Path(output)
     if (folder / "lists").exists() and not force:
         raise InputError(

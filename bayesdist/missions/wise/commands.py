@@ -17,6 +17,18 @@ from bayesdist.app.commands.options import (
 )
 
 
+def _number(
+    *names: str, help: str, default: float = 0.0, metavar: str = "A"
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Option with a number."""
+    return click.option(*names, type=float, default=default, metavar=metavar, help=help)
+
+
+_optical_rotation = _number(
+    "--rotation", metavar="DEG", help="Rotation of the optical model, degrees."
+)
+
+
 @command()
 @click.option("-o", "--output", default="bayesdist-demo", metavar="DIR", help="Folder to create.")
 @click.option(
@@ -47,13 +59,7 @@ def demo(line: str, output: str, format: str | None, force: bool) -> None:
     metavar="FILE,...",
     help="SIP header or WISE meta-data of an optical model; one, or one for each run.",
 )
-@click.option(
-    "--rotation",
-    type=float,
-    default=0.0,
-    metavar="DEG",
-    help="Rotation of the optical model, degrees.",
-)
+@_optical_rotation
 @click.option("--no-published", is_flag=True, help="Leave out the values of WISE's report.")
 @click.pass_obj
 def bands(
@@ -89,26 +95,12 @@ def bands(
 @new_folder
 @click.option("--band", required=True, metavar="W1", help="Band of the detections.")
 @click.option("--order", type=int, default=4, metavar="N", help="Final order of the polynomial.")
-@click.option(
-    "--radius",
-    type=float,
-    default=1.0,
-    metavar="A",
-    help="Acceptance radius of pairs at the array's centre, pixels.",
-)
-@click.option(
-    "--corner-radius", type=float, default=3.0, metavar="A", help="The same in the corners."
-)
+@_number("--radius", default=1.0, help="Acceptance radius of pairs at the array's centre, pixels.")
+@_number("--corner-radius", default=3.0, help="The same in the corners.")
 @click.option(
     "--optical", metavar="FILE", help="SIP header or WISE meta-data of the initial distortion."
 )
-@click.option(
-    "--rotation",
-    type=float,
-    default=0.0,
-    metavar="DEG",
-    help="Rotation of the optical model, degrees.",
-)
+@_optical_rotation
 @click.pass_obj
 def bring_up(line: str, detections: str, reference: str, output: str, **options: Any) -> None:
     """Determine pairs and distortion from unmatched star lists.
@@ -122,9 +114,7 @@ def bring_up(line: str, detections: str, reference: str, output: str, **options:
 
 @command()
 @click.argument("file", metavar="FILE")
-@click.option(
-    "--angle", type=float, default=0.0, metavar="DEG", help="Angle from x towards y, degrees."
-)
+@_number("--angle", metavar="DEG", help="Angle from x towards y, degrees.")
 @click.option("--mirror", is_flag=True, help="Change the sign of x first.")
 @click.option("-o", "--output", required=True, metavar="OUT", help="File to write.")
 @force
@@ -159,23 +149,11 @@ def _pairs(function: Callable[..., None]) -> Callable[..., None]:
 
 @command()
 @_pairs
-@click.option("--dx", type=float, default=0.0, metavar="A", help="Shift along x, pixels.")
-@click.option("--dy", type=float, default=0.0, metavar="A", help="Shift along y, pixels.")
-@click.option(
-    "--rotation",
-    type=float,
-    default=0.0,
-    metavar="DEG",
-    help="About the array's centre, from x towards y.",
-)
-@click.option(
-    "--scale-x",
-    type=float,
-    default=0.0,
-    metavar="A",
-    help="Relative to one: 1e-4 stretches x by so much.",
-)
-@click.option("--scale-y", type=float, default=0.0, metavar="A", help="Relative to one.")
+@_number("--dx", help="Shift along x, pixels.")
+@_number("--dy", help="Shift along y, pixels.")
+@_number("--rotation", metavar="DEG", help="About the array's centre, from x towards y.")
+@_number("--scale-x", help="Relative to one: 1e-4 stretches x by so much.")
+@_number("--scale-y", help="Relative to one.")
 @click.option("--fit", is_flag=True, help="Fit these five to the pairs, by least squares.")
 def transform(files: tuple[str, ...], output: str, **options: Any) -> None:
     """Transform all pairs by one linear transformation.
@@ -228,9 +206,7 @@ rvb.add_command(rereference)
     show_default="as published",
     help="Number of pairs in each band.",
 )
-@click.option(
-    "--false-fraction", type=float, default=0.03, metavar="F", help="Fraction of false matches."
-)
+@_number("--false-fraction", default=0.03, metavar="F", help="Fraction of false matches.")
 @click.option("--partition-pattern", is_flag=True, help="Add a pattern of blocks to the residuals.")
 @click.option(
     "--stars", type=int, metavar="N", help="Make one small table of one band with N stars instead."

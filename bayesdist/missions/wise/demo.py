@@ -100,8 +100,7 @@ def write_simulation(
 ) -> None:
     """Write stars.ecsv, truth.ecsv and config.toml of a simulated band.
 
-    `sip`: how its SIP header states u, v; by default as WISE has it. InputError when the folder
-    cannot be made or written.
+    `sip`: how its SIP header states u, v; by default as WISE has it.
     """
     made_folder(folder)
     stars = QTable()
@@ -123,14 +122,11 @@ def write_simulation(
         temporary.write_text(_CONFIG.format(band=band, sip=sip), encoding="utf-8")
 
 
-def demo(
-    folder: str | Path, *, format: str | None = None, force: bool = False, command: str = ""
-) -> str:
-    """Simulate, calibrate, and compare with the truth.
+def demo(folder: str | Path, *, format: str | None, force: bool, command: str) -> str:
+    """Text to print, once pairs are simulated, calibrated, and compared with the truth.
 
-    `folder`: holds ``input/`` and ``run/`` afterwards. `format`: one of FILES, in which the result
-    is written into ``file/``, too. `force`: replace an earlier demo. `command`: for the record.
-    Returns the text to print.
+    The folder holds ``input/`` and ``run/`` afterwards, and with one of FILES for a format the
+    result in ``file/``.
     """
     folder = Path(folder)
     known = {"input", "run", "file"}

@@ -88,3 +88,4 @@ class WiseArray:
 # the centres of the outermost ones; of W4 within +-254, their edges.
 _FULL = WiseArray((1016.0, 1016.0), 2.75)
 WISE_ARRAYS = {"W1": _FULL, "W2": _FULL, "W3": _FULL, "W4": WiseArray((508.0, 508.0), 5.5)}
+WISE_ARCSEC = {band: array.scale for band, array in WISE_ARRAYS.items()}  # per pixel

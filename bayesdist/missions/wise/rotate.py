@@ -24,16 +24,10 @@ def rotate(
     output: str | Path,
     *,
     degrees: float,
-    mirror: bool = False,
-    force: bool = False,
+    mirror: bool,
+    force: bool,
 ) -> str:
-    """Write a SIP header or WISE meta-data in rotated or mirrored pixels.
-
-    `output`: of the same kind as the input; a SIP header is a FITS file where the name ends in
-    .fits. `degrees`, `mirror`: as `rotated_sip`. `force`: replace a file that is there. Returns the
-    text to print. InputError for a file of another kind, an output in use, an angle that is no
-    finite number, and of WISE meta-data one that is no multiple of 90 degrees, or a skew.
-    """
+    """Text to print, once a SIP header or WISE meta-data are written in rotated pixels."""
     path, output = Path(path), Path(output)
     refuse_existing(output, force)
     key = open_document(path).format.key

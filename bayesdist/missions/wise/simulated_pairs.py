@@ -65,14 +65,10 @@ def simulate_table(
     stars: int = 6000,
     band: str = "W2",
     fraction: float = 0.03,
-    seed: int = 1,
-    force: bool = False,
+    seed: int,
+    force: bool,
 ) -> str:
-    """One small table of one band, and how to calibrate it.
-
-    `output`: folder. `fraction`: of false matches. `force`: replace a configuration that is there.
-    Returns the text to print. InputError for options that cannot be used, and a folder in use.
-    """
+    """Text to print, once one small table of one band and its configuration are written."""
     if stars < 1 or not 0 <= fraction < 1:
         raise InputError(
             "a simulation needs stars, and true matches among them",
@@ -95,20 +91,14 @@ def simulate_table(
 def simulate_sets(
     output: str | Path,
     *,
-    bands: Sequence[str] = ("W1", "W2", "W3", "W4"),
-    pairs: int | None = None,
-    false_fraction: float = 0.03,
-    partition_pattern: bool = False,
-    seed: int = 1,
-    force: bool = False,
+    bands: Sequence[str],
+    pairs: int | None,
+    false_fraction: float,
+    partition_pattern: bool,
+    seed: int,
+    force: bool,
 ) -> str:
-    """Full sets of bands in Parquet, and how to calibrate them.
-
-    `output`: folder. `pairs`: of each band; by default those of section 4 of WSDC D-T033.
-    `false_fraction`: of false matches. `partition_pattern`: blocks in the residuals. `force`:
-    replace sets that are there. Returns the text to print. InputError for options that cannot be
-    used, and a folder in use.
-    """
+    """Text to print, once full sets of bands in Parquet and their configurations are written."""
     folder = Path(output)
     if len(set(bands)) < len(bands):
         raise InputError("a band is named twice", where="--bands", do="name each once")

@@ -14,7 +14,7 @@ from astropy.time import Time
 from bayesdist.data import Matches, open_matches, write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs import files as rvb_files
-from bayesdist.missions.wise.pairs.radial_limit import RadialLimit, radial_rows
+from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.missions.wise.pairs.read import read_rvb, rvb_bands, stream_rvb
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs, colour_of
 from bayesdist.missions.wise.pairs.section import RvbBlock
@@ -277,9 +277,10 @@ def test_both_limits_are_judged(rng):
     # chi-square of two axes: exp(-q / 2) lies beyond q
     limit = RadialLimit(4.0, 4.0)
     still = Matches(x, y, *(np.column_stack([x, y]) + noise).T, *[np.full(n, 0.1)] * 2)
-    near, likely = radial_rows(still, SIZE, offset=tight, chi2=limit)
-    assert near.all()
-    assert abs((~likely).mean() - np.exp(-2)) < 4 * np.sqrt(np.exp(-2) / n)
+    unlikely = taken(RvbPairs(still), offset=tight, chi2=limit).rejected
+    assert set(unlikely) == {"chi-square beyond the radial limit"}
+    share = unlikely["chi-square beyond the radial limit"] / n
+    assert abs(share - np.exp(-2)) < 4 * np.sqrt(np.exp(-2) / n)
     both = taken(RvbPairs(matches), offset=tight, chi2=limit)
     assert sum(both.rejected.values()) + len(both) == n
     assert both.rejected["offset beyond the radial limit"] == n - len(lost)

@@ -16,13 +16,8 @@ from bayesdist.diagnose.residuals.changes import pattern_changes
 from bayesdist.diagnose.residuals.tables import period_table
 from bayesdist.infer import Rejection, fit_linear, load
 from bayesdist.missions.wise.assess.histograms import band_sums
-from bayesdist.missions.wise.assess.tables import (
-    WISE_ARCSEC,
-    band_to_band_table,
-    fitting_table,
-    multiframe_table,
-)
-from bayesdist.missions.wise.published import RESIDUAL_SIGMAS, WISE_BANDS
+from bayesdist.missions.wise.assess.tables import residual_tables
+from bayesdist.missions.wise.published import RESIDUAL_SIGMAS, WISE_ARCSEC, WISE_BANDS
 from bayesdist.missions.wise.simulate import wise_set
 
 from .calibrations import matches_of, pairs_of
@@ -59,6 +54,24 @@ def patterned():
     return {band: calibrated(band, True) for band in PATTERNED}
 
 
+@pytest.fixture(scope="module")
+def plain_tables(plain):
+    return tables_of(plain)
+
+
+@pytest.fixture(scope="module")
+def patterned_tables(patterned):
+    return tables_of(patterned)
+
+
+def tables_of(bands) -> dict:
+    """Rows by label, of each table."""
+    absorbed = dict.fromkeys(bands, TERMS)
+    found = {band: bins for band, (*_, bins) in bands.items()}
+    tables = residual_tables(found, rng=rng(), arcsec=WISE_ARCSEC, absorbed=absorbed)
+    return {name: rows(table) for name, table in tables.items()}
+
+
 def rows(table) -> dict:
     return {row.label: row for row in table.rows}
 
@@ -90,10 +103,10 @@ def bin_means(one, bins: int = 31) -> np.ndarray:
 
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("band", WISE_BANDS)
-def test_noise_of_table_5_1_is_sigma_over_root_n(plain, band, axis):
+def test_noise_of_table_5_1_is_sigma_over_root_n(plain, plain_tables, band, axis):
     """Less the 15 coefficients of the axis, which the fit has taken out."""
-    one, pairs, _, bins = plain[band]
-    row = rows(fitting_table({band: bins}, absorbed=TERMS, rng=rng()))[f"{band}/{axis}"]
+    one, pairs, *_ = plain[band]
+    row = plain_tables["5-1"][f"{band}/{axis}"]
     dof = row.n_bins - TERMS
     expected = noise2(one, pairs) * dof / row.n_bins
     low, high = chi2.ppf([RARE, 1 - RARE], dof) / dof
@@ -103,11 +116,8 @@ def test_noise_of_table_5_1_is_sigma_over_root_n(plain, band, axis):
     assert abs(row.variance) < 4.5 * row.variance_error
 
 
-def test_noise_of_two_bands_adds_in_table_5_2(plain):
-    found = rows(
-        band_to_band_table({b: plain[b][3] for b in WISE_BANDS}, absorbed=TERMS, rng=rng())
-    )
-    for label, row in found.items():
+def test_noise_of_two_bands_adds_in_table_5_2(plain, plain_tables):
+    for label, row in plain_tables["5-2"].items():
         later, earlier = label.partition("/")[0].split("-")
         dof = row.n_bins - TERMS
         expected = sum(WISE_ARCSEC[b] ** 2 * noise2(*plain[b][:2]) for b in (later, earlier))
@@ -120,9 +130,9 @@ def test_noise_of_two_bands_adds_in_table_5_2(plain):
 
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("band", PATTERNED)
-def test_what_remains_in_table_5_1_is_the_pattern(patterned, band, axis):
-    one, _, _, bins = patterned[band]
-    row = rows(fitting_table({band: bins}, absorbed=TERMS, rng=rng()))[f"{band}/{axis}"]
+def test_what_remains_in_table_5_1_is_the_pattern(patterned, patterned_tables, band, axis):
+    one, *_ = patterned[band]
+    row = patterned_tables["5-1"][f"{band}/{axis}"]
     true = bin_means(one)[AXES.index(axis)].var()
     assert abs(row.variance - true) < 4.5 * row.variance_error
     # none at all would be seen, and bins smooth it a little
@@ -132,24 +142,21 @@ def test_what_remains_in_table_5_1_is_the_pattern(patterned, band, axis):
 
 
 @pytest.mark.parametrize("axis", AXES)
-def test_what_remains_in_table_5_2_is_the_difference_of_the_patterns(patterned, axis):
-    found = rows(
-        band_to_band_table({b: patterned[b][3] for b in PATTERNED}, absorbed=TERMS, rng=rng())
-    )
+def test_what_remains_in_table_5_2_is_the_difference_of_the_patterns(
+    patterned, patterned_tables, axis
+):
     k = AXES.index(axis)
     means = {b: WISE_ARCSEC[b] * bin_means(patterned[b][0])[k] for b in PATTERNED}
     for later, earlier in (("W2", "W1"), ("W3", "W1"), ("W3", "W2")):
-        row = found[f"{later}-{earlier}/{axis}"]
+        row = patterned_tables["5-2"][f"{later}-{earlier}/{axis}"]
         true = (means[later] - means[earlier]).var()
         assert abs(row.variance - true) < 4.5 * row.variance_error
 
 
-def test_table_5_3_follows_from_table_5_1(patterned):
+def test_table_5_3_follows_from_table_5_1(patterned_tables):
     """All pairs of bins: sqrt(2) times the sigma, the range as maximum, zero in the middle."""
-    bins = {b: patterned[b][3] for b in PATTERNED}
-    fitting = rows(fitting_table(bins, absorbed=TERMS, rng=rng()))
-    for label, row in rows(multiframe_table(bins, absorbed=TERMS, rng=rng())).items():
-        scale, one = WISE_ARCSEC[label[:2]], fitting[label].value
+    for label, row in patterned_tables["5-3"].items():
+        scale, one = WISE_ARCSEC[label[:2]], patterned_tables["5-1"][label].value
         assert row.value["sigma"] == pytest.approx(np.sqrt(2) * scale * one["sigma"], rel=1e-12)
         assert row.value["max"] == pytest.approx(scale * (one["max"] - one["min"]), rel=1e-12)
         assert row.value["mean"] == pytest.approx(0.0, abs=1e-12)

@@ -173,7 +173,7 @@ def test_moments_add(rng):
     one, other = fit_transform(whole), fit_transform(total)
     np.testing.assert_allclose(other.transform.values, one.transform.values, atol=1e-12)
     assert total.n == 400 and other.chi2 == pytest.approx(one.chi2)
-    with pytest.raises(ValueError, match="different centres"):
+    with pytest.raises(ValueError, match="different centre"):
         whole + linear_moments(matches, (1.0, 1.0))
 
 

@@ -26,21 +26,14 @@ def handbook(
     path: str | Path,
     output: str | Path,
     *,
-    filter: str | None = None,
-    epoch: float | None = None,
-    scale: float | None = None,
-    detector: str | None = None,
-    magnification: float | None = None,
-    command: str = "",
+    filter: str | None,
+    epoch: float | None,
+    scale: float | None,
+    detector: str | None,
+    magnification: float | None,
+    command: str,
 ) -> str:
-    """Write the figures and the numbers of a calibration.
-
-    `path`: as of `calibration_at`. `output`: new or empty folder. `filter`, `scale`: as of
-    `calibration_at`. `epoch`: decimal years, for what depends on time. `detector`: WFC, HRC or SBC,
-    whose printed numbers stand beside; that of an IDCTAB of ACS by default. `magnification`: of the
-    vectors. `command`: for the record. Returns the numbers. InputError for what cannot be read or
-    written.
-    """
+    """Text with the numbers of a calibration, once they and its figures are in a new folder."""
     # figures take seconds to import
     from bayesdist.missions.acs.handbook.figures import (
         area_figure,

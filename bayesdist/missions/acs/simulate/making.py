@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -84,15 +85,6 @@ def simulate_acs(
         For an unknown or repeated filter, too few exposures or stars, fractions outside [0, 1), or
         a negative size.
     """
-    _check(filters, n_exposures=n_exposures, n_other=n_other)
-    if n_stars < FEWEST:
-        raise InputError(
-            f"n_stars is {n_stars}, and exposures may stay empty",
-            where="n_stars",
-            do=f"give {FEWEST} or more",
-        )
-    _check_shares(outlying=outlying, false=false, blended=blended)
-    _check_sizes(scatter=scatter, centroid=centroid, seed=seed)
     settings = {
         "seed": seed,
         "n_exposures": n_exposures,
@@ -108,6 +100,13 @@ def simulate_acs(
         "blended": blended,
         "pa_v3": pa_v3,
     }
+    _check(filters, settings)
+    if n_stars < FEWEST:
+        raise InputError(
+            f"n_stars is {n_stars}, and exposures may stay empty",
+            where="n_stars",
+            do=f"give {FEWEST} or more",
+        )
 
     def rng(*key: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
@@ -148,25 +147,22 @@ def simulate_acs(
     return AcsCampaign(catalog, early, late, log, lists, truth)
 
 
-def _check(filters: Sequence[str], **counts: int) -> None:
+# settings: lowest, first above the highest, and what to give
+_RANGES: dict[tuple[str, ...], tuple[float, float, str]] = {
+    ("n_exposures", "n_other"): (1, np.inf, "1 or more"),
+    ("outlying", "false", "blended"): (0.0, 1.0, "a fraction in [0, 1)"),
+    ("scatter", "centroid", "seed"): (0.0, np.inf, "0 or more"),
+}
+
+
+def _check(filters: Sequence[str], settings: Mapping[str, Any]) -> None:
     for name in filters:
         acs_solution(name)
     if not filters or len(set(filters)) < len(filters):
         raise InputError(
             f"filters are {', '.join(filters) or 'none'}", where="filters", do="name each one once"
         )
-    for name, value in counts.items():
-        if value < 1:
-            raise InputError(f"{name} is {value}", where=name, do="give 1 or more")
-
-
-def _check_shares(**shares: float) -> None:
-    for name, value in shares.items():
-        if not 0.0 <= value < 1.0:
-            raise InputError(f"{name} is {value:g}", where=name, do="give a fraction in [0, 1)")
-
-
-def _check_sizes(**sizes: float) -> None:
-    for name, value in sizes.items():
-        if not (value >= 0.0 and np.isfinite(value)):
-            raise InputError(f"{name} is {value:g}", where=name, do="give 0 or more")
+    for names, (low, high, words) in _RANGES.items():
+        for name in names:
+            if not low <= settings[name] < high:
+                raise InputError(f"{name} is {settings[name]:g}", where=name, do=f"give {words}")

@@ -6,22 +6,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial import polynomial
 from numpy.typing import ArrayLike
 
 from bayesdist.arrays import Bool, Float, Int
+from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.exposures import ExposureLog
 from bayesdist.missions.acs.simulate.pointings import AcsFrames
 from bayesdist.missions.acs.simulate.stars import TrueStars
-from bayesdist.model import DistortionModel, PolynomialBasis
-from bayesdist.model.lookup import LookupTable, corrected
+from bayesdist.model import DistortionModel
+from bayesdist.model.lookup import LookupTable
 
 LINEAR_TERMS = ("A_1", "A_2", "A_3", "B_1", "B_2", "B_3")
-CLOSE = 1e-10  # pixels: largest error of an inverse
-EXACT = 1e-13  # step in scaled pixels at which Newton's method has converged
-STEPS = 30
+MARGIN = 0.15  # beyond the edges of a chip, in halves of it: range of the inverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +86,10 @@ class AcsTruth:
         e = self.frames.names.index(exposure)
         x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.asarray(y, float))
         chips = np.broadcast_to(np.asarray(chip), x.shape)
-        x, y = corrected(self.tables, x, y, chip=chips, filter=self.log.exposures[e].filter)
         out = np.empty((x.size, 2))
         for number in np.unique(chips):
             rows = chips == number
-            field = Field(self.model.basis(int(number)), self._on_catalog(e, int(number)))
-            out[rows] = field.at(x[rows], y[rows])
+            out[rows] = self._map(e, int(number)).at(x[rows], y[rows]).T
         return out
 
     def to_pixels(
@@ -112,22 +108,14 @@ class AcsTruth:
         x, y : ndarray, shape (N,)
             FITS 1-based pixels, to 1e-9; NaN where the position is far off the chip.
         """
-        e = self.frames.names.index(exposure)
-        field = Field(self.model.basis(chip), self._on_catalog(e, chip))
-        u, v = np.atleast_1d(np.asarray(u, float)), np.atleast_1d(np.asarray(v, float))
-        x, y = np.full(u.shape, np.nan), np.full(u.shape, np.nan)
-        near = field.near(u, v)
-        straight_x, straight_y = field.inverse(u[near], v[near])
-        filter = self.log.exposures[e].filter
-        raw_x, raw_y = straight_x.copy(), straight_y.copy()
-        for _ in range(STEPS):  # tables are flat: each step gains two digits
-            seen_x, seen_y = corrected(self.tables, raw_x, raw_y, chip=chip, filter=filter)
-            off_x, off_y = straight_x - seen_x, straight_y - seen_y
-            raw_x += off_x
-            raw_y += off_y
-            if max(np.abs(off_x).max(initial=0.0), np.abs(off_y).max(initial=0.0)) < CLOSE:
-                break
-        x[near], y[near] = raw_x, raw_y
+        chip_map = self._map(self.frames.names.index(exposure), chip)
+        sky = np.stack([np.atleast_1d(np.asarray(w, float)) for w in (u, v)])
+        centre = (np.array(chip_map.basis.size)[:, None] + 1.0) / 2.0
+        off = np.linalg.solve(chip_map.linear, sky - chip_map.at(*centre))
+        reach = (1.0 + MARGIN) * np.array(chip_map.basis.half_size)[:, None]
+        near = (np.abs(off) < reach).all(axis=0)
+        x, y = np.full(sky.shape, np.nan)
+        (x[near], y[near]), _ = chip_map.pixels(sky[:, near])
         return x, y
 
     def linear_terms(self, exposure: str, chip: int) -> Float:
@@ -168,12 +156,15 @@ class AcsTruth:
             P = P + self.model.basis(chip).from_monomials(monomial)
         return (np.eye(2) + self.frames.shared[e]) @ P
 
-    def _on_catalog(self, e: int, chip: int) -> Float:
-        """Legendre coefficients (2, K) of (u, v) in the catalogue."""
+    def _map(self, e: int, chip: int) -> ChipMap:
+        """Map of a chip in an exposure to (u, v) in the catalogue."""
         c, s = np.cos(self.frames.angle[e]), np.sin(self.frames.angle[e])
-        out: Float = self.frames.vafactor[e] * np.array([[c, -s], [s, c]]) @ self._in_gauge(e, chip)
-        out[:, 0] += self.frames.centre[e]
-        return out
+        P = self.frames.vafactor[e] * np.array([[c, -s], [s, c]]) @ self._in_gauge(e, chip)
+        P[:, 0] += self.frames.centre[e]
+        filters = ("", self.log.exposures[e].filter)  # the detector's table comes first
+        tables = [t for name in filters for t in self.tables if (t.chip, t.filter) == (chip, name)]
+        name = self.frames.names[e]
+        return ChipMap(name, self.model.basis(chip), "pix", P, chip=chip, before=tuple(tables))
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,52 +189,3 @@ class AcsCampaign:
     log: ExposureLog
     lists: tuple[Detections, ...]
     truth: AcsTruth
-
-
-class Field:
-    """Polynomial map of one chip, with Legendre coefficients (2, K), and its inverse."""
-
-    MARGIN = 0.15  # beyond the edges, in halves of the chip: range of the inverse
-
-    def __init__(self, basis: PolynomialBasis, coef: Float) -> None:
-        self.basis = basis
-        n = basis.order + 1
-        # powers[i, j, axis] of X^i Y^j
-        self.powers = np.zeros((n, n, 2))
-        i, j = np.array(basis.terms).T
-        self.powers[i, j] = basis.to_scaled_powers(coef).T
-        self.by_x = polynomial.polyder(self.powers, axis=0)
-        self.by_y = polynomial.polyder(self.powers, axis=1)
-
-    def at(self, x: Float, y: Float) -> Float:
-        """Positions (N, 2) of pixels."""
-        return self._values(*self.basis.scaled(x, y))
-
-    def _values(self, X: Float, Y: Float) -> Float:
-        return np.stack([polynomial.polyval2d(X, Y, self.powers[..., a]) for a in (0, 1)], axis=-1)
-
-    def _linear_inverse(self, u: Float, v: Float) -> Float:
-        A = np.stack([self.powers[1, 0], self.powers[0, 1]], axis=-1)
-        return np.linalg.solve(A, np.stack([u, v]) - self.powers[0, 0][:, None])
-
-    def near(self, u: Float, v: Float) -> Bool:
-        """Boolean mask of the positions (N,) that may lie on the chip."""
-        X, Y = self._linear_inverse(u, v)
-        out: Bool = np.maximum(np.abs(X), np.abs(Y)) < 1.0 + self.MARGIN
-        return out
-
-    def inverse(self, u: Float, v: Float) -> tuple[Float, Float]:
-        """Pixels of positions on or near the chip, by Newton's method."""
-        X, Y = self._linear_inverse(u, v)
-        for _ in range(STEPS):
-            off = np.stack([u, v], axis=-1) - self._values(X, Y)
-            a, c = (polynomial.polyval2d(X, Y, self.by_x[..., k]) for k in (0, 1))
-            b, d = (polynomial.polyval2d(X, Y, self.by_y[..., k]) for k in (0, 1))
-            det = a * d - b * c
-            dX = (d * off[:, 0] - b * off[:, 1]) / det
-            dY = (a * off[:, 1] - c * off[:, 0]) / det
-            X, Y = X + dX, Y + dY
-            if max(np.abs(dX).max(initial=0.0), np.abs(dY).max(initial=0.0)) < EXACT:
-                break
-        nx, ny = self.basis.size
-        return (X * nx + nx + 1.0) / 2.0, (Y * ny + ny + 1.0) / 2.0

@@ -43,11 +43,6 @@ LONGEST_DIFFERENCES = {
 PRINTED_TABLES = {"5-1": TABLE_5_1, "5-2": TABLE_5_2, "5-3": TABLE_5_3}
 
 
-def _range(low: float, high: float) -> str:
-    a, b = f"{low:.2g}", f"{high:.2g}"
-    return a if a == b else f"{a} to {b}"
-
-
 @dataclass(frozen=True)
 class RowAccount:
     """The parts of one row's sigma, and the printed row beside it."""
@@ -129,8 +124,9 @@ class RowAccount:
         if self.printed is None or self.printed_noise is None:
             return ""
         ours, theirs = self.row.value["sigma"], self.printed.value["sigma"]
+        noise = " to ".join(dict.fromkeys(f"{end:.2g}" for end in self.printed_noise))
         out = f"{ours:.4g} found, {theirs:.4g} published: "
-        out += f"noise is {self.row.sigma_noise:.2g} here and {_range(*self.printed_noise)} there"
+        out += f"noise is {self.row.sigma_noise:.2g} here and {noise} there"
         if self.partition is not None:
             out += f", the partition {self.partition:.2g} here"
         if self.verdict == "same":

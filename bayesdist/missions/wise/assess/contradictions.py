@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from bayesdist.missions.wise.assess.published import PrintedRow
-from bayesdist.missions.wise.assess.tables import WISE_ARCSEC
+from bayesdist.missions.wise.published import WISE_ARCSEC
 
 
 def contradictions_within(row: PrintedRow) -> list[str]:

@@ -15,6 +15,7 @@ from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.residuals.binned import BinnedSums, band_bins
 from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.stars import Stars
+from bayesdist.infer.stars.sums import Sums
 from bayesdist.missions.wise.assess.distortion_field import DistortionField
 
 CALIBRATED = "calibrated"
@@ -23,19 +24,14 @@ _BLOCK = 2**16  # stars
 
 
 @dataclass(frozen=True, eq=False)
-class ResidualHistogram:
+class ResidualHistogram(Sums):
     """Counts of the residuals along x and y; those of pieces of the data add."""
+
+    SAME = ("reach",)
 
     reach: float  # the bins run evenly from -reach to reach, in pixels
     counts: Int  # (2, B)
     outside: Int  # (2,), residuals beyond
-
-    def __add__(self, other: ResidualHistogram) -> ResidualHistogram:
-        if self.reach != other.reach or self.counts.shape != other.counts.shape:
-            raise ValueError("histograms over different bins do not add")
-        return ResidualHistogram(
-            self.reach, self.counts + other.counts, self.outside + other.outside
-        )
 
     @property
     def edges(self) -> Float:
@@ -79,16 +75,12 @@ def histogram(residual: Float, reach: float, bins: int = HISTOGRAM_BINS) -> Resi
 
 
 @dataclass(frozen=True, eq=False)
-class BandSums:
+class BandSums(Sums):
     """Bins and histograms of one pass over the stars of a band; parts add."""
 
     bins: BinnedSums  # of the stars that the fit used, pixels
     # of all stars; that of the calibration under `CALIBRATED`
     histograms: Mapping[str, ResidualHistogram]
-
-    def __add__(self, other: BandSums) -> BandSums:
-        both = {name: one + other.histograms[name] for name, one in self.histograms.items()}
-        return BandSums(self.bins + other.bins, both)
 
 
 def band_sums(
@@ -98,14 +90,13 @@ def band_sums(
     to_pixels: Float,
     without: Mapping[str, DistortionField],
     reach: float,
-    bins: int = 31,
+    bins: int,
 ) -> BandSums:
-    """Bins and histograms of some stars: a task for `Shards.sum`.
+    """Bins and histograms of some stars of one chip: a task for `Shards.sum`.
 
-    `stars`: of a model with one chip. `theta`: (D,), the calibration. `clip`: says which stars go
-    into the bins. `to_pixels`: (2, 2), takes residuals to pixels along x and y. `without`: what the
-    residuals are longer by in another case: the distortion itself where nothing is corrected, or
-    its difference from another model. `reach`: of the histograms, pixels. `bins`: on each axis.
+    `to_pixels` (2, 2) takes residuals to pixels along x and y; `without` is what the residuals are
+    longer by in another case: the distortion itself where nothing is corrected, or its difference
+    from another model.
     """
     residual = to_pixels @ stars.residuals(theta).T
     used = clip.keeps_of(stars)

@@ -82,15 +82,22 @@ def residual_field(bins: BinnedResiduals, *, order: int = 0) -> ResidualField:
     n = bins.count[used]
     # the square of a t variable is larger than that of a normal one
     sem = sems[:, used] * np.sqrt((n - 1) / (n - 3))
-    by_x, by_y = (legendre.legvander(scaled(c), order) for c in (bins.x, bins.y))
-    design = np.stack([(by_y[:, j, None] * by_x[:, i])[used] for i, j in terms], axis=1)
+    design = polynomials(bins.x, bins.y, used, order)
     absorbed = np.stack([np.linalg.qr(design / s[:, None])[0] for s in sem])
     means = np.stack([bins.mean_u[used], bins.mean_v[used]])
     raw = ResidualField(bins.x, bins.y, used, sem, means / sem, absorbed)
     return ResidualField(bins.x, bins.y, used, sem, raw.without_polynomial(raw.white), absorbed)
 
 
-def scaled(centres: Float) -> Float:
+def polynomials(x: Float, y: Float, used: Bool, order: int) -> Float:
+    """Columns (M, K) of Legendre products up to an order, at the used bins (ny, nx)."""
+    by_x, by_y = (legendre.legvander(_scaled(c), order) for c in (x, y))
+    return np.stack(
+        [(by_y[:, j, None] * by_x[:, i])[used] for i, j in polynomial_terms(order)], axis=1
+    )
+
+
+def _scaled(centres: Float) -> Float:
     """Centres of bins on -1 to 1."""
     middle = (centres[0] + centres[-1]) / 2
     return (centres - middle) / (centres[-1] - middle)

@@ -11,14 +11,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial import legendre
 
 from bayesdist.arrays import Float
 from bayesdist.diagnose.residuals.binned import BinnedResiduals
 from bayesdist.distributions import f_sf
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.limits import STRUCTURE
-from bayesdist.missions.wise.assess.residual_field import ResidualField, residual_field, scaled
+from bayesdist.missions.wise.assess.residual_field import (
+    ResidualField,
+    polynomials,
+    residual_field,
+)
 from bayesdist.model.basis import polynomial_terms
 
 Base = tuple[Float, Float]
@@ -124,7 +127,8 @@ def residual_partition(
     p_value = (1 + above) / (DRAWS + 1)
     if not above:
         p_value = min(p_value, len(possible) * min(_tail(field, b) for b in bases.values()))
-    smooth = _free(field, _polynomial(field, order, _freedom(bases[k])))
+    higher = _order_with(_freedom(bases[k]), order)
+    smooth = _free(field, polynomials(field.x, field.y, field.used, higher))
     rms, pattern = _described(field, bases[k])
     return ResidualPartition(
         k, float(p_value), gain, float(_gain(field, field.white, smooth)), rms, pattern
@@ -150,14 +154,12 @@ def _shares(n: int, k: int) -> tuple[Float, Float]:
     return share, share * (k * (start + end - 2 * edge) - 1)
 
 
-def _polynomial(field: ResidualField, order: int, freedom: int) -> Float:
-    """Columns (M, K) of the lowest order above the fitted one with so many more terms."""
+def _order_with(freedom: int, order: int) -> int:
+    """The lowest order above the fitted one with so many more terms."""
     had = len(polynomial_terms(order))
     while len(polynomial_terms(order)) - had < freedom:
         order += 1
-    by_x, by_y = (legendre.legvander(scaled(c), order) for c in (field.x, field.y))
-    columns = [(by_y[:, j, None] * by_x[:, i])[field.used] for i, j in polynomial_terms(order)]
-    return np.stack(columns, axis=1)
+    return order
 
 
 def _free(field: ResidualField, columns: Float) -> Base:

@@ -26,11 +26,8 @@ from bayesdist.report.drawing import draw_all, save_drawings
 from bayesdist.report.page import parts_of, template
 
 
-def write_bands(folder: Path, inputs: BandsInput) -> list[str]:
-    """Names of bands.html and its figures, once they are written into a folder.
-
-    InputError when a file cannot be written.
-    """
+def _page(inputs: BandsInput, folder: Path) -> list[str]:
+    """Names of bands.html and its figures, once they are written into a folder."""
     drawings = draw_all(BANDS, inputs, pdf=True)
     paths = save_drawings(drawings, folder / "figures")
     overview, *parts = parts_of(BANDS, inputs, drawings)
@@ -51,21 +48,15 @@ def bands_of_runs(
     runs: Sequence[str | Path],
     output: str | Path,
     *,
-    bins: int = 31,
-    optical: Sequence[str | Path] = (),
-    rotation: float = 0.0,
-    published: bool = True,
-    command: str = "",
+    bins: int,
+    optical: Sequence[str | Path],
+    rotation: float,
+    published: bool,
+    command: str,
 ) -> str:
-    """Compare bands and write everything into a new folder.
+    """Text to print, once bands are compared and everything is written into a new folder.
 
-    `runs`: finished runs, one for each band. `output`: new or empty folder.  It appears with all
-    files in it, or not at all. `bins`: of residuals, on each axis. `optical`: SIP headers or WISE
-    meta-data of an optical model: one, or one for each run. `rotation`: degrees by which that is
-    turned, from x towards y. `published`: True if WISE's bands have the values of WSDC D-T033
-    beside them. `command`: for the record. Returns the text to print. InputError for runs that are
-    not finished or do not go together, an optical model that cannot be used, and a folder that is
-    in use.
+    It appears with all files in it, or not at all.
     """
     if bins < FEWEST_BINS:
         raise InputError(
@@ -86,7 +77,7 @@ def bands_of_runs(
             published=published,
             provenance={"command": command, **record["versions"]},
         )
-        files = [*write_tables(inputs, folder), *_meta(bands, folder), *write_bands(folder, inputs)]
+        files = [*write_tables(inputs, folder), *_meta(bands, folder), *_page(inputs, folder)]
         record |= record_of(inputs) | {"files": files}
     return _text(Path(output), inputs)
 

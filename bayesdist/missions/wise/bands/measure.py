@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
 from bayesdist.assess import uncertainty_map
-from bayesdist.diagnose.residuals.binned import BinnedSums
-from bayesdist.diagnose.residuals.tables import StatisticsTable
 from bayesdist.missions.wise.assess.account import PRINTED_BINS, accounts, partition_parts
 from bayesdist.missions.wise.assess.distortion_field import DistortionField, field_of_solution
 from bayesdist.missions.wise.assess.histograms import band_sums
 from bayesdist.missions.wise.assess.published import implied_sigma
 from bayesdist.missions.wise.assess.residual_correlation import residual_correlation
 from bayesdist.missions.wise.assess.residual_structure import residual_partition
-from bayesdist.missions.wise.assess.tables import (
-    band_to_band_table,
-    fitting_table,
-    multiframe_table,
-)
+from bayesdist.missions.wise.assess.tables import residual_tables
 from bayesdist.missions.wise.bands.context import BandResult, BandsInput, Printed
 from bayesdist.missions.wise.bands.inputs import BandRun
 from bayesdist.missions.wise.bands.optical import OpticalModel
@@ -59,7 +53,12 @@ def measure_bands(
         for name, run in runs.items()
     )
     arcsec = {b.name: b.arcsec for b in bands}
-    tables = _tables(bands)
+    tables = residual_tables(
+        {b.name: b.sums.bins for b in bands},
+        rng=np.random.default_rng(SEED),
+        arcsec=arcsec,
+        absorbed={b.name: len(polynomial_terms(b.order)) for b in bands},
+    )
     first, *others = bands
     return BandsInput(
         bands=bands,
@@ -150,34 +149,3 @@ def _printed(band: str, field: DistortionField) -> Printed:
         FORMAL_RADII[band],
         implied_sigma(FORMAL_RADII[band], SAMPLE_SIZES[band], order=field.basis.order),
     )
-
-
-def _tables(bands: tuple[BandResult, ...]) -> dict[str, StatisticsTable]:
-    """Tables 5-1 to 5-3; rows band by band, as the orders of the bands may differ."""
-    rng = np.random.default_rng(SEED)
-    arcsec = {b.name: b.arcsec for b in bands}
-    terms = {b.name: len(polynomial_terms(b.order)) for b in bands}
-
-    def rows(
-        function: Callable[..., StatisticsTable], *several: BandResult, **options: object
-    ) -> StatisticsTable:
-        sums: dict[str, BinnedSums] = {b.name: b.sums.bins for b in several}
-        absorbed = max(terms[b.name] for b in several)
-        return function(sums, rng=rng, absorbed=absorbed, **options)
-
-    pairs = [(a, b) for i, a in enumerate(bands) for b in bands[i + 1 :]]
-    made = {
-        "5-1": [rows(fitting_table, b) for b in bands],
-        "5-2": [rows(band_to_band_table, a, b, arcsec=arcsec) for a, b in pairs],
-        "5-3": [rows(multiframe_table, b, arcsec=arcsec) for b in bands],
-    }
-    return {
-        name: StatisticsTable(
-            several[0].title,
-            several[0].first,
-            several[0].unit,
-            tuple(row for table in several for row in table.rows),
-        )
-        for name, several in made.items()
-        if several
-    }

@@ -42,21 +42,15 @@ def bring_up_files(
     band: str,
     radius: float,
     corner_radius: float,
-    order: int = 4,
-    optical: str | Path | None = None,
-    rotation: float = 0.0,
-    command: str = "",
+    order: int,
+    optical: str | Path | None,
+    rotation: float,
+    command: str,
 ) -> str:
-    """Write the pairs that matching and fitting in turn arrive at, and a table of the rounds.
+    """Text to print, once the pairs that matching and fitting in turn arrive at are written.
 
-    `detections`, `reference`: Tables with columns x, y, sigma and frame: detections in pixels,
-    reference stars where an array without distortion would see them in the frame, in pixels too.
-    `output`: new folder: pairs/ for `format = "rvb"`, rounds.ecsv. `radius`, `corner_radius`:
-    within which pairs are accepted, in the array's centre and in its corners; pixels. `order`: of
-    the polynomial in the end. `optical`: SIP header or WISE meta-data to begin with; by default no
-    distortion. `rotation`: degrees by which that is turned, from x towards y. `command`: for the
-    record. Returns the text to print. InputError for what cannot be read or written, and as
-    `bring_up`.
+    The reference stars stand where an array without distortion would see them in the frame, in
+    pixels. The new folder has pairs/ for `format = "rvb"`, and rounds.ecsv.
     """
     band = band_name(band)
     array = WISE_ARRAYS[band]

@@ -34,7 +34,7 @@ class RvbBlock(Section):
                 "give the lower limit first"
             )
         for name in ("accept", "accept_chi2"):
-            given = [f"{name}_{end}" for end in ("centre", "corner") if self._at(name, end)]
+            given = [key for key in (f"{name}_centre", f"{name}_corner") if getattr(self, key)]
             if len(given) == 1:
                 raise ValueError(
                     f"data.rvb.{given[0]} stands alone; give {name}_centre and {name}_corner, "
@@ -45,12 +45,12 @@ class RvbBlock(Section):
     @property
     def offset(self) -> RadialLimit | None:
         """Limit on the distance of the reference position from the detection, in pixels."""
-        return self._limit("accept")
+        return self._limit(self.accept_centre, self.accept_corner)
 
     @property
     def chi2(self) -> RadialLimit | None:
         """Limit on the chi-square of that distance; a pair beyond both counts under the first."""
-        return self._limit("accept_chi2")
+        return self._limit(self.accept_chi2_centre, self.accept_chi2_corner)
 
     @property
     def takes_all(self) -> bool:
@@ -62,16 +62,10 @@ class RvbBlock(Section):
         """True if a pair needs a colour."""
         return self.colour is not None or self.bluest is not None
 
-    def _limit(self, name: str) -> RadialLimit | None:
-        centre, corner = (self._at(name, end) for end in ("centre", "corner"))
+    def _limit(self, centre: float | None, corner: float | None) -> RadialLimit | None:
         if centre is None or corner is None:
             return None
         return RadialLimit(centre, corner, self.accept_power)
-
-    def _at(self, name: str, end: str) -> float | None:
-        """Limit at one end of the radius, the array's centre or its corners."""
-        value: float | None = getattr(self, f"{name}_{end}")
-        return value
 
 
 class RvbData(Data):

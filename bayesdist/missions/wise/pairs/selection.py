@@ -16,7 +16,6 @@ from bayesdist.data.columns.labels import merged_counts
 from bayesdist.data.matches import Matches
 from bayesdist.data.tables.checks import counted
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.pairs.radial_limit import CHI2, OFFSET, radial_rows
 from bayesdist.missions.wise.pairs.rvb_pairs import (
     COLOUR,
     NO_COLOUR,
@@ -26,6 +25,8 @@ from bayesdist.missions.wise.pairs.rvb_pairs import (
 )
 from bayesdist.missions.wise.pairs.section import RvbBlock
 
+OFFSET = "offset beyond the radial limit"
+CHI2 = "chi-square beyond the radial limit"
 MOST_COLOURS = 100_000_000  # rows whose colours are compared with each other, 1.6 GB of them
 
 
@@ -76,16 +77,32 @@ class SelectedPairs:
 
     def _rules(self, pairs: RvbPairs, bluest: Bool | None) -> Mapping[str, Bool]:
         """Boolean masks of the pairs that pass, by the reason to drop the others."""
-        rules = {}
+        rules: dict[str, Bool] = {}
         if self.selection.by_colour:
             right = self._right_colour(pairs)
             if bluest is not None:
                 right = right & bluest[self.n_rows : self.n_rows + len(pairs)]
             rules = {NO_COLOUR: ~np.isnan(colours_of(pairs)), COLOUR: right}
-        offset, chi2 = self.selection.offset, self.selection.chi2
-        if offset is not None or chi2 is not None:
-            near, likely = radial_rows(pairs.matches, self.size, offset=offset, chi2=chi2)
-            rules |= {OFFSET: near, CHI2: likely}
+        offset, chi2, matches = self.selection.offset, self.selection.chi2, pairs.matches
+        where = ", ".join(matches.sources)
+        if matches.unit != "pix" and (offset is not None or chi2 is not None):
+            raise InputError(
+                f"u, v are in {matches.unit}, and offsets are judged in pixels",
+                where=where,
+                do="bring u, v to pixels of the array",
+            )
+        du, dv = matches.u - matches.x, matches.v - matches.y
+        if offset is not None:
+            rules[OFFSET] = np.hypot(du, dv) <= offset.at(matches.x, matches.y, self.size)
+        if chi2 is not None:
+            if matches.sigma_u is None or matches.sigma_v is None:
+                raise InputError(
+                    "a limit on chi-square needs errors",
+                    where=where,
+                    do="map sigma_u and sigma_v, or limit the offset alone",
+                )
+            value = (du / matches.sigma_u) ** 2 + (dv / matches.sigma_v) ** 2
+            rules[CHI2] = value <= chi2.at(matches.x, matches.y, self.size)
         return rules
 
     def _right_colour(self, pairs: RvbPairs) -> Bool:

@@ -33,14 +33,10 @@ SOLUTION_ALIASES: dict[str, tuple[str, ...]] = {
 def read_solutions(
     path: str | os.PathLike[str], *, centre: tuple[float, float]
 ) -> dict[str, RvbTransform]:
-    """Solutions of the frames of one band, as `rereference` takes them.
+    """Solutions of the frames of one band, solved about a centre, as `rereference` takes them.
 
-    `path`: an IPAC table or any other that `read_matches` knows, with a row for each frame, the
-    column frame, and some of shift_u shift_v rotation scale_u scale_v skew. `centre`: point about
-    which the frames were solved: the centre of the array, FITS 1-based pixels. A parameter without
-    a column is zero in all frames; scales are relative to one, the rotation in radians unless the
-    column has a unit. InputError for a missing column of frames, no parameter at all, a frame that
-    stands twice, and for what is no number.
+    A parameter without a column is zero in all frames; scales are relative to one, the rotation in
+    radians unless the column has a unit.
     """
     file = Path(path)
     table = read_table(file)
@@ -90,22 +86,18 @@ def transform_files(
     files: Sequence[str | Path],
     output: str | Path,
     *,
-    band: str | None = None,
-    columns: Mapping[str, str] | None = None,
-    dx: float = 0.0,
-    dy: float = 0.0,
-    rotation: float = 0.0,
-    scale_x: float = 0.0,
-    scale_y: float = 0.0,
-    fit: bool = False,
+    band: str | None,
+    columns: Mapping[str, str] | None,
+    dx: float,
+    dy: float,
+    rotation: float,
+    scale_x: float,
+    scale_y: float,
+    fit: bool,
 ) -> str:
-    """Pairs with all reference positions moved by one linear transformation.
+    """Text to print, once pairs with all reference positions moved alike are in a new folder.
 
-    `output`: new folder. `band`: needed where the files hold several. `columns`: as `stream_rvb`.
-    `dx`, `dy`: pixels. `rotation`: degrees, from x towards y. `scale_x`, `scale_y`: relative to
-    one. `fit`: the five parameters are those that bring reference positions to the detections, by
-    least squares. Returns the text to print. InputError for no transformation, one that is both
-    given and to be fitted, and as `stream_rvb`, `transformed` and `write_rvb`.
+    With `fit` the five parameters are those that bring reference positions to the detections.
     """
     transform = RvbTransform(dx, dy, radians(rotation), scale_x, scale_y)
     if (transform == RvbTransform()) != fit:
@@ -139,15 +131,10 @@ def rereference_files(
     *,
     free: str | Path,
     fixed: str | Path,
-    band: str | None = None,
-    columns: Mapping[str, str] | None = None,
+    band: str | None,
+    columns: Mapping[str, str] | None,
 ) -> str:
-    """Pairs brought from the frame solutions that they were made with to others.
-
-    `output`: new folder. `free`, `fixed`: Tables of solutions: those of the pairs, and those that
-    they are brought to. `band`, `columns`: as of `transform_files`. Returns the text to print.
-    InputError as `stream_rvb`, `read_solutions`, `rereference` and `write_rvb`.
-    """
+    """Text to print, once pairs are brought from the solutions `free` of their frames to others."""
     columns = columns or {}
     band = _band(files, band, columns)
     old, new = (read_solutions(path, centre=WISE_ARRAYS[band].centre) for path in (free, fixed))

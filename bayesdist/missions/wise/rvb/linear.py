@@ -12,6 +12,7 @@ import numpy as np
 from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
+from bayesdist.infer.stars.sums import Sums
 from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform
 
 FREE = 5  # parameters that are fitted, the first of `PARAMETERS`
@@ -20,8 +21,10 @@ _RANK = 1e-12  # eigenvalues of the unit-diagonal normal matrix below this are z
 
 
 @dataclass(frozen=True, eq=False)
-class LinearMoments:
+class LinearMoments(Sums):
     """All that pairs say about a linear transformation: sums, which add over pieces of the data."""
+
+    SAME = ("centre",)
 
     # (2, 3, 3), sum of w p p^T with p = (1, u - centre, v - centre), for the axes x and y
     weight: Float
@@ -29,17 +32,6 @@ class LinearMoments:
     chi2: float  # sum of w times the squared offsets
     n: int  # pairs
     centre: tuple[float, float]
-
-    def __add__(self, other: LinearMoments) -> LinearMoments:
-        if self.centre != other.centre:
-            raise ValueError("moments about different centres do not add")
-        return LinearMoments(
-            self.weight + other.weight,
-            self.right + other.right,
-            self.chi2 + other.chi2,
-            self.n + other.n,
-            self.centre,
-        )
 
 
 def linear_moments(matches: Matches, centre: tuple[float, float]) -> LinearMoments:
