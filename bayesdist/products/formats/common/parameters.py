@@ -27,10 +27,11 @@ from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products.formats.common.cards import named_in
-from bayesdist.products.formats.common.content import Content, Hdu, hdus_of
+from bayesdist.products.formats.common.content import Content, Hdu, fits_bytes
 
 EXTENSION = "BDPARAM"
 AGREE = 1e-6  # pixels by which numbers that were printed may differ from the parameters
+_SLACK = 1e-9  # pixels: rounding of a check itself
 _GRID = 33  # points of each axis over which two calibrations are compared
 _PLANES = ("free", "sky", "detector", "aperture")
 _ERRORS = ("covariance", "sigma", "none")
@@ -88,8 +89,7 @@ def parameters_hdu(calibration: Calibration, epoch: float | None = None) -> fits
 
 def parameters_content(calibration: Calibration, epoch: float | None = None) -> bytes:
     """FITS file with the table alone."""
-    made = hdus_of([fits.PrimaryHDU(), parameters_hdu(calibration, epoch)])
-    return b"".join(hdu.to_bytes() for hdu in made)
+    return fits_bytes([fits.PrimaryHDU(), parameters_hdu(calibration, epoch)])
 
 
 def stored_in(content: Content) -> Hdu | None:
@@ -183,6 +183,16 @@ def agreeing(stored: Calibration, read: Calibration, pixels: float) -> Calibrati
             do="keep together what was written together",
         )
     return replace(stored, name=read.name, before=read.before, after=read.after, notes=read.notes)
+
+
+def refuse_changed(off: float, header: fits.Header, where: str) -> None:
+    """Refuse tables that are farther from the parameters of their file than its header states."""
+    if not off <= 1.5 * float(header.get("BDWORST", 0.0)) + _SLACK:
+        raise FormatError(
+            f"its tables are off by {off:.2g} pixels from its parameters: one was changed",
+            where=where,
+            do="write the file again",
+        )
 
 
 def with_parameters(found: Calibration, content: Content | None, named: str) -> Calibration:
