@@ -70,6 +70,11 @@ class Calibration:
         """Chip numbers, the reference chip first."""
         return tuple(chip.number for chip in self.model.chips)
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Notes for the reader, that on the plane included."""
+        return tuple(note for note in (*self.notes, self.plane.note) if note)
+
     # -- forward ----------------------------------------------------------------------------------
 
     def at(self, epoch: float | None = None, *, origin: str = "reference") -> dict[int, ChipMap]:

@@ -283,7 +283,7 @@ def sampling_of(solution: Solution) -> tuple[float, tuple[str, ...]]:
 
 
 def fitted_map(
-    positions: Callable[[Float, Float], tuple[Float, Float]],
+    positions: Callable[[Float, Float], Float | tuple[Float, Float]],
     name: str,
     *,
     order: int,
@@ -295,7 +295,7 @@ def fitted_map(
 ) -> ChipMap:
     """Map with the values of a function from pixels to (u, v) that is a polynomial.
 
-    `positions` takes FITS 1-based pixels x, y (N,) to u, v (N,), a polynomial of total order
+    `positions` takes FITS 1-based pixels x, y (N,) to u and v (2, N), a polynomial of total order
     `order`; `monomial_cov` (2 K, 2 K) is of the coefficients of (x - xref)^i (y - yref)^j, u before
     v; other arguments as in `PolynomialBasis` and `ChipMap`.
     """
@@ -309,7 +309,7 @@ def fitted_map(
     # products of two terms have twice the order, for which so many nodes are exact
     x, y, weight = Chip(1, "", size, reference_pixel).quadrature(order + 1)
     norm = basis.mean_squares * weight.sum()
-    coefficients = (np.stack(positions(x, y)) * weight) @ basis.evaluate(x, y) / norm
+    coefficients = (np.asarray(positions(x, y)) * weight) @ basis.evaluate(x, y) / norm
     cov = None
     if monomial_cov is not None:
         back = np.kron(np.eye(2), basis.from_monomials(np.eye(basis.n_terms)).T)

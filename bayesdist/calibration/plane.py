@@ -11,6 +11,12 @@ from bayesdist.infer.solution import Solution
 
 ARCSEC = {"arcsec": 1.0, "mas": 1e-3, "deg": 3600.0}
 
+
+def arcsec_per(unit: str, scale_arcsec: float | None) -> float:
+    """Arcseconds in one unit of (u, v); pixels of unknown size count as arcseconds."""
+    return ARCSEC[unit] if unit != "pix" else (scale_arcsec or 1.0)
+
+
 PARAMETERS = ("shift_x", "shift_y", "log_scale", "angle")
 
 

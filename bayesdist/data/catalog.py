@@ -22,9 +22,10 @@ from bayesdist.data.tables.checks import (
     check_columns,
     columns_of,
     refuse_half,
+    row_number,
     without_missing,
 )
-from bayesdist.data.tables.column import Quantities, SourceColumn, row_number
+from bayesdist.data.tables.column import Quantities, SourceColumn
 from bayesdist.data.tables.names import ALIASES, find_columns
 from bayesdist.data.tables.units import check_unit
 from bayesdist.errors import InputError

@@ -15,8 +15,8 @@ from bayesdist.data.matches import Matches
 from bayesdist.data.reading.columns import columns_read, is_on_sky, match_columns
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky.positions import MOTIONS, SPARED, sky_columns
-from bayesdist.data.tables.checks import absent, without_missing
-from bayesdist.data.tables.column import Quantities, row_number
+from bayesdist.data.tables.checks import absent, row_number, without_missing
+from bayesdist.data.tables.column import Quantities
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns
 from bayesdist.errors import InputError
 

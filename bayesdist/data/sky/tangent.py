@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesdist.arrays import Float
-from bayesdist.data.tables.column import Place, row_number
+from bayesdist.data.tables.checks import Place, row_number
 from bayesdist.errors import InputError
 
 ARCSEC = np.degrees(1.0) * 3600.0  # seconds of arc in a radian

@@ -14,7 +14,13 @@ from bayesdist.errors import InputError
 NOT_FINITE = ("refuse", "reject")
 # of a value, and of an error: the square of one over that of the other is still a number
 LARGEST, SMALLEST = 1e30, 1e-100
+Place = Callable[[int], str]  # name of a row in an error, by its index in the arrays
 COMPLETED: Any = None  # default of what a table of columns fills in itself: then it is there
+
+
+def row_number(index: int) -> str:
+    """Name of a row, counted from 1."""
+    return f"row {index + 1}"
 
 
 def one_length(

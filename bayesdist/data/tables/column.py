@@ -14,21 +14,15 @@ from astropy.time import Time
 from numpy.typing import NDArray
 
 from bayesdist.arrays import Float, Int
-from bayesdist.data.tables.checks import absent
+from bayesdist.data.tables.checks import Place, absent, row_number
 from bayesdist.data.tables.names import known_unit
 from bayesdist.data.tables.units import conversion, unit_of
 from bayesdist.errors import InputError
 
 log = logging.getLogger("bayesdist")
 
-Place = Callable[[int], str]  # name of a row in an error, by its index in the arrays
 Array = TypeVar("Array", Float, Int)
 _YEARS = (1800.0, 2200.0)  # epochs outside are a wrong unit, not a date
-
-
-def row_number(index: int) -> str:
-    """Name of a row, counted from 1."""
-    return f"row {index + 1}"
 
 
 def encoded(values: NDArray[Any], *, ordered: bool = False) -> tuple[Int, tuple[Any, ...]]:

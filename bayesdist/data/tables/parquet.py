@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bayesdist.arrays import Int
-from bayesdist.data.tables.column import EncodedColumn, Place
+from bayesdist.data.tables.checks import Place
+from bayesdist.data.tables.column import EncodedColumn
 from bayesdist.errors import InputError
 from bayesdist.reading.faults import naming_faults
 from bayesdist.reading.parquet import open_parquet, parquet_column, parquet_units

@@ -12,7 +12,8 @@ from bayesdist.app.screen import table_text
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.arrays import Float
 from bayesdist.data.detections import Detections
-from bayesdist.data.tables.column import SourceColumn, row_number
+from bayesdist.data.tables.checks import row_number
+from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import find_columns
 from bayesdist.data.tables.repeated import first_duplicate
 from bayesdist.errors import InputError

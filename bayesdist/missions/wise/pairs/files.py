@@ -12,7 +12,8 @@ from astropy.table import Table
 from bayesdist.arrays import Float, Int
 from bayesdist.data.batches import BATCH
 from bayesdist.data.formats.files import input_files
-from bayesdist.data.tables.column import Columns, Place, SourceColumn, row_number
+from bayesdist.data.tables.checks import Place, row_number
+from bayesdist.data.tables.column import Columns, SourceColumn
 from bayesdist.data.tables.names import BASIC, find_columns
 from bayesdist.data.tables.parquet import ParquetPart, describe_part
 from bayesdist.errors import InputError

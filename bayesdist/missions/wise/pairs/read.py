@@ -18,7 +18,8 @@ from bayesdist.arrays import Bool
 from bayesdist.data.matches import Matches
 from bayesdist.data.reading.columns import match_columns
 from bayesdist.data.reading.options import ReadOptions, check_sigma, refuse_missing_errors
-from bayesdist.data.tables.column import Columns, Place, Quantities, SourceColumn
+from bayesdist.data.tables.checks import Place
+from bayesdist.data.tables.column import Columns, Quantities, SourceColumn
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs.files import (
     MAGNITUDES,

@@ -13,7 +13,7 @@ from typing import Any
 from bayesdist.app.kinds.matches.sources import MatchSource, is_large
 from bayesdist.app.store.rundir import PAIRS, RunDirectory, part_files
 from bayesdist.data import Matches, open_matches, write_partitioned
-from bayesdist.data.tables.column import Place
+from bayesdist.data.tables.checks import Place
 from bayesdist.data.tables.names import ALIASES
 from bayesdist.data.tables.parquet import ParquetPart
 from bayesdist.errors import InputError

@@ -7,7 +7,7 @@ Comments of the form ``# bayesdist KEY VALUE`` say more, which AST passes over.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from bayesdist.errors import FormatError, InputError
 from bayesdist.model.basis import MAX_ORDER
 from bayesdist.products.formats.ast.mapping import Step, parse_dump, steps_of
 from bayesdist.products.formats.common.content import Content
-from bayesdist.products.formats.common.document import MissingSizeError
+from bayesdist.products.formats.common.document import Choice, required_size
 from bayesdist.products.formats.common.parameters import with_parameters
 
 _REMARK = re.compile(r"#\s*bayesdist\s+(\w+)\s+(.*?)\s*$", re.MULTILINE)
@@ -78,17 +78,11 @@ def ast_of(content: Content) -> AstFile | None:
     return AstFile(content, steps, remarks)
 
 
-def ast_calibration(
-    file: AstFile,
-    name: str,
-    *,
-    size: tuple[float, float] | None = None,
-    as_used: bool = False,
-) -> Calibration:
+def ast_calibration(file: AstFile, name: str, choice: Choice) -> Calibration:
     """Calibration of the mapping, with the covariance of the file beside it if that is there.
 
-    `size` is columns and rows, for files without remarks (else MissingSizeError);
-    with `as_used` nothing but the mapping counts.
+    As used, nothing but the mapping counts.  MissingSizeError for files without remarks where no
+    size is chosen.
     """
     order = file.order
     if order > MAX_ORDER:
@@ -97,28 +91,26 @@ def ast_calibration(
             where=name,
             do=f"give those up to order {MAX_ORDER} by themselves",
         )
-    found = file.size or size
-    if found is None:
-        raise MissingSizeError(
-            "does not say how large the detector is", where=name, do="give it by --size NX NY"
-        )
+    size = required_size(file.size, choice.size, name, "detector")
     unit = file.remarks.get("unit", "arcsec")
     factor = 3600.0 / float(file.remarks.get("arcsec", ARCSEC.get(unit, 1.0)))
-    reference = file._pair("reference") or ((found[0] + 1) / 2, (found[1] + 1) / 2)
-
-    def positions(x: Float, y: Float) -> tuple[Float, Float]:
-        u, v = file.degrees(x, y)
-        return factor * u, factor * v
-
-    one = fitted_map(positions, name, order=order, size=found, reference_pixel=reference, unit=unit)
-    kind, point = file.remarks.get("plane", "free"), file._pair("point")
-    numbered = "chip" in file.remarks
-    number = int(file.remarks.get("chip", 1))
-    made = calibration_of_maps(
-        {number: one}, name, plane=Plane(kind, point=point), numbered=numbered
+    reference = file._pair("reference") or ((size[0] + 1) / 2, (size[1] + 1) / 2)
+    one = fitted_map(
+        lambda x, y: factor * np.stack(file.degrees(x, y)),
+        name,
+        order=order,
+        size=size,
+        reference_pixel=reference,
+        unit=unit,
     )
-    if not file.remarks:
-        made = replace(made, notes=("pixels are counted from 0, positions in degrees",))
-    if as_used:
+    kind, point = file.remarks.get("plane", "free"), file._pair("point")
+    made = calibration_of_maps(
+        {int(file.remarks.get("chip", 1)): one},
+        name,
+        plane=Plane(kind, point=point),
+        numbered="chip" in file.remarks,
+        notes=() if file.remarks else ("pixels are counted from 0, positions in degrees",),
+    )
+    if choice.as_used:
         return made
     return with_parameters(made, file.content.beside(file.side_file), file.side_file)

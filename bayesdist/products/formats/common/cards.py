@@ -9,8 +9,10 @@ from textwrap import wrap
 
 from astropy.io import fits
 
+from bayesdist.arrays import Float
 from bayesdist.errors import FormatError
 from bayesdist.infer.solution import Solution
+from bayesdist.model import LookupTable
 
 _UNPRINTABLE = re.compile(r"[^ -~]")  # a header has printable ASCII alone
 # Without one of these nothing ties pixels to a world.
@@ -59,6 +61,72 @@ def convergence_cards(solution: Solution) -> list[str]:
         text_card("BDCONV", "NO", "has the sampler converged?"),
         text_card("COMMENT", "NOT CONVERGED: provisional, not to be released."),
     ]
+
+
+def tangent_cards(
+    ctype: tuple[str, str],
+    crval: tuple[float, float],
+    crpix: tuple[float, float],
+    cd: Float,
+    comment: str = "",
+) -> list[str]:
+    """Cards of world coordinates on a tangent plane in degrees, with a comment on its type."""
+    return [
+        number_card("WCSAXES", 2),
+        text_card("CTYPE1", ctype[0], comment),
+        text_card("CTYPE2", ctype[1]),
+        text_card("CUNIT1", "deg"),
+        text_card("CUNIT2", "deg"),
+        text_card("RADESYS", "ICRS"),
+        *(number_card(f"CRVAL{k}", float(v), "[deg]") for k, v in enumerate(crval, 1)),
+        *(number_card(f"CRPIX{k}", float(v), "[pix]") for k, v in enumerate(crpix, 1)),
+        *(
+            number_card(f"CD{i + 1}_{j + 1}", float(cd[i, j]), "[deg/pix]")
+            for i in (0, 1)
+            for j in (0, 1)
+        ),
+        number_card("LONPOLE", 180.0, "[deg] north is up also at a pole"),
+    ]
+
+
+def solution_cards(
+    plane: str,
+    unit: str,
+    arcsec: float,
+    chip: int,
+    size: tuple[float, float],
+    epoch: float | None = None,
+) -> list[str]:
+    """Cards of what degrees on the sky do not tell of a solution: plane, unit, chip, date, size."""
+    dated = [] if epoch is None else [("BDEPOCH", float(epoch), "[yr] date of the coefficients")]
+    return [
+        text_card("BDPLANE", plane, "plane of u, v"),
+        text_card("BDUNIT", unit, "unit of u, v in the solution"),
+        number_card("BDARCS", float(arcsec), "[arcsec] in one of these units"),
+        number_card("BDCHIP", chip, "chip number"),
+        *(number_card(*card) for card in dated),
+        number_card("IMAGEW", int(size[0]), "[pix] columns of the detector"),
+        number_card("IMAGEH", int(size[1]), "[pix] rows of the detector"),
+    ]
+
+
+def node_cards(table: LookupTable) -> list[str]:
+    """Cards of the pixels at which the nodes of a table lie."""
+    return [
+        number_card(f"{keyword}{axis + 1}", float(value), comment)
+        for axis in (0, 1)
+        for keyword, value, comment in (
+            ("CRPIX", 1.0, "node, from 1"),
+            ("CRVAL", table.first[axis], "[pixel] of that node, from 1"),
+            ("CDELT", table.step[axis], "[pixel] between nodes"),
+        )
+    ]
+
+
+def append_cards(hdu: fits.hdu.base._BaseHDU, cards: Iterable[str]) -> None:
+    """Add cards to the end of a header, numbers with all their digits."""
+    for card in cards:
+        hdu.header.append(fits.Card.fromstring(card), end=True)
 
 
 def keyword_of(card: str) -> str:

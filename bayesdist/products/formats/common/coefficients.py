@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from math import comb
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -26,6 +27,7 @@ from numpy.typing import ArrayLike
 
 from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError
+from bayesdist.model import polynomial_terms
 
 Coefficients = Mapping[tuple[int, int], float]
 
@@ -83,6 +85,20 @@ def evaluate(
     """Values of a polynomial, without terms above the total `order`."""
     x, y = np.asarray(x, float), np.asarray(y, float)
     return polynomial.polyval2d(x, y, coefficient_matrix(coefficients, order))
+
+
+def substitution(order: int, M: Float) -> Float:
+    """Matrix (K, K) whose column k has the powers of (X, Y) of term k in (x, y) = M (X, Y)."""
+    terms = polynomial_terms(order)
+    index = {term: k for k, term in enumerate(terms)}
+    out = np.zeros((len(terms), len(terms)))
+    for k, (i, j) in enumerate(terms):
+        for a in range(i + 1):
+            for b in range(j + 1):
+                by_x = comb(i, a) * M[0, 0] ** a * M[0, 1] ** (i - a)
+                by_y = comb(j, b) * M[1, 0] ** b * M[1, 1] ** (j - b)
+                out[index[a + b, i + j - a - b], k] += by_x * by_y
+    return out
 
 
 def propagated_sigma(jacobian: Float, cov: Float) -> Float:

@@ -214,11 +214,16 @@ def read_hdus(path: str | os.PathLike[str]) -> tuple[Hdu, ...]:
     return read_content(path).whole()
 
 
-def hdus_of(made: Iterable[fits.hdu.base.ExtensionHDU | fits.PrimaryHDU]) -> tuple[Hdu, ...]:
-    """HDUs that astropy made, with the bytes that it writes."""
+def fits_bytes(made: Iterable[fits.hdu.base.ExtensionHDU | fits.PrimaryHDU]) -> bytes:
+    """FITS file of HDUs that astropy made."""
     stream = io.BytesIO()
     fits.HDUList(list(made)).writeto(stream)
-    return Content("new file", stream.getvalue()).whole()
+    return stream.getvalue()
+
+
+def hdus_of(made: Iterable[fits.hdu.base.ExtensionHDU | fits.PrimaryHDU]) -> tuple[Hdu, ...]:
+    """HDUs that astropy made, with the bytes that it writes."""
+    return Content("new file", fits_bytes(made)).whole()
 
 
 def write_hdus(hdus: Iterable[Hdu], path: str | os.PathLike[str]) -> None:

@@ -76,6 +76,21 @@ class MissingSizeError(InputError):
     """Error of a file that does not state the size of its image."""
 
 
+def required_size(
+    stated: tuple[float, float] | None,
+    given: tuple[float, float] | None,
+    name: str,
+    what: str = "image",
+) -> tuple[float, float]:
+    """Columns and rows that a file states, else those given; MissingSizeError without either."""
+    found = given if stated is None else stated
+    if found is None:
+        raise MissingSizeError(
+            f"does not say how large the {what} is", where=name, do="give it by --size NX NY"
+        )
+    return float(found[0]), float(found[1])
+
+
 @dataclass(frozen=True)
 class Choice:
     """Choice among the calibrations of a file, and values that the file may lack."""

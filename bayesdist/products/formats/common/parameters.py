@@ -14,6 +14,7 @@ BDSIGVn of u and v.  Look-up tables are not part of it: they stand in the file b
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -27,10 +28,11 @@ from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products.formats.common.cards import named_in
-from bayesdist.products.formats.common.content import Content, Hdu, hdus_of
+from bayesdist.products.formats.common.content import Content, Hdu, fits_bytes
 
 EXTENSION = "BDPARAM"
 AGREE = 1e-6  # pixels by which numbers that were printed may differ from the parameters
+_SLACK = 1e-9  # pixels: rounding of a check itself
 _GRID = 33  # points of each axis over which two calibrations are compared
 _PLANES = ("free", "sky", "detector", "aperture")
 _ERRORS = ("covariance", "sigma", "none")
@@ -88,8 +90,7 @@ def parameters_hdu(calibration: Calibration, epoch: float | None = None) -> fits
 
 def parameters_content(calibration: Calibration, epoch: float | None = None) -> bytes:
     """FITS file with the table alone."""
-    made = hdus_of([fits.PrimaryHDU(), parameters_hdu(calibration, epoch)])
-    return b"".join(hdu.to_bytes() for hdu in made)
+    return fits_bytes([fits.PrimaryHDU(), parameters_hdu(calibration, epoch)])
 
 
 def stored_in(content: Content) -> Hdu | None:
@@ -163,10 +164,20 @@ def largest_difference(a: Calibration, b: Calibration) -> float:
     return worst
 
 
-def agreeing(stored: Calibration, read: Calibration, pixels: float) -> Calibration:
+def refuse_other(far: float, most: float, where: str) -> None:
+    """Refuse parameters from which a file that was read is farther than `most` pixels."""
+    if not far <= most:
+        raise FormatError(
+            f"the parameters beside it are off by {far:.2g} pixels: one of the two was changed",
+            where=where,
+            do="keep together what was written together",
+        )
+
+
+def agreeing(stored: Calibration, read: Calibration) -> Calibration:
     """Stored calibration, after a check that a file that was read says the same.
 
-    FormatError where chips or unit are others, or positions differ by more than so many pixels.
+    FormatError where chips or unit are others, or positions differ.
     """
     chips = [(c.number, c.size) for c in stored.model.chips]
     if chips != [(c.number, c.size) for c in read.model.chips] or stored.unit != read.unit:
@@ -175,25 +186,34 @@ def agreeing(stored: Calibration, read: Calibration, pixels: float) -> Calibrati
             where=read.name,
             do="keep together what was written together",
         )
-    far = largest_difference(stored, read)
-    if not far <= pixels:
-        raise FormatError(
-            f"the parameters beside it are off by {far:.2g} pixels: one of the two was changed",
-            where=read.name,
-            do="keep together what was written together",
-        )
+    refuse_other(largest_difference(stored, read), AGREE, read.name)
     return replace(stored, name=read.name, before=read.before, after=read.after, notes=read.notes)
 
 
-def with_parameters(found: Calibration, content: Content | None, named: str) -> Calibration:
+def refuse_changed(off: float, header: fits.Header, where: str) -> None:
+    """Refuse tables that are farther from the parameters of their file than its header states."""
+    if not off <= 1.5 * float(header.get("BDWORST", 0.0)) + _SLACK:
+        raise FormatError(
+            f"its tables are off by {off:.2g} pixels from its parameters: one was changed",
+            where=where,
+            do="write the file again",
+        )
+
+
+def with_parameters(
+    found: Calibration,
+    content: Content | None,
+    named: str,
+    agree: Callable[[Calibration, Calibration], Calibration] = agreeing,
+) -> Calibration:
     """Calibration with the parameters that a content holds, after a check that the two agree.
 
     `named` is the file in which they should be: without it a note says that they are not here.
-    FormatError where they are others.
+    `agree` makes of the stored and the found calibration the one that is meant, or FormatError.
     """
     hdu = None if content is None else stored_in(content)
     if hdu is not None:
-        return agreeing(stored_calibration(hdu, found.name), found, AGREE)
+        return agree(stored_calibration(hdu, found.name), found)
     if not named:
         return found
     note = f"its covariance is in {named}, which is not here"

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from astropy.io import fits
+from pydantic import PositiveFloat
 
 from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.inverse import detector_grid
-from bayesdist.calibration.plane import ARCSEC
+from bayesdist.calibration.orientation import placed_at
+from bayesdist.calibration.plane import arcsec_per
 from bayesdist.model import LookupTable
 from bayesdist.products.formats.common.cards import (
+    append_cards,
     convergence_cards,
+    node_cards,
     number_card,
+    solution_cards,
+    tangent_cards,
     text_card,
     wrapped_cards,
 )
 from bayesdist.products.formats.common.coefficients import require_regular
-from bayesdist.products.formats.common.content import hdus_of
+from bayesdist.products.formats.common.content import fits_bytes
+from bayesdist.products.formats.common.document import BuildOptions, Built, FormatSettings
 from bayesdist.products.formats.common.parameters import parameters_hdu
 from bayesdist.products.formats.cpdis.file import ERRORS, TABLES
 
@@ -30,55 +35,48 @@ _MOST = 1025  # nodes of an axis
 _CHECK = 397  # points of each axis at which the tables are compared with the map
 
 
-def cpdis_content(
-    calibration: Calibration,
-    *,
-    epoch: float | None = None,
-    step: float | None = None,
-    scale_arcsec: float | None = None,
-    notes: Sequence[str] = (),
-) -> tuple[bytes, float]:
-    """Bytes of a file, and its largest error in pixels: of rounding, and between its nodes.
+class Settings(FormatSettings):
+    """Configuration of a file with look-up tables."""
 
-    `step` is pixels between nodes; by default as many as leave 1e-4 pixels, at least 4.
-    """
-    arcsec = ARCSEC[calibration.unit] if calibration.unit != "pix" else (scale_arcsec or 1.0)
-    maps = calibration.with_tables(calibration.at(epoch, origin="stated"))
+    step: PositiveFloat | None = None  # pixels between nodes; as many as leave 1e-4 pixels
+    crval: tuple[float, float] | None = None
+
+
+def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
+    """The file, with its largest error in pixels: of rounding, and between its nodes."""
+    scale = options.scale_arcsec
+    calibration = placed_at(calibration, settings.crval, scale, where="products.cpdis")
+    plane, unit = calibration.plane, calibration.unit
+    arcsec = arcsec_per(unit, scale)
+    maps = calibration.with_tables(calibration.at(options.epoch, origin="stated"))
     images, tables, worst = [], [], 0.0
     for k, (number, one) in enumerate(maps.items()):
         linear, crpix = _linear_part(one, number)
-        table, off = _sampled(one, linear, crpix, step)
+        table, off = _sampled(one, linear, crpix, settings.step)
         worst = max(worst, off)
         versions = (2 * k + 1, 2 * k + 2)
-        cards = [
-            *_wcs_cards(calibration, linear * arcsec / 3600, crpix),
-            *_record_cards(table, versions),
-            number_card("BDWORST", off, "[pix] of rounding and between nodes"),
-            *(
-                [number_card("BDTABLES", 1, "look-up tables are in it")]
-                if one.before or one.after
-                else []
-            ),
-            text_card("BDPLANE", calibration.plane.kind, "plane of u, v"),
-            text_card("BDUNIT", calibration.unit, "unit of u, v in the solution"),
-            number_card("BDARCS", float(arcsec), "[arcsec] in one of these units"),
-            number_card("BDCHIP", number, "chip number"),
-            number_card("IMAGEW", int(one.basis.size[0]), "[pix] columns of the detector"),
-            number_card("IMAGEH", int(one.basis.size[1]), "[pix] rows of the detector"),
-            *wrapped_cards("COMMENT", notes),
-            *convergence_cards(calibration.solution),
-        ]
+        ctype, crval = ("RA---TAN", "DEC--TAN"), plane.point or (0.0, 0.0)
+        cards = tangent_cards(ctype, crval, crpix, linear * arcsec / 3600)
+        if plane.point is None:
+            cards.append(text_card("COMMENT", "CRVAL is a placeholder."))
+        cards += _record_cards(table, versions)
+        cards.append(number_card("BDWORST", off, "[pix] of rounding and between nodes"))
+        if one.before or one.after:
+            cards.append(number_card("BDTABLES", 1, "look-up tables are in it"))
+        cards += solution_cards(plane.kind, unit, arcsec, number, one.basis.size)
+        cards += wrapped_cards("COMMENT", calibration.remarks)
+        cards += convergence_cards(calibration.solution)
         image = fits.ImageHDU(name="SCI", ver=k + 1)
-        for card in cards:
-            image.header.append(fits.Card.fromstring(card), end=True)
+        append_cards(image, cards)
         images.append(image)
         sigma = _sigma(one, linear, table)
         for axis, version in enumerate(versions):
             tables.append(_table_hdu(TABLES, version, table.values[axis], table))
             if sigma is not None:
                 tables.append(_table_hdu(ERRORS, version, sigma[axis], table))
-    made = hdus_of([fits.PrimaryHDU(), *images, *tables, parameters_hdu(calibration, epoch)])
-    return b"".join(hdu.to_bytes() for hdu in made), worst
+    parameters = parameters_hdu(calibration, options.epoch)
+    content = fits_bytes([fits.PrimaryHDU(), *images, *tables, parameters])
+    return (Built("cpdis.fits", "CPDIS", content, calibration, None, {"tables_pix": worst}),)
 
 
 def _linear_part(one: ChipMap, number: int) -> tuple[Float, tuple[float, float]]:
@@ -137,28 +135,6 @@ def _sigma(one: ChipMap, linear: Float, table: LookupTable) -> Float | None:
     return np.sqrt(moved.diagonal(axis1=1, axis2=2)).T.reshape(2, *table.shape)
 
 
-def _wcs_cards(calibration: Calibration, cd: Float, crpix: tuple[float, float]) -> list[str]:
-    known = calibration.plane.point
-    at = known or (0.0, 0.0)
-    return [
-        number_card("WCSAXES", 2),
-        text_card("CTYPE1", "RA---TAN"),
-        text_card("CTYPE2", "DEC--TAN"),
-        text_card("CUNIT1", "deg"),
-        text_card("CUNIT2", "deg"),
-        text_card("RADESYS", "ICRS"),
-        *(number_card(f"CRVAL{k}", float(v), "[deg]") for k, v in enumerate(at, 1)),
-        *(number_card(f"CRPIX{k}", v, "[pix]") for k, v in enumerate(crpix, 1)),
-        *(
-            number_card(f"CD{i + 1}_{j + 1}", float(cd[i, j]), "[deg/pix]")
-            for i in (0, 1)
-            for j in (0, 1)
-        ),
-        number_card("LONPOLE", 180.0, "[deg] north is up also at a pole"),
-        *([] if known else [text_card("COMMENT", "CRVAL is a placeholder.")]),
-    ]
-
-
 def _record_cards(table: LookupTable, versions: tuple[int, int]) -> list[str]:
     """Cards of CPDIS and of the DP records."""
     cards = []
@@ -179,13 +155,6 @@ def _record_cards(table: LookupTable, versions: tuple[int, int]) -> list[str]:
 
 def _table_hdu(name: str, version: int, plane: Float, table: LookupTable) -> fits.ImageHDU:
     hdu = fits.ImageHDU(np.asarray(plane, np.float32), name=name, ver=version)
-    for axis in (0, 1):
-        for keyword, value, comment in (
-            ("CRPIX", 1.0, "node, from 1"),
-            ("CRVAL", table.first[axis], "[pixel] of that node, from 1"),
-            ("CDELT", table.step[axis], "[pixel] between nodes"),
-        ):
-            card = number_card(f"{keyword}{axis + 1}", float(value), comment)
-            hdu.header.append(fits.Card.fromstring(card), end=True)
+    append_cards(hdu, node_cards(table))
     hdu.header["BUNIT"] = "pixel"
     return hdu

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from bayesdist.errors import FormatError
-from bayesdist.products.formats.common.document import Finding, MissingSizeError
+from bayesdist.products.formats.common.document import Choice, Finding, MissingSizeError
 from bayesdist.products.formats.cpdis.file import (
     ERRORS,
     TABLES,
@@ -33,7 +33,7 @@ def lint_cpdis(file: CpdisFile) -> tuple[Finding, ...]:
         out += [Finding(f.level, prefix + f.where, f.message) for f in found]
     if not [f for f in out if f.level == "error"]:
         try:
-            cpdis_calibration(file, file.name)
+            cpdis_calibration(file, file.name, Choice())
         except MissingSizeError:
             out.append(Finding("note", "NAXIS1", "the size of the image is not stated"))
         except FormatError as error:

@@ -20,7 +20,13 @@ from astropy.io import fits
 from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.model.lookup import LookupTable
-from bayesdist.products.formats.common.cards import number_card, text_card, wrapped_cards
+from bayesdist.products.formats.common.cards import (
+    append_cards,
+    node_cards,
+    number_card,
+    text_card,
+    wrapped_cards,
+)
 from bayesdist.products.formats.common.content import hdus_of
 from bayesdist.products.formats.lookup.file import AXES, LookupFile
 
@@ -76,7 +82,7 @@ def lookup_file(
     errors.
     """
     primary = fits.PrimaryHDU()
-    _append(primary, cards)
+    append_cards(primary, cards)
     hdus, sigmas = [primary], []
     for version, part in enumerate(parts, start=1):
         extra = part.padding(size[0])
@@ -95,7 +101,7 @@ def lookup_file(
 
 def _image(name: str, plane: Float, cards: Sequence[str]) -> fits.ImageHDU:
     hdu = fits.ImageHDU(np.asarray(plane, np.float32))
-    _append(hdu, [text_card("EXTNAME", name), *cards])
+    append_cards(hdu, [text_card("EXTNAME", name), *cards])
     return hdu
 
 
@@ -106,15 +112,7 @@ def _place_cards(table: LookupTable, version: int, size: tuple[int, int]) -> lis
         number_card("CCDCHIP", table.chip, "chip of the table"),
         number_card("ONAXIS1", int(size[0]), "columns of the chip"),
         number_card("ONAXIS2", int(size[1]), "rows of the chip"),
-        *(
-            number_card(f"{keyword}{axis + 1}", value, comment)
-            for axis in (0, 1)
-            for keyword, value, comment in (
-                ("CRPIX", 1.0, "node, from 1"),
-                ("CRVAL", table.first[axis], "[pixel] of that node, from 1"),
-                ("CDELT", table.step[axis], "[pixel] between nodes"),
-            )
-        ),
+        *node_cards(table),
         text_card("BUNIT", "pixel"),
     ]
 
@@ -139,8 +137,3 @@ def optional_cards(useafter: str | None, pedigree: str | None, history: Sequence
         *([text_card("PEDIGREE", pedigree)] if pedigree else []),
         *wrapped_cards("HISTORY", history),
     ]
-
-
-def _append(hdu: fits.PrimaryHDU | fits.ImageHDU, cards: Sequence[str]) -> None:
-    for card in cards:
-        hdu.header.append(fits.Card.fromstring(card), end=True)

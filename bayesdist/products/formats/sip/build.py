@@ -11,7 +11,7 @@ from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, as_calibration
 from bayesdist.calibration.chip_map import Monomials
 from bayesdist.calibration.inverse import fit_inverse
-from bayesdist.calibration.plane import ARCSEC
+from bayesdist.calibration.plane import ARCSEC, arcsec_per
 from bayesdist.calibration.sky import reprojected
 from bayesdist.errors import InputError
 from bayesdist.infer.solution import Solution
@@ -123,7 +123,7 @@ def sip_from_solution(
     one = calibration.chip(number, epoch, origin="stated")
     poly = one.monomials()
     require_regular(poly.linear, number)
-    unit_arcsec = ARCSEC[model.unit] if model.unit != "pix" else (scale_arcsec or 1.0)
+    unit_arcsec = arcsec_per(model.unit, scale_arcsec)
     sky = None
     if tangent_point is not None:
         sky = reprojected(one, unit_arcsec, tangent_point, crval, *SIP_ORDERS)

@@ -11,15 +11,13 @@ from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import fitted_map
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC, Plane
-from bayesdist.errors import FormatError
+from bayesdist.data.sky.tangent import sky_of_plane, tangent_plane
 from bayesdist.model import polynomial_terms
-from bayesdist.products.formats.common.cards import header_of, text_card
-from bayesdist.products.formats.common.content import Content
+from bayesdist.products.formats.common.cards import text_card
 from bayesdist.products.formats.common.document import PARAMETERS, Built, MissingSizeError
 from bayesdist.products.formats.common.parameters import (
     parameters_content,
-    stored_calibration,
-    stored_in,
+    refuse_other,
 )
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
 
@@ -44,24 +42,23 @@ def sip_calibration(
             where=name,
             do="add NAXIS1 and NAXIS2 (or IMAGEW and IMAGEH), or compare it with a file that says",
         )
+    order = max(sip.order) if min(sip.order) >= SIP_ORDERS[0] else 1
     linear = np.eye(2) if pixels else sip.cd * (1.0 if sip.linear_axes else 3600.0)
 
-    def positions(x: Float, y: Float) -> tuple[Float, Float]:
+    def positions(x: Float, y: Float) -> Float:
         if pixels:
-            return sip.forward(x, y)
-        xi, eta = sip.plane(x, y)
-        if sip.linear_axes:
-            return xi + sip.crval[0], eta + sip.crval[1]
-        return 3600.0 * xi, 3600.0 * eta
+            return np.stack(sip.forward(x, y))
+        at = np.stack(sip.plane(x, y))
+        return at + np.array(sip.crval)[:, None] if sip.linear_axes else 3600.0 * at
 
     one = fitted_map(
         positions,
         name,
-        order=max(sip.order) if min(sip.order) >= SIP_ORDERS[0] else 1,
+        order=order,
         size=found,
         reference_pixel=sip.crpix,
         unit="pix" if pixels or sip.linear_axes else "arcsec",
-        monomial_cov=_variances(sip, linear),
+        monomial_cov=_variances(sip, linear, order),
     )
     plane = Plane("detector") if pixels else Plane("sky", point=sip.crval)
     if sip.linear_axes:
@@ -77,11 +74,10 @@ def sip_calibration(
     )
 
 
-def _variances(sip: SipHeader, linear: Float) -> Float | None:
+def _variances(sip: SipHeader, linear: Float, order: int) -> Float | None:
     """Variances of a linear map of the header's sigmas; None where there are none."""
     if not sip.sigma_a and not sip.sigma_b:
         return None
-    order = max(sip.order) if min(sip.order) >= SIP_ORDERS[0] else 1
     terms = polynomial_terms(order)
     sigma = [float(s.get(t, 0.0)) for s in (sip.sigma_a, sip.sigma_b) for t in terms]
     turn = np.kron(linear, np.eye(len(terms)))
@@ -106,27 +102,9 @@ def side_file(calibration: Calibration, chip: int, epoch: float | None, header: 
     return Built(name, PARAMETERS, parameters_content(one), one, chip)
 
 
-def with_covariance(found: Calibration, sip: SipHeader, content: Content) -> Calibration:
-    """Calibration by the parameters that a header names, after a check that the two agree.
-
-    Without them, with a note.  FormatError where they are others.
-    """
-    name = str(header_of(sip.cards).get(KEYWORD, ""))
-    if not name:
-        return found
-    beside = content.beside(name)
-    hdu = None if beside is None else stored_in(beside)
-    if hdu is None:
-        note = f"its covariance is in {name}, which is not here"
-        return replace(found, notes=(*found.notes, note))
-    stored = stored_calibration(hdu, found.name)
-    far = _difference(found, stored)
-    if not far <= AGREE:
-        raise FormatError(
-            f"the parameters beside it are off by {far:.2g} pixels: one of the two was changed",
-            where=found.name,
-            do="keep together what was written together",
-        )
+def agreeing(stored: Calibration, found: Calibration) -> Calibration:
+    """Stored calibration of a header, after a check that what was read says the same."""
+    refuse_other(_difference(found, stored), AGREE, found.name)
     return replace(stored, notes=found.notes)
 
 
@@ -140,8 +118,6 @@ def _difference(found: Calibration, stored: Calibration) -> float:
     b = stored.forward(x, y, chip=there)
     pixel = np.sqrt(abs(np.linalg.det(stored.chip(there, origin="stated").linear)))
     if found.plane.point is not None and stored.plane.point is not None:
-        from bayesdist.data.sky.tangent import sky_of_plane, tangent_plane  # slow to import
-
         xi, eta = (ARCSEC[found.unit] * a).T
         ra, dec = sky_of_plane(xi, eta, found.plane.point)
         a = np.stack(tangent_plane(ra, dec, stored.plane.point), axis=-1) / ARCSEC[stored.unit]

@@ -19,15 +19,18 @@ from bayesdist.products.formats.common.document import (
     Format,
     FormatSettings,
 )
-from bayesdist.products.formats.common.read_back import ReadBack
+from bayesdist.products.formats.common.parameters import with_parameters
+from bayesdist.products.formats.sip.build import sip_from_solution
 from bayesdist.products.formats.sip.calibration import (
+    KEYWORD,
+    agreeing,
     side_file,
     sip_calibration,
-    with_covariance,
     with_side_file,
 )
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
 from bayesdist.products.formats.sip.lint import lint_sip
+from bayesdist.products.formats.sip.positions import sip_read_back
 from bayesdist.products.formats.sip.read import holds_sip, sip_of
 from bayesdist.products.formats.sip.write import sip_text
 
@@ -63,26 +66,16 @@ def _calibration(content: Content, name: str, choice: Choice) -> Calibration:
     stated = [k for k in ("D2IMDIS1", "D2IMDIS2", "CPDIS1", "CPDIS2") if k in header_of(sip.cards)]
     notes = (f"without the look-up tables of {', '.join(stated)}",) if stated else ()
     found = sip_calibration(sip, name, size=choice.size, notes=notes)
-    return found if choice.as_used else with_covariance(found, sip, content)
-
-
-def _read_back(
-    files: Sequence[Built], calibration: Calibration, options: BuildOptions
-) -> list[ReadBack]:
-    # no file that is read needs it
-    from bayesdist.products.formats.sip.positions import sip_read_back
-
-    return sip_read_back(files, calibration, options)
+    if choice.as_used:
+        return found
+    named = str(header_of(sip.cards).get(KEYWORD, ""))
+    return with_parameters(found, content.beside(named), named, agreeing)
 
 
 def _build(
     calibration: Calibration, settings: Settings, options: BuildOptions
 ) -> tuple[Built, ...]:
     """Headers, one for each chip."""
-    # no file that is read needs it
-    from bayesdist.products.formats.sip.build import sip_from_solution
-
-    notes = [*calibration.notes, *([calibration.plane.note] if calibration.plane.note else [])]
     out = []
     for number in calibration.numbers:
         sip = sip_from_solution(
@@ -90,7 +83,7 @@ def _build(
             chip=number,
             epoch=options.epoch,
             scale_arcsec=options.scale_arcsec,
-            notes=notes,
+            notes=calibration.remarks,
             **settings.model_dump(exclude={"parameters"}),
         )
         name = f"sip_{number}.hdr" if len(calibration.numbers) > 1 else "sip.hdr"
@@ -141,6 +134,6 @@ FORMAT = Format(
     _calibration,
     Settings,
     _build,
-    _read_back,
+    sip_read_back,
     highest_order=SIP_ORDERS[1],
 )

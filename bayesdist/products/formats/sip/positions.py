@@ -10,7 +10,7 @@ from astropy.io import fits
 
 from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.calibration.plane import ARCSEC
+from bayesdist.calibration.plane import ARCSEC, arcsec_per
 from bayesdist.data.sky.tangent import tangent_plane
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import PARAMETERS, BuildOptions, Built
@@ -42,7 +42,7 @@ def sip_positions(
     stated = like or sip
     if stated.linear_axes:
         return np.stack(sip.forward(x, y), axis=-1) @ stated.cd.T + stated.crval
-    in_unit = 3600.0 / (ARCSEC[unit] if unit != "pix" else scale_arcsec or 1.0)
+    in_unit = 3600.0 / arcsec_per(unit, scale_arcsec)
     offset = stated.offset or (0.0, 0.0)
     return np.stack(sip.forward(x, y), axis=-1) @ (in_unit * stated.cd).T + offset
 

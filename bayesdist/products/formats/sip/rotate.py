@@ -12,17 +12,16 @@ Calibration"), Appendix A. As there, a frame rotates by +90 degrees when u' = -v
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from math import comb
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.formats.common.cards import header_of, keyword_of
+from bayesdist.products.formats.common.coefficients import substitution
 from bayesdist.products.formats.sip.header import SipHeader
 
 Terms = Mapping[tuple[int, int], float]
@@ -101,7 +100,7 @@ def _pair(
     low = [{k: c for k, c in t.items() if sum(k) <= n} for t, n in zip((a, b), order, strict=True)]
     terms = polynomial_terms(max(order))
     old = np.array([[t.get(k, 0.0) for k in terms] for t in low])
-    R = coefficient_map(terms, M)
+    R = coefficient_map(max(order), M)
     new = (R @ old.ravel()).reshape(2, -1) + 0.0
     # a term is written where any old one goes to it, be its value zero or not
     there = np.array([[k in t for k in terms] for t in low], float).ravel()
@@ -140,37 +139,14 @@ def pixel_matrix(degrees: float, *, mirror: bool = False) -> Float:
     return matrix + 0.0  # no negative zeros
 
 
-def coefficient_map(terms: Sequence[tuple[int, int]], matrix: ArrayLike) -> Float:
+def coefficient_map(order: int, M: Float) -> Float:
     """Matrix R (2 K, 2 K) from the coefficients of (A, B) to those in a changed pixel frame.
 
-    New coefficients are R c, with c those of A followed by those of B, each in the order of `terms`
-    (powers of u and v, complete in each total order); their covariance is R cov R^T. A signed
-    permutation at multiples of 90 degrees.  InputError when the terms of one total order are not
-    all there, or the matrix is not orthogonal.
+    New coefficients are R c, with c those of A followed by those of B in the order of
+    `polynomial_terms`; their covariance is R cov R^T.  `M` is orthogonal, as of `pixel_matrix`: at
+    multiples of 90 degrees R is a signed permutation.
     """
-    M = np.asarray(matrix, float)
-    if M.shape != (2, 2) or not np.allclose(M @ M.T, np.eye(2), atol=1e-12, rtol=0):
-        raise InputError("is not orthogonal", where="matrix", do="take it from pixel_matrix")
-    place = {term: k for k, term in enumerate(terms)}
-    # old offsets from new ones: u = back[0] . w',  v = back[1] . w'
-    back = M.T
-    powers = np.zeros((len(terms), len(terms)))
-    for (p, q), old in place.items():
-        for k in range(p + 1):
-            for m in range(q + 1):
-                weight = comb(p, k) * comb(q, m) * back[0, 0] ** k * back[0, 1] ** (p - k)
-                weight *= back[1, 0] ** m * back[1, 1] ** (q - m)
-                if weight == 0.0:
-                    continue
-                new = place.get((k + m, p + q - k - m))
-                if new is None:
-                    raise InputError(
-                        f"of total order {p + q} some are missing, which rotation mixes",
-                        where="terms",
-                        do="give all terms of the order, those that are zero as well",
-                    )
-                powers[new, old] += weight
-    return np.kron(M, powers)
+    return np.asarray(np.kron(M, substitution(order, M.T)), float)
 
 
 def is_exact(M: Float) -> bool:

@@ -1,4 +1,4 @@
-"""STDGDC files, and the frame of the corrected positions in them.
+"""STDGDC files, the frame of the corrected positions in them, and their calibration.
 
 Extensions in this order, the primary header giving their dimensions:
 
@@ -20,16 +20,27 @@ the map stays in it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from astropy.io import fits
 
 from bayesdist.arrays import Float
-from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.calibration.calibration import Calibration, calibration_of_maps
+from bayesdist.calibration.chip_map import ChipMap, fitted_map
+from bayesdist.calibration.inverse import detector_grid
+from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError
+from bayesdist.model import LookupTable
+from bayesdist.products.formats.common.cards import named_in
 from bayesdist.products.formats.common.content import Content, Hdu
+from bayesdist.products.formats.common.document import Choice
+from bayesdist.products.formats.common.parameters import (
+    refuse_changed,
+    stored_calibration,
+    stored_in,
+)
 
 _S = ("BDS1_1", "BDS1_2", "BDS2_1", "BDS2_2")
 
@@ -112,25 +123,18 @@ class StdGdc:
         """Extensions that are not there."""
         return tuple(name for name in EXTENSIONS if self.hdu(name) is None)
 
-    @cached_property
-    def _tables(self) -> dict[str, Float]:
-        return {}
-
     def table(self, name: str) -> Float:
         """Values (ny, nx) of an extension; FormatError where it is missing or no table."""
-        if name not in self._tables:
-            hdu = self.hdu(name)
-            if hdu is None:
-                raise FormatError(
-                    f"has no extension {name}", where=self.name, do="give a whole STDGDC file"
-                )
-            values = hdu.image
-            if values.ndim != 2 or min(values.shape) < 2:
-                raise FormatError(
-                    f"has the shape {values.shape}", where=f"{self.name}, {name}", do="check it"
-                )
-            self._tables[name] = values
-        return self._tables[name]
+        hdu = self.hdu(name)
+        if hdu is None:
+            raise FormatError(
+                f"has no extension {name}", where=self.name, do="give a whole STDGDC file"
+            )
+        if hdu.image.ndim != 2 or min(hdu.image.shape) < 2:
+            raise FormatError(
+                f"has the shape {hdu.image.shape}", where=f"{self.name}, {name}", do="check it"
+            )
+        return hdu.image
 
     @property
     def size(self) -> tuple[int, int]:
@@ -144,3 +148,82 @@ def stdgdc_of(content: Content) -> StdGdc | None:
     names = {hdu.name for hdu in content.tables[1:]}
     stated = bool(content.tables) and "NDIM_XGC" in " ".join(content.tables[0].cards)
     return StdGdc(content) if len(names & set(EXTENSIONS)) >= 2 or stated else None
+
+
+# -- calibration ----------------------------------------------------------------------------------
+
+
+def corrections(file: StdGdc) -> LookupTable:
+    """Table of corrected less detector pixels: exactly bilinear, as programs use the file.
+
+    FormatError for tables of different shapes, or with numbers that are not finite.
+    """
+    xgc, ygc = file.table("XGC"), file.table("YGC")
+    if xgc.shape != ygc.shape:
+        raise FormatError("XGC and YGC differ in shape", where=file.name, do="check the file")
+    if not (np.isfinite(xgc).all() and np.isfinite(ygc).all()):
+        raise FormatError(
+            "XGC or YGC hold numbers that are not finite", where=file.name, do="check the file"
+        )
+    y, x = np.indices(xgc.shape, float)
+    shifts = np.stack([xgc - (x + 1), ygc - (y + 1)])
+    number = int(file.header.get("BDCHIP", 1))
+    return LookupTable(number, shifts, first=(1.0, 1.0), step=(1.0, 1.0))
+
+
+def stdgdc_calibration(file: StdGdc, name: str, choice: Choice) -> Calibration:
+    """Calibration of the tables; of a file of ours the one that it was made from.
+
+    As used, nothing but the tables counts, brought to the plane of a file of ours.  FormatError
+    where the parameters in the file and its tables differ by more than it states.
+    """
+    table = corrections(file)
+    hdu, frame = stored_in(file.content), CorrectedFrame.of_header(file.header)
+    plane, unit = Plane("detector"), "pix"
+    scale: float | None = 1.0
+    source = "pixels of the corrected frame"
+    if hdu is None or frame is None:
+        frame = CorrectedFrame((0.0, 0.0), np.zeros(2), np.eye(2))
+    else:
+        stored = stored_calibration(hdu, name)
+        if not choice.as_used:
+            return _of_ours(file, stored, frame, table)
+        plane, unit, scale, source = stored.plane, stored.unit, stored.scale, stored.scale_from
+    size = (float(file.size[0]), float(file.size[1]))
+    one = fitted_map(
+        lambda x, y: frame.positions(np.stack([x, y])),
+        name,
+        order=1,
+        size=size,
+        reference_pixel=((size[0] + 1) / 2, (size[1] + 1) / 2),
+        unit=unit,
+    )
+    return calibration_of_maps(
+        {table.chip: one},
+        name,
+        plane=plane,
+        numbered="BDCHIP" in file.header,
+        detector=named_in(file.header, "DETECTOR", name),
+        before=(table,),
+        scale=scale,
+        scale_from=source,
+    )
+
+
+def _of_ours(
+    file: StdGdc, stored: Calibration, frame: CorrectedFrame, table: LookupTable
+) -> Calibration:
+    """Stored calibration, after a check of the tables; what else these have is its own table."""
+    number = stored.numbers[0]
+    if file.header.get("BDTABLES", False):
+        y, x = np.indices(table.shape, float)
+        x, y = x.ravel() + 1, y.ravel() + 1
+        there = np.stack([x, y]) + table.values.reshape(2, -1)
+        rest = frame.positions(there) - stored.forward(x, y, chip=number).T
+        after = replace(table, chip=number, values=rest.reshape(2, *table.shape))
+        return replace(stored, after=(after,))
+    x, y = detector_grid(stored.model.chips[0].size, 129)
+    theirs = np.stack([x, y]) + table.evaluate(x, y).T
+    ours = frame.corrected(stored.forward(x, y, chip=number).T)
+    refuse_changed(float(np.hypot(*(ours - theirs)).max()), file.header, file.name)
+    return stored

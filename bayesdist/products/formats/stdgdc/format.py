@@ -2,28 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 
-from bayesdist.calibration.calibration import Calibration
-from bayesdist.products.formats.common.document import (
-    BuildOptions,
-    Built,
-    Choice,
-    Format,
-    FormatSettings,
-    finding_lines,
-)
-from bayesdist.products.formats.stdgdc.calibration import stdgdc_calibration
-from bayesdist.products.formats.stdgdc.file import SIGMAS, StdGdc, stdgdc_of
+from bayesdist.products.formats.common.document import Format, finding_lines
+from bayesdist.products.formats.stdgdc.build import Settings, build
+from bayesdist.products.formats.stdgdc.file import SIGMAS, StdGdc, stdgdc_calibration, stdgdc_of
 from bayesdist.products.formats.stdgdc.lint import lint_stdgdc
-
-
-class Settings(FormatSettings):
-    """Configuration of an STDGDC file."""
-
-    precision: Literal["single", "double"] = "single"
 
 
 def _describe(file: StdGdc) -> list[str]:
@@ -48,27 +32,7 @@ def _describe(file: StdGdc) -> list[str]:
     return [*lines, "", *finding_lines(findings)]
 
 
-def _calibration(file: StdGdc, name: str, choice: Choice) -> Calibration:
-    return stdgdc_calibration(file, name, as_used=choice.as_used)
-
-
-def _build(
-    calibration: Calibration, settings: Settings, options: BuildOptions
-) -> tuple[Built, ...]:
-    # no file that is read needs it
-    from bayesdist.products.formats.stdgdc.build import stdgdc_content
-
-    content, worst = stdgdc_content(
-        calibration,
-        epoch=options.epoch,
-        precision=settings.precision,
-        notes=[note for note in (*calibration.notes, calibration.plane.note) if note],
-    )
-    summary = {"tables_pix": worst}
-    return (Built("stdgdc.fits", "STDGDC", content, calibration, None, summary),)
-
-
 FORMAT = Format(
-    "stdgdc", "an STDGDC file", 32, stdgdc_of, _describe, lint_stdgdc, _calibration,
-    Settings, _build, holds_tables=True,
+    "stdgdc", "an STDGDC file", 32, stdgdc_of, _describe, lint_stdgdc, stdgdc_calibration,
+    Settings, build, holds_tables=True,
 )  # fmt: skip

@@ -10,9 +10,13 @@ from bayesdist.arrays import Float
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.errors import FormatError
 from bayesdist.model import LookupTable
-from bayesdist.products.formats.common.document import Finding
-from bayesdist.products.formats.stdgdc.calibration import stdgdc_calibration
-from bayesdist.products.formats.stdgdc.file import EXTENSIONS, SIGMAS, StdGdc
+from bayesdist.products.formats.common.document import Choice, Finding
+from bayesdist.products.formats.stdgdc.file import (
+    EXTENSIONS,
+    SIGMAS,
+    StdGdc,
+    stdgdc_calibration,
+)
 
 _CLOSE = 0.3  # pixels: an inverse that closes worse is counted from another pixel
 _TOO_FAR = 0.5  # of the detector: no camera moves pixels so far
@@ -148,6 +152,6 @@ def _stored(file: StdGdc) -> Iterator[Finding]:
         if values.shape != file.table("XGC").shape:
             yield Finding("warning", name, "has not the shape of the tables")
     try:
-        stdgdc_calibration(file, file.name)
+        stdgdc_calibration(file, file.name, Choice())
     except FormatError as error:
         yield Finding("error", "BDPARAM", error.cause)

@@ -10,7 +10,7 @@ from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.errors import FormatError, InputError
-from bayesdist.products.formats.common.document import MissingSizeError
+from bayesdist.products.formats.common.document import Choice, required_size
 from bayesdist.products.formats.common.parameters import with_parameters
 from bayesdist.products.formats.tpv.head import TpvFile, TpvHead
 
@@ -18,40 +18,34 @@ _RADIAL_ORDER = 9  # of the polynomial that stands for odd powers of r
 _EXACT = 1e-9  # pixels: below it a map is the polynomial that it was taken for
 
 
-def tpv_calibration(
-    file: TpvFile,
-    name: str,
-    *,
-    size: tuple[float, float] | None = None,
-    as_used: bool = False,
-) -> Calibration:
+def tpv_calibration(file: TpvFile, name: str, choice: Choice) -> Calibration:
     """Calibration of the headers, with the covariance of the file beside them where it is there.
 
-    `size` is columns and rows, for headers without them (else MissingSizeError);
-    with `as_used` nothing but the headers counts.  Powers of r are no polynomials: a note says how
-    well they are followed.  FormatError for headers without PV1_1 or PV2_1, or about several points
-    of the sky; and where the parameters beside them are others.
+    As used, nothing but the headers counts.  Powers of r are no polynomials: a note says how well
+    they are followed.  MissingSizeError for headers without a size where none is chosen;
+    FormatError for headers without PV1_1 or PV2_1, or about several points of the sky; and where
+    the parameters beside them are others.
     """
     _check(file, name)
     maps, notes = {}, list[str]()
     order = max(_RADIAL_ORDER if head.radial else head.order for head in file.heads)
-    unit = str(file.heads[0].header.get("BDUNIT", "arcsec"))
-    factor = 3600.0 / float(file.heads[0].header.get("BDARCS", ARCSEC.get(unit, 1.0)))
+    header = file.heads[0].header
+    unit = str(header.get("BDUNIT", "arcsec"))
+    factor = 3600.0 / float(header.get("BDARCS", ARCSEC.get(unit, 1.0)))
     for head in file.heads:
-        one, worst = _map(head, name, order, size, unit, factor)
+        one, worst = _map(head, name, order, choice.size, unit, factor)
         maps[head.number] = one
         if head.radial:
             notes.append(
                 f"powers of r of chip {head.number} are followed by a polynomial of order "
                 f"{order}, {worst:.2g} pix off at worst"
             )
-    header = file.heads[0].header
     kind = str(header.get("BDPLANE", "sky"))
     plane = Plane(kind, point=file.heads[0].crval if kind == "sky" else None)
     found = calibration_of_maps(
         maps, name, plane=plane, numbered=all(h.numbered for h in file.heads), notes=tuple(notes)
     )
-    if as_used:
+    if choice.as_used:
         return found
     beside = file.content if file.content.is_fits else file.content.beside(file.side_file)
     return with_parameters(found, beside, file.side_file)
@@ -83,25 +77,18 @@ def _map(
     head: TpvHead,
     name: str,
     order: int,
-    size: tuple[float, float] | None,
+    given: tuple[float, float] | None,
     unit: str,
     factor: float,
 ) -> tuple[ChipMap, float]:
     """Map of one chip in the unit, `factor` of them in a degree, and its miss in pixels."""
-    found = size if head.size is None else (float(head.size[0]), float(head.size[1]))
-    if found is None:
-        raise MissingSizeError(
-            "does not say how large the image is", where=name, do="give it by --size NX NY"
-        )
+    size = required_size(head.size, given, name)
 
-    def positions(x: Float, y: Float) -> tuple[Float, Float]:
-        xi, eta = head.plane(x, y)
-        return factor * xi, factor * eta
+    def positions(x: Float, y: Float) -> Float:
+        return factor * np.stack(head.plane(x, y))
 
-    one = fitted_map(
-        positions, name, order=order, size=found, reference_pixel=head.crpix, unit=unit
-    )
-    x, y = detector_grid(found, 65)
-    far = np.hypot(*(one.at(x, y) - np.stack(positions(x, y))))
+    one = fitted_map(positions, name, order=order, size=size, reference_pixel=head.crpix, unit=unit)
+    x, y = detector_grid(size, 65)
+    far = np.hypot(*(one.at(x, y) - positions(x, y)))
     worst = float(far.max() / np.sqrt(abs(np.linalg.det(factor * head.cd))))
     return one, 0.0 if worst < _EXACT else worst

@@ -2,31 +2,13 @@
 
 from __future__ import annotations
 
-from bayesdist.calibration.calibration import Calibration
-from bayesdist.calibration.orientation import placed_at
 from bayesdist.products.formats.common.content import Content
-from bayesdist.products.formats.common.document import (
-    PARAMETERS,
-    BuildOptions,
-    Built,
-    Choice,
-    Format,
-    FormatSettings,
-    finding_lines,
-)
-from bayesdist.products.formats.common.parameters import parameters_content
+from bayesdist.products.formats.common.document import Format, finding_lines
 from bayesdist.products.formats.sip.format import describe_wcs
+from bayesdist.products.formats.tpv.build import Settings, build
 from bayesdist.products.formats.tpv.calibration import tpv_calibration
 from bayesdist.products.formats.tpv.head import HIGHEST, TpvFile, tpv_of
 from bayesdist.products.formats.tpv.lint import lint_tpv
-
-NAME, SIDE = "tpv.head", "tpv_parameters.fits"
-
-
-class Settings(FormatSettings):
-    """Configuration of TPV headers."""
-
-    crval: tuple[float, float] | None = None
 
 
 def _describe(file: TpvFile) -> list[str]:
@@ -48,27 +30,7 @@ def _describe(file: TpvFile) -> list[str]:
     return [*lines, "", f"{content.name}, all chips", *finding_lines(findings)]
 
 
-def _calibration(file: TpvFile, name: str, choice: Choice) -> Calibration:
-    return tpv_calibration(file, name, size=choice.size, as_used=choice.as_used)
-
-
-def _build(
-    calibration: Calibration, settings: Settings, options: BuildOptions
-) -> tuple[Built, ...]:
-    """One text file with the headers of all chips, and the file with their covariance."""
-    # no file that is read needs it
-    from bayesdist.products.formats.tpv.build import tpv_cards, tpv_heads
-
-    calibration = placed_at(calibration, settings.crval, options.scale_arcsec, where="products.tpv")
-    heads = tpv_heads(calibration, epoch=options.epoch, scale_arcsec=options.scale_arcsec)
-    cards = [card.rstrip() for head in heads for card in tpv_cards(head, SIDE)]
-    return (
-        Built(SIDE, PARAMETERS, parameters_content(calibration, options.epoch), calibration),
-        Built(NAME, "TPV", ("\n".join(cards) + "\n").encode("ascii"), heads),
-    )
-
-
 FORMAT = Format(
-    "tpv", "TPV headers", 31, tpv_of, _describe, lint_tpv, _calibration, Settings, _build,
+    "tpv", "TPV headers", 31, tpv_of, _describe, lint_tpv, tpv_calibration, Settings, build,
     highest_order=HIGHEST,
 )  # fmt: skip

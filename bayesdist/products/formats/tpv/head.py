@@ -12,7 +12,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import comb
 
 import numpy as np
 from astropy.io import fits
@@ -68,20 +67,6 @@ def pv_values_of(axis: int, terms: tuple[Powers, ...], values: Float) -> dict[in
         for term, value in zip(terms, values, strict=True)
     }
     return dict(sorted(named.items()))
-
-
-def substitution(order: int, M: Float) -> Float:
-    """Matrix (K, K) whose column k has the powers of (X, Y) of term k in (x, y) = M (X, Y)."""
-    terms = polynomial_terms(order)
-    index = {term: k for k, term in enumerate(terms)}
-    out = np.zeros((len(terms), len(terms)))
-    for k, (i, j) in enumerate(terms):
-        for a in range(i + 1):
-            for b in range(j + 1):
-                by_x = comb(i, a) * M[0, 0] ** a * M[0, 1] ** (i - a)
-                by_y = comb(j, b) * M[1, 0] ** b * M[1, 1] ** (j - b)
-                out[index[a + b, i + j - a - b], k] += by_x * by_y
-    return out
 
 
 SIDE_FILE = "BDPARAM"  # keyword with the name of the file that has the covariance

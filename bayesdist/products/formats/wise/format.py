@@ -19,7 +19,9 @@ from bayesdist.products.formats.common.document import (
     finding_lines,
 )
 from bayesdist.products.formats.common.read_back import ReadBack
+from bayesdist.products.formats.sip.build import sip_from_solution
 from bayesdist.products.formats.sip.header import SIP_ORDERS, worst_closure
+from bayesdist.products.formats.sip.positions import headers_read_back
 from bayesdist.products.formats.sip.text import coefficient_lines
 from bayesdist.products.formats.wise.build import wise_text
 from bayesdist.products.formats.wise.lint import lint_wise_band
@@ -100,9 +102,6 @@ def _read_back(
     files: Sequence[Built], calibration: Calibration, options: BuildOptions
 ) -> list[ReadBack]:
     """Positions by the entries, with CD and zero point, which they lack, as they were made."""
-    # no file that is read needs it
-    from bayesdist.products.formats.sip.positions import headers_read_back
-
     out = []
     for one in files:
         [band] = bands_of(Content(one.file_name, one.content))
@@ -113,9 +112,6 @@ def _read_back(
 
 def _build(calibration: Calibration, _: Settings, options: BuildOptions) -> tuple[Built, ...]:
     """WISE's form: all linear terms in A and B, and an inverse of equal order."""
-    # no file that is read needs it
-    from bayesdist.products.formats.sip.build import sip_from_solution
-
     band = _band(calibration.detector)
     if band is None:
         raise InputError(
