@@ -16,6 +16,7 @@ from bayesdist.data.exposures import ExposureLog
 from bayesdist.missions.acs.simulate.pointings import AcsFrames
 from bayesdist.missions.acs.simulate.stars import TrueStars
 from bayesdist.model import DistortionModel, PolynomialBasis
+from bayesdist.model.basis import polynomial_values
 from bayesdist.model.lookup import LookupTable, corrected
 
 LINEAR_TERMS = ("A_1", "A_2", "A_3", "B_1", "B_2", "B_3")
@@ -212,15 +213,15 @@ class Field:
         self.powers = np.zeros((n, n, 2))
         i, j = np.array(basis.terms).T
         self.powers[i, j] = basis.to_scaled_powers(coef).T
-        self.by_x = polynomial.polyder(self.powers, axis=0)
-        self.by_y = polynomial.polyder(self.powers, axis=1)
+        self.by_x = np.asarray(polynomial.polyder(self.powers, axis=0), float)
+        self.by_y = np.asarray(polynomial.polyder(self.powers, axis=1), float)
 
     def at(self, x: Float, y: Float) -> Float:
         """Positions (N, 2) of pixels."""
         return self._values(*self.basis.scaled(x, y))
 
     def _values(self, X: Float, Y: Float) -> Float:
-        return np.stack([polynomial.polyval2d(X, Y, self.powers[..., a]) for a in (0, 1)], axis=-1)
+        return np.stack([polynomial_values(self.powers[..., a], X, Y) for a in (0, 1)], axis=-1)
 
     def _linear_inverse(self, u: Float, v: Float) -> Float:
         A = np.stack([self.powers[1, 0], self.powers[0, 1]], axis=-1)
@@ -237,8 +238,8 @@ class Field:
         X, Y = self._linear_inverse(u, v)
         for _ in range(STEPS):
             off = np.stack([u, v], axis=-1) - self._values(X, Y)
-            a, c = (polynomial.polyval2d(X, Y, self.by_x[..., k]) for k in (0, 1))
-            b, d = (polynomial.polyval2d(X, Y, self.by_y[..., k]) for k in (0, 1))
+            a, c = (polynomial_values(self.by_x[..., k], X, Y) for k in (0, 1))
+            b, d = (polynomial_values(self.by_y[..., k], X, Y) for k in (0, 1))
             det = a * d - b * c
             dX = (d * off[:, 0] - b * off[:, 1]) / det
             dY = (a * off[:, 1] - c * off[:, 0]) / det
