@@ -13,14 +13,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial import polynomial
 from numpy.typing import ArrayLike
 
 from bayesdist.arrays import Float
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
-from bayesdist.model.basis import MAX_ORDER
+from bayesdist.model.basis import MAX_ORDER, polynomial_values
 
 Terms = Mapping[tuple[int, int], float]
 Forward = Callable[[Float, Float], tuple[Float, Float]]
@@ -205,4 +204,4 @@ def _value(terms: Terms, U: Float, V: Float) -> Float:
     matrix = np.zeros((n + 1, n + 1))
     for (i, j), value in terms.items():
         matrix[i, j] = value
-    return np.asarray(polynomial.polyval2d(U, V, matrix), float)
+    return polynomial_values(matrix, U, V)

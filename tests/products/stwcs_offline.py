@@ -90,16 +90,20 @@ def updated(hdus: fits.HDUList, path: Path) -> dict[int, astropy.wcs.WCS]:
             return {done[ext].header["CCDCHIP"]: HSTWCS(done, ext=ext) for ext in (1, 2)}
 
 
+def solutions(
+    folder: Path, idctab: Path, date: str | None = None, **files: Path
+) -> dict[int, astropy.wcs.WCS]:
+    """HSTWCS of each chip, of an IDCTAB, and of D2IMFILE and NPOLFILE where they are given."""
+    hdus = original_exposure(idctab, date, **files)
+    return updated(hdus, folder / f"{idctab.stem}_flt.fits")
+
+
 def sky(
     folder: Path, idctab: Path, x: NDArray, y: NDArray, date: str | None = None, **files: Path
 ) -> dict[int, NDArray]:
-    """Sky positions (N, 2) in degrees of pixels of each chip, as stwcs makes them.
-
-    Of an IDCTAB, and of D2IMFILE and NPOLFILE where they are given.
-    """
-    hdus = original_exposure(idctab, date, **files)
-    wcs = updated(hdus, folder / f"{idctab.stem}_flt.fits")
-    return {chip: w.all_pix2world(np.stack([x, y], axis=1), 1) for chip, w in wcs.items()}
+    """Sky positions (N, 2) in degrees of pixels of each chip, as stwcs makes them."""
+    found = solutions(folder, idctab, date, **files)
+    return {chip: w.all_pix2world(np.stack([x, y], axis=1), 1) for chip, w in found.items()}
 
 
 def archived_sky(x: NDArray, y: NDArray) -> dict[int, NDArray]:

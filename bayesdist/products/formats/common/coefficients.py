@@ -22,12 +22,12 @@ from collections.abc import Mapping
 from math import comb
 
 import numpy as np
-from numpy.polynomial import polynomial
 from numpy.typing import ArrayLike
 
 from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError
 from bayesdist.model import polynomial_terms
+from bayesdist.model.basis import polynomial_values
 
 Coefficients = Mapping[tuple[int, int], float]
 
@@ -83,8 +83,7 @@ def evaluate(
     coefficients: Coefficients, x: ArrayLike, y: ArrayLike, order: int | None = None
 ) -> Float:
     """Values of a polynomial, without terms above the total `order`."""
-    x, y = np.asarray(x, float), np.asarray(y, float)
-    return polynomial.polyval2d(x, y, coefficient_matrix(coefficients, order))
+    return polynomial_values(coefficient_matrix(coefficients, order), x, y)
 
 
 def substitution(order: int, M: Float) -> Float:
@@ -134,14 +133,14 @@ def largest_magnitude(
     low = np.array([x_range[0], y_range[0]], float)
     high = np.array([x_range[1], y_range[1]], float)
     x, y = _candidates(low, high)
-    values = np.abs(polynomial.polyval2d(x, y, c))
+    values = np.abs(polynomial_values(c, x, y))
     start = np.argsort(values)[-_BEST:]
     best = np.stack([x[start], y[start]], axis=1)  # (_BEST, 2)
     step = (high - low) / (_GRID - 1)
     around = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 2), axis=-1).reshape(-1, 2)
     for _ in range(_HALVINGS):
         near = np.clip(best[:, None] + around * step, low, high)
-        size = np.abs(polynomial.polyval2d(near[..., 0], near[..., 1], c))
+        size = np.abs(polynomial_values(c, near[..., 0], near[..., 1]))
         best = np.take_along_axis(near, size.argmax(axis=1)[:, None, None], axis=1)[:, 0]
         step = step / 2
     return float(size.max())

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cache
 
 import numpy as np
 from numpy.polynomial import legendre
+from numpy.typing import ArrayLike
 
 from bayesdist.arrays import Bool, Float
 from bayesdist.errors import InputError
@@ -25,8 +26,6 @@ from bayesdist.products.formats.sip.families import (
 )
 from bayesdist.products.formats.sip.header import SipHeader
 
-Frozen = Any  # a distribution of scipy.stats with its parameters
-
 # Odds of a further, independent fault, for values that a suspect leaves unexplained.
 _SECOND_FAULT = 1e-2
 # Components of a closure are known to this; pixels.
@@ -38,6 +37,40 @@ _MIDDLES = (np.arange(2000) + 0.5) / 2000
 # Points of each axis over which stated maxima are compared, and the largest part of a maximum that
 # such a sample misses.
 _NODES, _SAMPLED = 129, 2e-4
+
+
+@cache
+def _student_nodes(dof: int) -> Float:
+    """Equally probable nodes of Student's t distribution of unit scale about zero."""
+    from scipy.special import stdtrit  # here, as few files need it, and all would wait for it
+
+    return np.asarray(stdtrit(dof, _MIDDLES), float)
+
+
+@dataclass(frozen=True)
+class _Student:
+    """Student's t distribution."""
+
+    dof: int
+    centre: float
+    scale: float
+
+    @property
+    def nodes(self) -> Float:
+        """Equally probable nodes."""
+        return self.centre + self.scale * _student_nodes(self.dof)
+
+    def below(self, values: ArrayLike) -> Float:
+        """Probability below each of some values."""
+        from scipy.special import stdtr
+
+        return np.asarray(stdtr(self.dof, (np.asarray(values) - self.centre) / self.scale), float)
+
+    def quantiles(self, probabilities: ArrayLike) -> Float:
+        """Values with these probabilities below them."""
+        from scipy.special import stdtrit
+
+        return np.asarray(self.centre + self.scale * stdtrit(self.dof, probabilities), float)
 
 
 @dataclass(frozen=True)
@@ -92,7 +125,7 @@ def implied_values(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple
             keyword = sip_keyword(family, *powers)
             posterior, score = closure.solved(sip, family, powers)
             share, sources = 1.0, ["A, B" if family in ("AP", "BP") else "AP, BP"]
-            nodes = posterior.ppf(_MIDDLES)
+            nodes = posterior.nodes
             if maxima is not None and family in ("A", "B"):
                 share, cut = _cut(posterior, maxima.allowed(family, powers, posterior))
                 if share > _SECOND_FAULT:
@@ -119,14 +152,14 @@ def implied_values(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple
     return tuple(sorted(implied, key=lambda one: -one.probability))
 
 
-def _cut(t: Frozen, intervals: list[tuple[float, float]]) -> tuple[float, Float]:
+def _cut(t: _Student, intervals: list[tuple[float, float]]) -> tuple[float, Float]:
     """Probability of the intervals, and equally probable nodes within them."""
-    limits = np.array([t.cdf(pair) for pair in intervals]).reshape(-1, 2)
+    limits = t.below(np.reshape(intervals, (-1, 2)))
     below = np.concatenate([[0.0], np.cumsum(limits[:, 1] - limits[:, 0])])
     share = float(below[-1])
     at = share * _MIDDLES
     which = np.clip(np.searchsorted(below, at) - 1, 0, None)
-    return share, t.ppf(limits[which, 0] + at - below[which]) if share > 0 else _MIDDLES
+    return share, t.quantiles(limits[which, 0] + at - below[which]) if share > 0 else _MIDDLES
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +192,9 @@ class _Closure:
             [self.projector @ (back_x - self.x), self.projector @ (back_y - self.y)]
         )
 
-    def solved(self, sip: SipHeader, family: str, powers: tuple[int, int]) -> tuple[Frozen, float]:
+    def solved(
+        self, sip: SipHeader, family: str, powers: tuple[int, int]
+    ) -> tuple[_Student, float]:
         """Distribution of one coefficient, and the logarithm of its evidence."""
         keyword = sip_keyword(family, *powers)
 
@@ -175,14 +210,13 @@ class _Closure:
         for _ in range(_STEPS):  # with one slope: a distortion is nearly linear in its coefficients
             value -= (d @ rest[mask]) / (d @ d)
             rest = components(value)
-        from scipy import stats  # here, as few files need it, and all would wait for it
         from scipy.special import betaln
 
         dof = int(mask.sum()) - 1
         inside, outside = (float(r @ r) + r.size * _ROUNDING**2 for r in (rest[mask], rest[~mask]))
         score = betaln(0.5, dof / 2) - dof / 2 * np.log(inside)
         score -= (~mask).sum() / 2 * np.log(outside)
-        return stats.t(dof, value, np.sqrt(inside / dof / (d @ d))), float(score)
+        return _Student(dof, float(value), float(np.sqrt(inside / dof / (d @ d)))), float(score)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,12 +249,14 @@ class StatedMaxima:
         low, high = self._limits(prefix)
         return bool(low <= np.abs(self._values(prefix)).max() <= high)
 
-    def allowed(self, prefix: str, powers: tuple[int, int], t: Frozen) -> list[tuple[float, float]]:
+    def allowed(
+        self, prefix: str, powers: tuple[int, int], t: _Student
+    ) -> list[tuple[float, float]]:
         """Intervals of a coefficient within which the stated maximum is reached."""
         base, monomial = self._values(prefix), self.u ** powers[0] * self.v ** powers[1]
         printed = getattr(self.sip, prefix.lower())[powers]
 
-        ends = np.array(t.interval(1 - _TAIL))
+        ends = t.quantiles([_TAIL / 2, 1 - _TAIL / 2])
         centre, half = ends.mean(), np.ptp(ends) / 2
 
         def beyond(z: float, limit: float) -> float:
