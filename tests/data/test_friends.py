@@ -8,7 +8,15 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from bayesdist.data.detections import NO_STAR
-from bayesdist.data.matching.friends import FINE, friends_of_friends
+from bayesdist.data.matching import friends
+from bayesdist.data.matching.friends import (
+    FINE,
+    MIN_SIDE,
+    Friends,
+    cells,
+    friends_of_friends,
+    grouped,
+)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -42,3 +50,79 @@ def test_chains_are_given_up():
     found = friends_of_friends(places, np.arange(20), 1.0)
     assert found.n_chains == found.n_ambiguous == 1
     assert found.n_stars == 0
+
+
+def field_of_cells(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Detections on a sky of some cells: stars on edges and corners, doubles and chains."""
+    rng = np.random.default_rng(seed)
+    side = 4.0 * MIN_SIDE
+    lattice = np.arange(-side, side, MIN_SIDE / 8)
+    # the lowest detection, from where cells of the least size have their edges at rows of stars
+    corner = np.full((1, 2), lattice[0] - MIN_SIDE / 8)
+    stars = np.stack(np.meshgrid(lattice, lattice), axis=-1).reshape(-1, 2)
+    # chains across cells, between the stars: along both axes, side by side, and along a diagonal
+    step = np.arange(0, 2.5 * MIN_SIDE, 0.9)[:, None]
+    chains = [
+        start + step * way
+        for start, way in (
+            ([7.5, 7.5], [1, 0]),
+            ([7.5, 12.5], [1, 0]),
+            ([3.3, 3.3], [0, 1]),
+            ([-295.0, -300.0], [0.7, 0.7]),
+        )
+    ]
+    places = np.concatenate(
+        [stars + rng.normal(0, 0.25, stars.shape) for _ in range(6)] + chains + [corner]
+    )
+    exposure = rng.integers(0, 5, len(places))
+    order = rng.permutation(len(places))
+    return places[order], exposure[order]
+
+
+def assert_same(a: Friends, b: Friends) -> None:
+    assert np.array_equal(a.star, b.star)
+    for name in ("n_stars", "n_doubled", "n_dropped", "n_chains"):
+        assert getattr(a, name) == getattr(b, name), name
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_groups_do_not_depend_on_the_cells(seed, monkeypatch):
+    """Nor on the sequence in which these are grouped; codes rise with the first detection."""
+    places, exposure = field_of_cells(seed)
+    monkeypatch.setattr(friends, "CELL", 10**9)
+    whole = friends_of_friends(places, exposure, 1.0)
+    assert whole.n_stars > 1000 and whole.n_doubled > 100 and whole.n_chains == 4
+    heads = np.unique(whole.star, return_index=True)[1][1:]
+    assert np.all(np.diff(heads) > 0)
+    for detections in (1, 1500, 4000):
+        monkeypatch.setattr(friends, "CELL", detections)
+        parts = list(cells(places, exposure, 1.0, detections))
+        assert len(parts) > 3
+        inside = np.concatenate([part.rows[part.inside] for part in parts])
+        assert np.array_equal(np.sort(inside), np.arange(len(places)))
+        # stars that lie in several cells
+        cut = sum(len(set(whole.star[part.rows[part.inside]]) - {NO_STAR}) for part in parts)
+        assert detections > 1 or cut > whole.n_stars + 500
+        assert_same(friends_of_friends(places, exposure, 1.0), whole)
+        backwards = friends_of_friends(
+            places, exposure, 1.0, each=lambda one, many: map(one, reversed(list(many)))
+        )
+        assert_same(backwards, whole)
+
+
+def test_one_cell_at_a_time_is_in_memory():
+    """Those of a sky that is not yet grouped do not exist."""
+    places, exposure = field_of_cells(1)
+    alive = [0]
+
+    def counted(many):
+        for one in many:
+            alive[0] += 1
+            yield one
+
+    def watched(one):
+        assert alive[0] == 1
+        alive[0] -= 1
+        return grouped(one)
+
+    friends_of_friends(places, exposure, 1.0, each=lambda one, many: map(watched, counted(many)))

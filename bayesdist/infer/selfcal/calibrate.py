@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.elimination import Mixture, memberships
 from bayesdist.infer.selfcal.gauge import Gauge
 from bayesdist.infer.selfcal.mode import PriorAt, SelfCalibrationMode, gauge_of, solve_in_gauge
+from bayesdist.infer.selfcal.pieces import each_of
 from bayesdist.infer.selfcal.problem import Problem, StarPriors, prepare
 from bayesdist.infer.selfcal.tangent import TangentPlane, places_of
 from bayesdist.infer.stars.shards import Compute
@@ -97,7 +99,7 @@ def self_calibrate(
     log : callable, optional
         Called with a sentence for each iteration.
     compute : Compute, optional
-        Where the passes over the detections are made; in this process by default.
+        Where detections are grouped and the passes over them are made; in this process by default.
 
     Returns
     -------
@@ -121,9 +123,9 @@ def self_calibrate(
     mode: SelfCalibrationMode | None = None
     for turn in range(max_iterations):
         flat = detections if plane is None else plane.onto_it(model, detections, theta)
-        friends = friends_of_friends(
-            places_of(model, flat, theta, dilation), flat.exposure, radius * pixel
-        )
+        places = places_of(model, flat, theta, dilation)
+        each = partial(each_of, compute)
+        friends = friends_of_friends(places, flat.exposure, radius * pixel, each=each)
         found = replace(flat, star=friends.star)
         problem = prepare(
             model,

@@ -7,8 +7,8 @@ its detections.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -180,6 +180,20 @@ def in_pieces(
         pieces.close()
 
 
+def each_of(compute: Compute | None, function: Task, sources: Iterable[Any]) -> Iterable[Any]:
+    """Results of a function of each source, in their order: one at a time here, or on a cluster.
+
+    InputError as `ClusterPieces`.
+    """
+    if compute is None or compute.engine != "dask":
+        return map(function, sources)
+    from bayesdist.infer.stars.cluster import ClusterPieces
+
+    with closing(ClusterPieces(function, sources, compute)) as made:
+        results: tuple[Any, ...] = made.sum(_alone)
+        return results
+
+
 @contextmanager
 def one_cluster(compute: Compute | None) -> Iterator[Compute | None]:
     """Context in which all `in_pieces` of its compute share one cluster, where that is one."""
@@ -208,6 +222,11 @@ class _Whole(MappedPieces):
 
     def close(self) -> None:
         """Nothing is to be released."""
+
+
+def _alone(made: Any) -> tuple[Any, ...]:
+    """On a worker: result of which a sum has each by itself."""
+    return (made,)
 
 
 def _received(piece: StarPiece) -> StarPiece:

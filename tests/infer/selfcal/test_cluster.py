@@ -10,17 +10,28 @@ import os
 import signal
 import sys
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import pytest
 
+from bayesdist.data.matching import friends
+from bayesdist.data.matching.friends import friends_of_friends, grouped
 from bayesdist.infer import Compute
 from bayesdist.infer.equations.priors import Prior
-from bayesdist.infer.selfcal import pieces, sample_selfcal, star_catalogue
+from bayesdist.infer.selfcal import pieces, sample_selfcal, self_calibrate, star_catalogue
 from bayesdist.infer.selfcal.elimination import Mixture, StarModes, expand
 from bayesdist.infer.selfcal.mode import mode_at, solve_in_gauge
-from bayesdist.infer.selfcal.pieces import StarPiece, in_pieces, log_density, slope, to_sample
+from bayesdist.infer.selfcal.pieces import (
+    StarPiece,
+    each_of,
+    in_pieces,
+    log_density,
+    slope,
+    to_sample,
+)
 from bayesdist.infer.selfcal.problem import StarPriors
+from bayesdist.infer.selfcal.tangent import places_of
 from bayesdist.infer.stars.cluster import ClusterPieces
 from tests.infer.selfcal import fields
 from tests.infer.workers import local_workers
@@ -58,6 +69,7 @@ def cluster(forked_workers):
 @pytest.fixture
 def compute(cluster, monkeypatch) -> Compute:
     monkeypatch.setattr(pieces, "PIECE", PIECE)
+    monkeypatch.setattr(friends, "CELL", PIECE)
     return Compute(engine="dask", scheduler=cluster.scheduler_address)
 
 
@@ -94,6 +106,14 @@ def die_once(piece, mark, first) -> np.ndarray:
         mark.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return piece.problem.var[:1]
+
+
+def grouped_after_death(cell, mark, last):
+    """Takes the worker down that has the last detection, the first time."""
+    if not mark.exists() and cell.rows[cell.inside][-1] == last:
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return grouped(cell)
 
 
 # -------------------------------------------------------------------------------------------------
@@ -184,6 +204,36 @@ def test_solution_and_stars_are_those_of_one_process(start, solution, compute):
         one, other = getattr(there, name), getattr(here, name)
         root = np.sqrt(np.diagonal(other, axis1=1, axis2=2))
         assert_close(one, other, root[:, :, None] * root[:, None])
+
+
+def test_stars_are_those_of_one_process(compute):
+    """Detections are grouped, solved and grouped again on the workers."""
+    simulated = fields.field(4, 6, 200, disturbed=0.03)
+    given = simulated.model, simulated.unlabelled, simulated.theta
+    more = {"match_radius": 1.0, "start_radius": 4.0, "min_detections": 3}
+    here, there = self_calibrate(*given, **more), self_calibrate(*given, **more, compute=compute)
+    assert np.array_equal(there.friends.star, here.friends.star)
+    assert there.friends.n_ambiguous == here.friends.n_ambiguous
+    assert there.iterations == here.iterations > 1
+    assert_same_mode(there.mode, here.mode)
+
+
+@pytest.mark.slow
+@only_in_full("tests/infer/stars kills one of them")
+def test_one_of_two_workers_is_killed_while_grouping(compute, tmp_path):
+    simulated = fields.field(3, 8, 300, n_chips=2, disturbed=0.03)
+    d = simulated.unlabelled
+    given = places_of(simulated.model, d, simulated.theta), d.exposure, 1.0
+    expected, mark = friends_of_friends(*given), tmp_path / "mark"
+
+    def each(function, sources):
+        assert function is grouped
+        dying = partial(grouped_after_death, mark=mark, last=len(d) - 1)
+        return each_of(compute, dying, sources)
+
+    found = friends_of_friends(*given, each=each)
+    assert mark.exists()
+    assert np.array_equal(found.star, expected.star)
 
 
 @pytest.mark.slow
