@@ -44,7 +44,8 @@ def corner_figure(columns: Sequence[Column]) -> Figure:
     n = len(columns)
     raw = np.stack([c.draws for c in columns], axis=-1)
     ranges = _ranges(raw)
-    scales = [display_scale(c.unit, limits) for c, limits in zip(columns, ranges, strict=True)]
+    # by the middle of the axis: the numbers at its ticks are not the largest
+    scales = [display_scale(c.unit, r.mean()) for c, r in zip(columns, ranges, strict=True)]
     factors = np.array([s.factor for s in scales])
     side = WIDTH if n > 3 else 1.6 * n + 0.9
     with figure_style():

@@ -187,6 +187,7 @@ def _errors(ax: Axes, stars: Table, unit: str) -> None:
             x, np.asarray(values) * scale.factor, ".", ms=2, mec="none", color=color, label=label
         )
     ax.set_yscale("log")
+    ax.locator_params(axis="x", integer=not by_mag)
     ax.set_xlabel("magnitude [mag]" if by_mag else "detections [count]")
     ax.set_ylabel(f"per axis (1 σ) [{scale.unit}]")
     ax.set_title("Errors of the stars")
