@@ -45,6 +45,11 @@ def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
                 rows.append((f"{chip}{axis}", *(rounded(s[k], s["sigma"] / 10) for k in names)))
     if r.held:
         pairs["Parameters"] += f", {count(len(r.held))} of them held by {words.constraint}"
+    notes = [f"From {r.sample}."] if r.sample else []
+    if words.leverage:
+        notes.append(
+            "The stars were fitted to these detections, so that residuals are smaller than errors."
+        )
     return (
         listing(words.fit.capitalize(), pairs),
         *((_skew_table(r),) if r.setting("fit", "skew", False) else ()),
@@ -52,19 +57,10 @@ def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
             f"Residuals of the {words.rows} used [{scale.unit}]",
             ("Chip, axis" if r.several else "Axis", *heads),
             tuple(rows),
-            note=_residual_note(r),
+            note=" ".join(notes),
             detail=True,
         ),
     )
-
-
-def _residual_note(r: ReportInput) -> str:
-    notes = [f"From {r.sample}."] if r.sample else []
-    if r.words.leverage:
-        notes.append(
-            "The stars were fitted to these detections, so that residuals are smaller than errors."
-        )
-    return " ".join(notes)
 
 
 def _skew_table(r: ReportInput) -> TextTable:
