@@ -19,48 +19,32 @@ from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import read_wise_meta, sip_from_solution, write_wise_meta
 from bayesdist.products.formats.sip.positions import sip_positions
 from bayesdist.products.registry import product_settings
-from tests.app.support import good, summary_of
+from tests.app.support import good, summary_of, write_job
 from tests.products.support import random_pixels, some_solution
 
 SIZE, GRID, REFERENCE = (512, 256), (9, 5), (256.0, 128.0)
 DRIFT = 2e-5
 FILES_OF_OTHERS = ("tpv.head", "ast.txt", "cpdis.fits")
 
-CONFIG = """
-[data]
-matches = "stars.ecsv"
-unit = "pix"
-[detector]
-name = "chip"
-size = [512, 256]
-[model]
-order = 3
-reference_pixel = [256.0, 128.0]
-[model.tdd]
-epoch0 = 2008.0
-terms = [["u", 1, 0], ["v", 1, 0]]
-[sampler]
-target_ess = 100
-[assess]
-epoch = 2008.0
-grid = [9, 5]
-draws = 400
-[[budget]]
-name = "catalogue"
-kind = "random"
-sigma_u = 0.004
-sigma_v = 0.004
-source = "a letter"
-[[budget]]
-name = "guiding"
-kind = "systematic"
-sigma_u = 0.001
-sigma_v = 0.001
-source = "Published: a handbook, Table 2"
-[products]
-sip = {inverse_order = 2}
-idctab = {instrument = "ACS", detector = "WFC"}
-"""
+BUDGET = [
+    {"name": "catalogue", "kind": "random", "sigma_u": 0.004, "sigma_v": 0.004,
+     "source": "a letter"},
+    {"name": "guiding", "kind": "systematic", "sigma_u": 0.001, "sigma_v": 0.001,
+     "source": "Published: a handbook, Table 2"},
+]  # fmt: skip
+# pixels of the handbook's size: an IDCTAB counts in arcseconds
+DETECTOR = {"name": "chip", "size": SIZE, "scale_mas": 50.0}
+CONFIG = {
+    "data": {"matches": "stars.ecsv", "unit": "pix"},
+    "model": {"order": 3, "reference_pixel": REFERENCE},
+    "model.tdd": {"epoch0": 2008.0, "terms": [["u", 1, 0], ["v", 1, 0]]},
+    "sampler": {"target_ess": 100},
+    "assess": {"epoch": 2008.0, "grid": GRID, "draws": 400},
+    "products": {
+        "sip": {"inverse_order": 2},
+        "idctab": {"instrument": "ACS", "detector": "WFC"},
+    },
+}
 
 
 @pytest.fixture(scope="module")
@@ -76,13 +60,8 @@ def run(tmp_path_factory):
     columns = {"x": x, "y": y, "u": u, "v": v, "epoch": epoch}
     for name in ("sigma_u", "sigma_v"):
         columns[name] = np.full(x.size, 0.02)
-    Table(columns).write(folder / "stars.ecsv")
-    (folder / "config.toml").write_text(
-        # pixels of the handbook's size: an IDCTAB counts in arcseconds
-        CONFIG.replace('name = "chip"', 'name = "chip"\nscale_mas = 50.0'),
-        encoding="utf-8",
-    )
-    good("run", folder / "config.toml", "-o", folder / "run", "-q")
+    config = write_job(folder, Table(columns), detector=DETECTOR, budget=BUDGET, **CONFIG)
+    good("run", config, "-o", folder / "run", "-q")
     return folder / "run"
 
 
