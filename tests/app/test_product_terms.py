@@ -14,9 +14,11 @@ from bayesdist.app.products.made_files import ProductInput, made_files
 from bayesdist.app.products.product_terms import _Laid, product_terms
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.calibration.calibration import GaussianSolution
+from bayesdist.calibration.calibration import GaussianSolution, calibration_of
+from bayesdist.calibration.plane import Plane
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import read_wise_meta, sip_from_solution, write_wise_meta
+from bayesdist.products.formats.common.document import BuildOptions
 from bayesdist.products.formats.sip.positions import sip_positions
 from bayesdist.products.registry import product_settings
 from tests.app.support import good, summary_of, write_job
@@ -69,6 +71,11 @@ def run(tmp_path_factory):
 def results(run):
     with open_results(RunDirectory.open(run)) as found:
         yield found
+
+
+def product_of(solution, **what):
+    """Ingredients of the files of a solution that no run has made."""
+    return ProductInput(solution, calibration_of(solution, "made up", **what), BuildOptions())
 
 
 def rows_of(run):
@@ -144,7 +151,7 @@ def test_axes_and_size_of_a_file_are_its_own_and_a_wave_is_not():
             at = model.basis(chip.number).terms.index(k)
             mean[model.coefficient_slice(chip.number, axis)][at] = half
     solution = SimpleNamespace(model=model, mean=mean)
-    product = ProductInput(solution, "")
+    product = product_of(solution)
 
     def wave(x, y, chip, epoch):
         return 0.01 * np.sin(np.stack([x, y], axis=-1) * 2 * np.pi / 32 + chip)
@@ -196,7 +203,7 @@ def test_digits_of_wise_entries_are_what_is_left(tmp_path):
 def test_files_that_others_read_are_measured_as_others_read_them():
     """A TPV header and an AST mapping to rounding; tables by what lies between their nodes."""
     solution = some_solution(3, unit="arcsec", pixel=0.26, angle=0.4, flip=True)
-    product = ProductInput(solution, "made up", tangent_point=(150.1, 2.2))
+    product = product_of(solution, plane=Plane("sky", point=(150.1, 2.2)))
     known = product_settings()
     asked = {"tpv": known["tpv"](), "ast": known["ast"](), "cpdis": known["cpdis"](step=64.0)}
     products = SimpleNamespace(release=None, asked=lambda: asked)
@@ -229,7 +236,7 @@ def test_files_of_pipelines_are_right_forward_and_miss_by_their_inverse(key, set
     """Forward to rounding, along axes of their own; back as far as the file states."""
     reference = ((size[0] + 1) / 2, (size[1] + 1) / 2)
     solution = some_solution(4, unit="arcsec", pixel=0.11, size=size, reference_pixel=reference)
-    product = ProductInput(solution, "made up")
+    product = product_of(solution)
     asked = {key: product_settings()[key](**settings)}
     config = SimpleNamespace(products=SimpleNamespace(release=None, asked=lambda: asked))
     forward, inverse = product_terms(product, config, None)
