@@ -21,7 +21,7 @@ from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import OUTLINE, PALETTE, WIDTH, new_figure, nice_below
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.run.residuals import residual_panels
-from bayesdist.report.texttable import TextTable, listing
+from bayesdist.report.texttable import TextTable, listing, tabulated
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
@@ -42,17 +42,17 @@ def lookup_table(r: ReportInput) -> TextTable:
         "binned": "binned and smoothed",
         "none": "not fitted",
     }
-    rows = tuple(
-        (
-            row.get("filter") or "detector",
-            c.chip_name(row["chip"]),
-            "{1} × {0}".format(*row["nodes"]),
-            number(row["rms"]),
-            number(row["largest"]),
-            number(row["sigma_median"]),
-        )
+    rows = [
+        {
+            "Of": row.get("filter") or "detector",
+            "Chip": c.chip_name(row["chip"]),
+            "Nodes": "{1} × {0}".format(*row["nodes"]),
+            "Rms of an axis [pix]": number(row["rms"]),
+            "Largest [pix]": number(row["largest"]),
+            "σ, median [pix]": number(row["sigma_median"]),
+        }
         for row in t["chips"]
-    )
+    ]
     caption, note = f"Look-up tables: {words.get(t['method'], t['method'])}", ""
     if "converged" in t:
         caption += ", converged" if t["converged"] else ", NOT converged"
@@ -62,13 +62,7 @@ def lookup_table(r: ReportInput) -> TextTable:
         )
     if t.get("detector"):
         note = f"The detector's are those of {t['detector']}. {note}".strip()
-    return TextTable(
-        caption,
-        ("Of", "Chip", "Nodes", "Rms of an axis [pix]", "Largest [pix]", "σ, median [pix]"),
-        rows,
-        words=(0, 1),
-        note=note,
-    )
+    return tabulated(caption, rows, words=(0, 1), note=note)
 
 
 @REPORT.figure("campaign-tables", needs=("campaign.residuals", "campaign.tables"))
