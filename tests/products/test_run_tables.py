@@ -64,7 +64,7 @@ def test_a_file_has_the_tables_of_the_run(product, tmp_path, key):
         (tmp_path / one.file_name).write_bytes(one.content)
     rng = np.random.default_rng(2)
     x, y = np.round(rng.uniform(2, 255, 400)), np.round(rng.uniform(2, 191, 400))
-    expected = replace(calibration, before=product.tables).forward(x, y, chip=1)
+    expected = replace(calibration, before=product.options.tables).forward(x, y, chip=1)
     plain = calibration.forward(x, y, chip=1)
     effect = np.hypot(*(expected - plain).T).max()
     assert effect > 0.02  # arcsec: they are no trifle
@@ -90,5 +90,5 @@ def test_a_file_has_the_tables_of_the_run(product, tmp_path, key):
 def test_a_file_without_tables_says_so(product, key):
     [warning] = _left_out(key, product)
     assert "look-up tables of the run are not in this file" in warning
-    assert _left_out(key, replace(product, tables=())) == ()
+    assert _left_out(key, replace(product, options=BuildOptions())) == ()
     assert _left_out("jwst", product) == ()

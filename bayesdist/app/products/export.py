@@ -93,7 +93,7 @@ def export(
 
 def _left_out(key: str, product: ProductInput) -> tuple[str, ...]:
     """Warning on the look-up tables of a run that a format has no room for."""
-    if not product.tables or format_of(key).holds_tables:
+    if not product.options.tables or format_of(key).holds_tables:
         return ()
     return (
         "the look-up tables of the run are not in this file, as its row 'forward' in the error "

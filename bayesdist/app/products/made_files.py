@@ -48,11 +48,6 @@ class ProductInput:
     options: BuildOptions
     aligned: bool = False  # the user of a file fits shift and rotation of an exposure
 
-    @property
-    def tables(self) -> tuple[LookupTable, ...]:
-        """By which pixels are corrected before the polynomials, of the detector and the filter."""
-        return self.options.tables
-
 
 def further_errors(budget: Sequence[Mapping[str, Any]]) -> tuple[FurtherError, ...]:
     """Rows of a budget of errors that the covariance of the exported solution does not hold."""

@@ -90,7 +90,7 @@ def _released(
     """The files of a release, one set for each segment: of several periods of one, the first."""
     filter = product.calibration.filter
     solutions = {filter: product.solution}
-    entries = write_files(block, number, base, folder, solutions, product.tables)
+    entries = write_files(block, number, base, folder, solutions, product.options.tables)
     paths = {e["kind"]: folder / e["path"] for e in entries}
     before = read_d2im(paths["D2IMFILE"]) if "D2IMFILE" in paths else ()
     npol = read_lookup_file(paths["NPOLFILE"]) if "NPOLFILE" in paths else None
@@ -132,8 +132,8 @@ def _term(product: ProductInput, file: str, direction: str, shift: Positions) ->
 def _solution(product: ProductInput, x: Float, y: Float, chip: int, epoch: float | None) -> Float:
     """Positions (N, 2) by the solution: tables where it has some, then the polynomials."""
     solution = product.solution
-    if product.tables:
-        x, y = corrected(product.tables, x, y, chip=chip, filter=product.calibration.filter)
+    if product.options.tables:
+        x, y = corrected(product.options.tables, x, y, chip=chip, filter=product.calibration.filter)
     place = place_of(solution.model, epoch=epoch, chip=chip)
     return np.asarray(place.basis.evaluate(x, y) @ place.polynomial(solution.mean).T)
 
