@@ -24,23 +24,14 @@ SELDOM = 50_000, 20, 100
 ALGEBRA = "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"
 COMMANDS = "bayesdist.app.commands"
 CORE = {
-    "init": f"{COMMANDS}.runs:init",
-    "check": f"{COMMANDS}.runs:check",
-    "run": f"{COMMANDS}.runs:run",
-    "stage": f"{COMMANDS}.runs:stage",
-    "report": f"{COMMANDS}.runs:report",
-    "requirements": f"{COMMANDS}.runs:requirements",
-    "budget": f"{COMMANDS}.runs:budget",
-    "plan": f"{COMMANDS}.planning:plan",
-    "plan-dither": f"{COMMANDS}.planning:plan_dither",
-    "select-order": f"{COMMANDS}.planning:select_order",
-    "monitor": f"{COMMANDS}.calibrations:monitor",
-    "compare": f"{COMMANDS}.calibrations:compare",
-    "inspect": f"{COMMANDS}.calibrations:inspect",
-    "apply": f"{COMMANDS}.calibrations:apply",
-    "convert": f"{COMMANDS}.calibrations:convert",
-    "release": f"{COMMANDS}.calibrations:release",
-    "docs": f"{COMMANDS}.documentation:docs",
+    name: f"{COMMANDS}.{module}:{name.replace('-', '_')}"
+    for module, names in {
+        "runs": "init check run stage report requirements budget",
+        "planning": "plan plan-dither select-order",
+        "calibrations": "monitor compare inspect apply convert release",
+        "documentation": "docs",
+    }.items()
+    for name in names.split()
 }
 SIMULATED = {"camera": f"{COMMANDS}.simulated:camera"}
 RENAMED = {

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import PurePath
+from typing import Any
 
 from bayesdist.checks import Check
 from bayesdist.numbers import MISSING, number
@@ -54,6 +55,12 @@ class TextTable:
         rows = self.rows[: self.leading or None]
         widths = (max(map(len, column)) for column in zip(self.columns, *rows, strict=True))
         return len(rows) <= _FEW_ROWS and sum(widths) <= _FEW_LETTERS
+
+
+def tabulated(caption: str, rows: Sequence[Mapping[str, str]], **look: Any) -> TextTable:
+    """Table of rows whose cells stand beside their headings; `look` is as of `TextTable`."""
+    columns = tuple(rows[0]) if rows else ()
+    return TextTable(caption, columns, tuple(tuple(row.values()) for row in rows), **look)
 
 
 def listing(

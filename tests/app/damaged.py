@@ -10,7 +10,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 from bayesdist.reading.tables import read_table
-from tests.app.support import cli, good, one_sentence, refused, snapshot, summary_of
+from tests.app.support import cli, edit, good, one_sentence, refused, snapshot, summary_of
 
 CONFIG = "campaign_f606w.toml"
 ONE = "f606w-004"  # the exposure that is damaged; the break is between it and f606w-005
@@ -25,9 +25,7 @@ class Campaign:
 
     def replaced(self, old: str, new: str) -> Campaign:
         """The same with another configuration."""
-        text = (self.path / CONFIG).read_text(encoding="utf-8")
-        assert old in text
-        (self.path / CONFIG).write_text(text.replace(old, new), encoding="utf-8")
+        edit(self.path / CONFIG, {old: new})
         return self
 
     def without_drift(self) -> Campaign:

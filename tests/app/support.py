@@ -197,6 +197,21 @@ def write_config(path: Path, **sections: Any) -> Path:
     return path
 
 
+def replaced(text: str, changes: Mapping[str, str]) -> str:
+    """A text with these parts of it replaced; each is there."""
+    for old, new in changes.items():
+        assert old in text, old
+        text = text.replace(old, new)
+    return text
+
+
+def edit(config: Path, changes: Mapping[str, str]) -> Path:
+    """Replace parts of a configuration."""
+    text = config.read_text(encoding="utf-8")
+    config.write_text(replaced(text, changes), encoding="utf-8")
+    return config
+
+
 def write_job(folder: Path, table: Table | None = None, **sections: Any) -> Path:
     """stars.ecsv and config.toml in a folder; the configuration's path."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from tests.app.support import cli, good, one_sentence, refused
+from tests.app.support import cli, good, one_sentence, refused, write_config, write_job
 from tests.reduced import only_in_full
 
 pytestmark = pytest.mark.usefixtures("figures_made")
@@ -16,50 +16,23 @@ SIZE = (512, 256)
 N, EPOCHS = 250, np.linspace(2004.0, 2012.0, 6)
 SIGMA, DRIFT = 0.02, 2e-5
 
-CONFIG = """
-[data]
-matches = "stars.ecsv"
-unit = "pix"
-[detector]
-name = "chip"
-size = [512, 256]
-scale_mas = 50.0
-[model]
-order = 2
-reference_pixel = [256.0, 128.0]
-[model.tdd]
-epoch0 = 2008.0
-terms = [["u", 1, 0], ["v", 1, 0]]
-[sampler]
-target_ess = 200
-[assess]
-epoch = 2008.0
-grid = [9, 5]
-draws = 2000
-years_ahead = 20.0
-[[budget]]
-name = "catalogue"
-kind = "random"
-sigma_u = 0.004
-sigma_v = 0.004
-included_in_scatter = true
-source = "a paper"
-[[budget]]
-name = "proper motions"
-kind = "random"
-sigma_u = 0.0
-sigma_v = 0.0
-source = "stars at rest in the simulation"
-[[budget]]
-name = "aberration"
-kind = "scale"
-sigma = 4e-6
-[[requirement]]
-name = "edge"
-statistic = "max"
-limit = 0.02
-region = "inner 100 %"
-"""
+BUDGET = [
+    {"name": "catalogue", "kind": "random", "sigma_u": 0.004, "sigma_v": 0.004,
+     "included_in_scatter": True, "source": "a paper"},
+    {"name": "proper motions", "kind": "random", "sigma_u": 0.0, "sigma_v": 0.0,
+     "source": "stars at rest in the simulation"},
+    {"name": "aberration", "kind": "scale", "sigma": 4e-6},
+]  # fmt: skip
+CONFIG = {
+    "data": {"matches": "stars.ecsv", "unit": "pix"},
+    "detector": {"name": "chip", "size": SIZE, "scale_mas": 50.0},
+    "model": {"order": 2, "reference_pixel": (256.0, 128.0)},
+    "model.tdd": {"epoch0": 2008.0, "terms": [["u", 1, 0], ["v", 1, 0]]},
+    "sampler": {"target_ess": 200},
+    "assess": {"epoch": 2008.0, "grid": (9, 5), "draws": 2000, "years_ahead": 20.0},
+    "budget": BUDGET,
+    "requirement": [{"name": "edge", "statistic": "max", "limit": 0.02, "region": "inner 100 %"}],
+}
 
 
 @pytest.fixture(scope="module")
@@ -82,9 +55,7 @@ def run(tmp_path_factory):
             "mag": mag,
         }
     )
-    table.write(folder / "stars.ecsv")
-    (folder / "config.toml").write_text(CONFIG)
-    good("run", folder / "config.toml", "-o", folder / "run", "-q")
+    good("run", write_job(folder, table, **CONFIG), "-o", folder / "run", "-q")
     return folder / "run"
 
 
@@ -184,10 +155,10 @@ def test_a_budget_that_cannot_be_given_is_refused_in_one_sentence(run, arguments
 
 def too_large(run, folder):
     """The same job with a catalogue that is said to be worse than the residuals scatter."""
-    text = CONFIG.replace("sigma_u = 0.004", "sigma_u = 0.04")
+    data = CONFIG["data"] | {"matches": str(run.parent / "stars.ecsv")}
+    worse = [BUDGET[0] | {"sigma_u": 0.04}, *BUDGET[1:]]
     folder.mkdir()
-    stars = str(run.parent / "stars.ecsv")
-    (folder / "config.toml").write_text(text.replace('"stars.ecsv"', f'"{stars}"'))
+    write_config(folder / "config.toml", **CONFIG | {"data": data, "budget": worse})
     return folder / "config.toml"
 
 

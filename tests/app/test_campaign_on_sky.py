@@ -217,6 +217,17 @@ def staged(config: Path, *stages: str) -> Path:
     return carried_out(run, *stages)
 
 
+def unmatched(config: Path, *words: str) -> str:
+    """The sentence, with these words, by which star lists are refused when they are matched."""
+    run = config.parent / "run"
+    run.mkdir()
+    (run / "config.toml").write_text(in_place(config), encoding="utf-8")
+    result = cli("stage", "match", run, "-q")
+    assert result.code == 1
+    one_sentence(result.err, *words)
+    return result.err
+
+
 def off_truth(run: Path) -> tuple[float, int]:
     """Chi-square of predicted less true positions over the detector, and its degrees of freedom.
 
@@ -298,12 +309,7 @@ def test_a_parity_that_is_given_is_the_only_one(tmp_path):
     found = summary_of(staged(config, "match"))["matching"]
     assert found["parity"] == "direct" and not found["warnings"]
     config = write(tmp_path / "other", 1, parity="mirrored")
-    folder = config.parent / "run"
-    folder.mkdir()
-    (folder / "config.toml").write_text(in_place(config), encoding="utf-8")
-    result = cli("stage", "match", folder, "-q")
-    assert result.code == 1
-    one_sentence(result.err, "its mirror image does match", "campaign.parity = 'direct'")
+    unmatched(config, "its mirror image does match", "campaign.parity = 'direct'")
 
 
 def test_another_field_is_refused_in_both_parities(tmp_path):
@@ -314,13 +320,8 @@ def test_another_field_is_refused_in_both_parities(tmp_path):
         return table
 
     config = write(tmp_path / "in", -1, change=elsewhere)
-    folder = config.parent / "run"
-    folder.mkdir()
-    (folder / "config.toml").write_text(in_place(config), encoding="utf-8")
-    result = cli("stage", "match", folder, "-q")
-    assert result.code == 1
-    one_sentence(result.err, "does not match", "the mirror image does not match either")
-    assert "parity" not in result.err  # both were tried
+    said = unmatched(config, "does not match", "the mirror image does not match either")
+    assert "parity" not in said  # both were tried
 
 
 def vizier(table):
@@ -386,12 +387,7 @@ def test_a_catalogue_without_units_gets_its_unit_from_the_configuration(tmp_path
     refused(tmp_path, "check", config, words=["has no unit", "campaign.unit"])
     config = write(tmp_path / "in", -1, change=on_a_plane(unit), unit=unit)
     assert f"900 of 900 stars, in {unit}" in good("check", config).out
-    folder = config.parent / "run"
-    folder.mkdir()
-    (folder / "config.toml").write_text(in_place(config), encoding="utf-8")
-    result = cli("stage", "match", folder, "-q")
-    assert result.code == 1
-    one_sentence(result.err, "its mirror image does match", "campaign.parity = 'mirrored'")
+    unmatched(config, "its mirror image does match", "campaign.parity = 'mirrored'")
     config = write(tmp_path / "all", -1, change=on_a_plane(unit), unit=unit, parity="mirrored")
     found = summary_of(staged(config, "match"))["matching"]
     assert found["parity"] == "mirrored" and found["completeness"]["median"] > 0.95

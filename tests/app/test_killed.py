@@ -20,7 +20,7 @@ import xarray as xr
 
 from bayesdist.app.cli import main
 from tests.app.selfcal.support import list_table, small, write_selfcal
-from tests.app.support import good
+from tests.app.support import edit, good
 
 pytestmark = pytest.mark.slow
 
@@ -122,17 +122,14 @@ def _of_matches(folder: Path, full: bool) -> Path:
 def _of_campaign(folder: Path, full: bool) -> Path:
     """Star lists of a few exposures, tables, and a drift."""
     good("simulate", "acs", "-o", folder, "--exposures", 8, "--stars", 3000, "--seed", 3, "-q")
-    config = folder / "campaign_f606w.toml"
-    text = config.read_text(encoding="utf-8")
-    for old, new in {
-        'method = "field"': 'step = [512.0, 512.0]\nmethod = "field"',
-        "[assess]": "[sampler]\nensembles = 2\ntarget_ess = 50\ntarget_rhat = 1.2\n\n[assess]",
-        "grid = [33, 17]": "grid = [5, 3]\ndraws = 100",
-    }.items():
-        assert old in text
-        text = text.replace(old, new)
-    config.write_text(text, encoding="utf-8")
-    return config
+    return edit(
+        folder / "campaign_f606w.toml",
+        {
+            'method = "field"': 'step = [512.0, 512.0]\nmethod = "field"',
+            "[assess]": "[sampler]\nensembles = 2\ntarget_ess = 50\ntarget_rhat = 1.2\n\n[assess]",
+            "grid = [33, 17]": "grid = [5, 3]\ndraws = 100",
+        },
+    )
 
 
 def _of_selfcal(folder: Path, full: bool) -> Path:

@@ -14,53 +14,39 @@ from bayesdist.app.products.made_files import ProductInput, made_files
 from bayesdist.app.products.product_terms import _Laid, product_terms
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.calibration.calibration import GaussianSolution
+from bayesdist.calibration.calibration import GaussianSolution, calibration_of
+from bayesdist.calibration.plane import Plane
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import read_wise_meta, sip_from_solution, write_wise_meta
+from bayesdist.products.formats.common.document import BuildOptions
 from bayesdist.products.formats.sip.positions import sip_positions
 from bayesdist.products.registry import product_settings
-from tests.app.support import good, summary_of
+from tests.app.support import good, summary_of, write_job
 from tests.products.support import random_pixels, some_solution
 
 SIZE, GRID, REFERENCE = (512, 256), (9, 5), (256.0, 128.0)
 DRIFT = 2e-5
 FILES_OF_OTHERS = ("tpv.head", "ast.txt", "cpdis.fits")
 
-CONFIG = """
-[data]
-matches = "stars.ecsv"
-unit = "pix"
-[detector]
-name = "chip"
-size = [512, 256]
-[model]
-order = 3
-reference_pixel = [256.0, 128.0]
-[model.tdd]
-epoch0 = 2008.0
-terms = [["u", 1, 0], ["v", 1, 0]]
-[sampler]
-target_ess = 100
-[assess]
-epoch = 2008.0
-grid = [9, 5]
-draws = 400
-[[budget]]
-name = "catalogue"
-kind = "random"
-sigma_u = 0.004
-sigma_v = 0.004
-source = "a letter"
-[[budget]]
-name = "guiding"
-kind = "systematic"
-sigma_u = 0.001
-sigma_v = 0.001
-source = "Published: a handbook, Table 2"
-[products]
-sip = {inverse_order = 2}
-idctab = {instrument = "ACS", detector = "WFC"}
-"""
+BUDGET = [
+    {"name": "catalogue", "kind": "random", "sigma_u": 0.004, "sigma_v": 0.004,
+     "source": "a letter"},
+    {"name": "guiding", "kind": "systematic", "sigma_u": 0.001, "sigma_v": 0.001,
+     "source": "Published: a handbook, Table 2"},
+]  # fmt: skip
+# pixels of the handbook's size: an IDCTAB counts in arcseconds
+DETECTOR = {"name": "chip", "size": SIZE, "scale_mas": 50.0}
+CONFIG = {
+    "data": {"matches": "stars.ecsv", "unit": "pix"},
+    "model": {"order": 3, "reference_pixel": REFERENCE},
+    "model.tdd": {"epoch0": 2008.0, "terms": [["u", 1, 0], ["v", 1, 0]]},
+    "sampler": {"target_ess": 100},
+    "assess": {"epoch": 2008.0, "grid": GRID, "draws": 400},
+    "products": {
+        "sip": {"inverse_order": 2},
+        "idctab": {"instrument": "ACS", "detector": "WFC"},
+    },
+}
 
 
 @pytest.fixture(scope="module")
@@ -76,13 +62,8 @@ def run(tmp_path_factory):
     columns = {"x": x, "y": y, "u": u, "v": v, "epoch": epoch}
     for name in ("sigma_u", "sigma_v"):
         columns[name] = np.full(x.size, 0.02)
-    Table(columns).write(folder / "stars.ecsv")
-    (folder / "config.toml").write_text(
-        # pixels of the handbook's size: an IDCTAB counts in arcseconds
-        CONFIG.replace('name = "chip"', 'name = "chip"\nscale_mas = 50.0'),
-        encoding="utf-8",
-    )
-    good("run", folder / "config.toml", "-o", folder / "run", "-q")
+    config = write_job(folder, Table(columns), detector=DETECTOR, budget=BUDGET, **CONFIG)
+    good("run", config, "-o", folder / "run", "-q")
     return folder / "run"
 
 
@@ -90,6 +71,11 @@ def run(tmp_path_factory):
 def results(run):
     with open_results(RunDirectory.open(run)) as found:
         yield found
+
+
+def product_of(solution, **what):
+    """Ingredients of the files of a solution that no run has made."""
+    return ProductInput(solution, calibration_of(solution, "made up", **what), BuildOptions())
 
 
 def rows_of(run):
@@ -165,7 +151,7 @@ def test_axes_and_size_of_a_file_are_its_own_and_a_wave_is_not():
             at = model.basis(chip.number).terms.index(k)
             mean[model.coefficient_slice(chip.number, axis)][at] = half
     solution = SimpleNamespace(model=model, mean=mean)
-    product = ProductInput(solution, "")
+    product = product_of(solution)
 
     def wave(x, y, chip, epoch):
         return 0.01 * np.sin(np.stack([x, y], axis=-1) * 2 * np.pi / 32 + chip)
@@ -217,7 +203,7 @@ def test_digits_of_wise_entries_are_what_is_left(tmp_path):
 def test_files_that_others_read_are_measured_as_others_read_them():
     """A TPV header and an AST mapping to rounding; tables by what lies between their nodes."""
     solution = some_solution(3, unit="arcsec", pixel=0.26, angle=0.4, flip=True)
-    product = ProductInput(solution, "made up", tangent_point=(150.1, 2.2))
+    product = product_of(solution, plane=Plane("sky", point=(150.1, 2.2)))
     known = product_settings()
     asked = {"tpv": known["tpv"](), "ast": known["ast"](), "cpdis": known["cpdis"](step=64.0)}
     products = SimpleNamespace(release=None, asked=lambda: asked)
@@ -250,7 +236,7 @@ def test_files_of_pipelines_are_right_forward_and_miss_by_their_inverse(key, set
     """Forward to rounding, along axes of their own; back as far as the file states."""
     reference = ((size[0] + 1) / 2, (size[1] + 1) / 2)
     solution = some_solution(4, unit="arcsec", pixel=0.11, size=size, reference_pixel=reference)
-    product = ProductInput(solution, "made up")
+    product = product_of(solution)
     asked = {key: product_settings()[key](**settings)}
     config = SimpleNamespace(products=SimpleNamespace(release=None, asked=lambda: asked))
     forward, inverse = product_terms(product, config, None)

@@ -6,6 +6,7 @@ import pytest
 from astropy.table import Table
 
 from bayesdist.app.cli import main
+from tests.app.support import edit
 from tests.reduced import only_in_full
 
 SCOPED = """
@@ -35,14 +36,13 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scope")
     assert main(["simulate", "wise", "-o", str(folder), "--stars", "1500", "-q"]) == 0
     config = folder / "config.toml"
-    text = config.read_text(encoding="utf-8")
-    for old, new in {
-        "[sampler]": "[sampler]\ntarget_ess = 100\ntarget_rhat = 1.05",
-        "grid = [33, 33]": "grid = [17, 17]\ndraws = 400",
-    }.items():
-        assert old in text
-        text = text.replace(old, new)
-    config.write_text(text, encoding="utf-8")
+    edit(
+        config,
+        {
+            "[sampler]": "[sampler]\ntarget_ess = 100\ntarget_rhat = 1.05",
+            "grid = [33, 33]": "grid = [17, 17]\ndraws = 400",
+        },
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bayesdist.app.run.report", lambda results, pdf: [])
         assert main(["run", str(config), "-o", str(folder / "run"), "-q"]) == 0

@@ -24,7 +24,7 @@ from bayesdist.app.store.made_from import (
 )
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer import load_posterior
-from tests.app.support import cli, good, refused, snapshot, summary_of, toml
+from tests.app.support import cli, good, refused, replaced, snapshot, summary_of, toml
 from tests.reduced import case_in_full
 
 pytestmark = pytest.mark.usefixtures("no_report")
@@ -52,10 +52,7 @@ def run(unreported, tmp_path) -> Path:
 
 def edited(finished, *replacements: tuple[str, str], more: str = "") -> Path:
     """The configuration of the run with other settings, beside it."""
-    text = finished.config.read_text(encoding="utf-8")
-    for old, new in replacements:
-        assert old in text
-        text = text.replace(old, new)
+    text = replaced(finished.config.read_text(encoding="utf-8"), dict(replacements))
     path = finished.config.with_name("edited.toml")
     path.write_text(text + more, encoding="utf-8")
     return path

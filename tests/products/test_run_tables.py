@@ -10,9 +10,9 @@ from astropy.io import fits
 
 import bayesdist as bd
 from bayesdist.app.products.export import _left_out
-from bayesdist.app.products.made_files import ProductInput, ingredients
-from bayesdist.calibration.calibration import GaussianSolution
-from bayesdist.products.formats.common.document import PARAMETERS
+from bayesdist.app.products.made_files import ProductInput
+from bayesdist.calibration.calibration import GaussianSolution, calibration_of
+from bayesdist.products.formats.common.document import PARAMETERS, BuildOptions
 from bayesdist.products.registry import (
     all_formats,
     build,
@@ -48,7 +48,8 @@ def product():
         for name in ("", "F606W")
     )
     solution = GaussianSolution(model, theta, 1e-8 * np.eye(model.n_params))
-    return ProductInput(solution, "run", "camera", tables=tables, filter="F606W")
+    calibration = calibration_of(solution, "run", detector="camera", filter="F606W")
+    return ProductInput(solution, calibration, BuildOptions(tables=tables))
 
 
 @pytest.mark.parametrize("key", GIVEN)
@@ -56,14 +57,14 @@ def test_a_file_has_the_tables_of_the_run(product, tmp_path, key):
     """As other programs have it: tables of both kinds, one after the other, and the polynomials."""
     if key in ("jwst", "roman"):
         pytest.importorskip("asdf")
-    calibration, options = ingredients(product)
+    calibration, options = product.calibration, product.options
     assert {one.key: one.holds_tables for one in all_formats()}[key]
     files = build(key, calibration, product_settings()[key](**GIVEN[key]), options)
     for one in files:
         (tmp_path / one.file_name).write_bytes(one.content)
     rng = np.random.default_rng(2)
     x, y = np.round(rng.uniform(2, 255, 400)), np.round(rng.uniform(2, 191, 400))
-    expected = replace(calibration, before=product.tables).forward(x, y, chip=1)
+    expected = replace(calibration, before=product.options.tables).forward(x, y, chip=1)
     plain = calibration.forward(x, y, chip=1)
     effect = np.hypot(*(expected - plain).T).max()
     assert effect > 0.02  # arcsec: they are no trifle
@@ -89,5 +90,5 @@ def test_a_file_has_the_tables_of_the_run(product, tmp_path, key):
 def test_a_file_without_tables_says_so(product, key):
     [warning] = _left_out(key, product)
     assert "look-up tables of the run are not in this file" in warning
-    assert _left_out(key, replace(product, tables=())) == ()
+    assert _left_out(key, replace(product, options=BuildOptions())) == ()
     assert _left_out("jwst", product) == ()

@@ -9,6 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from bayesdist.diagnose.holdout.validation import HoldoutValidation
+from bayesdist.infer import Posterior
 from bayesdist.missions.wise.bands.command import BANDS
 from bayesdist.missions.wise.bands.context import BandsInput
 from bayesdist.report.campaign import CampaignResults
@@ -23,15 +25,15 @@ from .campaigns import campaign_input
 from .plots import drawings_of
 
 RESULTS = {"report": ReportInput, "bands": BandsInput}
+PARTS = {"campaign": CampaignResults, "held_out": HoldoutValidation, "posterior": Posterior}
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
 def names_of(results: type) -> set[str]:
-    """Attributes of results, those of a campaign behind a dot."""
+    """Attributes of results, those of their parts behind a dot."""
     own = {f.name for f in dataclasses.fields(results)}
-    if "campaign" in own:
-        own |= {f"campaign.{f.name}" for f in dataclasses.fields(CampaignResults)}
-    return own
+    parts = own & PARTS.keys()
+    return own | {f"{one}.{f.name}" for one in parts for f in dataclasses.fields(PARTS[one])}
 
 
 @pytest.mark.parametrize("registry", [REPORT, BANDS], ids=lambda one: one.name)

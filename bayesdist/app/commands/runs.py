@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -31,13 +31,7 @@ MISSED = 4  # exit code of requirements that are not all met
     help="Number of columns and rows of each chip.",
 )
 @force
-def init(
-    config: str,
-    matches: str | None,
-    columns: Mapping[str, str] | None,
-    size: tuple[int, int] | None,
-    force: bool,
-) -> None:
+def init(config: str, matches: str | None, **options: Any) -> None:
     """Write a commented configuration for a table of matched stars."""
     if matches is None:
         toml = Path(config).with_suffix(".toml").name
@@ -49,7 +43,7 @@ def init(
         )
     from bayesdist.app.commands.on_files.init import init as write_configuration
 
-    click.echo(write_configuration(config, matches, columns=columns, size=size, force=force))
+    click.echo(write_configuration(config, matches, **options))
 
 
 @command(calls=f"{ON_RUNS}.check:check")
@@ -72,25 +66,15 @@ def check() -> None:
     help="Seed of the random numbers.",
 )
 @click.pass_obj
-def run(
-    line: str,
-    config: str,
-    output: str,
-    resume: bool,
-    force: bool,
-    strict: bool,
-    seed: int | None,
-) -> None:
+def run(line: str, config: str, output: str, **options: Any) -> None:
     """Calibrate: match, fit, sample, diagnose, evaluate, export, report."""
-    if resume and force:
+    if options["resume"] and options["force"]:
         raise click.UsageError("--resume and --force exclude each other.")
     from bayesdist.app.run import run as whole_job
     from bayesdist.app.store.rundir import RunDirectory
     from bayesdist.app.tables.margins import results_text
 
-    path = whole_job(
-        config, output, resume=resume, force=force, strict=strict, seed=seed, command=line
-    )
+    path = whole_job(config, output, command=line, **options)
     click.echo(results_text(RunDirectory(path)))  # its input was checked when it began
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
@@ -59,6 +60,16 @@ CONFIG: TypeAdapter[Config] = TypeAdapter(
 LEAST, MOST, MOST_WHOLE = 1e-20, 1e15, 2**63 - 1
 
 
+@contextmanager
+def _as_config_errors(where: str = "") -> Iterator[None]:
+    """Errors of input as those of a configuration; with its file in front, where it is named."""
+    try:
+        yield
+    except InputError as error:
+        place = f"{where}: {error.where}" if where else error.where
+        raise ConfigError(error.cause, where=place, do=error.do) from error
+
+
 class _RequirementFile(Section):
     requirement: Annotated[list[RequirementBlock], Field(min_length=1)]
 
@@ -76,14 +87,12 @@ def parse_config(text: str, where: str) -> Config:
     """A configuration from the text of a file; `where` names it in errors."""
     raw = _settings(text, where, begin="write one by 'bayesdist init'")
     config = _validated(CONFIG, KINDS, raw, where)
-    try:
+    with _as_config_errors(where):
         config.time()
         config.mixture()
         config.user_terms()
         config.requirements()
         config.spans()
-    except InputError as error:
-        raise ConfigError(error.cause, where=f"{where}: {error.where}", do=error.do) from error
     return config
 
 
@@ -99,18 +108,14 @@ def load_requirements(path: str | Path) -> tuple[Requirement, ...]:
     """Read a file of ``[[requirement]]`` blocks."""
     text, begin = load_text(path), "give it [[requirement]] blocks"
     blocks = validated(_RequirementFile, text, str(path), begin=begin).requirement
-    try:
+    with _as_config_errors(str(path)):
         return tuple(Requirement(**r.model_dump()) for r in blocks)
-    except InputError as error:
-        raise ConfigError(error.cause, where=f"{path}: {error.where}", do=error.do) from error
 
 
 def load_text(path: str | Path) -> str:
     """Text of a file as it stands, with its line ends."""
-    try:
+    with _as_config_errors():
         return read_text(path, most=MOST_TEXT)
-    except InputError as error:
-        raise ConfigError(error.cause, where=error.where, do=error.do) from error
 
 
 def validated(kind: type[Section], text: str, where: str, *, begin: str) -> Any:
@@ -120,10 +125,8 @@ def validated(kind: type[Section], text: str, where: str, *, begin: str) -> Any:
 
 def _settings(text: str, where: str, *, begin: str) -> dict[str, Any]:
     """Settings of a TOML text, of which there have to be some."""
-    try:
+    with _as_config_errors():
         raw = toml_of(text.removeprefix("\ufeff"), where)
-    except InputError as error:
-        raise ConfigError(error.cause, where=error.where, do=error.do) from error
     if not raw:
         raise ConfigError("holds no settings", where=where, do=begin)
     for key, value in _numbers(raw, ""):

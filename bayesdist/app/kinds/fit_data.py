@@ -25,23 +25,17 @@ class StarReader:
 
     def __init__(self, compute: Compute | None = None) -> None:
         self.compute = compute or Compute()
-        self._asked: tuple[Matches, ErrorLaw] | None = None
-        self._matches: Matches | None = None
+        # those that were asked for, with which errors, and what came of it
+        self._read: tuple[Matches, ErrorLaw, Matches] | None = None
         self._shards: Shards | None = None
         self._sample: Matches | None = None
 
     def matches(self, stars: Matches, errors: ErrorLaw = QUOTED) -> Matches:
         """The stars with their errors."""
-        known = self._asked
-        if (
-            self._matches is None
-            or known is None
-            or known[0] is not stars
-            or known[1] is not errors
-        ):
+        if self._read is None or self._read[0] is not stars or self._read[1] is not errors:
             self.close()
-            self._asked, self._matches = (stars, errors), errors.applied(stars)
-        return self._matches
+            self._read = stars, errors, errors.applied(stars)
+        return self._read[2]
 
     def shards(self, model: DistortionModel, stars: Matches, errors: ErrorLaw = QUOTED) -> Shards:
         """The stars as passes of a model go over them; closed by whoever closes the reader."""
@@ -60,16 +54,16 @@ class StarReader:
 
     def moved(self, stars: Matches) -> None:
         """Take note that the stars that were asked for last lie in other files now."""
-        if self._asked is None or self.compute.engine == "dask":  # workers may read them again
+        if self._read is None or self.compute.engine == "dask":  # workers may read them again
             self.close()
         else:
-            self._asked = stars, self._asked[1]
-            self._matches = self._asked[1].applied(stars)
+            errors = self._read[1]
+            self._read = stars, errors, errors.applied(stars)
 
     def close(self) -> None:
         """Let go of the stars, and of whoever holds them."""
         self._close_shards()
-        self._asked = self._matches = self._sample = None
+        self._read = self._sample = None
 
     def _close_shards(self) -> None:
         if self._shards is not None:

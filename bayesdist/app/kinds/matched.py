@@ -36,6 +36,7 @@ class Matched:
 
     section: ClassVar[str] = ""  # of summary.json, that has the facts
     has_catalogue: ClassVar[bool] = True  # positions of stars come from a reference catalogue
+    along_detector: ClassVar[bool] = False  # u and v are so, and not along the sky
 
     stars: Matches  # that are fitted
     held: Matches | None = None  # that are held out
@@ -52,7 +53,7 @@ class Matched:
     @property
     def tangent_point(self) -> tuple[float, float] | None:
         """Sky position of (u, v) = (0, 0), degrees; None where u, v are not along the sky."""
-        return self.stars.tangent_point
+        return None if self.along_detector else self.stars.tangent_point
 
     @property
     def mirrored(self) -> bool:

@@ -52,7 +52,7 @@ def export(
     product = product_of(posterior, found, data, config, source)
     budget = [] if evaluation is None else evaluation.budget.rows()
     stars = None
-    if product.tangent_point is not None and config.products.asked():
+    if product.calibration.plane.point is not None and config.products.asked():
         if found is not None:
             stars = found.sample
         else:
@@ -62,9 +62,10 @@ def export(
     if release is not None:
         held = config.tables.detector is not None
         tables = published_tables(data.fitted.tables, held=held)
-        number, solutions = config.chips()[0].number, {product.filter: product.solution}
+        number, solutions = config.chips()[0].number, {data.matched.filter: product.solution}
         products += write_files(release, number, base, folder, solutions, tables)
-    product = replace(product, further=further_errors(budget))
+    calibration = replace(product.calibration, further=further_errors(budget))
+    product = replace(product, calibration=calibration)
     for key, files in made_files(product, config).items():
         left_out = _left_out(key, product)
         for built in files:
@@ -92,7 +93,7 @@ def export(
 
 def _left_out(key: str, product: ProductInput) -> tuple[str, ...]:
     """Warning on the look-up tables of a run that a format has no room for."""
-    if not product.tables or format_of(key).holds_tables:
+    if not product.options.tables or format_of(key).holds_tables:
         return ()
     return (
         "the look-up tables of the run are not in this file, as its row 'forward' in the error "

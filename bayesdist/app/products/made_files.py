@@ -43,23 +43,10 @@ IN_COVARIANCE = (
 class ProductInput:
     """Ingredients of the files of a run."""
 
-    solution: Solution
-    source: str  # where it is from: the folder of a run
-    detector: str = ""
-    epoch: float | None = None  # of the assessment, decimal years
-    scale_arcsec: float | None = None  # size of a pixel, where the configuration gives it
-    # sky position of (u, v) = (0, 0), degrees; None where u, v are not along the sky
-    tangent_point: tuple[float, float] | None = None
-    # of several with frames of their own the one for which a file is right on the sky
-    exposure: str = ""
-    # in which gauge the solution stands, as a sentence; empty where that is no question
-    gauge: str = ""
-    # by which pixels are corrected before the polynomials, of the detector and of the filter
-    tables: tuple[LookupTable, ...] = ()
-    filter: str = ""
+    solution: Solution  # with the frames of its exposures
+    calibration: Calibration  # of it, with what the files say of its run
+    options: BuildOptions
     aligned: bool = False  # the user of a file fits shift and rotation of an exposure
-    # errors of positions that the covariance does not hold; once the budget is known
-    further: tuple[FurtherError, ...] = ()
 
 
 def further_errors(budget: Sequence[Mapping[str, Any]]) -> tuple[FurtherError, ...]:
@@ -79,21 +66,27 @@ def further_errors(budget: Sequence[Mapping[str, Any]]) -> tuple[FurtherError, .
 
 def product_input(solution: Solution, data: FitData, config: Config, source: str) -> ProductInput:
     """Ingredients of the files of a solution; they say that it is from `source`, or a detector."""
-    mas, fitted, model = config.detector.scale_mas, data.fitted, data.model
-    several = model.frames != "none" and len(model.exposures) > 1
-    return ProductInput(
+    fitted, model, detector = data.fitted, data.model, config.detector
+    plane, point = Plane(), data.matched.tangent_point
+    if point is not None:
+        note = ""
+        if model.frames != "none" and len(model.exposures) > 1:
+            # for which exposure a file is right on the sky, as they differ
+            first = model.exposures[0]
+            note = f"On the sky it is exposure {first}: others have frames of their own."
+        plane = Plane("sky", point=point, note=note)
+    found = calibration_of(
         solution,
-        source or config.detector.name or "solution",
-        config.detector.name,
-        assessment_epoch(data, config),
-        None if mas is None else mas / 1000,
-        data.matched.tangent_point,
-        model.exposures[0] if several else "",
-        fitted.gauge_words,
-        fitted.tables.tables,
-        data.matched.filter,
-        fitted.scatter is not None,
+        source or detector.name or "solution",
+        plane=plane,
+        detector=detector.name,
+        filter=data.matched.filter,
     )
+    notes = (fitted.gauge_words,) if fitted.gauge_words else ()
+    scale = None if detector.scale_mas is None else detector.scale_mas / 1000
+    options = BuildOptions(assessment_epoch(data, config), scale, fitted.tables.tables)
+    joint = fitted.scatter is not None
+    return ProductInput(solution, replace(found, notes=notes), options, joint)
 
 
 def solution_of(posterior: Posterior, found: Diagnostics | None, fitted: Fitted) -> Posterior:
@@ -115,30 +108,10 @@ def product_of(
 
 def made_files(product: ProductInput, config: Config) -> dict[str, tuple[Built, ...]]:
     """Files by the key of their format."""
-    calibration, options = ingredients(product)
     return {
-        key: build(key, calibration, settings, options)
+        key: build(key, product.calibration, settings, product.options)
         for key, settings in config.products.asked().items()
     }
-
-
-def ingredients(product: ProductInput) -> tuple[Calibration, BuildOptions]:
-    """The calibration that the files hold, with what they say of its run; and their options."""
-    point, plane = product.tangent_point, Plane()
-    if point is not None:
-        # for which exposure a file is right on the sky, where they differ
-        note = f"On the sky it is exposure {product.exposure}: others have frames of their own."
-        plane = Plane("sky", point=point, note=note if product.exposure else "")
-    found = calibration_of(
-        product.solution,
-        product.source,
-        plane=plane,
-        detector=product.detector,
-        filter=product.filter,
-    )
-    notes = (product.gauge,) if product.gauge else ()
-    found = replace(found, notes=notes, further=product.further)
-    return found, BuildOptions(product.epoch, product.scale_arcsec, product.tables)
 
 
 def write_files(

@@ -19,7 +19,7 @@ import numpy as np
 
 from bayesdist.app.config import Config
 from bayesdist.app.config.products import ReleaseBlock
-from bayesdist.app.products.made_files import ProductInput, ingredients, made_files, write_files
+from bayesdist.app.products.made_files import ProductInput, made_files, write_files
 from bayesdist.arrays import Float
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import MEASURED, PRODUCT, Known, Row
@@ -47,10 +47,9 @@ def product_terms(product: ProductInput, config: Config, base: Path) -> tuple[Kn
     They are read back from their bytes, so that digits and orders are those of the files; nothing
     of the run is touched.
     """
-    calibration, options = ingredients(product)
     found: list[ReadBack] = []
     for key, files in made_files(product, config).items():
-        found += read_back(key, files, calibration, options)
+        found += read_back(key, files, product.calibration, product.options)
     release = config.products.release
     if release is None:
         return tuple(_terms(product, found))
@@ -89,9 +88,9 @@ def _released(
     product: ProductInput, block: ReleaseBlock, number: int, base: Path, folder: Path
 ) -> list[Calibration]:
     """The files of a release, one set for each segment: of several periods of one, the first."""
-    filter = product.filter
+    filter = product.calibration.filter
     solutions = {filter: product.solution}
-    entries = write_files(block, number, base, folder, solutions, product.tables)
+    entries = write_files(block, number, base, folder, solutions, product.options.tables)
     paths = {e["kind"]: folder / e["path"] for e in entries}
     before = read_d2im(paths["D2IMFILE"]) if "D2IMFILE" in paths else ()
     npol = read_lookup_file(paths["NPOLFILE"]) if "NPOLFILE" in paths else None
@@ -117,7 +116,7 @@ def _released(
 def _term(product: ProductInput, file: str, direction: str, shift: Positions) -> Known:
     solution = product.solution
     least = ROUNDING * solution.model.pixel_size(solution.mean)
-    if product.tangent_point is not None:
+    if product.calibration.plane.point is not None:
         least = max(least, SKY_ROUNDING / ARCSEC[solution.model.unit])
     against = "the solution" if direction == FORWARD else "its forward terms"
     source = f"{MEASURED}: as written, against {against}"
@@ -133,8 +132,8 @@ def _term(product: ProductInput, file: str, direction: str, shift: Positions) ->
 def _solution(product: ProductInput, x: Float, y: Float, chip: int, epoch: float | None) -> Float:
     """Positions (N, 2) by the solution: tables where it has some, then the polynomials."""
     solution = product.solution
-    if product.tables:
-        x, y = corrected(product.tables, x, y, chip=chip, filter=product.filter)
+    if product.options.tables:
+        x, y = corrected(product.options.tables, x, y, chip=chip, filter=product.calibration.filter)
     place = place_of(solution.model, epoch=epoch, chip=chip)
     return np.asarray(place.basis.evaluate(x, y) @ place.polynomial(solution.mean).T)
 
@@ -172,7 +171,7 @@ class _Laid:
     def _map(self, epoch: float | None) -> tuple[complex, complex, bool]:
         if epoch not in self._kept:
             size = 1.0
-            date = self.product.epoch
+            date = self.product.options.epoch
             if self.scaled:
                 size = abs(self._fitted(epoch)[1] if epoch == date else self._map(date)[1])
             self._kept[epoch] = self._fitted(epoch, size)

@@ -28,7 +28,7 @@ def sky_closure(
     None where the stars are not on the sky, or none is left: of several exposures with frames only
     the first one counts, whose header it is.
     """
-    point, solution = product.tangent_point, product.solution
+    point, solution = product.calibration.plane.point, product.solution
     if point is None:
         return None
     from astropy import units as apu
@@ -49,9 +49,8 @@ def sky_closure(
     true = SkyCoord(
         *sky_of_plane(table.u[mine] * arcsec, table.v[mine] * arcsec, point), unit="deg"
     )
-    uv = model.predict(
-        solution.mean, x, y, chip=chip, **({} if model.time is None else {"epoch": product.epoch})
-    )
+    when = {} if model.time is None else {"epoch": product.options.epoch}
+    uv = model.predict(solution.mean, x, y, chip=chip, **when)
     u, v = uv.T * arcsec
     own = SkyCoord(*sky_of_plane(u, v, point), unit="deg")
     east, north = (float(a.to_value(apu.arcsec).mean()) for a in true.spherical_offsets_to(at))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from bayesdist.app.assessment import series
-from tests.app.support import good
+from tests.app.support import edit, good
 
 # coarse nodes and few draws: quick.  Wider cells than the pattern's leave the linear terms alone;
 # 100 draws' worth moves a mean by a tenth of its sigma
@@ -25,11 +25,7 @@ def folder(tmp_path_factory) -> Path:
     options = ("--exposures", 16, "--secondary-exposures", 8, "--stars", 8000, "--seed", 5, "-q")
     good("simulate", "acs", "-o", folder, "--filters", "F606W,F814W", *options)
     for config in folder.glob("campaign_*.toml"):
-        text = config.read_text(encoding="utf-8")
-        for old, new in QUICK.items():
-            assert old in text
-            text = text.replace(old, new)
-        config.write_text(text, encoding="utf-8")
+        edit(config, QUICK)
     return folder
 
 

@@ -37,7 +37,7 @@ from bayesdist.products import (
     read_idctab,
     read_lookup_file,
 )
-from tests.app.support import carried_out, cli, good, one_sentence, snapshot
+from tests.app.support import carried_out, cli, good, one_sentence, replaced, snapshot
 from tests.infer.small_campaign import Truth
 from tests.products.acs_offline import Pointing, to_sky
 from tests.products.acs_offline import corrected as corrected_by_stwcs
@@ -54,10 +54,7 @@ def config_of(folder, filter: str, **changes: str) -> str:
     text = (folder / f"campaign_{filter.lower()}.toml").read_text(encoding="utf-8")
     for name in INPUTS:
         text = text.replace(f'"{name}"', f'"{folder / name}"')
-    for old, new in changes.items():
-        assert old in text
-        text = text.replace(old, new)
-    return text
+    return replaced(text, changes)
 
 
 def calibrated(run, text: str, *stages: str):

@@ -33,9 +33,8 @@ class CampaignMatched(Matched):
     """Raw pixels beside aberration-neutral catalogue positions, with the catalogue's errors."""
 
     section: ClassVar[str] = "matching"
+    along_detector: ClassVar[bool] = True
 
-    stars: Matches
-    held: Matches | None = None
     inputs: Inputs = field(kw_only=True)  # catalogue, exposures and star lists
     pairs: Matches = field(kw_only=True)  # all matches, fitted or held out
 
@@ -48,11 +47,6 @@ class CampaignMatched(Matched):
         """Matches to be fitted by polynomials of another order."""
         config = self.inputs.config.of_order(order)
         return replace(self, inputs=replace(self.inputs, config=config))
-
-    @property
-    def tangent_point(self) -> None:
-        """None: u and v lie along the detector."""
-        return None
 
     @property
     def filter(self) -> str:

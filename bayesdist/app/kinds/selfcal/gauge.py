@@ -52,30 +52,14 @@ def gauge_table(gauge: Gauge, fixed: Mapping[str, str], model: DistortionModel) 
         _row(d, fixed) | {"edge_pix": d.edge_pix}
         for d in sorted(gauge.directions, key=lambda d: (not d.free, not d.weak))
     ]
-    rows += [
-        {
-            "name": f"combination led by {model.names[int(k)]}",
-            "state": "nearly free",
-            "sigma_detections": sigma,
-            "sigma_fixed": np.nan,
-            "unit": "pix at the edge",
-            "edge_pix": 1.0,
-            "fixed_by": "",
-        }
-        for sigma, k in gauge.weakest
-    ]
-    rows += [
-        {
-            "name": f"combination with {name}",
-            "state": "free",
-            "sigma_detections": np.inf,
-            "sigma_fixed": np.nan,
-            "unit": "",
-            "edge_pix": np.nan,
-            "fixed_by": "",
-        }
-        for name in gauge.unnamed
-    ]
+    blank = {"sigma_fixed": np.nan, "unit": "", "edge_pix": np.nan, "fixed_by": ""}
+    for sigma, k in gauge.weakest:
+        row = {"name": f"combination led by {model.names[int(k)]}", "state": "nearly free"}
+        at_edge = {"sigma_detections": sigma, "unit": "pix at the edge", "edge_pix": 1.0}
+        rows.append(blank | row | at_edge)
+    for name in gauge.unnamed:
+        row = {"name": f"combination with {name}", "state": "free"}
+        rows.append(blank | row | {"sigma_detections": np.inf})
     return Table(rows)[COLUMNS]
 
 

@@ -104,8 +104,8 @@ class SelfcalMatched(Matched):
 
     section: ClassVar[str] = "selfcal"
     has_catalogue: ClassVar[bool] = False
+    along_detector: ClassVar[bool] = True
 
-    stars: Matches
     inputs: Inputs = field(kw_only=True)
     # with their stars and errors, on one tangent plane
     detections: Detections = field(kw_only=True)
@@ -113,11 +113,6 @@ class SelfcalMatched(Matched):
     theta: Float = field(kw_only=True)  # (D,), of the first solution
     places: Float = field(kw_only=True)  # (S, q), its stars
     mixture: Mixture = field(kw_only=True)  # its errors
-
-    @property
-    def tangent_point(self) -> None:
-        """None: u and v lie along the detector."""
-        return None
 
     @property
     def unused(self) -> dict[str, int]:

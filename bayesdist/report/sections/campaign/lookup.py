@@ -21,7 +21,7 @@ from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import OUTLINE, PALETTE, WIDTH, new_figure, nice_below
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.run.residuals import residual_panels
-from bayesdist.report.texttable import TextTable, listing
+from bayesdist.report.texttable import TextTable, listing, tabulated
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
@@ -42,17 +42,17 @@ def lookup_table(r: ReportInput) -> TextTable:
         "binned": "binned and smoothed",
         "none": "not fitted",
     }
-    rows = tuple(
-        (
-            row.get("filter") or "detector",
-            c.chip_name(row["chip"]),
-            "{1} × {0}".format(*row["nodes"]),
-            number(row["rms"]),
-            number(row["largest"]),
-            number(row["sigma_median"]),
-        )
+    rows = [
+        {
+            "Of": row.get("filter") or "detector",
+            "Chip": c.chip_name(row["chip"]),
+            "Nodes": "{1} × {0}".format(*row["nodes"]),
+            "Rms of an axis [pix]": number(row["rms"]),
+            "Largest [pix]": number(row["largest"]),
+            "σ, median [pix]": number(row["sigma_median"]),
+        }
         for row in t["chips"]
-    )
+    ]
     caption, note = f"Look-up tables: {words.get(t['method'], t['method'])}", ""
     if "converged" in t:
         caption += ", converged" if t["converged"] else ", NOT converged"
@@ -62,13 +62,7 @@ def lookup_table(r: ReportInput) -> TextTable:
         )
     if t.get("detector"):
         note = f"The detector's are those of {t['detector']}. {note}".strip()
-    return TextTable(
-        caption,
-        ("Of", "Chip", "Nodes", "Rms of an axis [pix]", "Largest [pix]", "σ, median [pix]"),
-        rows,
-        words=(0, 1),
-        note=note,
-    )
+    return tabulated(caption, rows, words=(0, 1), note=note)
 
 
 @REPORT.figure("campaign-tables", needs=("campaign.residuals", "campaign.tables"))
@@ -144,12 +138,14 @@ def _base(c: CampaignResults) -> str:
     return "with the detector's tables alone" if any(c.table_filters) else "without"
 
 
-def _maps_of_residuals(r: ReportInput) -> Mapping[str, str]:
-    which = ("without", "with") if needed(r.campaign).tables else ("without",)
-    return {f"residuals_{one}_tables": one for one in which}
-
-
-@REPORT.figure("campaign-tables", needs=("campaign.residuals",), each=_maps_of_residuals)
+@REPORT.figure(
+    "campaign-tables",
+    needs=("campaign.residuals",),
+    each=lambda r: {
+        f"residuals_{which}_tables": which
+        for which in ("without", *(("with",) if r.campaign.tables else ()))
+    },
+)
 def residual_map(r: ReportInput, which: str) -> Plot:
     """Mean residual of each cell, without the tables or with them, at one scale for both.
 
@@ -157,7 +153,12 @@ def residual_map(r: ReportInput, which: str) -> Plot:
     """
     c = needed(r.campaign)
     binned = binned_of(c.residuals, which)
-    M, key = _common_scale(c.residuals)
+    # one scale for both maps, at which the vectors without tables are seen well
+    length = np.concatenate([_lengths(one.binned_without) for one in c.residuals])
+    typical = float(np.quantile(length, 0.95)) if length.size else 1.0
+    step = min(spacing(one.binned_without.x, one.binned_without.y) for one in c.residuals)
+    M = nice_below(1.6 * step / typical) if typical > 0 else 1.0
+    key = nice_below(float(length.max(initial=0.0)) / 1.5)
     panels = residual_panels(binned, r.mosaic, unit="pix", magnification=M, key=key)
     mean, noise = rms_of_cells(*binned)
     cell = c.residuals[0].chip.size[0] / len(binned[0].x)
@@ -180,18 +181,6 @@ def residual_map(r: ReportInput, which: str) -> Plot:
     return Plot(
         panels.figure, title, text, f"Map of residual vectors; the largest is {size_of(largest)}."
     )
-
-
-def _common_scale(chips: Sequence[ChipResiduals]) -> tuple[float, float]:
-    """Magnification at which the vectors without tables are seen well, and length of the key.
-
-    Both maps use it.
-    """
-    length = np.concatenate([_lengths(c.binned_without) for c in chips])
-    typical = float(np.quantile(length, 0.95)) if length.size else 1.0
-    step = min(spacing(c.binned_without.x, c.binned_without.y) for c in chips)
-    magnification = nice_below(1.6 * step / typical) if typical > 0 else 1.0
-    return magnification, nice_below(float(length.max(initial=0.0)) / 1.5)
 
 
 def binned_of(chips: Sequence[ChipResiduals], which: str) -> list[BinnedResiduals]:
@@ -249,10 +238,13 @@ def table_nodes(r: ReportInput, filter: str) -> Plot:
     panels.frame(0.03 * r.mosaic.longest_side)
     arrows, titles = [], []
     for k, table in enumerate(chips):
-        arrows.append(None if table is None else _arrows(table))
-        text = "no table"
+        one, text = None, "no table"
         if table is not None:
+            x, y = (a.ravel() for a in np.meshgrid(*table.nodes()))
+            du, dv = (a.ravel() for a in table.values)
+            one = Arrows(x, y, du, dv, min(table.step))
             text = f"largest shift {np.hypot(*table.values).max():.3g} pix"
+        arrows.append(one)
         titles.append(panels.title(k, text))
     vector_map(
         panels,
@@ -278,12 +270,6 @@ def table_nodes(r: ReportInput, filter: str) -> Plot:
         f" ({'; '.join(parts)}). The largest shift is {size_of(largest)}.",
         f"Map of the shifts at the nodes; the largest is {size_of(largest)}.",
     )
-
-
-def _arrows(table: LookupTable) -> Arrows:
-    x, y = (a.ravel() for a in np.meshgrid(*table.nodes()))
-    du, dv = (a.ravel() for a in table.values)
-    return Arrows(x, y, du, dv, min(table.step))
 
 
 @REPORT.figure(

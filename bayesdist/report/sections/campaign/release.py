@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from bayesdist.diagnose.overlap import OverlapTest
-from bayesdist.numbers import MISSING, count, number, size_of
+from bayesdist.numbers import count, number, size_of
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.arrows import Arrows, magnification_of, vector_map
 from bayesdist.report.figures.panels import Panels
 from bayesdist.report.figures.style import WIDTH, new_figure, nice_below
 from bayesdist.report.registry import Plot
-from bayesdist.report.texttable import TextTable
+from bayesdist.report.texttable import TextTable, tabulated
 
 MIN_STARS_PER_CELL = 5  # for a cell that is drawn and counted
 
@@ -40,14 +40,14 @@ def released_files(r: ReportInput) -> TextTable | None:
         dates = "all" if period is None else "{:g} to {:g}".format(*years.get(period, (0, 0)))
         lost = max((abs(one["mas"]) for one in p.get("lost", ())), default=None)
         rows.append(
-            (p["path"], _KINDS[p["kind"]], dates, MISSING if lost is None else number(lost, 2))
+            {
+                "File": p["path"],
+                "What it is": _KINDS[p["kind"]],
+                "Dates": dates,
+                "Drift that it cannot hold, at most [mas]": number(lost, 2),
+            }
         )
-    return TextTable(
-        "Released files",
-        ("File", "What it is", "Dates", "Drift that it cannot hold, at most [mas]"),
-        tuple(rows),
-        words=(0, 1, 2),
-    )
+    return tabulated("Released files", rows, words=(0, 1, 2))
 
 
 @REPORT.figure("campaign-release", needs=("campaign.overlap",))

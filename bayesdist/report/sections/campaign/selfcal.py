@@ -15,7 +15,7 @@ from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, SelfcalResults, needed
 from bayesdist.report.figures.style import CYCLE, INK, PALE, WIDTH, new_figure
 from bayesdist.report.registry import Plot
-from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing
+from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing, tabulated
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -33,28 +33,19 @@ def selfcal_tables(r: ReportInput) -> tuple[TextTable, ...]:
 
 def _gauge(found: SelfcalResults) -> TextTable:
     rows = [
-        (
-            _property(str(row["name"])),
-            str(row["state"]),
-            _sigma(row["sigma_detections"], row["unit"]),
-            _sigma(row["sigma_fixed"], row["unit"]),
-            _edge(row["sigma_fixed"], row["edge_pix"]),
-            MISSING if np.ma.is_masked(row["fixed_by"]) else str(row["fixed_by"]) or MISSING,
-        )
+        {
+            "Property": _property(str(row["name"])),
+            "From detections": str(row["state"]),
+            "σ from these": _sigma(row["sigma_detections"], row["unit"]),
+            "σ as fixed": _sigma(row["sigma_fixed"], row["unit"]),
+            "at the edge [pix]": _edge(row["sigma_fixed"], row["edge_pix"]),
+            "Fixed by": "" if np.ma.is_masked(row["fixed_by"]) else str(row["fixed_by"]),
+        }
         for row in found.gauge
     ]
-    heads = (
-        "Property",
-        "From detections",
-        "σ from these",
-        "σ as fixed",
-        "at the edge [pix]",
-        "Fixed by",
-    )
-    return TextTable(
+    return tabulated(
         "Degeneracies of the detections, and the constraints that remove them",
-        heads,
-        tuple(rows),
+        [{key: text or MISSING for key, text in row.items()} for row in rows],
         words=(0, 1, 5),
         note=f"{found.words} Relative positions do not depend on any of it: their errors are in"
         " the maps of that name.",
@@ -97,25 +88,20 @@ def _detections(found: SelfcalResults) -> TextTable:
 
 def _exposures(found: SelfcalResults, r: ReportInput) -> TextTable:
     rows = [
-        (
-            str(row["exposure"]),
-            count(row["detections"]),
-            percent(float(row["fraction_common"])),
-            number(float(row["rms"])),
-            number(float(row["shift_u"]), 6),
-            number(float(row["shift_v"]), 6),
-            number(float(row["rotation"]), 6),
-        )
+        {
+            "Exposure": str(row["exposure"]),
+            "Detections": count(row["detections"]),
+            "In common": percent(float(row["fraction_common"])),
+            "rms on an axis [pix]": number(float(row["rms"])),
+            f"Shift u [{r.unit}]": number(float(row["shift_u"]), 6),
+            f"Shift v [{r.unit}]": number(float(row["shift_v"]), 6),
+            "Rotation [deg]": number(float(row["rotation"]), 6),
+        }
         for row in found.matching[:MAX_ROWS]
     ]
-    heads = (
-        *("Exposure", "Detections", "In common", "rms on an axis [pix]"),
-        *(f"Shift u [{r.unit}]", f"Shift v [{r.unit}]", "Rotation [deg]"),
-    )
-    return TextTable(
+    return tabulated(
         "Exposures",
-        heads,
-        tuple(rows),
+        rows,
         note="In common: of the detections that lie where another exposure looks. "
         + further(len(found.matching)),
         detail=True,

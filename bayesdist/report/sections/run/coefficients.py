@@ -11,7 +11,7 @@ from bayesdist.numbers import MISSING, interval, number, rounded
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.sections.gauge import gauge_mark, gauge_note
-from bayesdist.report.texttable import MAX_ROWS, TextTable, further
+from bayesdist.report.texttable import MAX_ROWS, TextTable, further, tabulated
 
 _ON_SCREEN = ("68 %", "95 %", "R-hat", "ESS")
 _WIDER = 1.05  # than the sampled one: an error that rounding or few draws do not explain
@@ -119,41 +119,27 @@ def _parameter_table(
         ratio = None
         if number(sigma) != MISSING and number(sd) != MISSING and float(sigma) > 0:
             ratio = float(sd) / float(sigma)
-        sampled = (
-            rounded(cell(row, "mean", factor), sd),
-            number(sd, 2),
-            number(ratio),
-            interval(cell(row, "lo68", factor), cell(row, "hi68", factor), sd),
-            interval(cell(row, "lo95", factor), cell(row, "hi95", factor), sd),
-        )
-        rhat = cell(row, "rhat")
+        sampled = {
+            "Posterior mean": rounded(cell(row, "mean", factor), sd),
+            "sd": number(sd, 2),
+            "sd / σ": number(ratio),
+            "68 %": interval(cell(row, "lo68", factor), cell(row, "hi68", factor), sd),
+            "95 %": interval(cell(row, "lo95", factor), cell(row, "hi95", factor), sd),
+        }
         out.append(
-            (
-                str(row["name"]),
-                rounded(cell(row, "value", factor), sigma),
-                number(sigma, 2),
-                *(r.marked(c) for c in sampled),
-                number(rhat, 4),
-                number(cell(row, "ess_bulk"), 3),
-                *((unit,) if with_unit else ()),
-            )
+            {
+                "Name": str(row["name"]),
+                "Least squares": rounded(cell(row, "value", factor), sigma),
+                "Formal σ": number(sigma, 2),
+                **{key: r.marked(text) for key, text in sampled.items()},
+                "R-hat": number(cell(row, "rhat"), 4),
+                "ESS": number(cell(row, "ess_bulk"), 3),
+                **({"Unit": unit} if with_unit else {}),
+            }
         )
-    heads = (
-        "Name",
-        "Least squares",
-        "Formal σ",
-        "Posterior mean",
-        "sd",
-        "sd / σ",
-        "68 %",
-        "95 %",
-        "R-hat",
-        "ESS",
-    )
-    columns = (*heads, *(("Unit",) if with_unit else ()))
     # where an interval is that of the sd and convergence was tested as a whole, paper omits them
-    on_paper = tuple(k for k, name in enumerate(columns) if name not in _ON_SCREEN)
-    return TextTable(caption, columns, tuple(out), words=(0, len(heads)), on_paper=on_paper)
+    on_paper = tuple(k for k, name in enumerate(out[0]) if name not in _ON_SCREEN)
+    return tabulated(caption, out, words=(0, 10), on_paper=on_paper)
 
 
 def _monomial_table(r: ReportInput, chip: int) -> TextTable:

@@ -16,7 +16,14 @@ from bayesdist.report.figures.fields import Grid, scalar_map
 from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import INK, PALETTE, SEQUENTIAL, WIDTH, new_figure
 from bayesdist.report.registry import Plot
-from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing, short_paths
+from bayesdist.report.texttable import (
+    MAX_ROWS,
+    TextTable,
+    further,
+    listing,
+    short_paths,
+    tabulated,
+)
 
 if TYPE_CHECKING:
     from bayesdist.data import MagnitudeErrors
@@ -70,57 +77,35 @@ def data_tables(r: ReportInput) -> tuple[TextTable, ...]:
 def _magnitude_table(r: ReportInput) -> TextTable:
     e = needed(r.magnitude_errors)
     scale = display_scale(r.unit, np.concatenate([e.sigma_u, e.sigma_v]))
-    rows = tuple(
-        (
-            f"{mag:.2f}".replace("-", "−"),
-            count(n),
-            number(su * scale.factor),
-            number(sv * scale.factor),
-        )
+    rows = [
+        {
+            "Magnitude": f"{mag:.2f}".replace("-", "−"),
+            r.words.rows.capitalize(): count(n),
+            f"σ u [{scale.unit}]": number(su * scale.factor),
+            f"σ v [{scale.unit}]": number(sv * scale.factor),
+        }
         for mag, n, su, sv in zip(e.mag, e.n, e.sigma_u, e.sigma_v, strict=True)
-    )
-    return TextTable(
-        "Errors by magnitude, estimated from the residuals",
-        (
-            "Magnitude",
-            r.words.rows.capitalize(),
-            f"σ u [{scale.unit}]",
-            f"σ v [{scale.unit}]",
-        ),
-        rows,
-        words=(),
-        detail=True,
-    )
+    ]
+    caption = "Errors by magnitude, estimated from the residuals"
+    return tabulated(caption, rows, words=(), detail=True)
 
 
 def _exposure_table(r: ReportInput) -> TextTable:
     names, fit, sums = r.stars.table.exposure_names, r.fit, r.exposures
     scale = display_scale(r.unit, [fit.rms_u, fit.rms_v])
     flagged = r.flagged
-    rows = tuple(
-        (
-            names[k],
-            count(sums.n[k]),
-            count(sums.n_used[k]),
-            *(number(rms[k] * scale.factor) for rms in sums.rms),
-            MISSING if flagged is None else r.marked(count(flagged[k])),
-        )
+    rows = [
+        {
+            "Exposure": names[k],
+            r.words.rows.capitalize(): count(sums.n[k]),
+            "Used": count(sums.n_used[k]),
+            f"rms u [{scale.unit}]": number(sums.rms[0][k] * scale.factor),
+            f"rms v [{scale.unit}]": number(sums.rms[1][k] * scale.factor),
+            "Outliers (P > 0.5)": MISSING if flagged is None else r.marked(count(flagged[k])),
+        }
         for k in np.flatnonzero(sums.n)
-    )
-    return TextTable(
-        "Exposures",
-        (
-            "Exposure",
-            r.words.rows.capitalize(),
-            "Used",
-            f"rms u [{scale.unit}]",
-            f"rms v [{scale.unit}]",
-            "Outliers (P > 0.5)",
-        ),
-        rows[:MAX_ROWS],
-        note=further(len(rows)),
-        detail=True,
-    )
+    ]
+    return tabulated("Exposures", rows[:MAX_ROWS], note=further(len(rows)), detail=True)
 
 
 @REPORT.figure("data", when=lambda r: bool(_magnitudes(r).any()))

@@ -12,7 +12,7 @@ from bayesdist.limits import SCORE_TESTS
 from bayesdist.numbers import MISSING, count, display_scale, number, rounded, with_mas
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
-from bayesdist.report.texttable import TextTable, listing
+from bayesdist.report.texttable import TextTable, listing, tabulated
 
 
 @REPORT.table("fit")
@@ -45,6 +45,11 @@ def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
                 rows.append((f"{chip}{axis}", *(rounded(s[k], s["sigma"] / 10) for k in names)))
     if r.held:
         pairs["Parameters"] += f", {count(len(r.held))} of them held by {words.constraint}"
+    notes = [f"From {r.sample}."] if r.sample else []
+    if words.leverage:
+        notes.append(
+            "The stars were fitted to these detections, so that residuals are smaller than errors."
+        )
     return (
         listing(words.fit.capitalize(), pairs),
         *((_skew_table(r),) if r.setting("fit", "skew", False) else ()),
@@ -52,19 +57,10 @@ def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
             f"Residuals of the {words.rows} used [{scale.unit}]",
             ("Chip, axis" if r.several else "Axis", *heads),
             tuple(rows),
-            note=_residual_note(r),
+            note=" ".join(notes),
             detail=True,
         ),
     )
-
-
-def _residual_note(r: ReportInput) -> str:
-    notes = [f"From {r.sample}."] if r.sample else []
-    if r.words.leverage:
-        notes.append(
-            "The stars were fitted to these detections, so that residuals are smaller than errors."
-        )
-    return " ".join(notes)
 
 
 def _skew_table(r: ReportInput) -> TextTable:
@@ -139,27 +135,20 @@ def score_test_table(r: ReportInput) -> TextTable:
     """Table of the tests of the residuals, and of their results."""
     seen = [t.smallest for t in r.score_tests if np.isfinite(t.smallest)]
     scale = display_scale(r.unit, seen or [1.0])
-    rows = tuple(
-        (
-            t.name if t.unit == r.unit else f"{t.name}, per year",
-            f"{number(t.statistic, 3)} ({t.dof:.4g})",
-            "< 1e-300" if t.p_value < 1e-300 else number(t.p_value, 2),
-            number(t.size * scale.factor, 2),
-            number(t.smallest * scale.factor, 2) if np.isfinite(t.smallest) else MISSING,
-            f"found: {t.remedy}" if t.significant else "nothing found",
-        )
+    size, least = f"Size [{scale.unit}]", f"Detectable [{scale.unit}]"
+    rows = [
+        {
+            "Test": t.name if t.unit == r.unit else f"{t.name}, per year",
+            "Statistic (dof)": f"{number(t.statistic, 3)} ({t.dof:.4g})",
+            "p": "< 1e-300" if t.p_value < 1e-300 else number(t.p_value, 2),
+            size: number(t.size * scale.factor, 2),
+            least: number(t.smallest * scale.factor, 2) if np.isfinite(t.smallest) else MISSING,
+            "Result": f"found: {t.remedy}" if t.significant else "nothing found",
+        }
         for t in r.score_tests
-    )
-    return TextTable(
+    ]
+    return tabulated(
         "Score tests of the residuals",
-        (
-            "Test",
-            "Statistic (dof)",
-            "p",
-            f"Size [{scale.unit}]",
-            f"Detectable [{scale.unit}]",
-            "Result",
-        ),
         rows,
         words=(0, 5),
         stacked=(5,),

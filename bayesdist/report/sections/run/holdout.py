@@ -18,7 +18,7 @@ from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.panels import chip_axes
 from bayesdist.report.figures.style import CYCLE, INK, WIDTH, new_figure
 from bayesdist.report.registry import Plot
-from bayesdist.report.texttable import TextTable
+from bayesdist.report.texttable import TextTable, tabulated
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.holdout.tests import HeldTest
@@ -34,20 +34,19 @@ _KEY = 3.0  # length of the arrow in the key, in sigma
 def holdout_coverage(r: ReportInput) -> TextTable:
     """Table of the coverage of the held-out stars along each axis."""
     found = needed(r.held_out)
-    rows = tuple(
-        (
-            c.axis,
-            f"{c.level:g} σ",
-            count(c.n),
-            f"{c.value:.3f}",
-            f"{c.interval[0]:.3f} to {c.interval[1]:.3f}",
-            f"{c.expected:.3f}",
-        )
+    rows = [
+        {
+            "Axis": c.axis,
+            "Within": f"{c.level:g} σ",
+            "Stars": count(c.n),
+            "Fraction": f"{c.value:.3f}",
+            "95 % interval": f"{c.interval[0]:.3f} to {c.interval[1]:.3f}",
+            "Predicted": f"{c.expected:.3f}",
+        }
         for c in found.coverage
-    )
-    heads = ("Axis", "Within", "Stars", "Fraction", "95 % interval", "Predicted")
+    ]
     note = "False matches are part of the prediction; the interval is that of independent stars."
-    return TextTable("Coverage of the held-out stars", heads, rows, words=(0, 1), note=note)
+    return tabulated("Coverage of the held-out stars", rows, words=(0, 1), note=note)
 
 
 @REPORT.table("holdout", needs=("held_out",))
@@ -55,24 +54,23 @@ def holdout_table(r: ReportInput) -> TextTable:
     """Table of the most informative tests."""
     found = needed(r.held_out)
     shown = found.tests[:_MOST_TESTS]
-    rows = tuple(
-        (
-            _question(test, found.unit),
-            test.where,
-            count(test.n),
-            number(test.value, 3),
-            number(test.expected, 3),
-            number(test.p_value, 2),
-            number(test.p_corrected, 2),
-        )
+    rows = [
+        {
+            "Test": _question(test, found.unit),
+            "Where": test.where,
+            "Stars": count(test.n),
+            "Found": number(test.value, 3),
+            "Predicted": number(test.expected, 3),
+            "p": number(test.p_value, 2),
+            "p, corrected": number(test.p_corrected, 2),
+        }
         for test in shown
-    )
-    heads = ("Test", "Where", "Stars", "Found", "Predicted", "p", "p, corrected")
+    ]
     note = (
         f"The {len(shown)} most telling of {len(found.tests)} tests, all in holdout.ecsv; corrected"
         " for their number after Holm (1979)."
     )
-    return TextTable("Tests of the held-out stars", heads, rows, words=(0, 1), note=note)
+    return tabulated("Tests of the held-out stars", rows, words=(0, 1), note=note)
 
 
 def _question(test: HeldTest, unit: str) -> str:

@@ -24,7 +24,7 @@ from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import nice_below
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.gauge import gauge_mark, gauge_of_maps
-from bayesdist.report.texttable import TextTable
+from bayesdist.report.texttable import TextTable, tabulated
 
 if TYPE_CHECKING:
     from bayesdist.assess import VectorMap
@@ -37,38 +37,26 @@ def map_table(r: ReportInput) -> TextTable:
     typical = max(float(m.per_axis.max()) for c in r.chips for m in c.maps)
     for c in r.chips:
         for m in c.maps:
-            cells = [
-                with_mas(v, m.unit, r.scale_mas, like=typical)
-                for v in (
-                    m.sigma_u_max,
-                    m.sigma_v_max,
-                    float(m.per_axis.max()),
-                    float(np.median(m.per_axis)),
-                    float(m.circular_error(0.68).max()),
-                    float(m.circular_error(0.95).max()),
-                )
-            ]
-            cells.append("({:.0f}, {:.0f})".format(*m.position_of_max))
+            sizes = {
+                "Largest σ u": m.sigma_u_max,
+                "Largest σ v": m.sigma_v_max,
+                "Largest per axis": float(m.per_axis.max()),
+                "Median per axis": float(np.median(m.per_axis)),
+                "Largest CE68": float(m.circular_error(0.68).max()),
+                "Largest CE95": float(m.circular_error(0.95).max()),
+            }
+            row = {k: with_mas(v, m.unit, r.scale_mas, like=typical) for k, v in sizes.items()}
+            row["At pixel"] = "({:.0f}, {:.0f})".format(*m.position_of_max)
             if m is not c.formal_map:
-                cells = [r.marked(text) for text in cells]
-            name = f"{c.chip.name}, {m.kind}" if r.several else m.kind
-            rows.append((name, *cells))
+                row = {k: r.marked(text) for k, text in row.items()}
+            whose = {"Chip, solution": f"{c.chip.name}, {m.kind}"}
+            rows.append((whose if r.several else {"Solution": m.kind}) | row)
     first = r.chips[0].formal_map
     when = "" if first.epoch is None else f", epoch {first.epoch:.2f}"
     which = "each chip" if r.several else f"chip {first.chip}"
-    return TextTable(
+    return tabulated(
         f"Uncertainty of the position, 1 σ, {which}{when}{gauge_mark(r)}",
-        (
-            "Chip, solution" if r.several else "Solution",
-            "Largest σ u",
-            "Largest σ v",
-            "Largest per axis",
-            "Median per axis",
-            "Largest CE68",
-            "Largest CE95",
-            "At pixel",
-        ),
-        tuple(rows),
+        rows,
         note="Per axis: rms of σ u and σ v. CE68, CE95: radii of the circles that hold 68 and 95 %."
         f" {gauge_of_maps(r)}".rstrip(),
     )

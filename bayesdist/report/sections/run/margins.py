@@ -22,7 +22,7 @@ from bayesdist.report.figures.style import (
 )
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.gauge import gauge_of_new_exposure
-from bayesdist.report.texttable import TextTable
+from bayesdist.report.texttable import TextTable, tabulated
 
 if TYPE_CHECKING:
     from bayesdist.assess import Margin
@@ -39,32 +39,31 @@ def margin_table(r: ReportInput) -> TextTable:
     for m in r.margins:
         asked = m.requirement
         spread = (m.interval[1] - m.interval[0]) / 4
-        cells = (
-            rounded(m.value, spread),
-            interval(m.interval[0], m.interval[1], spread),
-            f"{rounded(m.margin, spread)} ({percent(m.percent / 100, 2)})",
-            counted(m.probability_met, m.mc_error, m.n_effective),
-        )
+        cells = {
+            "Value": rounded(m.value, spread),
+            "95 % interval": interval(m.interval[0], m.interval[1], spread),
+            "Margin": f"{rounded(m.margin, spread)} ({percent(m.percent / 100, 2)})",
+            "P(met)": counted(m.probability_met, m.mc_error, m.n_effective),
+        }
         epoch = "" if m.epoch is None else f" at {m.epoch:.2f}"
         if asked.epochs is not None:
             epoch = f" from {asked.epochs[0]:.2f} to {asked.epochs[1]:.2f}, worst{epoch}"
         chip = next((c.chip.name for c in r.chips if c.chip.number == asked.chip), "")
         on = f" on {chip}" if chip and r.several else ""
         scope = f" {asked.scope}" if asked.scope else ""
+        statistic = f"{asked.statistic}{scope}{on}{epoch} at most {asked.limit:g} {asked.unit}"
         out.append(
-            (
-                asked.name,
-                f"{asked.statistic}{scope}{on}{epoch} at most {asked.limit:g} {asked.unit},"
-                f" with probability {asked.probability:g}",
-                *(r.marked(c) for c in cells),
-                m.unit,
-                _judgement(m, r.several),
-            )
+            {
+                "Name": asked.name,
+                "Requirement": f"{statistic}, with probability {asked.probability:g}",
+                **{key: r.marked(text) for key, text in cells.items()},
+                "Unit": m.unit,
+                "Verdict": _judgement(m, r.several),
+            }
         )
-    return TextTable(
+    return tabulated(
         "Margins",
-        ("Name", "Requirement", "Value", "95 % interval", "Margin", "P(met)", "Unit", "Verdict"),
-        tuple(out),
+        out,
         words=(0, 1, 6, 7),
         stacked=(7,),
         note="Margin: the limit minus the value that the statistic stays under with the probability"

@@ -22,7 +22,7 @@ from bayesdist.report.figures.arrows import CHANCE, Arrows, magnification_of, sp
 from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import nice_below
 from bayesdist.report.registry import Plot
-from bayesdist.report.texttable import TextTable, listing
+from bayesdist.report.texttable import TextTable, listing, tabulated
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.periods import TimeVariation
@@ -65,36 +65,27 @@ def _periods(found: TimeVariation, r: ReportInput) -> TextTable:
         z = np.abs(comparison.coefficients(name, against).z)
         start, stop = found.spans[name]
         n = comparison.counts[comparison.names.index(name)]
+        single = against is None
         rows.append(
-            (
-                name if against is None else f"{name} against {against}",
-                f"{(start + stop) / 2:.3f}" if against is None else MISSING,
-                count(n) if against is None else MISSING,
-                with_mas(change.largest, r.unit, mas),
-                with_mas(change.sigma, r.unit, mas, 2),
-                r.position(change.at, change.chip),
-                with_mas(change.noise_95, r.unit, mas),
-                probability(change.p_value),
-                probability(change.p_field),
-                f"{int((z > _CLEAR).sum())} of {len(z)}, {number(z.max(), 2)}",
-            )
+            {
+                "Period (MJD)": name if single else f"{name} against {against}",
+                "Year": f"{(start + stop) / 2:.3f}" if single else MISSING,
+                "Pairs": count(n) if single else MISSING,
+                "Largest difference": with_mas(change.largest, r.unit, mas),
+                "σ there": with_mas(change.sigma, r.unit, mas, 2),
+                "At pixel": r.position(change.at, change.chip),
+                "95 % of noise": with_mas(change.noise_95, r.unit, mas),
+                "p of the largest": probability(change.p_value),
+                "p of the field": probability(change.p_field),
+                f"Coefficients beyond {_CLEAR:g} σ, largest": (
+                    f"{int((z > _CLEAR).sum())} of {len(z)}, {number(z.max(), 2)}"
+                ),
+            }
         )
     chance = 2 * comparison.means.shape[1] * 0.00135
-    return TextTable(
+    return tabulated(
         "Models of the periods against the combined model",
-        (
-            "Period (MJD)",
-            "Year",
-            "Pairs",
-            "Largest difference",
-            "σ there",
-            "At pixel",
-            "95 % of noise",
-            "p of the largest",
-            "p of the field",
-            f"Coefficients beyond {_CLEAR:g} σ, largest",
-        ),
-        tuple(rows),
+        rows,
         words=(0, 5, 7, 8),
         note="95 % of noise: what noise alone makes of the largest difference over the array, which"
         " p of the largest refers to; p of the field is that of all coefficients together."

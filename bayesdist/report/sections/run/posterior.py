@@ -33,7 +33,7 @@ from bayesdist.report.figures.style import (
     new_figure,
 )
 from bayesdist.report.registry import Plot
-from bayesdist.report.texttable import TextTable
+from bayesdist.report.texttable import TextTable, tabulated
 
 if TYPE_CHECKING:
     from bayesdist.infer import Posterior
@@ -111,14 +111,14 @@ def added_errors_table(r: ReportInput) -> TextTable:
         for a, axis in enumerate("uv" if found.by_axis else ("u and v",)):
             size, error = scale.factor * found.sigma[g, a], scale.factor * found.sigma_error[g, a]
             rows.append(
-                (
-                    f"{found.by} {label}" if found.by else "all",
-                    axis,
-                    count(found.n[g, a]),
-                    rounded(size, error),
-                    number(error, 2),
-                    number(scale.factor * found.excess[g, a], 3),
-                )
+                {
+                    "Stars": f"{found.by} {label}" if found.by else "all",
+                    "Axis": axis,
+                    "Number": count(found.n[g, a]),
+                    f"Error [{scale.unit}]": rounded(size, error),
+                    "σ": number(error, 2),
+                    "Added to the quoted errors": number(scale.factor * found.excess[g, a], 3),
+                }
             )
     gains = ", ".join(f"by {name} {number(gain, 3)}" for name, gain in found.evidence.items())
     note = (
@@ -127,8 +127,7 @@ def added_errors_table(r: ReportInput) -> TextTable:
     )
     if found.added is not None:
         note += " What is beyond the least was added to the quoted errors, and j is the least."
-    heads = ("Stars", "Axis", "Number", f"Error [{scale.unit}]", "σ", "Added to the quoted errors")
-    return TextTable("Errors beyond the quoted ones", heads, tuple(rows), words=(0, 1), note=note)
+    return tabulated("Errors beyond the quoted ones", rows, words=(0, 1), note=note)
 
 
 @REPORT.figure("outliers", needs=("posterior.hyper",))
