@@ -14,7 +14,7 @@ from bayesdist.app.results import Results
 from bayesdist.assess import Requirement
 from bayesdist.assess.evaluation import budget_over
 from bayesdist.assess.requirements.margins import judge
-from bayesdist.assess.terms.centroid import centroid_errors
+from bayesdist.assess.terms.given import centroid_errors
 from bayesdist.diagnose.residuals.sample import centroid_scatter, star_sample
 from bayesdist.errors import InputError
 

@@ -19,10 +19,9 @@ from bayesdist.assess.requirements.margins import Margin, judge
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.validity import ValidityPeriod, validity_period
 from bayesdist.assess.requirements.verdict import rests_on
-from bayesdist.assess.terms.centroid import centroids_of
 from bayesdist.assess.terms.correlated import StructureErrors
 from bayesdist.assess.terms.forms import Known
-from bayesdist.assess.terms.given import Centroids
+from bayesdist.assess.terms.given import Centroids, centroids_of
 from bayesdist.assess.units import pixel_scale_of
 from bayesdist.checks import Check, in_order, worst
 from bayesdist.diagnose.diagnostics import Diagnostics

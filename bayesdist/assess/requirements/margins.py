@@ -182,6 +182,9 @@ def check_requirements(
     model = error_model(solution, terms=terms, aligned=aligned, pixel_scale=pixel_scale)
     if not requirements:  # terms in units that need a scale are refused all the same
         return ()
+    converged = solution.convergence
+    if converged is not None:
+        checks = (convergence_check(converged), *checks)
     return judge(
         model.drawn(n_draws, rng),
         requirements,
@@ -189,7 +192,7 @@ def check_requirements(
         epoch=epoch,
         chip=chip,
         pixel_scale=pixel_scale,
-        checks=(*_convergence(solution), *checks),
+        checks=checks,
     )
 
 
@@ -342,12 +345,6 @@ def _of_extremes(
     )
     texts = [*(one.sentence for one in doubts), reason]
     return replace(worse, verdict="undecided", reason="; ".join(texts))
-
-
-def _convergence(solution: Solution) -> tuple[Check, ...]:
-    """Check that draws can be relied on, of a solution that has draws of its own."""
-    convergence = solution.convergence
-    return () if convergence is None else (convergence_check(convergence),)
 
 
 def _margin(
