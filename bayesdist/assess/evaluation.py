@@ -229,13 +229,6 @@ def drawn_errors(
     return model.drawn(n or settings.draws, restarted(rng))
 
 
-def budget_over(
-    errors: ErrorModel, settings: EvaluationSettings, rng: np.random.Generator
-) -> ErrorBudget:
-    """The budget over the grid of all chips."""
-    return errors.at(settings.domain(errors), n=settings.draws, rng=restarted(rng))
-
-
 def judged(
     errors: ErrorModel,
     diagnostics: Diagnostics,
