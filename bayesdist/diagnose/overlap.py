@@ -91,7 +91,7 @@ def overlap_test(
     pairs: Matches,
     solution: Solution,
     known: Calibration,
-    tables: Sequence[LookupTable] = (),
+    tables: Sequence[LookupTable],
     *,
     unit_arcsec: float,
     pixel: float,

@@ -156,9 +156,7 @@ def bins_for(n: int) -> int:
     return int(np.clip(np.sqrt(n / STARS_PER_BIN), 2, MAX_BINS))
 
 
-def period_part(
-    matches: Matches, *, fit: LinearFit, bins: int, radial_weight: float = 1.0
-) -> PeriodPart:
+def period_part(matches: Matches, *, fit: LinearFit, bins: int, radial_weight: float) -> PeriodPart:
     """A task for `sum_by_period`.
 
     `matches` are those of one period, `fit` is that of all data; `bins` are those on each axis,

@@ -241,7 +241,7 @@ class Centroids:
 
 
 def centroid_errors(
-    scatter: MagnitudeErrors, contained: Sequence[tuple[str, float, float]] = ()
+    scatter: MagnitudeErrors, contained: Sequence[tuple[str, float, float]]
 ) -> MagnitudeErrors:
     """Scatter of residuals by magnitude, less other errors that are in it.
 
@@ -268,7 +268,7 @@ def centroid_errors(
 
 
 def centroids_of(
-    diagnostics: Diagnostics, contained: Sequence[tuple[str, float, float]] = ()
+    diagnostics: Diagnostics, contained: Sequence[tuple[str, float, float]]
 ) -> MagnitudeErrors | None:
     """Errors of centroids by magnitude: the scatter of residuals less what has a term of its own.
 
