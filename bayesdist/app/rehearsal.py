@@ -12,9 +12,9 @@ from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.products.made_files import made_files, product_input
 from bayesdist.app.results import Results
 from bayesdist.assess import Requirement
-from bayesdist.assess.evaluation import budget_over
+from bayesdist.assess.budget.budget import budget_of
 from bayesdist.assess.requirements.margins import judge
-from bayesdist.assess.terms.centroid import centroid_errors
+from bayesdist.assess.terms.given import centroid_errors
 from bayesdist.diagnose.residuals.sample import centroid_scatter, star_sample
 from bayesdist.errors import InputError
 
@@ -59,14 +59,15 @@ def _check_residuals(data: FitData, config: Config) -> None:
 
 def _rehearse_evaluation(data: FitData, config: Config, n_draws: int) -> None:
     """Refuse terms and requirements that the run could not be judged by."""
-    settings = replace(rehearsal_settings(data, config), draws=n_draws)
+    settings = rehearsal_settings(data, config)
     errors = errors_of_fit(data.fit, data, config)
-    budget_over(errors, settings, assessment_rng(config))
+    drawn = errors.drawn(n_draws, assessment_rng(config))
+    budget_of(drawn, settings.domain(errors))
     # without a posterior centroids have no errors yet
     has_mag = data.placed.has_mag
     requirements = [_of_any_star(r, has_mag=has_mag) for r in config.requirements()]
     judge(
-        errors.drawn(n_draws, assessment_rng(config)),
+        drawn,
         requirements,
         grid=settings.grid,
         epoch=settings.epoch,

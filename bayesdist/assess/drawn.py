@@ -90,7 +90,7 @@ class DrawnErrors:
             self._cache[domain] = tuple(one.on(domain, self.image) for one in self.draws)
         return self._cache[domain]
 
-    def treatments(self, grid: tuple[int, int] | None = None) -> tuple[DrawnErrors, ...]:
+    def treatments(self, grid: tuple[int, int] | None) -> tuple[DrawnErrors, ...]:
         """Draws with what may vary over the field varying: smoothly, and everywhere.
 
         Nothing where no term may vary.

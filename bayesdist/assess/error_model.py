@@ -185,44 +185,26 @@ def error_model(
 def diagnosed_error_model(
     posterior: Posterior,
     diagnostics: Diagnostics,
-    terms: Sequence[ErrorTerm] = (),
+    terms: Sequence[ErrorTerm],
     *,
-    hierarchy: LinearFit | None = None,
-    catalogue: str = "catalogue",
-    single: bool = False,
-    frames: bool = False,
-    structure_left: bool = True,
-    aligned: bool = False,
-    pixel_scale: float | None = None,
+    hierarchy: LinearFit | None,
+    catalogue: str,
+    single: bool,
+    frames: bool,
+    structure_left: bool,
+    aligned: bool,
+    pixel_scale: float | None,
 ) -> ErrorModel:
     """The error model of a posterior, with what residuals say of it.
 
-    Parameters
-    ----------
-    posterior : Posterior
-        As it was sampled.
-    diagnostics : Diagnostics
-        Its correlated errors, and what errors of the catalogue do, count in.
-    terms : sequence of ErrorTerm
-        Other errors.
-    hierarchy : LinearFit, optional
-        Of a hierarchy of exposures: its covariance has no noise of draws.
-    catalogue : str
-        Name of the file that states the catalogue's errors.
-    single : bool
-        Whether the star lies in a single exposure, whose deviation counts; else in the mean.
-    frames : bool
-        Whether errors of the exposures' frames follow the correlated errors.
-    structure_left : bool
-        Whether what the model leaves out at a position counts; not where errors of look-up tables
-        stand for it.
-    aligned, pixel_scale
-        As of `error_model`.
-
-    Raises
-    ------
-    InputError
-        As `error_model`.
+    `posterior`: as it was sampled. `diagnostics`: its correlated errors, and what errors of the
+    catalogue do, count in. `terms`: other errors. `hierarchy`: the fit of a hierarchy of exposures,
+    whose covariance has no noise of draws. `catalogue`: name of the file that states the
+    catalogue's errors. `single`: whether the star lies in a single exposure, whose deviation
+    counts; else in the mean. `frames`: whether errors of the exposures' frames follow the
+    correlated errors. `structure_left`: whether what the model leaves out at a position counts; not
+    where errors of look-up tables stand for it. `aligned`, `pixel_scale`, InputError: as of
+    `error_model`.
     """
     measured: list[ErrorTerm] = []
     correlated = diagnostics.correlated

@@ -19,10 +19,9 @@ from bayesdist.assess.requirements.margins import Margin, judge
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.validity import ValidityPeriod, validity_period
 from bayesdist.assess.requirements.verdict import rests_on
-from bayesdist.assess.terms.centroid import centroids_of
 from bayesdist.assess.terms.correlated import StructureErrors
 from bayesdist.assess.terms.forms import Known
-from bayesdist.assess.terms.given import Centroids
+from bayesdist.assess.terms.given import Centroids, centroids_of
 from bayesdist.assess.units import pixel_scale_of
 from bayesdist.checks import Check, in_order, worst
 from bayesdist.diagnose.diagnostics import Diagnostics
@@ -228,13 +227,6 @@ def drawn_errors(
     centroids = centroids_of(diagnostics, settings.contained) if known else None
     model = errors.with_terms(Centroids(centroids), *files)
     return model.drawn(n or settings.draws, restarted(rng))
-
-
-def budget_over(
-    errors: ErrorModel, settings: EvaluationSettings, rng: np.random.Generator
-) -> ErrorBudget:
-    """The budget over the grid of all chips."""
-    return errors.at(settings.domain(errors), n=settings.draws, rng=restarted(rng))
 
 
 def judged(

@@ -135,10 +135,10 @@ def diagnose_fit(
     shards: Shards,
     table: Matches,
     *,
-    eliminated: SelfCalibrationMode | None = None,
-    centroid: MagnitudeErrors | Literal["residuals"] | None = "residuals",
-    things: str = "pairs",
-    known: bool = False,
+    eliminated: SelfCalibrationMode | None,
+    centroid: MagnitudeErrors | Literal["residuals"] | None,
+    things: str,
+    known: bool,
 ) -> Diagnostics:
     """Diagnostics by residuals alone, of a posterior where there is one; nothing is estimated.
 
@@ -183,7 +183,7 @@ def diagnose_fit(
 
 
 def residual_sums(
-    fit: LinearFit, shards: Shards, solution: Likelihood | None = None
+    fit: LinearFit, shards: Shards, solution: Likelihood | None
 ) -> tuple[dict[int, dict[str, Bins]], StarSums]:
     """Bins of each chip by the name of the partition, and sums of residuals in them.
 

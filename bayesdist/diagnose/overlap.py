@@ -91,7 +91,7 @@ def overlap_test(
     pairs: Matches,
     solution: Solution,
     known: Calibration,
-    tables: Sequence[LookupTable] = (),
+    tables: Sequence[LookupTable],
     *,
     unit_arcsec: float,
     pixel: float,
@@ -108,7 +108,7 @@ def overlap_test(
     if chosen is None:
         return None
     shared = _shared(pairs, *chosen)
-    epochs = tuple(_epoch(pairs, rows) for rows in shared)
+    epochs = tuple(float(np.median(pairs.column("epoch")[rows])) for rows in shared)
     planes = [
         (
             _known_plane(known, pairs, rows, epoch),
@@ -169,10 +169,6 @@ def _shared(pairs: Matches, a: int, b: int) -> tuple[Int, Int]:
     of_a, of_b = (np.flatnonzero(pairs.exposure == code) for code in (a, b))
     _, first, second = np.intersect1d(star[of_a], star[of_b], return_indices=True)
     return of_a[first], of_b[second]
-
-
-def _epoch(pairs: Matches, rows: Int) -> float:
-    return float(np.median(pairs.column("epoch")[rows]))
 
 
 def _known_plane(known: Calibration, pairs: Matches, rows: Int, epoch: float) -> Float:

@@ -9,7 +9,6 @@ import numpy as np
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.error_model import error_model
-from bayesdist.assess.terms.forms import TogetherField
 
 JOINT = "model"
 
@@ -33,7 +32,7 @@ class DrawnFields:
         [one] = [
             part
             for field in fields
-            for part in (field.parts if isinstance(field, TogetherField) else (field,))
+            for part in field.parts
             if name in [row.name for row in part.rows]
         ]
         return one.errors(draws, {})

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bayesdist.assess.terms.centroid import centroid_errors
+from bayesdist.assess.terms.given import centroid_errors
 from bayesdist.data import Matches
 from bayesdist.diagnose.residuals.sample import StarSample, centroid_scatter
 from bayesdist.errors import InputError

@@ -168,10 +168,10 @@ def _drawn(
         every = slice(0, errors.n_draws)
         joint = 0.0
         for field in errors.at(domain):
-            for part in getattr(field, "parts", (field,)):
+            for part in field.parts:
                 if isinstance(part, PolynomialField):
                     parts.setdefault(part.rows[0].name, []).append(part.errors(every, {}))
-            for one in getattr(field, "summed", (field,)):
+            for one in field.summed:
                 if isinstance(one, PolynomialField):
                     joint = joint + one.errors(every, {})
         parts.setdefault(MODEL, []).append(joint)

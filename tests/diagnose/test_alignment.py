@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
+from bayesdist.diagnose.periods import pattern_changes
 from bayesdist.diagnose.residuals.binned import BinValues, band_bins
-from bayesdist.diagnose.residuals.changes import pattern_changes
 from bayesdist.diagnose.residuals.rows import (
     STATISTICS,
     bin_row,

@@ -14,6 +14,7 @@ import pytest
 from scipy.stats import binom, chi2, kstest, norm
 
 from bayesdist.data.holdout import HoldoutSpec, split_matches
+from bayesdist.diagnose.holdout.grouped import SpreadMoments, sum_tails
 from bayesdist.diagnose.holdout.predictive import (
     SCALES,
     Predictive,
@@ -21,7 +22,6 @@ from bayesdist.diagnose.holdout.predictive import (
     scores_of,
     uniforms_of,
 )
-from bayesdist.diagnose.holdout.spread import SpreadMoments, sum_tails
 from bayesdist.diagnose.holdout.sums import _beyond
 from bayesdist.diagnose.holdout.validation import holdout_validation
 from bayesdist.diagnose.significance import holm

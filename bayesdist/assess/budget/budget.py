@@ -213,16 +213,15 @@ def budget_of(errors: DrawnErrors, domain: EvaluationDomain) -> ErrorBudget:
     terms: list[tuple[bool, BudgetTerm]] = []
     products = []
     for one in fields:
-        squares = one.squares()
-        for row in one.rows:
-            known = {c: one.relative_error(row.name, c, monte_carlo) for c in domain.chips}
-            u, v = np.sqrt(squares[row.name]).T
+        for row, part, square in one.by_row():
+            known = {c: part.relative_error(c, monte_carlo) for c in domain.chips}
+            u, v = np.sqrt(square).T
             first = known[domain.chips[0]]
             found = BudgetTerm(row.name, row.kind, u, v, row.source, first, known)
             if row.kind == PRODUCT:
                 products.append(found)
             else:
-                terms.append((not one.of_parameters(row.name), found))
+                terms.append((not part.of_parameters, found))
     u, v = np.sqrt(sum(one.total() for one in fields)).T
     return ErrorBudget(
         domain,

@@ -24,7 +24,6 @@ from bayesdist.assess.terms.forms import (
     Known,
     PolynomialField,
     Row,
-    TogetherField,
 )
 from bayesdist.assess.terms.given import Centroids
 from bayesdist.data.magnitude_errors import MagnitudeErrors
@@ -95,10 +94,8 @@ def budget_surface(
     domain = EvaluationDomain.of_chips(model, grid, epoch=epoch)
     parts, local, constant, products = [], list[GridRow](), [], list[GridRow]()
     for draws, one in zip(errors.draws, errors.at(domain), strict=True):
-        squares = one.squares()
-        for row in one.rows:
-            values = squares[row.name]
-            if one.of_parameters(row.name):
+        for row, part, values in one.by_row():
+            if part.of_parameters:
                 parts.append(row)
             elif isinstance(draws, Known):
                 products.append(GridRow(row, tuple(_shifts(draws, domain, n) for n in nodes)))
@@ -164,17 +161,10 @@ def _of_parameters(fields: Sequence[ErrorField], chip: int) -> dict[str, Float]:
     out: dict[str, Float] = {}
     joint: Float | float = 0.0
     for one in fields:
-        if isinstance(one, PolynomialField):
-            parts: Sequence[ErrorField] = (one,)
-            whole: Sequence[ErrorField] = (one,)
-        elif isinstance(one, TogetherField):
-            parts, whole = one.parts, one.summed
-        else:
-            continue
-        for part in parts:
+        for part in one.parts:
             if isinstance(part, PolynomialField):
                 out[part.rows[0].name] = _second(part.coefficients[chip])
-        added = [p.coefficients[chip] for p in whole if isinstance(p, PolynomialField)]
+        added = [p.coefficients[chip] for p in one.summed if isinstance(p, PolynomialField)]
         if added:
             joint = joint + _second(sum(added[1:], added[0]))
     return out | {JOINT: np.asarray(joint)}

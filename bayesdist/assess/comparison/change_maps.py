@@ -13,7 +13,6 @@ from bayesdist.distributions import f_sf
 from bayesdist.infer.compare.change_date import ChangeDate
 from bayesdist.infer.compare.monitoring import Change
 from bayesdist.limits import DIFFERENCE
-from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.numbers import p_words
 
 
@@ -144,8 +143,8 @@ def change_maps(
     change: Change,
     *,
     rng: np.random.Generator,
-    names: tuple[str, str] = ("new matches", "release"),
-    grid: tuple[int, int] = DEFAULT_GRID,
+    names: tuple[str, str],
+    grid: tuple[int, int],
 ) -> tuple[Comparison, ...]:
     """The change of each chip over its grid.
 

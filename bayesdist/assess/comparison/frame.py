@@ -71,7 +71,7 @@ class CommonFrame:
         return term_squares(self.basis)
 
 
-def common_frame(a: ChipMap, b: ChipMap, *, keep: bool = False) -> CommonFrame:
+def common_frame(a: ChipMap, b: ChipMap, *, keep: bool) -> CommonFrame:
     """Bring two calibrations to one frame.
 
     `a`, `b`: of one detector; of any order, reference pixel, orientation, parity and unit.  Their

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 from bayesdist.arrays import Float
 from bayesdist.infer.compare.planning import with_information
@@ -69,24 +71,15 @@ def _need(
     probability_met: Callable[[Solution], float],
     asked: float,
 ) -> Need:
+    @cache
     def reached(n: int) -> float:
         return probability_met(with_information(solution, n * schedule.information))
 
-    few, many, found = 0, MOST, reached(MOST)
-    if found < asked:
-        return Need(schedule.name, None, found)
-    n = 1
-    while n < many:  # doubling: most needs are small
-        p = reached(n)
-        if p >= asked:
-            many, found = n, p
-            break
-        few, n = n, 2 * n
-    while many - few > 1:
-        middle = (few + many) // 2
-        p = reached(middle)
-        if p >= asked:
-            many, found = middle, p
-        else:
-            few = middle
-    return Need(schedule.name, many, found)
+    if reached(MOST) < asked:
+        return Need(schedule.name, None, reached(MOST))
+    enough = 1
+    while reached(enough) < asked:  # doubling: most needs are small
+        enough *= 2
+    numbers = range(enough // 2 + 1, enough + 1)
+    n = numbers[bisect_left(numbers, asked, key=reached)]
+    return Need(schedule.name, n, reached(n))

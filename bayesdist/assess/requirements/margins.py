@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -182,6 +183,9 @@ def check_requirements(
     model = error_model(solution, terms=terms, aligned=aligned, pixel_scale=pixel_scale)
     if not requirements:  # terms in units that need a scale are refused all the same
         return ()
+    converged = solution.convergence
+    if converged is not None:
+        checks = (convergence_check(converged), *checks)
     return judge(
         model.drawn(n_draws, rng),
         requirements,
@@ -189,7 +193,7 @@ def check_requirements(
         epoch=epoch,
         chip=chip,
         pixel_scale=pixel_scale,
-        checks=(*_convergence(solution), *checks),
+        checks=checks,
     )
 
 
@@ -221,12 +225,8 @@ def judge(
     ways, found = (errors, *errors.treatments(grid)), {}
     for domain, names in wanted.items():
         owner = next(r for r, case in zip(requirements, cases, strict=True) if domain in case)
-        try:
+        with _named(owner):  # its separation or magnitude may be wrong
             found[domain] = [one.statistics(domain, sorted(names)) for one in ways]
-        except InputError as error:  # of its separation or magnitude
-            raise InputError(
-                error.cause, where=f"{owner.where}, {error.where}", do=error.do
-            ) from None
 
     doubts = doubts_of(checks)
     n_effective = errors.n_effective
@@ -234,14 +234,10 @@ def judge(
     margins = []
     for r, case in zip(requirements, cases, strict=True):
         factor = convert(1.0, unit, r.unit, pixel_scale)
-        extremes = [
-            _margin(r, case, draws, way, factor, n_effective, doubts)
-            for way, *draws in zip(
-                ways,
-                *([factor * one[r.statistic] for one in found[domain]] for domain in case),
-                strict=True,
-            )
-        ]
+        extremes = []
+        for k, way in enumerate(ways):
+            draws = [factor * found[domain][k][r.statistic] for domain in case]
+            extremes.append(_margin(r, case, draws, way, factor, n_effective, doubts))
         worse = min(range(len(ways)), key=lambda k: extremes[k].probability_met)
         margin = _of_extremes(extremes, extremes[worse], varying, doubts)
         if extremes[worse].verdict == "missed" and not doubts:
@@ -294,7 +290,7 @@ def domains_of(
             where=r.where,
             do=f"name its chip, one of {', '.join(str(c.number) for c in chips)}",
         )
-    try:
+    with _named(r):  # its region may be wrong
         first = EvaluationDomain.of_chips(
             model,
             grid,
@@ -305,9 +301,17 @@ def domains_of(
             relative=r.relative,
             separation=r.separation,
         )
-    except InputError as error:  # of its region
-        raise InputError(error.cause, where=f"{r.where}, {error.where}", do=error.do) from None
     return tuple(first.at(epoch) for epoch in epochs)
+
+
+@contextmanager
+def _named(requirement: Requirement) -> Iterator[None]:
+    """Context whose errors name the requirement."""
+    try:
+        yield
+    except InputError as error:
+        where = f"{requirement.where}, {error.where}"
+        raise InputError(error.cause, where=where, do=error.do) from None
 
 
 def _chips_of(
@@ -342,12 +346,6 @@ def _of_extremes(
     )
     texts = [*(one.sentence for one in doubts), reason]
     return replace(worse, verdict="undecided", reason="; ".join(texts))
-
-
-def _convergence(solution: Solution) -> tuple[Check, ...]:
-    """Check that draws can be relied on, of a solution that has draws of its own."""
-    convergence = solution.convergence
-    return () if convergence is None else (convergence_check(convergence),)
 
 
 def _margin(

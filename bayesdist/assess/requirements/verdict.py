@@ -63,9 +63,9 @@ def rests_on(
     diagnostics: Diagnostics,
     epoch: float | None,
     *,
-    given: Sequence[str] = (),
-    aligned: bool = False,
-    single: bool = False,
+    given: Sequence[str],
+    aligned: bool,
+    single: bool,
     dates: Float,
 ) -> tuple[str, ...]:
     """Clauses on what a verdict at an epoch assumes, or has measured.

@@ -21,7 +21,6 @@ from bayesdist.assess.terms.forms import (
 )
 from bayesdist.assess.terms.parameters import CatalogueErrors
 from bayesdist.infer.solution import Solution
-from bayesdist.model import DistortionModel
 
 COEFFICIENTS = "coefficients"
 TIME_DEPENDENCE = "time dependence"
@@ -105,23 +104,19 @@ def _parts(
     model, mean = solution.model, np.asarray(solution.mean, float)
 
     def static(chip: int) -> Float:
-        return _static(model, theta, chip) - _static(model, mean, chip)
+        slices = [model.coefficient_slice(chip, axis) for axis in (0, 1)]
+        return np.stack([theta[:, s] - mean[s] for s in slices], axis=1)
 
     def drift(chip: int) -> Float:
         gauge = place_of(model, epoch=epoch, chip=chip)
         return gauge.polynomial(theta) - gauge.polynomial(mean) - static(chip)
 
     def frame(exposure: Int, chip: int) -> Float:
-        out = np.zeros((len(theta), 2, model.n_terms))
+        only = np.tile(mean, (len(theta), 1))
         for e in np.unique(exposure):
-            rows = np.flatnonzero(exposure == e)
-            only = np.tile(mean, (rows.size, 1))
-            block = model.frame_slice(int(e))
-            only[:, block] = theta[rows, block]
-            out[rows] = polynomial_errors(
-                model, mean, only, epoch=epoch, chip=chip, exposure=int(e)
-            )
-        return out
+            rows, block = np.flatnonzero(exposure == e), model.frame_slice(int(e))
+            only[rows, block] = theta[rows, block]
+        return polynomial_errors(model, mean, only, epoch=epoch, chip=chip, exposure=exposure)
 
     out: dict[str, Callable[[int], Float]] = {COEFFICIENTS: static}
     if model.time is not None:
@@ -129,8 +124,3 @@ def _parts(
     if exposure is not None:
         out[EXPOSURE_FRAME] = partial(frame, exposure)
     return out
-
-
-def _static(model: DistortionModel, theta: Float, chip: int) -> Float:
-    """Legendre coefficients (n, 2, K) of a chip without drift."""
-    return np.stack([theta[..., model.coefficient_slice(chip, axis)] for axis in (0, 1)], axis=-2)

@@ -182,7 +182,7 @@ def linear_deviations(
     n: int,
     rng: np.random.Generator,
     *,
-    exposures: bool = True,
+    exposures: bool,
 ) -> LinearDeviations | None:
     """Posterior draws of the deviations of exposures and of the curvature of drifts.
 

@@ -104,7 +104,7 @@ def estimate_discrepancy(
     if stars is not None and stars.star is not None:
         repeated = shared_stars(stars, likelihood, model, priors.star * pixel)
     excess = score_excess(working) * (1.0 if repeated is None else repeated.repetition)
-    information = working.with_excess(excess)
+    information = replace(working, excess=excess)
     chips = range(len(model.chips)) if structure else ()
     near = {} if sample is None or not structure else shared_variances(sample, likelihood, model)
     found, theta, facts = _structures(

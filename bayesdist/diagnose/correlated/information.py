@@ -8,7 +8,7 @@ are.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -139,10 +139,6 @@ class Information:
         for cells in self.groups():
             out[cells.columns] += cells.onto_parameters(cells.score[..., None])[:, 0]
         return out
-
-    def with_excess(self, excess: Float) -> Information:
-        """Information of these cells, its likelihood flattened by the excess (chips, C, 2)."""
-        return replace(self, excess=excess)
 
     def leverage(self, cells: GroupCells) -> Float:
         """Fraction (C, 2) of its own residual that a star of each cell absorbs, on each axis."""

@@ -117,20 +117,21 @@ class Discrepancy:
     @property
     def structure_rms(self) -> float | None:
         """Rms over the detector of the structure, both axes together; None where there is none."""
-        rows = self.facts.get("structure")
-        if not rows:
-            return None
-        by_axis = {a: np.mean([r["rms"] ** 2 for r in rows if r["axis"] == a]) for a in "uv"}
-        return float(np.sqrt(by_axis["u"] + by_axis["v"]))
+        by_axis = self._sizes("rms")
+        return None if by_axis is None else float(np.hypot(*by_axis))
 
     @property
     def structure_median(self) -> tuple[float, float] | None:
         """Median rms over the detector along u and v, without the prior's tail; None without."""
+        return self._sizes("median")
+
+    def _sizes(self, name: str) -> tuple[float, float] | None:
+        """Sizes of the structure along u and v, over all chips."""
         rows = self.facts.get("structure")
         if not rows:
             return None
         u, v = (
-            float(np.sqrt(np.mean([r["median"] ** 2 for r in rows if r["axis"] == axis])))
+            float(np.sqrt(np.mean([r[name] ** 2 for r in rows if r["axis"] == axis])))
             for axis in "uv"
         )
         return u, v

@@ -14,7 +14,13 @@ from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.bins import ALL, Partition
 from bayesdist.diagnose.holdout.frames import Frame
-from bayesdist.diagnose.holdout.grouped import GroupedScores, ScaleSums, StarScores, membership
+from bayesdist.diagnose.holdout.grouped import (
+    GroupedScores,
+    ScaleSums,
+    SpreadMoments,
+    StarScores,
+    membership,
+)
 from bayesdist.diagnose.holdout.predictive import (
     Predictive,
     marginals_of,
@@ -23,7 +29,6 @@ from bayesdist.diagnose.holdout.predictive import (
 )
 from bayesdist.diagnose.holdout.rows import HeldRows, predicted_rows
 from bayesdist.diagnose.holdout.shared import SharedErrors
-from bayesdist.diagnose.holdout.spread import SpreadMoments
 
 PIT_BINS = 20
 TAILS = (3.0, 4.0, 5.0)  # sigma

@@ -142,9 +142,11 @@ def exposure_test(projection: Projection) -> Outcome | None:
     dof = n / stretch
     T = T / stretch
     square, noise = (float(values) for values in np.mean(squares, axis=0))
-    family = replace(EXPOSURES, remedy=_remedy(model.frames))
+    remedy = EXPOSURES.remedy
+    if model.frames != "affine":
+        remedy = f"set model.frames to 'affine', or {remedy}"
     return outcome(
-        family,
+        replace(EXPOSURES, remedy=remedy),
         T,
         dof,
         None,
@@ -153,12 +155,6 @@ def exposure_test(projection: Projection) -> Outcome | None:
         noise=noise,
         unit=model.unit,
     )
-
-
-def _remedy(frames: str) -> str:
-    """Remedy of deviations, as a clause, by the kind of the frames."""
-    hierarchy = EXPOSURES.remedy
-    return hierarchy if frames == "affine" else f"set model.frames to 'affine', or {hierarchy}"
 
 
 def _deviations(projection: Projection, names: list[str]) -> Iterator[_Deviations]:

@@ -85,11 +85,6 @@ class Projection:
         G = self.n_global
         return np.asarray(self.score[G:] - self.nuisance.T @ self.score[:G])
 
-    def whole_information(self, which: Int) -> Float:
-        """Information (n, n) of some regressors beside the exposures' parameters alone."""
-        inside = self.n_global + which
-        return self.information[np.ix_(inside, inside)]
-
     def efficient_information(self, which: Int) -> Float:
         """Information (n, n) of some regressors, the parameters projected out."""
         G = self.n_global

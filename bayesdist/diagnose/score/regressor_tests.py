@@ -140,7 +140,9 @@ class _Directions:
         S = projection.efficient_information(columns)
         A = beside_others(S, own, directions)
         S = A.T @ S @ A
-        whole = directions.T @ projection.whole_information(columns[own]) @ directions
+        # beside the exposures' parameters alone
+        inside = projection.n_global + columns[own]
+        whole = directions.T @ projection.information[np.ix_(inside, inside)] @ directions
         N = independent_directions(whole, S, several.least)
         # eigenvectors: their information is diagonal
         basis = A @ (N / np.sqrt(np.einsum("nq,nm,mq->q", N, S, N, optimize=True)))

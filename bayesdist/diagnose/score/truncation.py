@@ -127,7 +127,7 @@ def _alike(variance: Float, inlier: Float) -> Int:
     return np.clip(np.searchsorted(large, np.arange(len(count))), 0, len(large) - 1)[part]
 
 
-def truncation_test(sample: ScoredSample, match_radius: float | None = None) -> Outcome | None:
+def truncation_test(sample: ScoredSample, match_radius: float | None) -> Outcome | None:
     """Test for true matches missing beyond some radius.
 
     `match_radius` is in the unit of u and v. None for less than `MIN_STARS` true matches.

@@ -164,40 +164,29 @@ def pieces(columns: Columns) -> Iterator[Piece]:
             phi[here] = basis.evaluate_scaled(p.X[rows][here], p.Y[rows][here])
             more = columns.values(code, rows.start + here)
             dense.append((here, np.concatenate([phi[here], more], axis=1)))
-        # parameters of exposures and drifts
-        m = structure.extra.shape[1]
-        values, index = np.zeros((n, 2, m)), np.zeros((n, m), np.int64)
+        entries = []
         for g in np.unique(group):
             here = np.flatnonzero(group == g)
-            used = structure.columns[g] >= 0
-            index[here] = np.where(used, structure.columns[g] - p.model.n_polynomial, 0)
-            values[here] = np.einsum("mak,nk->nam", structure.extra[g], phi[here])
-        row = np.broadcast_to(2 * np.arange(n)[:, None, None] + np.arange(2)[:, None], values.shape)
-        at = np.broadcast_to(index[:, None, :], values.shape)
-        entries = [(values.ravel(), row.ravel(), at.ravel())]
-        frame = structure.linear[group]
-        if columns.deviations is not None:
-            for g in np.unique(group):
-                here = np.flatnonzero(group == g)
-                which, moved = columns.deviations.at(
-                    int(g), int(p.groups.chip[g]), float(p.groups.epoch[g]), phi[here],
-                    columns.centre,
-                )  # fmt: skip
-                moved = structure.linear[g] @ moved
-                row = 2 * here[:, None, None] + np.arange(2)[:, None]
-                entries.append(
-                    (
-                        moved.ravel(),
-                        np.broadcast_to(row, moved.shape).ravel(),
-                        np.broadcast_to(n_sparse_params + which, moved.shape).ravel(),
-                    )
-                )
+            # parameters of exposures and drifts
+            used = np.flatnonzero(structure.columns[g] >= 0)
+            values = np.einsum("mak,nk->nam", structure.extra[g][used], phi[here])
+            moved = [(structure.columns[g][used] - p.model.n_polynomial, values)]
+            if columns.deviations is not None:
+                place = int(p.groups.chip[g]), float(p.groups.epoch[g])
+                which, values = columns.deviations.at(int(g), *place, phi[here], columns.centre)
+                moved.append((n_sparse_params + which, structure.linear[g] @ values))
+            row = 2 * here[:, None, None] + np.arange(2)[:, None]
+            for at, values in moved:
+                parts = (values, row, at)
+                entries.append([np.broadcast_to(part, values.shape).ravel() for part in parts])
         data, row, at = (np.concatenate(part) for part in zip(*entries, strict=True))
         sparse = csr_array((data, (row, at)), shape=(2 * n, columns.n_sparse))
-        yield Piece(
-            slice(first, last), rows, p.star[rows] - first, places_by_star(p, rows), frame,
-            tuple(dense), sparse,
-        )  # fmt: skip
+        star, by_star, frame = (
+            p.star[rows] - first,
+            places_by_star(p, rows),
+            structure.linear[group],
+        )
+        yield Piece(slice(first, last), rows, star, by_star, frame, tuple(dense), sparse)
         first = last
 
 

@@ -132,7 +132,11 @@ def selfcal_score_tests(
     deviating = _tested(sums, EXPOSURES_OF_SELFCAL, chosen, each, each)
     moving = None
     if epoch is not None and whole.n_star == 2 and np.ptp(epoch) > SHORTEST:
-        moving = _motions(solution, epoch)
+        scores = scores_of_detections(solution)
+        stars = StarResiduals(
+            whole.star, epoch, scores.gradient, scores.curvature, whole.priors.precision
+        )
+        moving = motion_outcome(stars, model.unit, MOTIONS_OF_SELFCAL)
     found += [one for one in (deviating, moving) if one is not None]
     return corrected([*found, *noise_tests(sample)])
 
@@ -223,13 +227,6 @@ def _tested(
         noise=noise,
         unit=sums.unit,
     )
-
-
-def _motions(solution: SelfCalibrationMode, epoch: Float) -> Outcome | None:
-    """Test for stars that move."""
-    p, scores = solution.problem, scores_of_detections(solution)
-    residuals = StarResiduals(p.star, epoch, scores.gradient, scores.curvature, p.priors.precision)
-    return motion_outcome(residuals, p.model.unit, MOTIONS_OF_SELFCAL)
 
 
 def _sample(

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from bayesdist.diagnose.periods import pattern_changes
 from bayesdist.diagnose.residuals.binned import band_bins
-from bayesdist.diagnose.residuals.changes import pattern_changes
 from bayesdist.diagnose.residuals.tables import period_table
 from bayesdist.infer import Rejection, fit_linear, load
 from bayesdist.missions.wise.assess.histograms import band_sums

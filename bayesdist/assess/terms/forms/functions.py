@@ -136,7 +136,7 @@ class FunctionField(DrawnField):
                 out[rows] = part if side == 0 else out[rows] + part
         return out
 
-    def relative_error(self, name: str, chip: int, monte_carlo: float) -> float | None:
+    def relative_error(self, chip: int, monte_carlo: float) -> float | None:
         """As the rms of each draw over the chip scatters, where the size was measured."""
         if self.of.covariance is not None:
             return None

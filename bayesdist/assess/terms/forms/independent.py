@@ -51,7 +51,7 @@ class NoiseField(ErrorField):
         square = self.sigma**2
         return square if pairs is None else square[pairs[0]] + square[pairs[1]]
 
-    def relative_error(self, name: str, chip: int, monte_carlo: float) -> float | None:
+    def relative_error(self, chip: int, monte_carlo: float) -> float | None:
         """As it was stated."""
         return self.of.known.get(chip)
 
@@ -98,6 +98,6 @@ class KnownField(ErrorField):
         """Nothing."""
         return np.zeros_like(self.squares()[self.rows[0].name])
 
-    def relative_error(self, name: str, chip: int, monte_carlo: float) -> float | None:
+    def relative_error(self, chip: int, monte_carlo: float) -> float | None:
         """Known exactly."""
         return 0.0

@@ -111,6 +111,8 @@ class PolynomialField(DrawnField):
 
     coefficients: dict[int, Float]  # (n, 2, K), by chip number
 
+    of_parameters = True
+
     @classmethod
     def of(
         cls,
@@ -145,10 +147,6 @@ class PolynomialField(DrawnField):
             parts.append(np.swapaxes(both.reshape(-1, 2, len(phi)), 1, 2))
         out = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
         return out if size == 1.0 else size * out
-
-    def of_parameters(self, name: str) -> bool:
-        """All of it."""
-        return True
 
     def total(self) -> Float:
         """Mean squares (P, 2), by second moments where they are those of positions."""

@@ -8,9 +8,9 @@ correlated is one term with several rows.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -78,6 +78,8 @@ class ErrorField(ABC):
     rows: tuple[Row, ...]
     domain: EvaluationDomain
 
+    of_parameters: ClassVar[bool] = False  # True for errors of parameters
+
     @property
     def uniform(self) -> bool:
         """True if the error is the same at all positions."""
@@ -92,13 +94,26 @@ class ErrorField(ABC):
     def total(self) -> Float:
         """Mean squares (P, 2) of all rows together."""
 
-    def relative_error(self, name: str, chip: int, monte_carlo: float) -> float | None:
-        """Relative error of the size of a row on a chip; None where it is not known."""
-        return monte_carlo
+    @property
+    def parts(self) -> tuple[ErrorField, ...]:
+        """Fields of single rows."""
+        return (self,)
 
-    def of_parameters(self, name: str) -> bool:
-        """True if a row is an error of parameters."""
-        return False
+    @property
+    def summed(self) -> tuple[ErrorField, ...]:
+        """Fields whose sum is the error."""
+        return (self,)
+
+    def by_row(self) -> Iterator[tuple[Row, ErrorField, Float]]:
+        """Each row, with its own field and its mean squares (P, 2)."""
+        squares = self.squares()
+        for part in self.parts:
+            for row in part.rows:
+                yield row, part, squares[row.name]
+
+    def relative_error(self, chip: int, monte_carlo: float) -> float | None:
+        """Relative error of the size of a single row on a chip; None where it is not known."""
+        return monte_carlo
 
 
 class DrawnField(ErrorField):

@@ -37,7 +37,7 @@ class Together:
 class TogetherField(DrawnField):
     """Rows of one term at the positions of a domain."""
 
-    parts: tuple[DrawnField, ...]
+    members: tuple[DrawnField, ...]
     whole: DrawnField | None = None  # the joint error, where it is more than the sum of the rows
     remainder: bool = False  # as of `Together`
 
@@ -55,9 +55,14 @@ class TogetherField(DrawnField):
         return cls(rows, domain, parts, whole, remainder)
 
     @property
+    def parts(self) -> tuple[DrawnField, ...]:
+        """A field for each row."""
+        return self.members
+
+    @property
     def n_draws(self) -> int:
         """Number of draws."""
-        return self.parts[0].n_draws
+        return self.members[0].n_draws
 
     @cached_property
     def summed(self) -> tuple[DrawnField, ...]:
@@ -67,7 +72,7 @@ class TogetherField(DrawnField):
     @cached_property
     def _added(self) -> tuple[DrawnField, ...]:
         """Parts that are in the total."""
-        return tuple(p for p in self.parts if all(row.in_total for row in p.rows))
+        return tuple(p for p in self.members if all(row.in_total for row in p.rows))
 
     def errors(self, draws: slice, scale: Scale) -> Float:
         """The joint error (d, N, 2), each row multiplied by its factor."""
@@ -101,7 +106,7 @@ class TogetherField(DrawnField):
     @cached_property
     def _squares(self) -> dict[str, Float]:
         out: dict[str, Float] = {}
-        for part in self.parts:
+        for part in self.members:
             out |= part.squares()
         if self.remainder:
             last = self.rows[-1].name
@@ -120,14 +125,3 @@ class TogetherField(DrawnField):
     def total(self) -> Float:
         """Mean squares (P, 2) of the joint error."""
         return self._total
-
-    def relative_error(self, name: str, chip: int, monte_carlo: float) -> float | None:
-        """As of the row's own form."""
-        return self._part(name).relative_error(name, chip, monte_carlo)
-
-    def of_parameters(self, name: str) -> bool:
-        """As of the row's own form."""
-        return self._part(name).of_parameters(name)
-
-    def _part(self, name: str) -> DrawnField:
-        return next(p for p in self.parts if name in [row.name for row in p.rows])
