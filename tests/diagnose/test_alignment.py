@@ -31,7 +31,6 @@ from bayesdist.missions.wise.assess.published import (
     TABLE_5_1,
     TABLE_5_2,
     TABLE_5_3,
-    TABLE_C_1,
     noise_of_bins,
     printed_rows,
 )
@@ -41,6 +40,14 @@ from bayesdist.missions.wise.simulate import simulate_wise
 from tests.reduced import only_in_full
 
 SIZE = (60.0, 60.0)
+TABLE_C_1 = """
+25-Day/X 0.00016 0.03644 -0.08390 0.09606 -0.00066 -0.06650 0.08068
+JD212.5/X 0.00245 0.03778 -0.09498 0.10607 0.00102 -0.07175 0.08426
+JD412.5/X -0.00256 0.03630 -0.09234 0.09361 -0.00368 -0.07417 0.07788
+25-Day/Y 0.00060 0.01559 -0.05461 0.08401 0.00003 -0.03432 0.04386
+JD212.5/Y -0.00393 0.01653 -0.05701 0.09080 -0.00429 -0.03883 0.04397
+JD412.5/Y 0.00544 0.01675 -0.04477 0.07794 0.00426 -0.03108 0.04950
+"""
 
 
 def _brute(values):

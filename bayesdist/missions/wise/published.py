@@ -48,21 +48,14 @@ WISE_COEFFICIENTS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
 }
 # fmt: on
 
-# Appendix B: A_DMAX, B_DMAX; section 4: longest vector, the zeroth order suppressed
-LARGEST_CORRECTIONS = {
-    "W1": (2.046, 1.066),
-    "W2": (2.083, 1.089),
-    "W3": (2.095, 1.300),
-    "W4": (0.971, 0.582),
-}
+# section 4: longest vector, the zeroth order suppressed
 LONGEST_VECTORS = {"W1": 2.931, "W2": 3.048, "W3": 3.004, "W4": 1.435}
 
 # section 4: pairs in the calibrations; section 6: largest radius of the formal uncertainty, px
 SAMPLE_SIZES = {"W1": 10_350_744, "W2": 11_213_542, "W3": 3_765_817, "W4": 315_505}
 FORMAL_RADII = {"W1": 0.0093, "W2": 0.0082, "W3": 0.0028, "W4": 0.0026}
 
-# Table 5-1, px: mean radial residual, and sigma over 31 x 31 bins of the mean residual in X and Y
-RADIAL_RESIDUALS = {"W1": 0.1050, "W2": 0.1153, "W3": 0.2993, "W4": 0.4832}
+# Table 5-1, px: sigma over 31 x 31 bins of the mean residual in X and Y
 RESIDUAL_SIGMAS = {
     "W1": (0.01949, 0.01159),
     "W2": (0.01679, 0.008914),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from bayesdist.report.registry import Registry, Section
@@ -62,8 +62,14 @@ class BandResult:
     vectors: VectorMap  # the distortion without its constant, pixels
     formal_map: UncertaintyMap
     posterior_map: UncertaintyMap
-    minus_optical: VectorMap | None = None  # the distortion less the optical model, pixels
-    printed: Printed | None = None
+    minus_optical: VectorMap | None  # the distortion less the optical model, pixels
+    printed: Printed | None
+
+    @property
+    def coverage_chi2(self) -> float:
+        """Chi-square of the pairs used in bins against their mean."""
+        count = self.sums.bins.count
+        return float(((count - count.mean()) ** 2).sum() / count.mean())
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +82,10 @@ class BandsInput:
     accounts: Mapping[str, tuple[RowAccount, ...]]  # likewise
     # later bands less the first, as 'W2-W1', in pixels of the first
     differences: Mapping[str, VectorMap]
-    n_bins: int = 31  # on each axis
-    wise: bool = False  # True if published values stand beside ours, which are those of WISE
-    optical: str = ""  # what the optical model is; empty without one
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    n_bins: int  # on each axis
+    wise: bool  # True if published values stand beside ours, which are those of WISE
+    optical: str  # what the optical model is; empty without one
+    provenance: Mapping[str, Any]
 
     @property
     def provisional(self) -> bool:

@@ -224,7 +224,6 @@ def coverage_table(inputs: BandsInput) -> TextTable:
     for b in inputs.bands:
         n = b.sums.bins.count
         mean = float(n.mean())
-        chi2 = float(((n - mean) ** 2).sum() / mean)
         rows.append(
             (
                 b.name,
@@ -233,7 +232,7 @@ def coverage_table(inputs: BandsInput) -> TextTable:
                 f"{number(mean, 4)} ± {number(np.sqrt(mean), 2)}",
                 count(n.min()),
                 count(n.max()),
-                number(chi2 / (n.size - 1), 3),
+                number(b.coverage_chi2 / (n.size - 1), 3),
             )
         )
     heads = ("All pairs", "Used", "Expected per bin", "Fewest", "Most", "χ² / dof")

@@ -42,11 +42,10 @@ class BandRun:
 
 
 def open_bands(paths: Sequence[str | Path]) -> dict[str, BandRun]:
-    """Open the runs of several bands.
+    """Runs of several bands, opened, in the order given; those of WISE in their own.
 
-    The result is in the order given; those of WISE in their own. InputError for a run that is not
-    finished, has several chips or no scale, for two runs of one band, and for bands that do not see
-    one field.
+    InputError for a run that is not finished, has several chips or no scale, for two runs of one
+    band, and for bands that do not see one field.
     """
     out: dict[str, BandRun] = {}
     for path in paths:

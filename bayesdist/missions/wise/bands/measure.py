@@ -32,25 +32,19 @@ SEED = 20110201
 def measure_bands(
     runs: Mapping[str, BandRun],
     *,
-    bins: int = 31,
-    optical: Mapping[str, OpticalModel] | None = None,
-    published: bool = True,
-    provenance: Mapping[str, object] | None = None,
+    bins: int,
+    optical: Mapping[str, OpticalModel],
+    published: bool,
+    provenance: Mapping[str, object],
 ) -> BandsInput:
-    """Everything that tables and diagrams show.
-
-    `runs`: their stars are read once and let go of, band by band. `bins`: on each axis.
-    `published`: True if values of WSDC D-T033 stand beside those of WISE's bands. InputError for an
-    optical model of another shape. DegenerateError when too few bins hold stars.
-    """
+    """Everything that tables and diagrams show; stars are read once and let go of, band by band."""
     wise = published and set(runs) <= set(WISE_BANDS)
     fields = {
         name: field_of_solution(run.results.solution, epoch=run.results.epoch)
         for name, run in runs.items()
     }
     bands = tuple(
-        _measured(run, fields[name], (optical or {}).get(name), bins, wise)
-        for name, run in runs.items()
+        _measured(run, fields[name], optical.get(name), bins, wise) for name, run in runs.items()
     )
     arcsec = {b.name: b.arcsec for b in bands}
     tables = residual_tables(
@@ -81,8 +75,8 @@ def measure_bands(
         },
         n_bins=bins,
         wise=wise,
-        optical="; ".join(dict.fromkeys(one.label for one in (optical or {}).values())),
-        provenance=provenance or {},
+        optical="; ".join(dict.fromkeys(one.label for one in optical.values())),
+        provenance=provenance,
     )
 
 

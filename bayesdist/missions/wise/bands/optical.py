@@ -27,8 +27,8 @@ class OpticalModel:
     def field(self, chip: Chip, arcsec: float) -> DistortionField:
         """The model over an array that sees the same field, in that array's pixels.
 
-        `arcsec`: per pixel of the array. InputError when the header's image has another shape than
-        the array, or covers a field of quite another size by its CD matrix.
+        InputError when the header's image has another shape than the array, or covers a field of
+        quite another size by its CD matrix.
         """
         size = self.sip.size or chip.size
         times = [own / n for own, n in zip(size, chip.size, strict=True)]
@@ -48,31 +48,24 @@ class OpticalModel:
                 where=self.label,
                 do="give a model of the band's own field, or correct size and CD of the header",
             )
-        # where CRPIX lies on this array, whose pixels may be wider than the model's
-        x, y = ((r - 0.5) / t + 0.5 for r, t in zip(self.sip.crpix, times, strict=True))
-        basis = PolynomialBasis(max(self.sip.order), chip.size, (x, y))
+        basis = PolynomialBasis(max(self.sip.order), size, self.sip.crpix)
         monomials = np.zeros((2, basis.n_terms))
         for axis, (terms, order) in enumerate(
             zip((self.sip.a, self.sip.b), self.sip.order, strict=True)
         ):
             for (p, q), value in terms.items():
                 if p + q <= order:
-                    monomials[axis, basis.terms.index((p, q))] = (
-                        value * times[0] ** p * times[1] ** q / times[axis]
-                    )
+                    monomials[axis, basis.terms.index((p, q))] = value
+        # Legendre products belong to the whole array, whatever its pixels
+        polynomial = basis.from_monomials(monomials) / np.array(times)[:, None]
         about = PolynomialBasis(basis.order, chip.size, chip.reference_pixel)
-        return DistortionField.of(about, basis.from_monomials(monomials), np.eye(2))
+        return DistortionField.of(about, polynomial, np.eye(2))
 
 
 def optical_models(
     paths: Sequence[str | Path], turn: float, bands: Sequence[str]
 ) -> dict[str, OpticalModel]:
-    """Optical models of some bands.
-
-    `paths`: one for all bands, or one for each; none for no model. `turn`: degrees by which they
-    are turned, from x towards y. The result is by band. InputError for a number of files that is
-    neither one nor that of the bands, a file that cannot be read, or meta-data without a band.
-    """
+    """Optical models by band, turned by degrees from x towards y; one for all bands or for each."""
     if not paths:
         return {}
     if len(paths) not in (1, len(bands)):

@@ -94,7 +94,7 @@ def _band(b: BandResult) -> dict[str, Any]:
             "poisson_error": np.sqrt(count.mean()),
             "min": count.min(),
             "max": count.max(),
-            "chi2": ((count - count.mean()) ** 2).sum() / count.mean(),
+            "chi2": b.coverage_chi2,
             "dof": count.size - 1,
         },
         "minus_optical_max": None if b.minus_optical is None else b.minus_optical.length_max,

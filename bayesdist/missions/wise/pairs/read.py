@@ -38,11 +38,7 @@ PathLike = str | os.PathLike[str]
 
 
 def rvb_bands(path: PathLike | Sequence[PathLike]) -> dict[str, int]:
-    """Number of pairs of each band in some files.
-
-    `path`: as `stream_rvb`. Returns bands in the order of their wavelength. InputError without a
-    column of bands, and for what is no band.
-    """
+    """Number of pairs of each band in some files, in the order of their wavelength."""
     return _bands_of(open_rvb_files(path, None))
 
 

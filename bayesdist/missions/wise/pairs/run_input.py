@@ -44,12 +44,10 @@ def open_rvb(
     pixel_origin: int,
     size: tuple[float, float],
 ) -> Matches | None:
-    """RvB pairs of one band, left on disk.
+    """RvB pairs of one band, left on disk: those that `stream_rvb` gives of these arguments.
 
-    `path`, `band`, `columns`, `unit`, `sigma`, `pixel_origin`, `size`: as `stream_rvb`. Returns the
-    pairs that `stream_rvb` gives.  None where the files are no Parquet, hold other bands beside
-    this one, or have to be converted: dates in MJD, magnitudes by band. InputError as `stream_rvb`
-    and `open_matches`.
+    None where the files are no Parquet, hold other bands beside this one, or have to be converted:
+    dates in MJD, magnitudes by band.
     """
     files = open_rvb_files(path, columns)
     band = chosen_band(files, band)
@@ -110,11 +108,7 @@ class RvbInput:
     _counts: Mapping[str, Any] | None = None
 
     def load(self) -> Matches:
-        """The selected pairs.
-
-        InputError for all that is wrong with files and selection, and a detector that is not the
-        band's.
-        """
+        """The selected pairs."""
         data, size = self.data, self.size
         path = self.run.config.named_files(self.run.base)
         options = _options(data, size)
@@ -171,11 +165,7 @@ class RvbInput:
         return opened.with_counts(len(opened) + sum(rejected.values()), rejected)
 
     def move_into_run(self) -> bool:
-        """Move what was written into the folder of the run, which has begun.
-
-        Returns True for pairs that were moved, and have to be opened anew. InputError when the
-        system refuses.
-        """
+        """Truth of pairs that were moved into the folder of the run, and have to be opened anew."""
         if self._scratch is None or self._counts is None:
             return False
         target = made_folder(self.run / PAIRS)
@@ -203,11 +193,7 @@ class RvbInput:
 def load_rvb(
     path: str | Path | Sequence[str | Path], data: RvbData, size: tuple[float, float]
 ) -> Matches:
-    """RvB pairs in memory, as a configuration reads and selects them.
-
-    `size`: columns and rows of the detector. InputError for all that is wrong with files and
-    selection, and a detector that is not the band's.
-    """
+    """RvB pairs in memory, as a configuration reads and selects them."""
     if data.band is not None:
         _require_array(data.band, size)
     batches = list(stream_rvb(path, **_options(data, size)))
