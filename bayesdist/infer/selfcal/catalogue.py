@@ -49,7 +49,7 @@ def star_catalogue(
         inner = cov[np.ix_(solution.free, solution.free)] / np.outer(scale, scale)
         root[solution.free] = scale[:, None] * np.linalg.cholesky(inner)
     with in_pieces(problem, solution.stars, compute) as pieces:
-        parts = pieces.sum(_covariances, solution.theta, solution.mixture, root)
+        parts = list(pieces.each(_covariances, solution.theta, solution.mixture, root))
     total, own, members = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     # a star without members is somewhere in the match circle
     widest = problem.least_root**-2
@@ -70,7 +70,7 @@ def star_catalogue(
 
 def _covariances(
     piece: StarPiece, theta: Float, mixture: Mixture, root: Float
-) -> tuple[tuple[Float, Float, Float], ...]:
+) -> tuple[Float, Float, Float]:
     """Covariances (S, q, q) of the stars of a piece, in all and of their own; members (S,).
 
     `root` (D, F) is a square root of the covariance of the parameters.
@@ -85,4 +85,4 @@ def _covariances(
         spread = np.swapaxes(back, 1, 2) @ (rows @ root)
         total[some] = own[some] + spread @ np.swapaxes(spread, 1, 2)
     w = memberships(p, theta, mixture, stars)
-    return ((total, own, np.asarray(np.bincount(p.star, w, minlength=S), float)),)
+    return total, own, np.asarray(np.bincount(p.star, w, minlength=S), float)

@@ -258,7 +258,7 @@ def newton_step(curvature: Float, gradient: Float, free: Int) -> Float | None:
 
 def wide_mixture(pieces: MappedPieces, theta: Float) -> Mixture:
     """Mixture with errors as large as those of a start."""
-    square = np.concatenate(pieces.sum(of.squares, theta))
+    square = np.concatenate(list(pieces.each(of.squares, theta)))
     # the median of r^2 is 1.386 sigma^2
     return Mixture(START_SCALE * float(np.sqrt(np.median(square) / (2 * np.log(2)))), 0.02)
 

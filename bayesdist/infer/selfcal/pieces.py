@@ -136,19 +136,22 @@ def slope(piece: ModePiece, theta: Float, mixture: Mixture, observed: bool) -> E
     return expand(piece.problem, theta, mixture, stars, observed=observed)[0]
 
 
-def squares(piece: StarPiece, theta: Float) -> tuple[Float, ...]:
-    """Squared distances (N,) of detections from their stars: sums are the pieces' one by one."""
-    return (piece.problem.squares(theta, piece.stars),)
+# -- results of each piece ------------------------------------------------------------------------
 
 
-def _state(piece: StarPiece) -> tuple[tuple[Float, ...], ...]:
+def squares(piece: StarPiece, theta: Float) -> Float:
+    """Squared distances (N,) of detections from their stars."""
+    return piece.problem.squares(theta, piece.stars)
+
+
+def _state(piece: StarPiece) -> tuple[Float, ...]:
     p = piece.problem
-    return ((p.X, p.Y, p.offset, p.W, piece.stars),)
+    return p.X, p.Y, p.offset, p.W, piece.stars
 
 
 def gathered(problem: Problem, pieces: MappedPieces) -> StarPiece:
     """All stars of a problem as one piece, in the state of its pieces."""
-    states = pieces.sum(_state)
+    states = pieces.each(_state)
     X, Y, offset, W, stars = (
         columns[0] if len(columns) == 1 else np.concatenate(columns)
         for columns in zip(*states, strict=True)
@@ -173,7 +176,7 @@ def in_pieces(
         # dask is imported where it is asked for
         from bayesdist.infer.stars.cluster import ClusterPieces
 
-        pieces = ClusterPieces(_received, whole.split(PIECE), compute)
+        pieces = ClusterPieces(_same, whole.split(PIECE), compute)
     try:
         yield pieces
     finally:
@@ -190,8 +193,7 @@ def each_of(compute: Compute | None, function: Task, sources: Iterable[Any]) -> 
     from bayesdist.infer.stars.cluster import ClusterPieces
 
     with closing(ClusterPieces(function, sources, compute)) as made:
-        results: tuple[Any, ...] = made.sum(_alone)
-        return results
+        return list(made.each(_same))
 
 
 @contextmanager
@@ -216,6 +218,10 @@ class _Whole(MappedPieces):
         """Result of the task."""
         return task(self._piece, *args)
 
+    def each(self, task: Task, *args: Any) -> tuple[Any]:
+        """Result of the task, alone."""
+        return (task(self._piece, *args),)
+
     def map(self, task: Task, *args: Any) -> Self:
         """Piece that the task makes."""
         return type(self)(task(self._piece, *args))
@@ -224,11 +230,6 @@ class _Whole(MappedPieces):
         """Nothing is to be released."""
 
 
-def _alone(made: Any) -> tuple[Any, ...]:
-    """On a worker: result of which a sum has each by itself."""
-    return (made,)
-
-
-def _received(piece: StarPiece) -> StarPiece:
-    """On a worker: the piece as it was sent, to be kept there."""
+def _same(piece: Any) -> Any:
+    """On a worker: the piece as it was sent, to be kept there; or as it was made, to be fetched."""
     return piece

@@ -1,11 +1,12 @@
 """The Dask engine: pieces of the data stay on the workers that made them, and only sums travel.
 
 Each piece is the result of one task, and stays on the worker that ran it.  A pass is one
-map-reduce: a task for each piece, run on its worker, whose results come back and are added in the
-order of the pieces, as threads add them, however many workers there are and whatever happens to
-them: a worker that is lost takes its pieces along, and Dask makes them again elsewhere.  The result
-of a kernel for one piece is reproducible up to rounding: code that was compiled for another
-processor may differ in the last bits.
+map-reduce: a task for each piece, run on its worker, whose results are added in the order of the
+pieces, by the tree by which threads add them.  Workers add until few are left, which come back.  So
+it is however many workers there are and whatever happens to them: a worker that is lost takes its
+pieces along, and Dask makes them again elsewhere.  The result of a kernel for one piece is
+reproducible up to rounding: code that was compiled for another processor may differ in the last
+bits.
 
 The only module that uses dask and distributed; it is imported when the engine is requested.
 """
@@ -30,6 +31,7 @@ from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import kernel
 from bayesdist.infer.stars.shards import (
+    BRANCHES,
     Compute,
     MappedPieces,
     Shards,
@@ -114,10 +116,22 @@ class ClusterPieces(MappedPieces):
         """Sum over the pieces of ``task(piece, *args)``, in their order.
 
         InputError when there are no workers any more, or when they die of the task; else any
-        exception that the task raises on the first piece, in their order, that it fails on.
+        exception that the task raises on the first piece, in their order, that it fails on; of more
+        than `BRANCHES` pieces, on one of the first branch.
         """
         with _large_graphs():
-            return total(self._results(self._tasks(task, args)))
+            parts = self._tasks(task, args)
+            while len(parts) > BRANCHES:
+                parts = [
+                    self._client.submit(total, parts[k : k + BRANCHES], pure=False)
+                    for k in range(0, len(parts), BRANCHES)
+                ]
+            return total(self._results(parts))
+
+    def each(self, task: Task, *args: Any) -> Iterator[Any]:
+        """Results ``task(piece, *args)`` in the order of the pieces; errors as `sum`."""
+        with _large_graphs():
+            yield from self._results(self._tasks(task, args))
 
     def map(self, task: Task, *args: Any) -> Self:
         """Pieces ``task(piece, *args)``, each on the worker that has the piece.

@@ -1,15 +1,17 @@
 """The data in pieces, and the one operation on them: a task on each, and the sum.
 
 All passes over matched stars go through `Shards.sum`, where the pieces are called shards.  Results
-add up in the order of the shards, which is that of the data, so that they depend neither on the
-threads nor on the engine.
+add up by a tree in the order of the shards, which is that of the data, so that they depend neither
+on the threads nor on the engine.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import reduce
+from itertools import islice
 from typing import Any, Self
 
 from bayesdist.data.matches import BatchReader, Matches
@@ -21,6 +23,7 @@ from bayesdist.model import DistortionModel, Groups
 
 Task = Callable[..., Any]
 
+BRANCHES = 16  # of the tree by which results add up
 SAMPLE = 1_000_000  # stars from whose errors the median error is computed
 
 
@@ -80,6 +83,10 @@ class Pieces(ABC):
 
 class MappedPieces(Pieces):
     """Pieces from which others are made, where they are."""
+
+    @abstractmethod
+    def each(self, task: Task, *args: Any) -> Iterable[Any]:
+        """Results ``task(piece, *args)``, in the order of the pieces."""
 
     @abstractmethod
     def map(self, task: Task, *args: Any) -> Self:
@@ -143,9 +150,16 @@ def shard_of(model: DistortionModel, reader: BatchReader, n_total: int) -> tuple
     return stars, survey(stars, table, max(1, n_total // SAMPLE))
 
 
-def total(parts: Any) -> Any:
-    """Sum of one or more parts, from the first to the last."""
-    out = None
-    for part in parts:
-        out = part if out is None else out + part
-    return out
+def total(parts: Iterable[Any]) -> Any:
+    """Sum of one or more parts in their order, by a tree: of so many that follow one another first.
+
+    None for no parts.
+    """
+    rest, sums = iter(parts), []
+    while (some := reduce(_added, islice(rest, BRANCHES), None)) is not None:
+        sums.append(some)
+    return total(sums) if len(sums) > 1 else next(iter(sums), None)
+
+
+def _added(a: Any, b: Any) -> Any:
+    return b if a is None else a + b

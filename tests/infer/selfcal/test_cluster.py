@@ -32,6 +32,8 @@ from bayesdist.infer.selfcal.pieces import (
 )
 from bayesdist.infer.selfcal.problem import StarPriors
 from bayesdist.infer.selfcal.tangent import places_of
+from bayesdist.infer.stars import cluster as cluster_module
+from bayesdist.infer.stars import shards
 from bayesdist.infer.stars.cluster import ClusterPieces
 from tests.infer.selfcal import fields
 from tests.infer.workers import local_workers
@@ -98,6 +100,15 @@ def pid_of(piece) -> tuple[int, ...]:
 
 def content(piece) -> tuple[np.ndarray, ...]:
     return (piece.problem.var,)
+
+
+def inverse_variances(piece) -> np.ndarray:
+    """Numbers of all sizes, whose sum depends on the order."""
+    return np.array([np.sum(1 / piece.problem.var), np.sum(piece.problem.X)])
+
+
+def failing(piece) -> float:
+    return 1 / 0
 
 
 def die_once(piece, mark, first) -> np.ndarray:
@@ -167,6 +178,27 @@ def test_density_and_slope_are_those_of_the_whole(solution, compute):
     _, again = expand(solution.problem, theta[0], Mixture(0.01, 0.02), solution.stars.copy())
     modes = StarModes.at(solution.problem, solution.theta, solution.mixture, solution.stars)
     assert np.abs(modes.moved(solution.problem, theta[0]) - again).max() < 0.01
+
+
+def test_sums_by_a_tree_of_workers_are_those_of_one_process(solution, compute, monkeypatch):
+    """In the same order, bit for bit; and only the last branches come back."""
+    monkeypatch.setattr(shards, "BRANCHES", 2)
+    monkeypatch.setattr(cluster_module, "BRANCHES", 2)
+    fetched, inner = [], ClusterPieces._results
+
+    def counted(self, futures):
+        fetched.append(len(futures))
+        return inner(self, futures)
+
+    with in_pieces(solution.problem, solution.stars, compute) as there:
+        parts = list(there.each(inverse_variances))
+        assert len(parts) > 4  # three levels
+        monkeypatch.setattr(ClusterPieces, "_results", counted)
+        assert np.array_equal(there.sum(inverse_variances), shards.total(parts))
+        assert np.array_equal(np.concatenate(there.sum(content)), solution.problem.var)
+        assert fetched and max(fetched) <= 2
+        with pytest.raises(ZeroDivisionError):
+            there.sum(failing)
 
 
 def assert_same_mode(a, b):
