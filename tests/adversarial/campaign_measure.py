@@ -15,11 +15,11 @@ from bayesdist.app.run import make_stages
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import LocalErrors
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.evaluation import budget_over
 from bayesdist.assess.terms.local import INTERPOLATION as BETWEEN
 from bayesdist.infer.transforms import reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh
+from bayesdist.streams import restarted
 from tests.app.support import after_stages
 
 from .campaign_truth import ARCSEC, BRIGHT, EPOCH0, FAINT, NEW, TERMS, CampaignTruth
@@ -163,5 +163,7 @@ def table_errors(results: Results, truth: CampaignTruth) -> np.ndarray:
 
 def stated_sigma(results: Results) -> np.ndarray:
     """Standard deviations (N, 2) of all terms of the budget together, over the same grid."""
-    total = budget_over(results.errors, results.settings, assessment_rng(results.config)).total
+    errors, settings = results.errors, results.settings
+    rng = restarted(assessment_rng(results.config))
+    total = errors.at(settings.domain(errors), n=settings.draws, rng=rng).total
     return np.column_stack([total.u, total.v])

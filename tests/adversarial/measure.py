@@ -20,10 +20,10 @@ from bayesdist.app.config import load_config
 from bayesdist.app.results import Results
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Margin, Requirement
-from bayesdist.assess.evaluation import budget_over
 from bayesdist.assess.statistics import field_statistic
 from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.model.grid import grid_pixels, mesh
+from bayesdist.streams import restarted
 from tests.app.support import after_stages
 
 from . import campaign_measure
@@ -98,7 +98,9 @@ def actual_error(results: Results, truth: Truth, rng: np.random.Generator) -> np
 
 def stated_sigma(results: Results) -> np.ndarray:
     """Standard deviations (ny * nx, 2) of all terms of the budget together, over the same grid."""
-    total = budget_over(results.errors, results.settings, assessment_rng(results.config)).total
+    errors, settings = results.errors, results.settings
+    rng = restarted(assessment_rng(results.config))
+    total = errors.at(settings.domain(errors), n=settings.draws, rng=rng).total
     return np.column_stack([total.u, total.v])
 
 
