@@ -41,12 +41,14 @@ def _refuse_sets(value: Any) -> None:
         return  # at once: whether these are models or mappings takes long to find out
     if isinstance(value, set | frozenset):
         raise TypeError(f"{type(value).__name__} is no JSON and cannot be in a record or a key")
-    if (is_dataclass(value) and not isinstance(value, type)) or isinstance(value, BaseModel):
-        value = vars(value)
-    if isinstance(value, Mapping):
+    if isinstance(value, dict):
         value = value.values()
     elif not isinstance(value, list | tuple):
-        return
+        if (is_dataclass(value) and not isinstance(value, type)) or isinstance(value, BaseModel):
+            value = vars(value)
+        if not isinstance(value, Mapping):
+            return
+        value = value.values()
     for one in value:
         _refuse_sets(one)
 
@@ -62,7 +64,12 @@ def _plain(value: Any) -> Any:
 
 def digest_of(value: Any) -> str:
     """SHA-256 of a value as plain JSON: 64 hexadecimal digits."""
-    text = json.dumps(as_json(value), sort_keys=True, separators=(",", ":"))
+    return digest_of_plain(as_json(value))
+
+
+def digest_of_plain(plain: Any) -> str:
+    """SHA-256 of plain JSON, as by `as_json`."""
+    text = json.dumps(plain, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 

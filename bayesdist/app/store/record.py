@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import sys
 from collections.abc import Mapping, Set
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 from pydantic_core import to_json
 
-from bayesdist.app.store.keys import as_json, digest_of
+from bayesdist.app.store.keys import as_json, digest_of, digest_of_plain
 from bayesdist.app.store.summary import Sections
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path, sha256_of
@@ -170,7 +170,7 @@ class Record:
                 do="use that version, or choose another folder",
             )
         model_of(_WHOLE, facts, str(path), do=do)
-        if facts.pop("sha256") != digest_of(facts):
+        if facts.pop("sha256") != digest_of_plain(facts):
             raise InputError(
                 "was changed since bayesdist wrote it (its checksum is another)",
                 where=str(path),
@@ -208,8 +208,11 @@ class Record:
 
     def write(self, path: Path) -> None:
         """Replace run.json."""
-        found = {name: asdict(one) for name, one in self.artefacts.items()}
-        whole = {"schema": SCHEMA, **self.facts, "stages": self.stages, "artefacts": found}
-        whole |= {"under_way": self.under_way, "checkpoints": self.checkpoints}
+        whole = {"schema": SCHEMA, **self.facts, "stages": self.stages}
+        whole |= {
+            "artefacts": self.artefacts,
+            "under_way": self.under_way,
+            "checkpoints": self.checkpoints,
+        }
         plain = as_json(whole)
-        write_text(path, json_text(plain | {"sha256": digest_of(plain)}))
+        write_text(path, json_text(plain | {"sha256": digest_of_plain(plain)}))
