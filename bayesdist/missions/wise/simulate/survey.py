@@ -110,12 +110,14 @@ def false_matches(survey: Survey, scale: float, share: float) -> FalseMatches:
     nodes, weights = legendre.leggauss(NODES)
     half, weight = (nodes + 1.0) / 2.0, weights / 2.0
     r2 = ((half[:, None] ** 2 + half**2) / 2.0).ravel()
-    chance = _chance(density[:, None], r2)
-    of_frame, of_place = survey.share(), np.outer(weight, weight).ravel()
+    each, which = np.unique(density, return_inverse=True)  # each half orbit has the same ones
+    chance = _chance(each[:, None], r2)
+    of_density = np.bincount(which, survey.share())
+    of_place = np.outer(weight, weight).ravel()
 
     def excess(logit: float) -> float:
         odds = np.exp(logit) * chance
-        return float(of_frame @ (odds / (odds + 1.0)) @ of_place) - share
+        return float(of_density @ (odds / (odds + 1.0)) @ of_place) - share
 
     odds = np.exp(brentq(excess, -40.0, 40.0, xtol=1e-10))
     return FalseMatches(density, float(odds / (1.0 + odds)))
