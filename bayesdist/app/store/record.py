@@ -6,6 +6,7 @@ import platform
 import sys
 from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
@@ -40,11 +41,14 @@ def json_text(plain: Any) -> str:
     return to_json(plain, indent=1).decode() + "\n"
 
 
+_version = cache(metadata.version)
+
+
 def versions() -> dict[str, str]:
     """Versions of Python, the platform, and the packages that matter."""
     out = {"python": sys.version.split()[0], "platform": platform.platform()}
     out["bayesdist"] = __version__  # also where it runs from a source tree
-    out |= {name: metadata.version(name) for name in PACKAGES}
+    out |= {name: _version(name) for name in PACKAGES}
     return out
 
 
