@@ -139,7 +139,7 @@ def test_draws_of_tau_are_its_posterior():
         x = np.linspace(-30, -5, 1501)
         density = np.array([scatter.log_density(np.exp([t])) for t in x])
         cdf = np.cumsum(np.exp(density - density.max()))
-        draws = np.log(scatter.draws(4000, rng)[:, 0])
+        draws = np.log(scatter.draws(1500, rng)[:, 0])
         p = np.interp(draws, x, cdf / cdf[-1])
         # resampled points repeat: a sample of a few hundred independent ones at least
         assert stats.kstest(p, "uniform").statistic < 0.06

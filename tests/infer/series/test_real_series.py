@@ -78,7 +78,7 @@ def answers(series: list[Series]) -> list[tuple[SeriesPosterior, HeldOut]]:
 
 @pytest.fixture(scope="module")
 def decam_answers(decam, full):
-    return answers(some(decam, full, 24))
+    return answers(some(decam, full, 41))
 
 
 @pytest.fixture(scope="module")
