@@ -68,8 +68,7 @@ def job(tmp_path_factory) -> Path:
 def usual(job, tmp_path_factory) -> Path:
     """The run as it is in usual surroundings."""
     run = tmp_path_factory.mktemp("usual") / "run"
-    done = started("run", job, "-o", run)
-    assert done.returncode == 0, done.stderr
+    good("run", job, "-o", run)
     return run
 
 
