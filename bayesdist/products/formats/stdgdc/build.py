@@ -26,7 +26,7 @@ from bayesdist.products.formats.common.document import BuildOptions, Built, Form
 from bayesdist.products.formats.common.parameters import parameters_hdu
 from bayesdist.products.formats.stdgdc.file import EXTENSIONS, SIGMAS, CorrectedFrame, frame_of
 
-_BETWEEN = 997  # points along each axis, between pixels, at which the tables are checked
+_BETWEEN = 997  # points along each axis at most, between pixels, at which the tables are checked
 _LARGEST = 2**26  # pixels: beyond it a detector is a misprint
 
 
@@ -111,6 +111,6 @@ def _planes(
 
 def _error(one: ChipMap, frame: CorrectedFrame, xgc: Float, ygc: Float) -> float:
     """Largest distance of what the tables give from the map, at nodes and between them, pixels."""
-    x, y = detector_grid(one.basis.size, _BETWEEN)
+    x, y = detector_grid(one.basis.size, min(_BETWEEN, 3 * int(max(one.basis.size))))
     table = LookupTable(1, np.stack([xgc, ygc]), first=(1.0, 1.0), step=(1.0, 1.0))
     return float(np.hypot(*(table.evaluate(x, y).T - frame.corrected(one.at(x, y)))).max())
