@@ -14,6 +14,9 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN     = $(VENV)/bin
 
+# else each process that tests and commands start compiles all modules again: seconds, dozens of times
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test types imports test-full docs bench bench-check lint clean
 
 demo: $(VENV)/.installed

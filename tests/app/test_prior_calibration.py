@@ -139,7 +139,7 @@ def test_intervals_cover_as_they_say(full):
 
 
 @pytest.mark.parametrize("n_stars", [case_in_full(10, instead="as many as before are run"), 200])
-def test_a_prior_of_few_draws_covers_at_least_as_it_says(n_stars):
+def test_a_prior_of_few_draws_covers_at_least_as_it_says(n_stars, full):
     """Mean and covariance of four draws a parameter, the fewest that are taken: 68 and 95 %.
 
     Few stars after it get errors that are too large, by no more than the factor of Hartlap on the
@@ -149,7 +149,7 @@ def test_a_prior_of_few_draws_covers_at_least_as_it_says(n_stars):
     x, y = rng.uniform(1, 1000, 50), rng.uniform(1, 800, 50)
     n = model.n_params
     pulls, plain, wider = [], [], []
-    for _ in range(150):
+    for _ in range(400 if full else 80):
         theta = truth_of(model, rng)
         second = stars_of(model, theta, n_stars, rng)
         exact = earlier(fitted(stars_of(model, theta, 200, rng), model), model, frame="none")
