@@ -61,16 +61,17 @@ def required_reduction(
 
     sizes = {name: factor * size for name, size in errors.sizes(domain).items()}
     largest = max(sizes, key=lambda name: sizes[name])
-    alone = {}
+    best, most = "", 0.0
     for name in sizes:
-        if sizes[name] > 0 and met(name, 0.0):
+        # a term that must shrink more than another one is not bisected
+        if sizes[name] > 0 and met(name, most):
             low, high = 0.0, 1.0
             for _ in range(STEPS):
                 middle = (low + high) / 2
                 low, high = (middle, high) if met(name, middle) else (low, middle)
-            alone[name] = low
-    if not alone:
+            if not best or low > most:
+                best, most = name, low
+    if not best:
         return RequiredReduction(largest, 0.0, sizes[largest], 0.0, False, requirement.unit)
-    best = max(alone, key=lambda name: alone[name])
     now = sizes[best]
-    return RequiredReduction(best, alone[best], now, alone[best] * now, True, requirement.unit)
+    return RequiredReduction(best, most, now, most * now, True, requirement.unit)

@@ -75,7 +75,10 @@ def share_out(loop: Callable[..., None], n: int, *arguments: Any) -> None:
 
 def at_once(function: Callable[..., Any], *arguments: Iterable[Any]) -> list[Any]:
     """Results of a function that is called as by `map`, on all threads at a time."""
-    with ThreadPoolExecutor(nb.get_num_threads()) as pool:
+    threads = nb.get_num_threads()
+    if threads < 2:
+        return list(map(function, *arguments))
+    with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(function, *arguments))
 
 
