@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.polynomial import legendre
 
 from bayesdist.arrays import Float
+from bayesdist.assess.comparison.frame import turn_matrix
 from bayesdist.assess.solution import Place, Solution, place_of
 from bayesdist.errors import InputError, require_known
 from bayesdist.model.basis import point_blocks
@@ -114,78 +114,48 @@ def distortion_vectors(
     """
     require_known(part, PARTS, "part of the distortion", where="part")
     place = place_of(solution.model, epoch=epoch, chip=chip)
-    polynomial = place.polynomial(solution.mean)
-    similarity, note = _reference(place, polynomial)
+    basis, reference = place.basis, np.array(place.chip.reference_pixel)
+    # Legendre coefficients (2, K) of positions and of pixels about those of the reference pixel
+    polynomial = place.polynomial(solution.mean).copy()
+    polynomial[:, 0] -= polynomial @ basis.evaluate(*reference[:, None])[0]
+    pixels = basis.from_monomials(np.eye(basis.n_terms)[1:3])
+    similarity, note = _similarity(place, polynomial, pixels)
+    linear = similarity
     if part == "non_linear":
-        linear = _linear_part(place, polynomial)
+        linear = basis.to_monomials(polynomial)[:, 1:3]
         note = "the terms of order 2 and more about the reference pixel"
-    else:
-        linear = similarity
-    xref, yref = place.chip.reference_pixel
-    at_reference = polynomial @ place.basis.evaluate([xref], [yref])[0]
     x, y = grid_pixels(place.chip.size, grid)
     X, Y = mesh(x, y)
-    d = np.empty((2, X.size))
-    for rows in point_blocks(X.size):
-        w = polynomial @ place.basis.evaluate(X[rows], Y[rows]).T
-        offset = np.stack([X[rows] - xref, Y[rows] - yref])
-        d[:, rows] = w - at_reference[:, None] - linear @ offset
-    return VectorMap(
-        x=x,
-        y=y,
-        du=d[0].reshape(y.size, x.size),
-        dv=d[1].reshape(y.size, x.size),
-        unit=solution.model.unit,
-        part=part,
-        part_note=note,
-        similarity=similarity,
-    )
+    left = polynomial - linear @ pixels
+    d = [left @ basis.evaluate(X[rows], Y[rows]).T for rows in point_blocks(X.size)]
+    du, dv = np.concatenate(d, axis=1).reshape(2, y.size, x.size)
+    return VectorMap(x, y, du, dv, solution.model.unit, part, note, similarity)
 
 
-def _linear_part(place: Place, polynomial: Float) -> Float:
-    """Matrix d(u, v) / d(x, y) at the reference pixel."""
-    px, py = place.basis.gradient(*np.array(place.chip.reference_pixel)[:, None])
-    return np.concatenate([polynomial @ px.T, polynomial @ py.T], axis=1)
+def _similarity(place: Place, polynomial: Float, pixels: Float) -> tuple[Float, str]:
+    """Linear map from pixels that distortion is shown against, and a note.
 
-
-def _reference(place: Place, polynomial: Float) -> tuple[Float, str]:
-    """Positions that distortion is shown against, by identity or best similarity, and a note."""
-    scale, angle, parity = _best_similarity(place, polynomial)
-    turn = scale * np.exp(1j * angle)
-    if place.model.unit == "pix" and parity > 0 and abs(turn - 1.0) < NEAR_IDENTITY:
-        return np.eye(2), "relative to the array position itself, with zero at the reference pixel"
-    flip = np.diag([1.0, parity])
-    matrix = np.array([[turn.real, -turn.imag], [turn.imag, turn.real]]) @ flip
-    note = (
-        "relative to the best similarity about the reference pixel: "
-        f"scale {scale:.6g} {place.model.unit}/pixel, rotation {np.degrees(angle):.3f} deg, "
-        f"parity {parity:+d}"
-    )
-    return matrix, note
-
-
-def _best_similarity(place: Place, polynomial: Float) -> tuple[float, float, int]:
-    """Scale, rotation (radians) and parity that bring pixel offsets nearest to (u, v).
-
-    Least squares over the whole area of the detector, about the reference pixel: Gauss-Legendre
-    nodes make the integrals exact, so that the answer does not depend on the grid shown.
+    It is the identity, or scale, rotation and parity that bring pixels nearest to positions: least
+    squares over the whole area of the detector, about the reference pixel.  `polynomial` and
+    `pixels` are Legendre coefficients (2, K) of both.
     """
-    nodes, weights = legendre.leggauss(place.model.order + 1)
-    nx, ny = place.chip.size
-    X, Y = mesh((nodes * nx + nx + 1.0) / 2.0, (nodes * ny + ny + 1.0) / 2.0)
-    weight = np.outer(weights, weights).ravel()
-    xref, yref = place.chip.reference_pixel
-    values = place.basis.evaluate(np.append(X, xref), np.append(Y, yref)) @ polynomial.T
-    u, v = (values[:-1] - values[-1]).T
-    z, w = (X - xref) + 1j * (Y - yref), u + 1j * v
-    norm = np.sum(weight * np.abs(z) ** 2)
-    straight = np.sum(weight * w * z.conj()) / norm
-    flipped = np.sum(weight * w * z) / norm
-    best, parity = (straight, 1) if abs(straight) >= abs(flipped) else (flipped, -1)
-    if best == 0:
+    w, z = (one[0] + 1j * one[1] for one in (polynomial, pixels))
+    weight = place.basis.mean_squares
+    norm = weight @ np.abs(z) ** 2
+    straight, flipped = (complex(np.sum(weight * w * one) / norm) for one in (z.conj(), z))
+    mirrored = abs(straight) < abs(flipped)
+    turn = flipped if mirrored else straight
+    if turn == 0:
         raise InputError(
             "the solution has no linear part to compare the distortion with",
             where=f"chip {place.chip.number}",
             do="check its coefficients",
         )
-    return float(np.abs(best)), float(np.angle(best)), parity
+    if place.model.unit == "pix" and not mirrored and abs(turn - 1.0) < NEAR_IDENTITY:
+        return np.eye(2), "relative to the array position itself, with zero at the reference pixel"
+    note = (
+        "relative to the best similarity about the reference pixel: "
+        f"scale {abs(turn):.6g} {place.model.unit}/pixel, rotation "
+        f"{np.degrees(np.angle(turn)):.3f} deg, parity {-1 if mirrored else 1:+d}"
+    )
+    return turn_matrix(turn, mirrored=mirrored), note

@@ -17,6 +17,7 @@ from bayesdist.arrays import Float, Int
 from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
 from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
+from bayesdist.infer.compare.frame_fields import mean_squares
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.expected import ExpectedSolution, expected_solution
 from bayesdist.infer.selfcal.gauge import SAME_ROLL
@@ -144,24 +145,12 @@ class PlannedPattern:
 
     @cached_property
     def by_degree(self) -> dict[int, float]:
-        """Gauge-free rms over detector and axes of the polynomials of each degree, pixels.
-
-        Legendre polynomials are orthogonal over a chip, and the mean square of P_i P_j is
-        1 / ((2 i + 1) (2 j + 1)).
-        """
+        """Gauge-free rms over detector and axes of the polynomials of each degree, pixels."""
         solution = self.solution
         model, gauge = solution.model, solution.gauge
-        variance = np.diag(solution.up_to(gauge.null))
-        terms = np.array(model.basis().terms)
-        mean_square = 1.0 / np.prod(2 * terms + 1, axis=1)
-        degree = terms.sum(axis=1)
-        of_term = np.zeros(len(terms))
-        for chip in model.chips:
-            fraction = np.prod(chip.size) / self.camera.pixels
-            for axis in (0, 1):
-                of_term += (
-                    fraction * variance[model.coefficient_slice(chip.number, axis)] * mean_square
-                )
+        square = mean_squares(model) * np.diag(solution.up_to(gauge.null))[: model.n_polynomial]
+        degree = np.sum(model.basis().terms, axis=1)
+        of_term = square.reshape(-1, len(degree)).sum(axis=0)
         return {
             int(k): float(np.sqrt(of_term[degree == k].sum() / 2))
             for k in range(1, model.order + 1)

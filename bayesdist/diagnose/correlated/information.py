@@ -35,7 +35,6 @@ class GroupCells:
     """One group of stars, cell by cell."""
 
     chip: int  # code
-    exposure: int  # code
     epoch: float
     X: Float  # scaled positions (C,)
     Y: Float
@@ -89,7 +88,6 @@ class Information:
                 curvature = curvature / (root[:, :, None] * root[:, None, :])
             yield GroupCells(
                 chip,
-                exposure,
                 float(groups.epoch[g]),
                 X[here],
                 Y[here],

@@ -24,6 +24,7 @@ from bayesdist.diagnose.holdout.predictive import (
     predictions,
     scores_of,
 )
+from bayesdist.infer.equations.scaled import determined
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import RIGID, frame_names, nearest_frame
 
@@ -87,35 +88,14 @@ def frames_for(predictive: Predictive, held: Matches, names: Sequence[str]) -> d
         sums = _frame_sums(predictive, held, values, soft=step < SOFT)
         for name, (gradient, curvature, *_) in sums.items():
             pull = gradient - precision * values[name]
-            values[name] = values[name] + _solved(curvature + np.diag(precision), pull)
+            root = determined(curvature + np.diag(precision))
+            values[name] = values[name] + root @ (root.T @ pull)
     final = _frame_sums(predictive, held, values, soft=False)
-    return {
-        name: Frame(
-            kinds,
-            values[name],
-            _inverse(information + np.diag(precision)),
-            shared,
-            precision,
-            n,
-        )
-        for name, (_, _, information, shared, n) in final.items()
-    }
-
-
-def _unit(matrix: Float) -> Float:
-    """Scales that bring a diagonal to one: shears and shifts have units far apart."""
-    diagonal = np.diag(matrix)
-    return np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 0.0)
-
-
-def _solved(matrix: Float, right: Float) -> Float:
-    s = _unit(matrix)
-    return np.asarray(s * np.linalg.lstsq(s[:, None] * matrix * s, s * right)[0])
-
-
-def _inverse(matrix: Float) -> Float:
-    s = _unit(matrix)
-    return np.asarray(s[:, None] * np.linalg.pinv(s[:, None] * matrix * s) * s)
+    out = {}
+    for name, (_, _, information, shared, n) in final.items():
+        root = determined(information + np.diag(precision))
+        out[name] = Frame(kinds, values[name], root @ root.T, shared, precision, n)
+    return out
 
 
 def _of_exposures(held: Matches, names: Sequence[str]) -> Iterator[tuple[str, Matches, Int]]:

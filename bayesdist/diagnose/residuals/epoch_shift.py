@@ -17,7 +17,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial import legendre
 
 from bayesdist.arrays import Float, Int
 from bayesdist.data.magnitude_errors import MAD_TO_SIGMA
@@ -26,7 +25,6 @@ from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.sample import ScoredSample, scored_sample
 from bayesdist.infer.solution import Solution
 from bayesdist.limits import EPOCH_SHIFT
-from bayesdist.model.basis import polynomial_terms
 
 SAMPLE = 20_000  # detections that are looked at
 MIN_STARS = 30  # stars with motions
@@ -123,11 +121,8 @@ def _scatter(values: Float) -> float:
 def _left_over(sample: ScoredSample, weight: Float, *fields: Float) -> Iterator[Float]:
     """Vectors (2, N) less their polynomials on each chip of each exposure."""
     out = [field.copy() for field in fields]
-    order = sample.model.order
-    i, j = np.array(polynomial_terms(order)).T
     for rows in _together(sample):
-        X, Y = sample.X[rows], sample.Y[rows]
-        basis = legendre.legvander(X, order)[:, i] * legendre.legvander(Y, order)[:, j]
+        basis = sample.model.basis().evaluate_scaled(sample.X[rows], sample.Y[rows])
         w = np.sqrt(weight[rows])
         if (w > 0).sum() < 2 * basis.shape[1]:  # too few for a polynomial: a shift
             basis = basis[:, :1]

@@ -199,7 +199,7 @@ def _of_exposure(
     whole, cross, score = np.zeros((n, n)), np.zeros((n, G)), np.zeros(n)
     square = np.zeros((n, n))
     to_local = np.zeros((0 if local is None else len(local.index), n))
-    area = np.array([1.0 / ((2 * i + 1) * (2 * j + 1)) for i, j in model.basis().terms])
+    area = model.basis().mean_squares
     fields = [_fields(block, names, model.origin) for block in blocks]
     parts = [block.parts(G) for block in blocks]
     for block, Z, (by_global, by_local) in zip(blocks, fields, parts, strict=True):

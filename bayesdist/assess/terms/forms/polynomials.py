@@ -12,6 +12,7 @@ from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
 from bayesdist.calibration.chip_map import position_moments
+from bayesdist.infer.compare.frame_fields import mean_squares
 from bayesdist.model import DistortionModel
 
 
@@ -58,21 +59,16 @@ def without_rigid(
     2, K), the residual errors: least squares over stars that cover all chips evenly.
     """
     chips = model.chips
-    basis = model.basis(chips[0].number)
-    # mean square of each Legendre product over a chip, times the chip's area
-    square = np.array([1.0 / ((2 * i + 1) * (2 * j + 1)) for i, j in basis.terms])
-    area = np.array([chip.size[0] * chip.size[1] for chip in chips])
-    weight = (area / area.sum())[:, None, None] * square
-
-    rigid = np.zeros((3, len(chips), 2, basis.n_terms))
+    weight = mean_squares(model).reshape(len(chips), 2, -1)
+    rigid = np.zeros((3, *weight.shape))
     rigid[0, :, 0, 0] = rigid[1, :, 1, 0] = 1.0
     for c, chip in enumerate(chips):
         u, v = positions[chip.number]
         rigid[2, c] = -v, u
     # about the middle of the detector a rotation is no shift
-    rigid[2, ..., 0] -= np.einsum("c,ca->a", area / area.sum(), rigid[2, ..., 0])
+    rigid[2, ..., 0] -= np.einsum("ca,ca->a", weight[..., 0], rigid[2, ..., 0])
     stacked = np.stack([errors[chip.number] for chip in chips], axis=1)
-    normal = np.einsum("pcak,cak,qcak->pq", rigid, np.broadcast_to(weight, rigid[0].shape), rigid)
+    normal = np.einsum("pcak,cak,qcak->pq", rigid, weight, rigid)
     projected = np.einsum("pcak,ncak->np", rigid * weight, stacked)
     rest = stacked - np.einsum("np,pcak->ncak", np.linalg.solve(normal, projected.T).T, rigid)
     return {chip.number: rest[:, c] for c, chip in enumerate(chips)}
