@@ -10,6 +10,7 @@ from astropy.table import Table
 
 from bayesdist.data.exposures import ExposureLog
 from bayesdist.data.storage.write import write_columns
+from bayesdist.data.tables.checks import columns_of
 from bayesdist.files import atomic_path
 from bayesdist.missions.acs.simulate.pointings import AcsFrames
 from bayesdist.missions.acs.simulate.stars import TrueStars
@@ -32,7 +33,7 @@ def write_truth(truth: AcsTruth, folder: Path) -> None:
     for table, name in ((theta, "theta.ecsv"), (_frames_table(truth), "exposures.ecsv")):
         with atomic_path(folder / name) as temporary:
             table.write(temporary, format="ascii.ecsv")
-    stars = {key: getattr(truth.stars, key) for key in ("u", "v", "pm_u", "pm_v", "mag")}
+    stars = columns_of(truth.stars, ("u", "v", "pm_u", "pm_v", "mag"))
     write_columns(folder / "stars.parquet", stars, STAR_UNITS)
     if truth.tables:
         _write_tables(truth, folder / "tables.parquet")
