@@ -16,6 +16,7 @@ from bayesdist.missions.acs.simulate.pointings import AcsFrames
 from bayesdist.missions.acs.simulate.stars import TrueStars
 from bayesdist.missions.acs.simulate.truth import LINEAR_TERMS, AcsTruth, DetectionTruth
 from bayesdist.model import DistortionModel
+from bayesdist.model.grid import mesh
 from bayesdist.model.lookup import LookupTable
 from bayesdist.reading.faults import naming_faults
 from bayesdist.reading.tables import read_table
@@ -120,7 +121,7 @@ def _write_tables(truth: AcsTruth, path: Path) -> None:
     rows: dict[str, list[Any]] = {key: [] for key in ("chip", "filter", "x", "y", "dx", "dy")}
     labels = tuple(dict.fromkeys(table.filter for table in truth.tables))
     for table in truth.tables:
-        x, y = (grid.ravel() for grid in np.meshgrid(*table.nodes()))
+        x, y = mesh(*table.nodes())
         rows["chip"].append(np.full(x.size, table.chip))
         rows["filter"].append(np.full(x.size, labels.index(table.filter)))
         rows["x"].append(x)
