@@ -75,11 +75,8 @@ def _parts(kind: str, p: Float) -> tuple[Float, Float]:
 def frame_matrix(kind: str, p: ArrayLike) -> tuple[Float, Float]:
     """Linear part M (..., 2, 2) and shift d (..., 2) of T, for parameters (..., q)."""
     p = np.asarray(p, float)
-    if "rotation" in frame_names(kind):
-        turn, behind = _parts(kind, p)
-        return turn @ behind, p[..., :2].copy()
-    M = np.broadcast_to(np.eye(2), (*p.shape[:-1], 2, 2)).copy()
-    return M, p[..., :2].copy() if kind == "shift" else np.zeros((*p.shape[:-1], 2))
+    turn, behind = _parts(kind, p)
+    return turn @ behind, np.zeros((*p.shape[:-1], 2)) if kind == "none" else p[..., :2].copy()
 
 
 def frame_tangent(kind: str, p: ArrayLike) -> Float:

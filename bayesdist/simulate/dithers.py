@@ -8,6 +8,7 @@ import numpy as np
 
 from bayesdist.arrays import Bool, Float, Int
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.model.grid import mesh
 
 MOST_STEPS = 30
 CLOSE = 1e-9  # pixels
@@ -100,8 +101,7 @@ def _outline(
     model: DistortionModel, theta: Float, exposure: int, chip: Chip
 ) -> tuple[Float, Float]:
     """Lowest and highest corner (2,) of a rectangle of the sky that holds a chip with room."""
-    x, y = (np.linspace(0.5, n + 0.5, EDGE) for n in chip.size)
-    x, y = (z.ravel() for z in np.meshgrid(x, y))
+    x, y = mesh(*(np.linspace(0.5, n + 0.5, EDGE) for n in chip.size))
     points = model.predict(theta, x, y, exposure=exposure, chip=chip.number)
     room = OUTSIDE * np.ptp(points, axis=0)
     return points.min(axis=0) - room, points.max(axis=0) + room

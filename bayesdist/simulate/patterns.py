@@ -12,6 +12,7 @@ from scipy.spatial.distance import pdist
 
 from bayesdist.arrays import Float
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.model.grid import mesh
 
 GAP = 50.0  # pixels between chips without a given position
 ONE_LINE = 0.02  # of the spread along the offsets, below which that across them counts as none
@@ -42,8 +43,9 @@ class DitherPattern:
 
 def grid_offsets(n: tuple[int, int], step: tuple[float, float]) -> Float:
     """Offsets (n_x n_y, 2) of a regular grid, row by row from zero; `step` is in pixels."""
-    x, y = np.meshgrid(np.arange(n[0]) * step[0], np.arange(n[1]) * step[1])
-    return np.stack([x.ravel(), y.ravel()], axis=1)
+    return np.stack(
+        mesh(np.arange(n[0], dtype=float) * step[0], np.arange(n[1], dtype=float) * step[1]), axis=1
+    )
 
 
 def rolls_in_turn(n: int, n_offsets: int, rolls: Sequence[float]) -> Float:

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.app.screen import progress_bar, table_text
+from bayesdist.app.store.record import write_text
 from bayesdist.arrays import Float
 from bayesdist.errors import InputError
-from bayesdist.files import atomic_path
 from bayesdist.infer.solution import Solution
 from bayesdist.missions.acs.simulate import AcsCampaign, acs_solution, simulate_acs, write_acs
 from bayesdist.model import DistortionModel
@@ -129,8 +129,7 @@ def simulate_campaign(
     first = REFERENCE if REFERENCE in filters else filters[0]
     names = [first, *(name for name in filters if name != first)]
     for name in names:
-        with atomic_path(folder / _config_of(name)) as temporary:
-            temporary.write_text(_config(name, first), encoding="utf-8")
+        write_text(folder / _config_of(name), _config(name, first))
     lines = [
         f"bayesdist run {folder / _config_of(name)} -o {folder / _run(name)}" for name in names
     ]

@@ -13,11 +13,13 @@ from bayesdist.app.commands.on_files.convert import convert
 from bayesdist.app.results import results_of
 from bayesdist.app.run import run
 from bayesdist.app.screen import number, table_text
+from bayesdist.app.store.output import write_table
+from bayesdist.app.store.record import write_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.margins import results_text
 from bayesdist.data import Matches
 from bayesdist.errors import InputError
-from bayesdist.files import atomic_path, made_folder
+from bayesdist.files import made_folder
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.missions.wise.simulate import simulate_wise
 from bayesdist.simulate import Truth
@@ -115,11 +117,9 @@ def write_simulation(
         "outlier_scale": truth.outlier_scale,
         "false_matches": int(truth.false.sum()),
     }
-    for table, name in ((stars, "stars.ecsv"), (true, "truth.ecsv")):
-        with atomic_path(folder / name) as temporary:
-            table.write(temporary, format="ascii.ecsv")
-    with atomic_path(folder / "config.toml") as temporary:
-        temporary.write_text(_CONFIG.format(band=band, sip=sip), encoding="utf-8")
+    write_table(stars, folder / "stars.ecsv")
+    write_table(true, folder / "truth.ecsv")
+    write_text(folder / "config.toml", _CONFIG.format(band=band, sip=sip))
 
 
 def demo(folder: str | Path, *, format: str | None, force: bool, command: str) -> str:

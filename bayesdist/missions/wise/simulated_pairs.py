@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.app.screen import table_text
+from bayesdist.app.store.record import write_text
 from bayesdist.errors import InputError
-from bayesdist.files import atomic_path
 from bayesdist.missions.wise.demo import write_simulation
 from bayesdist.missions.wise.simulate import WiseSet, simulate_wise, wise_set, write_wise_set
 from bayesdist.missions.wise.simulate.optical import DELIVERED_TURN, write_optical_model
@@ -122,8 +122,7 @@ def simulate_sets(
     lines = []
     for one, name in zip(sets, names, strict=True):
         n_false = write_wise_set(one, folder, threads=os.cpu_count() or 1, force=force)
-        with atomic_path(folder / f"{name}.toml") as temporary:
-            temporary.write_text(_wise_config(one), encoding="utf-8")
+        write_text(folder / f"{name}.toml", _wise_config(one))
         blocks = 0 if one.pattern is None else one.pattern.blocks
         rows.append(
             {

@@ -19,6 +19,9 @@ from bayesdist.model.lookup import corrected
 from tests.missions.acs.test_acs_distortion import A_2, B_2, B_3
 from tests.reduced import only_in_full
 
+# positions that are where the truth says
+EXACT = {"n_stars": 6000, "fine_scale": False, "centroid": 0.0, "blended": 0.0, "false": 0.0}
+
 
 @pytest.fixture(scope="module")
 def small():
@@ -144,15 +147,7 @@ def measured_linear_terms(campaign, e, stars):
 @pytest.fixture(scope="module")
 def exact():
     """Exact positions, no tables, no deviations: only what Tables 1-3 say, at several epochs."""
-    return simulate_acs(
-        n_exposures=6,
-        n_stars=6000,
-        fine_scale=False,
-        scatter=0.0,
-        centroid=0.0,
-        blended=0.0,
-        false=0.0,
-    )
+    return simulate_acs(n_exposures=6, scatter=0.0, **EXACT)
 
 
 def test_exact_lists_give_back_tables_1_to_3(exact):
@@ -170,15 +165,7 @@ def test_exact_lists_give_back_tables_1_to_3(exact):
 
 def test_true_linear_terms_are_what_a_perfect_solution_finds(exact):
     """With the scatter of exposures, too."""
-    scattered = simulate_acs(
-        n_exposures=3,
-        n_stars=6000,
-        fine_scale=False,
-        scatter=1e-4,
-        centroid=0.0,
-        blended=0.0,
-        false=0.0,
-    )
+    scattered = simulate_acs(n_exposures=3, scatter=1e-4, **EXACT)
     for campaign in (exact, scattered):
         for e, one in enumerate(campaign.log):
             found = measured_linear_terms(campaign, e, campaign.truth.stars.at(one.epoch))

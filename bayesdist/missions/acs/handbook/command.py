@@ -83,9 +83,8 @@ def _title(found: Calibration, filter: str | None, epoch: float | None) -> str:
 def _residuals(path: Path) -> tuple[Mapping[int, BinnedResiduals], str]:
     """Mean residuals in cells, by chip; or none, and what to say of that."""
     home = path if path.is_dir() else path.parent
-    if path.is_file() and path.suffix != ".nc":  # products may be in other units
-        return {}, "; no residuals, which only runs have"
-    if not (home / "run.json").exists():
+    product = path.is_file() and path.suffix != ".nc"  # its unit may be another one
+    if product or not (home / "run.json").exists():
         return {}, "; no residuals, which only runs have"
     try:
         with open_results(RunDirectory.open(home)) as results:

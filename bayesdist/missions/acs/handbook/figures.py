@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from bayesdist.arrays import Float
 from bayesdist.missions.acs.handbook.numbers import detector_numbers
 from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
+from bayesdist.model.grid import mesh
 from bayesdist.numbers import size_of
 from bayesdist.report.figures.arrows import Arrows, magnification_of, vector_map
 from bayesdist.report.figures.fields import Grid, contour_levels, scalar_map
@@ -40,8 +41,7 @@ def non_linear_figure(
         x, y = _grid(size, _VECTORS)
         f = detector.non_linear(n, x, y)
         along = f.along_x.ravel(), f.along_y.ravel()
-        gx, gy = (a.ravel() for a in np.meshgrid(x, y))
-        chips.append(Arrows(gx, gy, *along, float(x[1] - x[0])))
+        chips.append(Arrows(*mesh(x, y), *along, float(x[1] - x[0])))
     step = min(one.step for one in chips)
     longest = max(float(one.length.max()) for one in chips)
     M = magnification or (nice_below(2.5 * step / longest) if longest > 1e-9 * step else 1.0)

@@ -11,6 +11,7 @@ from bayesdist.data import ReferenceCatalog, read_catalog
 from bayesdist.data.exposures import read_exposures, write_exposures
 from bayesdist.data.starlists import read_star_lists
 from bayesdist.data.storage.write import write_columns
+from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path, made_folder
 from bayesdist.missions.acs.simulate.truth import AcsCampaign
@@ -99,7 +100,7 @@ def write_acs(
     write_exposures(campaign.log, out[-1])
     for one in campaign.lists:
         out.append(folder / "lists" / f"{one.name}.parquet")
-        columns = {key: getattr(one, key) for key in ("x", "y", "chip", "mag", "q")}
+        columns = columns_of(one, ("x", "y", "chip", "mag", "q"))
         write_columns(out[-1], columns, {"x": "pix", "y": "pix"})
     write_truth(campaign.truth, folder / "truth")
     settings = ", ".join(f"{key} {value}" for key, value in campaign.truth.settings.items())
@@ -159,7 +160,6 @@ def _write_catalog(catalog: ReferenceCatalog, path: Path) -> None:
         *("star", "u", "v", "sigma_u", "sigma_v"),
         *("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v", "mag"),
     )
-    columns = {name: getattr(catalog, name) for name in names}
-    columns = {name: values for name, values in columns.items() if values is not None}
+    columns = columns_of(catalog, names)
     columns["epoch"] = np.broadcast_to(np.asarray(catalog.epoch, float), (len(catalog),)).copy()
     write_columns(path, columns, CATALOG_UNITS)

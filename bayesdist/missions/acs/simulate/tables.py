@@ -15,6 +15,7 @@ from scipy.sparse import csr_array
 from bayesdist.arrays import Float
 from bayesdist.missions.acs.simulate.distortion import CHIPS, EPOCH0, HALF, acs_solution
 from bayesdist.model import PolynomialBasis
+from bayesdist.model.grid import mesh
 from bayesdist.model.lookup import LookupTable
 
 STEP = 64.0
@@ -34,10 +35,9 @@ FILTER_LENGTH = 150.0  # "spatially coherent over ~150 pixels", Section 4.3.2
 
 def _nodes() -> tuple[Float, Float]:
     """Pixels of all nodes, (ny nx,) each."""
-    x = (STEP + 1) / 2 + STEP * np.arange(SHAPE[1])
-    y = (STEP + 1) / 2 + STEP * np.arange(SHAPE[0])
-    X, Y = np.meshgrid(x, y)
-    return X.ravel(), Y.ravel()
+    x = (STEP + 1) / 2 + STEP * np.arange(SHAPE[1], dtype=float)
+    y = (STEP + 1) / 2 + STEP * np.arange(SHAPE[0], dtype=float)
+    return mesh(x, y)
 
 
 @lru_cache(maxsize=2)
@@ -60,10 +60,7 @@ def _followed(chip: int) -> Float:
     basis = PolynomialBasis(ORDER, CHIPS[0].size, HALF)
     at_nodes = basis.evaluate(*_nodes())
     n, K = at_nodes.shape
-    x, y = (
-        g.ravel()
-        for g in np.meshgrid(*(np.arange(0.5 + FINE / 2, size, FINE) for size in CHIPS[0].size))
-    )
+    x, y = mesh(*(np.arange(0.5 + FINE / 2, size, FINE) for size in CHIPS[0].size))
     by_pixel = [
         model.predict(theta, x + dx, y + dy, epoch=EPOCH0[0], chip=chip)
         - model.predict(theta, x - dx, y - dy, epoch=EPOCH0[0], chip=chip)

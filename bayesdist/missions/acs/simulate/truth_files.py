@@ -10,11 +10,13 @@ from astropy.table import Table
 
 from bayesdist.data.exposures import ExposureLog
 from bayesdist.data.storage.write import write_columns
+from bayesdist.data.tables.checks import columns_of
 from bayesdist.files import atomic_path
 from bayesdist.missions.acs.simulate.pointings import AcsFrames
 from bayesdist.missions.acs.simulate.stars import TrueStars
 from bayesdist.missions.acs.simulate.truth import LINEAR_TERMS, AcsTruth, DetectionTruth
 from bayesdist.model import DistortionModel
+from bayesdist.model.grid import mesh
 from bayesdist.model.lookup import LookupTable
 from bayesdist.reading.faults import naming_faults
 from bayesdist.reading.tables import read_table
@@ -32,7 +34,7 @@ def write_truth(truth: AcsTruth, folder: Path) -> None:
     for table, name in ((theta, "theta.ecsv"), (_frames_table(truth), "exposures.ecsv")):
         with atomic_path(folder / name) as temporary:
             table.write(temporary, format="ascii.ecsv")
-    stars = {key: getattr(truth.stars, key) for key in ("u", "v", "pm_u", "pm_v", "mag")}
+    stars = columns_of(truth.stars, ("u", "v", "pm_u", "pm_v", "mag"))
     write_columns(folder / "stars.parquet", stars, STAR_UNITS)
     if truth.tables:
         _write_tables(truth, folder / "tables.parquet")
@@ -119,7 +121,7 @@ def _write_tables(truth: AcsTruth, path: Path) -> None:
     rows: dict[str, list[Any]] = {key: [] for key in ("chip", "filter", "x", "y", "dx", "dy")}
     labels = tuple(dict.fromkeys(table.filter for table in truth.tables))
     for table in truth.tables:
-        x, y = (grid.ravel() for grid in np.meshgrid(*table.nodes()))
+        x, y = mesh(*table.nodes())
         rows["chip"].append(np.full(x.size, table.chip))
         rows["filter"].append(np.full(x.size, labels.index(table.filter)))
         rows["x"].append(x)

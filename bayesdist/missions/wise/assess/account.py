@@ -168,13 +168,20 @@ def accounts(
         return out
     rows = {name: printed_rows(text) for name, text in PRINTED_TABLES.items()}
     across = contradictions_across(rows["5-1"], rows["5-2"], rows["5-3"])
-    return {
-        name: tuple(
-            _with_printed(name, one, rows, across, _noises(one, name, tables, n_used, rows, arcsec))
-            for one in several
+
+    def with_printed(table: str, one: RowAccount) -> RowAccount:
+        label = one.row.label
+        printed = rows[table][label]
+        # a label with two bands is of Table 5-2, one that 5-3 shares with 5-1 is meant for 5-3
+        others = [s for s in across if table != "5-1" and s.startswith(f"{label}:")]
+        return replace(
+            one,
+            printed=printed,
+            printed_noise=_noises(label, table, tables["5-1"], n_used, rows["5-1"], arcsec),
+            contradictions=(*contradictions_within(printed), *others),
         )
-        for name, several in out.items()
-    }
+
+    return {name: tuple(with_printed(name, one) for one in out[name]) for name in out}
 
 
 def partition_parts(
@@ -216,46 +223,25 @@ def _difference(
     return float(np.sqrt(max(total - noise, 0.0)))
 
 
-def _with_printed(
-    table: str,
-    one: RowAccount,
-    rows: Mapping[str, Mapping[str, PrintedRow]],
-    across: list[str],
-    noise: tuple[float, float],
-) -> RowAccount:
-    label = one.row.label
-    printed = rows[table].get(label)
-    if printed is None:
-        return one
-    # a label with two bands is of Table 5-2, one that 5-3 shares with 5-1 is meant for 5-3
-    others = [s for s in across if table != "5-1" and s.startswith(f"{label}:")]
-    return replace(
-        one,
-        printed=printed,
-        printed_noise=noise,
-        contradictions=(*contradictions_within(printed), *others),
-    )
-
-
 def _noises(
-    one: RowAccount,
+    label: str,
     table: str,
-    tables: Mapping[str, StatisticsTable],
+    fitting: StatisticsTable,
     n_used: Mapping[str, int],
-    rows: Mapping[str, Mapping[str, PrintedRow]],
+    printed_fitting: Mapping[str, PrintedRow],
     arcsec: Mapping[str, float],
 ) -> tuple[float, float]:
     """Least and most noise of a printed row; of two bands that of both together."""
-    bands, _, axis = one.row.label.partition("/")
+    bands, _, axis = label.partition("/")
     square = np.zeros(2)
     for band in bands.split("-"):
         length, printed = (
             noise_of_bins(r[f"{band}/radial"].value["mean"], n[band], PRINTED_BINS**2)
-            for r, n in ((tables["5-1"], n_used), (rows["5-1"], SAMPLE_SIZES))
+            for r, n in ((fitting, n_used), (printed_fitting, SAMPLE_SIZES))
         )
         # lengths of normal residuals scatter less than the residuals themselves
         normal = float(np.sqrt(2 - np.pi / 2)) if axis == "radial" else 1.0
-        here = tables["5-1"][f"{band}/{axis}"].sigma_noise / length
+        here = fitting[f"{band}/{axis}"].sigma_noise / length
         scale = 1.0 if table == "5-1" else arcsec[band]
         square += (scale * printed * np.sort([normal, here])) ** 2
     low, high = np.sqrt(2 * square if table == "5-3" else square)

@@ -87,6 +87,5 @@ def field_of_solution(solution: Solution, *, epoch: float | None = None) -> Dist
     basis = place.basis
     polynomial = to_pixels @ place.polynomial(solution.mean)
     # the array position itself: P_1 along each axis, half the size times it
-    for axis, term in enumerate(((1, 0), (0, 1))):
-        polynomial[axis, basis.terms.index(term)] -= basis.half_size[axis]
+    polynomial[:, 1:3] -= np.diag(basis.half_size)
     return DistortionField.of(basis, polynomial, to_pixels)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.output import record_folder
+from bayesdist.app.store.record import write_text
 from bayesdist.errors import InputError
-from bayesdist.files import atomic_path
 
 # importing them registers what the page shows
 from bayesdist.missions.wise.bands import curves, figures, findings, tables  # noqa: F401
@@ -33,8 +33,7 @@ def _page(inputs: BandsInput, folder: Path) -> list[str]:
     overview, *parts = parts_of(BANDS, inputs, drawings)
     page = template("bands.html.jinja", __package__)
     text = page.render(run=inputs, overview=overview, parts=parts, verdict=findings.verdict(inputs))
-    with atomic_path(folder / "bands.html") as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(folder / "bands.html", text)
     return ["bands.html", *(f"figures/{path.name}" for path in paths)]
 
 

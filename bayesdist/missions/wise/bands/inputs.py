@@ -14,6 +14,11 @@ from bayesdist.missions.wise.published import WISE_BANDS
 from bayesdist.model import Chip
 
 SAME_FIELD = 0.01  # by so much the fields of two bands may differ in size
+# section of the configuration, what it is called, and what to do
+_OTHER_KINDS = (
+    ("campaign", "campaign", "compare its filters by 'bayesdist release'"),
+    ("selfcal", "self-calibration", "give runs of matched stars, one for each band"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,18 +68,9 @@ def open_bands(paths: Sequence[str | Path]) -> dict[str, BandRun]:
 
 def _opened(path: str | Path) -> BandRun:
     run = RunDirectory.open(path)
-    if run.config.campaign is not None:
-        raise InputError(
-            "is a run of a campaign",
-            where=str(path),
-            do="compare its filters by 'bayesdist release'",
-        )
-    if run.config.selfcal is not None:
-        raise InputError(
-            "is a run of a self-calibration",
-            where=str(path),
-            do="give runs of matched stars, one for each band",
-        )
+    for kind, word, do in _OTHER_KINDS:
+        if getattr(run.config, kind) is not None:
+            raise InputError(f"is a run of a {word}", where=str(path), do=do)
     results = results_of(run)
     run.require("bands", ("fit", "sample", "diagnose"))
     chips = results.posterior.model.chips

@@ -77,9 +77,8 @@ def _start(model: DistortionModel, band: str, optical: str | Path, rotation: flo
     n = min(basis.n_terms, found.polynomial.shape[1])
     coefficients[:, :n] = found.polynomial[:, :n]
     # the pixels themselves
-    for axis, term in enumerate(((1, 0), (0, 1))):
-        coefficients[axis, 0] += chip.reference_pixel[axis]
-        coefficients[axis, basis.terms.index(term)] += basis.half_size[axis]
+    coefficients[:, 0] += chip.reference_pixel
+    coefficients[:, 1:3] += np.diag(basis.half_size)
     return coefficients.ravel()
 
 

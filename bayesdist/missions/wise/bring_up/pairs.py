@@ -14,6 +14,7 @@ from bayesdist.data.matching.pairs import mutual_pairs
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.model import DistortionModel
+from bayesdist.model.grid import mesh
 
 RARE = 1e-3
 DISPLACED = 10.0  # in units of the radius in the corners
@@ -60,8 +61,7 @@ class Field:
         )
         self.code = iy * bins + ix
         self.size = size
-        x, y = (g.ravel() for g in np.meshgrid(*(np.linspace(1.0, n, GRID) for n in size)))
-        self.grid = Detections(x, y)
+        self.grid = Detections(*mesh(*(np.linspace(1.0, n, GRID) for n in size)))
 
     def positions(self, theta: Float | None, stars: Detections) -> Float:
         """Undistorted positions (N, 2); without parameters the pixel positions themselves."""

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.data.storage.write import Part, write_parts
+from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
 
@@ -158,13 +159,7 @@ def write_rvb(batches: Iterable[RvbPairs], folder: str | os.PathLike[str]) -> in
 
 def _columns(pairs: RvbPairs) -> dict[str, Any]:
     m = pairs.matches
-    columns: dict[str, Any] = {
-        name: getattr(m, name) for name in _NUMBERS if getattr(m, name) is not None
-    }
-    if pairs.colour is not None:
-        columns["colour"] = pairs.colour
-    if m.star is not None:
-        columns["star"] = m.star
+    columns = columns_of(m, _NUMBERS) | columns_of(pairs, ["colour"]) | columns_of(m, ["star"])
     if m.exposure_names != ("1",):  # there is a column of frames
         columns["frame"] = (m.exposure, m.exposure_names)
     columns["band"] = (np.zeros(len(m), np.int64), (pairs.band,))

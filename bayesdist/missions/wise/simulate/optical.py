@@ -67,11 +67,9 @@ def optical_model(band: str = "W2", turn: int = 270) -> tuple[DistortionModel, F
     model, truth = wise_solution(band)
     basis = model.basis()
     half = basis.half_size
-    none = np.zeros((2, basis.n_terms))
-    cubic = np.zeros((2, basis.n_terms))
+    none, cubic = np.zeros((2, 2, basis.n_terms))
+    none[:, 0], none[:, 1:3] = model.chips[0].reference_pixel, np.eye(2)
     for axis, terms in enumerate((((3, 0), (1, 2)), ((2, 1), (0, 3)))):
-        linear = basis.terms.index((1, 0) if axis == 0 else (0, 1))
-        none[axis, [0, linear]] = model.chips[0].reference_pixel[axis], 1.0
         for i, j in terms:
             cubic[axis, basis.terms.index((i, j))] = half[0] ** -i * half[1] ** -j
     none, cubic = basis.from_monomials(none), basis.from_monomials(cubic)
@@ -98,8 +96,7 @@ def write_optical_model(path: Path) -> None:
     model, theta = optical_model(BAND, DELIVERED_TURN)
     array, basis = WISE_ARRAYS[BAND], model.basis()
     forward = basis.to_monomials(theta.reshape(2, -1))
-    for axis, term in enumerate(((1, 0), (0, 1))):
-        forward[axis, basis.terms.index(term)] -= 1.0
+    forward[:, 1:3] -= np.eye(2)
     forward[:, 0] = 0.0  # the rest at the reference pixel is rounding
     a, b = (dict(zip(basis.terms, map(float, one), strict=True)) for one in forward)
     nx, ny = array.size

@@ -13,6 +13,7 @@ from numpy.polynomial import legendre
 
 from bayesdist.arrays import Float
 from bayesdist.model import PolynomialBasis
+from bayesdist.model.grid import mesh
 
 BLOCKS = {"W1": 5, "W2": 5, "W3": 2}  # on each axis
 
@@ -74,5 +75,4 @@ def _nodes(basis: PolynomialBasis, blocks: int) -> tuple[Float, Float, Float]:
     within = ((np.arange(blocks)[:, None] + (nodes + 1.0) / 2.0) / blocks).ravel()
     one = np.tile(weights / (2.0 * blocks), blocks)
     nx, ny = basis.size
-    x, y = np.meshgrid(0.5 + nx * within, 0.5 + ny * within)
-    return x.ravel(), y.ravel(), np.outer(one, one).ravel()
+    return *mesh(0.5 + nx * within, 0.5 + ny * within), np.outer(one, one).ravel()

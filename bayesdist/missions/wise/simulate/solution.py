@@ -48,13 +48,12 @@ def wise_solution(band: str = "W2") -> tuple[DistortionModel, Float]:
         )
     array = WISE_ARRAYS[band]
     model = DistortionModel(4, (Chip(1, band, array.size, array.centre),))
-    terms = model.basis().terms
     theta = np.empty(model.n_params)
     for axis, sip in enumerate(WISE_COEFFICIENTS[band]):
         # SIP: the corrected offset from the reference pixel is the raw one plus the polynomial
         monomial = np.array(sip)
         monomial[0] += array.centre[axis]
-        monomial[terms.index((1, 0) if axis == 0 else (0, 1))] += 1.0
+        monomial[1 + axis] += 1.0  # the terms x and y follow the constant
         theta[model.coefficient_slice(None, axis)] = model.basis().from_monomials(monomial)
     return model, theta
 
