@@ -145,19 +145,16 @@ def _vectors(solution: Posterior, part: str, chip: Chip, epoch: float | None) ->
 
 def _product_checks(product: dict[str, Any]) -> tuple[Check, ...]:
     """Checks of a file as written."""
-    out = []
-    if product.get("closure_pix") is not None:
-        out.append(Check("Products", "worst closure of the inverse (pix)", product["closure_pix"]))
-    for key, name in (("a_dmax", "A_DMAX (pix)"), ("b_dmax", "B_DMAX (pix)")):
-        if product.get(key) is not None:
-            out.append(Check("Products", name, product[key]))
-    if product.get("sky"):
-        sky = product["sky"]
-        name = f"rms distance from RA, Dec of {sky['n']} stars (arcsec)"
-        out.append(Check("Products", name, sky["rms_arcsec"]))
-        out.append(
-            Check("Products", "largest distance from the solution (arcsec)", sky["solution_arcsec"])
-        )
+    named = {
+        "closure_pix": "worst closure of the inverse (pix)",
+        "a_dmax": "A_DMAX (pix)",
+        "b_dmax": "B_DMAX (pix)",
+    }
+    found = {name: product.get(key) for key, name in named.items()}
+    if sky := product.get("sky"):
+        found[f"rms distance from RA, Dec of {sky['n']} stars (arcsec)"] = sky["rms_arcsec"]
+        found["largest distance from the solution (arcsec)"] = sky["solution_arcsec"]
+    out = [Check("Products", name, size) for name, size in found.items() if size is not None]
     levels = {"error": "fail", "warning": "warn", "note": "note"}
     for finding in product["findings"]:
         level, _, text = finding.partition(": ")

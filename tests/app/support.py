@@ -21,6 +21,7 @@ from bayesdist.app.cli import main
 from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results, results_of
 from bayesdist.app.run import ASSESS, initialized, make_stages
+from bayesdist.app.screen import start_logging
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches
 from bayesdist.model import Chip, DistortionModel
@@ -245,6 +246,7 @@ def partly_run(folder: Path, config: Path, *stages: str) -> Path:
 
 def carried_out(run: Path, *stages: str) -> Path:
     """Stages of a run whose folder holds nothing but a configuration."""
+    start_logging(quiet=True)  # as a command does: the log of the run has all of it
     names = [one for name in stages for one in (ASSESS if name == "assess" else (name,))]
     with initialized(RunDirectory.open(run)) as results:
         make_stages(results, names)

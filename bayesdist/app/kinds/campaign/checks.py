@@ -51,16 +51,13 @@ def campaign_checks(summary: Mapping[str, Any]) -> tuple[Check, ...]:
         out.append(_converged("Series of linear terms converged", time))
         off = len(time.get("outlying_exposures", ()))
         out.append(Check(GROUP, "Exposures that lie off the lines", count(off)))
-    wrong = summary.get("exposures_outlying") or ()
-    if wrong:
-        names = ", ".join(str(name) for name in wrong)
-        out.append(
-            Check(GROUP, "Exposures that went wrong in the joint fit", names, "none", "warn")
-        )
-    skipped = summary.get("exposures_skipped") or {}
-    if skipped:
-        what = "Exposures that could not be fitted alone"
-        out.append(Check(GROUP, what, ", ".join(skipped), "none", "warn"))
+    for what, key in (
+        ("Exposures that went wrong in the joint fit", "exposures_outlying"),
+        ("Exposures that could not be fitted alone", "exposures_skipped"),
+    ):
+        names = ", ".join(str(name) for name in summary.get(key) or ())
+        if names:
+            out.append(Check(GROUP, what, names, "none", "warn"))
     out += [
         Check(GROUP, name, level="warn", sentence=text, doubt=doubt)
         for part, (name, doubt) in WARNING.items()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from bayesdist.arrays import Bool, Float, Int
@@ -123,8 +124,8 @@ def _errorbar(ax: Axes, k: int, at: Float, mean: Float, error: Float, label: str
     )
 
 
-def _against_pixels(r: ReportInput, most: int, *, points: bool) -> tuple[Plot, float]:
-    """Plot without words: u and v against x and y; and the largest mean in units of its error."""
+def _against_pixels(r: ReportInput, most: int, *, points: bool) -> tuple[Figure, float]:
+    """Figure of u and v against x and y; and the largest mean in units of its error."""
     found, table = _residuals_of(r), r.stars.table
     pixels = table.x[found.shown], table.y[found.shown]
     fig = new_figure(WIDTH, 2.4)
@@ -160,16 +161,10 @@ def _against_pixels(r: ReportInput, most: int, *, points: bool) -> tuple[Plot, f
     axes[0, 0].set_ylim(-reach * scale.factor, reach * scale.factor)
     if r.several:
         legend_above(fig, axes[0, 0])
-    worst = max(
-        (
-            float(np.abs(one.mean / one.error).max())
-            for group in means
-            for one in group
-            if len(one.n)
-        ),
-        default=0.0,
-    )
-    return Plot(fig, "", "", ""), worst
+    # largest of all means in units of their errors
+    pulls = [np.abs(one.mean / one.error).max() for one in (*means[0], *means[1]) if len(one.n)]
+    worst = float(max(pulls, default=0.0))
+    return fig, worst
 
 
 def _reach(means: Sequence[Sequence[Means]]) -> float:
@@ -224,9 +219,9 @@ def chi_square_by_exposure(r: ReportInput) -> Plot:
 @REPORT.figure("residuals", printed=True)
 def residuals_by_position(r: ReportInput) -> Plot:
     """Residuals du and dv against x and y, with means in bins and their errors."""
-    plot, worst = _against_pixels(r, _BINS, points=True)
+    figure, worst = _against_pixels(r, _BINS, points=True)
     return Plot(
-        plot.figure,
+        figure,
         "Residuals against position",
         f"Points are single {r.words.rows}, markers the weighted means in bins with their 1 σ"
         " errors. Means scatter about zero, with a χ² near the number of bins, where the polynomial"
@@ -239,9 +234,9 @@ def residuals_by_position(r: ReportInput) -> Plot:
 @REPORT.figure("residuals", printed=True)
 def residuals_by_column_and_row(r: ReportInput) -> Plot:
     """Mean residuals of narrow strips of columns and of rows, with their errors."""
-    plot, worst = _against_pixels(r, _FINE_BINS, points=False)
+    figure, worst = _against_pixels(r, _FINE_BINS, points=False)
     return Plot(
-        plot.figure,
+        figure,
         "Mean residuals by column and row",
         "Weighted means over narrow strips of columns (left) and of rows (right), with 1 σ errors."
         " Steps or saw teeth are errors of the pixel grid, as at the edges of stitched blocks, that"
