@@ -6,7 +6,7 @@ were fitted, their covariance, what fixes the gauge, and where they are from.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,8 +16,9 @@ from pydantic import BaseModel, Field, TypeAdapter
 from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of_maps
 from bayesdist.calibration.further import further_from, further_records, scaled
-from bayesdist.calibration.plane import ARCSEC, Plane
-from bayesdist.errors import FormatError, InputError
+from bayesdist.calibration.inverse import detector_grid
+from bayesdist.calibration.plane import Plane, arcsec_per
+from bayesdist.errors import BayesdistError, FormatError, InputError
 from bayesdist.model import Chip, DistortionModel, LookupTable
 from bayesdist.reading.documents import model_of
 from bayesdist.version import __version__
@@ -111,7 +112,7 @@ def at_date(
             do="give the pixel scale (of convert: --scale)",
         )
     date = epoch if calibration.model.time is not None else None
-    factor = float(scale_arcsec or 1.0) if unit == "pix" else ARCSEC[unit]
+    factor = arcsec_per(unit, scale_arcsec)
     one = calibration.chip(chip, date, origin="stated")
     if unit != "arcsec":
         one = replace(one.transformed(factor * np.eye(2)), unit="arcsec")
@@ -269,3 +270,22 @@ def calibration_from(
         notes=(*source.notes, *(["has not converged"] if source.converged is False else [])),
         further=further_from(known.further_errors, where),
     )
+
+
+def error_lines(read: Callable[[], Calibration] | None, source: str) -> list[str]:
+    """Line of text on the errors of a record, by what reads it; None where there is no record."""
+    if read is None:
+        return ["  errors    none stated"]
+    try:
+        found = read()
+        [chip] = found.by_chip().values()
+        cov = chip.covariance_at(*detector_grid(chip.basis.size, 65))
+    except BayesdistError:
+        return [f"  errors    of {source} that cannot be read"]
+    if cov is None:
+        return ["  errors    none stated"]
+    sigma = 1e3 * np.sqrt((cov[:, 0, 0] + cov[:, 1, 1]) / 2)
+    return [
+        f"  errors    {found.errors}: {np.median(sigma):.3g} mas per axis at the median, "
+        f"{sigma.max():.3g} at worst"
+    ]

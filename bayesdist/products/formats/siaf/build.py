@@ -4,64 +4,75 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap, Monomials
 from bayesdist.calibration.inverse import fit_inverse
-from bayesdist.errors import required
+from bayesdist.errors import InputError, required
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.formats.common.coefficients import require_regular
 from bayesdist.products.formats.common.content import Content
-from bayesdist.products.formats.common.document import BuildOptions
+from bayesdist.products.formats.common.document import (
+    PARAMETERS,
+    BuildOptions,
+    Built,
+    FormatSettings,
+)
 from bayesdist.products.formats.common.record import at_date, record_of
 from bayesdist.products.formats.siaf.table import (
     COLUMNS,
     COVARIANCE,
+    HIGHEST,
     KEYWORDS,
     NAMES,
     SIDE,
-    SiafTable,
     side_name,
     table_of,
 )
 
-
-@dataclass(frozen=True, eq=False)
-class SiafFiles:
-    """Table and side file of one chip."""
-
-    name: str
-    text: str
-    table: SiafTable  # as read back
-    side_name: str
-    side_text: str
-    closure: float  # pixels
+WHERE = "products.siaf"
 
 
-def siaf_files(
-    calibration: Calibration,
-    chip: int,
-    aperture: str,
-    *,
-    order: int | None,
-    options: BuildOptions,
-    where: str,
-) -> SiafFiles:
-    """Table and side file of one chip, at one date.
+class Settings(FormatSettings):
+    """Configuration of a SIAF table of coefficients."""
+
+    aperture: str | None = None  # by default the names of the chips, or of the detector
+    order: Annotated[int, Field(ge=1, le=HIGHEST)] | None = None
+
+
+def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
+    """A side file and a table for each chip, in this order: whoever reads the table finds both."""
+    several = len(calibration.numbers) > 1
+    out: list[Built] = []
+    for chip in calibration.model.chips:
+        aperture = (chip.name if several else settings.aperture) or calibration.detector
+        if not aperture:
+            raise InputError(
+                "the aperture has no name",
+                where=WHERE,
+                do="give aperture, as in 'NIS_CEN' (of convert: --option aperture=NIS_CEN)",
+            )
+        out += _files(calibration, chip.number, aperture, settings.order, options)
+    return tuple(out)
+
+
+def _files(
+    calibration: Calibration, chip: int, aperture: str, order: int | None, options: BuildOptions
+) -> tuple[Built, Built]:
+    """Side file and table of one chip, at one date.
 
     (u, v) are taken as Ideal coordinates of the aperture.  Look-up tables are left out.  `order` is
     that of the rows and with it of the inverse, by default that of the polynomial; errors as for
     `at_date` and `fit_inverse`.
     """
-    one = replace(
-        at_date(calibration, chip, options.epoch, options.scale_arcsec, where=where), before=()
-    )
-    tables = [t for t in calibration.before if t.chip == chip]
+    one = at_date(calibration, chip, options.epoch, options.scale_arcsec, where=WHERE)
+    one = replace(one, before=())
     known = one.chip(chip, origin="stated")
     poly = known.monomials()
     require_regular(poly.linear, chip)
@@ -69,30 +80,28 @@ def siaf_files(
     columns = [*_forward(poly), *_inverse(known, rows_order)]
     date = options.epoch if calibration.model.time is not None else None
     name = f"siaf_distortion_{aperture}.txt".lower()
+    side = side_name(name)
     size, reference = known.basis.size, known.basis.reference_pixel
+    tables = any(table.chip == chip for table in calibration.before)
     head = [
         f"{aperture} distortion coefficients by bayesdist",
         f"from {calibration.name}" + ("" if date is None else f", at {date:g}"),
         *calibration.notes,
         *(["Look-up tables are left out."] if tables else []),
-        f"{COVARIANCE} {side_name(name)}.",
+        f"{COVARIANCE} {side}.",
         *(f"{k} = {v!r}" for k, v in zip(KEYWORDS, (*size, *reference), strict=True)),
     ]
     lines = _lines(aperture, rows_order, columns)
-    made = table_of(Content("new table", _joined(head, lines)))
-    closure = required(made.closure(), "a new table states no size")
+    table = table_of(Content("new table", _joined(head, lines)))
+    closure = required(table.closure(), "a new table states no size")
     head.append(f"Idl2Sci of Sci2Idl misses a pixel by {closure:.2g} pixels at worst.")
-    raw = _joined(head, lines)
     record = record_of(one, calibration, epoch=date, closure=closure)
     record["provenance"]["detector"] = aperture
-    side = {SIDE: 1, "table": name} | _covariance(poly) | {"bayesdist": record}
-    return SiafFiles(
-        name,
-        raw.decode("ascii"),
-        table_of(Content("new table", raw)),
-        side_name(name),
-        json.dumps(_listed(side), indent=1, allow_nan=False) + "\n",
-        closure,
+    values = {SIDE: 1, "table": name} | _covariance(poly) | {"bayesdist": record}
+    text = json.dumps(_listed(values), indent=1, allow_nan=False) + "\n"
+    return (
+        Built(side, PARAMETERS, text.encode("ascii"), record),
+        Built(name, "SIAF table", _joined(head, lines), table, chip, {"closure_pix": closure}),
     )
 
 

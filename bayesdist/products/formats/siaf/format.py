@@ -3,26 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
-from bayesdist.calibration.calibration import Calibration
-from bayesdist.calibration.inverse import detector_grid
-from bayesdist.errors import BayesdistError, InputError
 from bayesdist.products.formats.common.content import Content
-from bayesdist.products.formats.common.document import (
-    PARAMETERS,
-    BuildOptions,
-    Built,
-    Choice,
-    Format,
-    FormatSettings,
-    finding_lines,
-)
+from bayesdist.products.formats.common.document import Built, Format, finding_lines
 from bayesdist.products.formats.common.read_back import ReadBack, of_chips
-from bayesdist.products.formats.common.record import calibration_from
+from bayesdist.products.formats.common.record import calibration_from, error_lines
+from bayesdist.products.formats.siaf.build import Settings, build
 from bayesdist.products.formats.siaf.lint import lint_siaf
 from bayesdist.products.formats.siaf.table import (
     HIGHEST,
@@ -64,70 +53,13 @@ def describe_siaf(table: SiafTable) -> list[str]:
 
 
 def _uncertainty(table: SiafTable) -> list[str]:
-    if table.record is None:
-        return ["  errors    none stated"]
-    try:
-        found = calibration_from(table.record, table.name)
-    except BayesdistError:
-        return ["  errors    of a side file that cannot be read"]
-    [chip] = found.by_chip().values()
-    cov = chip.covariance_at(*detector_grid(chip.basis.size, 65))
-    if cov is None:
-        return ["  errors    none stated"]
-    sigma = 1e3 * np.sqrt((cov[:, 0, 0] + cov[:, 1, 1]) / 2)
-    return [
-        f"  errors    {found.errors}: {np.median(sigma):.3g} mas per axis at the median, "
-        f"{sigma.max():.3g} at worst"
-    ]
-
-
-WHERE = "products.siaf"
-
-
-class Settings(FormatSettings):
-    """Configuration of a SIAF table of coefficients."""
-
-    aperture: str | None = None  # by default the names of the chips, or of the detector
-    order: Annotated[int, Field(ge=1, le=HIGHEST)] | None = None
+    record = table.record
+    found = None if record is None else lambda: calibration_from(record, table.name)
+    return error_lines(found, "a side file")
 
 
 def _parse(content: Content) -> SiafTable | None:
     return table_of(content) if holds_table(content) else None
-
-
-def _calibration(table: SiafTable, _: str, choice: Choice) -> Calibration:
-    return siaf_calibration(table, choice)
-
-
-def _build(
-    calibration: Calibration, settings: Settings, options: BuildOptions
-) -> tuple[Built, ...]:
-    """A table and its side file for each chip."""
-    # no file that is read needs it
-    from bayesdist.products.formats.siaf.build import siaf_files
-
-    several = len(calibration.numbers) > 1
-    out: list[Built] = []
-    for chip in calibration.model.chips:
-        aperture = (chip.name if several else settings.aperture) or calibration.detector
-        if not aperture:
-            raise InputError(
-                "the aperture has no name",
-                where=WHERE,
-                do="give aperture, as in 'NIS_CEN' (of convert: --option aperture=NIS_CEN)",
-            )
-        made = siaf_files(
-            calibration, chip.number, aperture, order=settings.order, options=options, where=WHERE
-        )
-        # the side file first: whoever reads the table finds it
-        out += [
-            Built(made.side_name, PARAMETERS, made.side_text.encode("ascii"), made),
-            Built(
-                made.name, "SIAF table", made.text.encode("ascii"), made.table, chip.number,
-                {"closure_pix": made.closure},
-            ),
-        ]  # fmt: skip
-    return tuple(out)
 
 
 def _read_back(files: Sequence[Built], *_: Any) -> list[ReadBack]:
@@ -147,9 +79,9 @@ FORMAT = Format(
     _parse,
     describe_siaf,
     lint_siaf,
-    _calibration,
+    siaf_calibration,
     Settings,
-    _build,
+    build,
     _read_back,
     highest_order=HIGHEST,
 )
