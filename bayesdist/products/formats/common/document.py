@@ -139,9 +139,6 @@ class Built:
     warnings: tuple[str, ...] = ()  # on what programs will make of it, for the terminal
 
 
-Builder = Callable[[Calibration, Any, BuildOptions], tuple[Built, ...]]
-
-
 @dataclass(frozen=True)
 class Format:
     """Format of files, as its functions.
@@ -184,7 +181,7 @@ class Format:
     lint: Callable[[Any], Sequence[Finding]] | None = None
     calibration: Callable[[Any, str, Choice], Calibration] | None = None
     settings: type[FormatSettings] | None = None
-    build: Builder | None = None
+    build: Callable[[Calibration, Any, BuildOptions], tuple[Built, ...]] | None = None
     read_back: Callable[[Sequence[Built], Calibration, BuildOptions], Sequence[ReadBack]] | None = (
         None
     )

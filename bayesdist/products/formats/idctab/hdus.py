@@ -23,7 +23,12 @@ from astropy.io import fits
 from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import Orientation
-from bayesdist.products.formats.common.cards import number_card, text_card, wrapped_cards
+from bayesdist.products.formats.common.cards import (
+    append_cards,
+    number_card,
+    text_card,
+    wrapped_cards,
+)
 from bayesdist.products.formats.idctab.numbers import ChipInverse, ChipNumbers
 
 
@@ -119,9 +124,7 @@ def sigma_hdu(pieces: Sequence[Piece], cov: Float) -> fits.BinTableHDU:
     ]
     hdu = fits.BinTableHDU.from_columns(columns, name="SIGMA")
     drift = {k: v for s in sigmas for k, v in s.items() if k.startswith("TDD")}
-    for name, value in drift.items():
-        card = number_card(name, value, "[arcsec/pix/yr] 1-sigma")
-        hdu.header.append(fits.Card.fromstring(card), end=True)
+    append_cards(hdu, (number_card(k, v, "[arcsec/pix/yr] 1-sigma") for k, v in drift.items()))
     return hdu
 
 

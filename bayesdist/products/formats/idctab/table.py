@@ -62,16 +62,10 @@ class IdcTab:
 
     Examples
     --------
-    >>> chip = bd.Chip(1, "WFC2", (4096, 2048), (2048.0, 1024.0))
-    >>> model = bd.DistortionModel(1, (chip,))
-    >>> theta = np.zeros(model.n_params)
-    >>> theta[model.coefficient_slice(None, 0)] = model.basis().from_monomials([0.0, 1.0, 0.0])
-    >>> theta[model.coefficient_slice(None, 1)] = model.basis().from_monomials([0.0, 0.0, 1.0])
-    >>> matches, _ = bd.simulate_matches(model, theta, 500, rng=np.random.default_rng(1))
-    >>> fit = bd.fit_linear(matches, model)
-    >>> tab = bd.idctab_from_solution(
-    ...     fit, instrument="ACS", detector="WFC", scale_arcsec=0.05, filters=[("F606W", "CLEAR2L")]
-    ... )
+    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
+    >>> camera = {"instrument": "WFC3", "detector": "IR", "scale_arcsec": 0.13}
+    >>> tab = bd.idctab_from_solution(fit, **camera, filters=["F160W"])
     >>> len(tab.rows)  # without an inverse
     1
     """
@@ -434,16 +428,10 @@ def read_idctab(path: str | os.PathLike[str]) -> IdcTab:
 
     Examples
     --------
-    >>> chip = bd.Chip(1, "WFC2", (4096, 2048), (2048.0, 1024.0))
-    >>> model = bd.DistortionModel(1, (chip,))
-    >>> theta = np.zeros(model.n_params)
-    >>> theta[model.coefficient_slice(None, 0)] = model.basis().from_monomials([0.0, 1.0, 0.0])
-    >>> theta[model.coefficient_slice(None, 1)] = model.basis().from_monomials([0.0, 0.0, 1.0])
-    >>> matches, _ = bd.simulate_matches(model, theta, 500, rng=np.random.default_rng(1))
-    >>> fit = bd.fit_linear(matches, model)
-    >>> tab = bd.idctab_from_solution(
-    ...     fit, instrument="ACS", detector="WFC", scale_arcsec=0.05, filters=[("F606W", "CLEAR2L")]
-    ... )
+    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
+    >>> camera = {"instrument": "WFC3", "detector": "IR", "scale_arcsec": 0.13}
+    >>> tab = bd.idctab_from_solution(fit, **camera, filters=["F160W"])
     >>> bd.write_idctab(tab, "test_idc.fits")
     >>> bool((bd.read_idctab("test_idc.fits").rows == tab.rows).all())
     True
@@ -467,16 +455,10 @@ def write_idctab(tab: IdcTab, path: str | os.PathLike[str]) -> None:
 
     Examples
     --------
-    >>> chip = bd.Chip(1, "WFC2", (4096, 2048), (2048.0, 1024.0))
-    >>> model = bd.DistortionModel(1, (chip,))
-    >>> theta = np.zeros(model.n_params)
-    >>> theta[model.coefficient_slice(None, 0)] = model.basis().from_monomials([0.0, 1.0, 0.0])
-    >>> theta[model.coefficient_slice(None, 1)] = model.basis().from_monomials([0.0, 0.0, 1.0])
-    >>> matches, _ = bd.simulate_matches(model, theta, 500, rng=np.random.default_rng(1))
-    >>> fit = bd.fit_linear(matches, model)
-    >>> tab = bd.idctab_from_solution(
-    ...     fit, instrument="ACS", detector="WFC", scale_arcsec=0.05, filters=[("F606W", "CLEAR2L")]
-    ... )
+    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
+    >>> camera = {"instrument": "WFC3", "detector": "IR", "scale_arcsec": 0.13}
+    >>> tab = bd.idctab_from_solution(fit, **camera, filters=["F160W"])
     >>> bd.write_idctab(tab, "test_idc.fits")
     >>> bool((bd.read_idctab("test_idc.fits").rows == tab.rows).all())
     True
