@@ -14,9 +14,10 @@ import numpy as np
 from pydantic import BaseModel, Field, TypeAdapter
 
 from bayesdist.arrays import Float
-from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of_maps
-from bayesdist.calibration.further import further_from, further_records, scaled
+from bayesdist.calibration.calibration import Calibration, GaussianSolution
+from bayesdist.calibration.further import further_from, further_records
 from bayesdist.calibration.inverse import detector_grid
+from bayesdist.calibration.orientation import in_arcsec
 from bayesdist.calibration.plane import Plane, arcsec_per
 from bayesdist.errors import BayesdistError, FormatError, InputError
 from bayesdist.model import Chip, DistortionModel, LookupTable
@@ -113,28 +114,14 @@ def at_date(
         )
     date = epoch if calibration.model.time is not None else None
     factor = arcsec_per(unit, scale_arcsec)
-    one = calibration.chip(chip, date, origin="stated")
-    if unit != "arcsec":
-        one = replace(one.transformed(factor * np.eye(2)), unit="arcsec")
-    tables = [t for t in calibration.before if t.chip == chip]
+    made = in_arcsec(calibration.only(chip, date), factor)
     known = calibration.model.chips[calibration.model.chip_code(chip)]
-    made = calibration_of_maps(
-        {chip: one},
-        calibration.name,
-        cov=one.cov,
-        errors=calibration.errors,
-        plane=calibration.plane,
-        instrument=calibration.instrument,
-        detector=calibration.detector,
-        filter=calibration.filter,
-        numbered=calibration.numbered,
-        before=tuple(t for t in tables if t.filter in ("", calibration.filter)),
-        notes=calibration.notes,
-        further=scaled(calibration.further, factor),
+    model = replace(made.model, chips=(known,))  # with its name
+    return replace(
+        made,
+        solution=GaussianSolution(model, made.solution.mean, made.solution.cov),
+        before=tuple(t for t in made.before if t.filter in ("", calibration.filter)),
     )
-    model = replace(made.model, chips=(known,))
-    solution = GaussianSolution(model, made.solution.mean, made.solution.cov)
-    return replace(made, solution=solution)
 
 
 def record_of(

@@ -33,13 +33,13 @@ from bayesdist.products.formats.common.document import (
 )
 from bayesdist.products.formats.common.parameters import parameters_content
 from bayesdist.products.formats.sip.format import describe_wcs
-from bayesdist.products.formats.tpv.calibration import tpv_calibration
 from bayesdist.products.formats.tpv.head import (
     HIGHEST,
     SIDE_FILE,
     TpvFile,
     TpvHead,
     pv_values_of,
+    tpv_calibration,
     tpv_of,
 )
 from bayesdist.products.formats.tpv.lint import lint_tpv
