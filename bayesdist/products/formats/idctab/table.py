@@ -37,6 +37,8 @@ from bayesdist.products.formats.common.content import Hdu, read_hdus, write_hdus
 from bayesdist.products.formats.idctab.drift import drift, scheme_of
 from bayesdist.products.formats.idctab.hst import serves
 
+Filter = str | Sequence[str] | None  # one name, or those of both wheels
+
 FILTER_COLUMNS = ("FILTER1", "FILTER2", "FILTER", "OPT_ELEM")
 HIGHEST = 9  # order: CX and CY have one digit for each power
 # The chip to whose zero point stwcs refers both chips of ACS/WFC and of WFC3/UVIS.
@@ -203,12 +205,7 @@ class IdcTab:
 
     # -- one row ---------------------------------------------------------------------------------
 
-    def row(
-        self,
-        chip: int,
-        filter: str | Sequence[str] | None = None,
-        direction: str = "FORWARD",
-    ) -> int:
+    def row(self, chip: int, filter: Filter = None, direction: str = "FORWARD") -> int:
         """Index of the row that stwcs would use.
 
         Parameters
@@ -243,12 +240,7 @@ class IdcTab:
             )
         return int(found[0])
 
-    def matching_rows(
-        self,
-        chip: int,
-        filter: str | Sequence[str] | None = None,
-        direction: str = "FORWARD",
-    ) -> Int:
+    def matching_rows(self, chip: int, filter: Filter = None, direction: str = "FORWARD") -> Int:
         """Indices of all rows of a chip, filter and direction.
 
         Parameters
@@ -296,10 +288,7 @@ class IdcTab:
         return x, y
 
     def coefficients(
-        self,
-        chip: int,
-        filter: str | Sequence[str] | None = None,
-        direction: str = "FORWARD",
+        self, chip: int, filter: Filter = None, direction: str = "FORWARD"
     ) -> tuple[Float, Float]:
         """Coefficients of x^i y^j, for (i, j) in `terms`.
 
@@ -327,7 +316,7 @@ class IdcTab:
         x: ArrayLike,
         y: ArrayLike,
         *,
-        filter: str | Sequence[str] | None = None,
+        filter: Filter = None,
         direction: str = "FORWARD",
         epoch: float | None = None,
     ) -> tuple[Float, Float]:
@@ -372,12 +361,7 @@ class IdcTab:
         return u, v
 
     def invert(
-        self,
-        chip: int,
-        Xc: ArrayLike,
-        Yc: ArrayLike,
-        *,
-        filter: str | Sequence[str] | None = None,
+        self, chip: int, Xc: ArrayLike, Yc: ArrayLike, *, filter: Filter = None
     ) -> tuple[Float, Float]:
         """Pixels of positions in the aperture's frame, by the INVERSE row.
 
