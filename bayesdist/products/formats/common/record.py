@@ -7,7 +7,7 @@ were fitted, their covariance, what fixes the gauge, and where they are from.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from pydantic import BaseModel, Field, TypeAdapter
 
 from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, GaussianSolution
-from bayesdist.calibration.further import further_from, further_records
+from bayesdist.calibration.further import further_from
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.orientation import in_arcsec
 from bayesdist.calibration.plane import Plane, arcsec_per
@@ -178,7 +178,7 @@ def record_of(
     if closure is not None:
         record["inverse"] = {"closure_pix": float(closure)}
     if calibration.further:
-        record["further_errors"] = further_records(calibration.further)
+        record["further_errors"] = [asdict(row) for row in calibration.further]
     if calibration.errors != "none":
         record["covariance"] = np.array(calibration.solution.cov, float)
     return record
