@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesdist.arrays import Bool, Float, Int
-from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.calibration.chip_map import ChipMap, chip_of
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.subarray import FULL, Subarray
 from bayesdist.errors import InputError
@@ -161,13 +161,7 @@ class Application:
 
     def chip(self, number: int) -> ChipMap:
         """Map of a chip; InputError for an unknown one."""
-        if number not in self.chips:
-            raise InputError(
-                f"there is no chip {number}",
-                where="application",
-                do=f"choose one of {', '.join(map(str, self.chips))}",
-            )
-        return self.chips[number]
+        return chip_of(self.chips, number, "application")
 
     def _image(self, chip: int) -> Subarray:
         return self.images.get(chip, FULL)

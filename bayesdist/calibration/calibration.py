@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesdist.arrays import Float
-from bayesdist.calibration.chip_map import ChipMap, sampling_of
+from bayesdist.calibration.chip_map import ChipMap, chip_of, sampling_of
 from bayesdist.calibration.further import FurtherError
 from bayesdist.calibration.inverse import ExplicitInverse
 from bayesdist.calibration.plane import Plane
@@ -151,15 +151,7 @@ class Calibration:
     ) -> ChipMap:
         """Polynomial of one chip, the reference chip by default; errors as for `at`."""
         maps = self.at(epoch, origin=origin)
-        if number is None:
-            return next(iter(maps.values()))
-        if number not in maps:
-            raise InputError(
-                f"there is no chip {number}",
-                where=self.name,
-                do=f"choose one of {', '.join(map(str, maps))}",
-            )
-        return maps[number]
+        return chip_of(maps, self.numbers[0] if number is None else number, self.name)
 
     def joint_covariance(
         self, numbers: Sequence[int], epoch: float | None = None, *, origin: str = "reference"

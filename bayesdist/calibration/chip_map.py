@@ -7,7 +7,7 @@ it, which are evaluated at the corrected pixel; they have no part in the covaria
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -271,6 +271,17 @@ def _even_grid(size: tuple[float, float]) -> tuple[Float, Float]:
     """Points (N,) over a detector, denser than any table that a polynomial could follow."""
     x, y = np.meshgrid(*(np.linspace(0.5, n + 0.5, _FIT_NODES) for n in size))
     return x.ravel(), y.ravel()
+
+
+def chip_of(maps: Mapping[int, ChipMap], number: int, where: str) -> ChipMap:
+    """Map of a chip; InputError for an unknown one."""
+    if number not in maps:
+        raise InputError(
+            f"there is no chip {number}",
+            where=where,
+            do=f"choose one of {', '.join(map(str, maps))}",
+        )
+    return maps[number]
 
 
 def sampling_of(solution: Solution) -> tuple[float, tuple[str, ...]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from bayesdist.errors import FormatError
@@ -30,11 +30,6 @@ class FurtherError:
 def scaled(rows: Sequence[FurtherError], factor: float) -> tuple[FurtherError, ...]:
     """Rows in another unit."""
     return tuple(replace(row, u=factor * row.u, v=factor * row.v) for row in rows)
-
-
-def further_records(rows: Sequence[FurtherError]) -> list[dict[str, Any]]:
-    """Rows as names, texts and numbers."""
-    return [asdict(row) for row in rows]
 
 
 def further_from(records: Sequence[Mapping[str, Any]], where: str) -> tuple[FurtherError, ...]:

@@ -271,12 +271,12 @@ def placed_at(
                 where="detector.scale_mas",
                 do="give the pixel scale (of convert: --scale)",
             )
-        calibration = _in_arcsec(calibration, scale_arcsec)
+        calibration = in_arcsec(calibration, scale_arcsec)
     plane = Plane("sky", point=(float(crval[0]), float(crval[1])), note=calibration.plane.note)
     return replace(calibration, plane=plane, with_plane=None)
 
 
-def _in_arcsec(calibration: Calibration, pixel: float) -> Calibration:
+def in_arcsec(calibration: Calibration, pixel: float) -> Calibration:
     """Calibration in arcseconds; `pixel` is the size of one."""
     solution, model = calibration.solution, calibration.model
     return replace(

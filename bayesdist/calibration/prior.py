@@ -147,30 +147,13 @@ def prior_of_calibration(
 ) -> CalibrationPrior:
     """Prior of a model by an earlier calibration of the same detector.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        With its covariance, and without look-up tables.
-    model : DistortionModel
-        Of the same order or a higher one, whose further terms have no prior.
-    frame : str, optional
-        Frame of the new stars against the earlier plane, along which the prior is flat; by default
-        that of the model's exposures.
-    epoch : float, optional
-        Decimal years: the date of a calibration that drifts, for a model that does not.
-    change_pix : float
-        Rms over the detector, on each axis, by which the two may differ: independent terms of equal
-        rms are added to the covariance.
-
-    Returns
-    -------
-    CalibrationPrior
-
-    Raises
-    ------
-    InputError
-        For a calibration without covariance or with look-up tables, of other chips, another unit, a
-        higher order, or another drift.
+    The calibration has its covariance, and no look-up tables; the model is of the same order or a
+    higher one, whose further terms have no prior.  `frame` is that of the new stars against the
+    earlier plane, along which the prior is flat: by default that of the model's exposures.  `epoch`
+    is the date of a calibration that drifts, for a model that does not.  `change_pix` is the rms
+    over the detector, on each axis, by which the two may differ: independent terms of equal rms are
+    added to the covariance.  InputError for a calibration of other chips, another unit, a higher
+    order or another drift.
     """
     own, name = calibration.model, calibration.name
     _require_alike(calibration, model)

@@ -52,34 +52,12 @@ def sky_positions(
     centroids: tuple[ArrayLike, ArrayLike] | None = None,
     joint: bool = False,
 ) -> SkyPositions:
-    """Positions on the sky of pixels, with all errors that the calibration knows.
+    """Positions on the sky of FITS 1-based pixels (N,), with all errors that the calibration knows.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        In a plane that touches the sky, or with a `point`.
-    x, y : array_like, shape (N,)
-        FITS 1-based pixels.
-    chip : array_like of int, shape (N,)
-        Chip number of each.
-    epoch : float, optional
-        Decimal years, of a calibration that drifts.
-    point : tuple of float, optional
-        Sky position of (u, v) = (0, 0) in degrees, u to the east and v to the north, in place of
-        the calibration's own.
-    centroids : tuple of array_like, optional
-        Standard deviations of x and y, in pixels.
-    joint : bool
-        Whether the covariance of all stars is wanted.
-
-    Returns
-    -------
-    SkyPositions
-
-    Raises
-    ------
-    InputError
-        For a plane that does not touch the sky and no point, or a unit that is no angle.
+    `chip` is the chip number of each, or of all.  `point` is the sky position of (u, v) = (0, 0) in
+    degrees, u to the east and v to the north, in place of the calibration's own; `centroids` are
+    standard deviations of x and y in pixels; with `joint` the covariance of all stars is there.
+    InputError for a plane that does not touch the sky and no point, or a unit that is no angle.
     """
     x, y = np.atleast_1d(np.asarray(x, float)), np.atleast_1d(np.asarray(y, float))
     chip = np.broadcast_to(np.asarray(chip, np.int64), x.shape)

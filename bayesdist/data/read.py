@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.data.formats.astrometrynet import COLUMNS as CORR_COLUMNS
-from bayesdist.data.formats.astrometrynet import matches_from_corr
 from bayesdist.data.formats.files import (
+    CORR_COLUMNS,
     FORMATS,
     exposure_names,
     input_files,
@@ -36,6 +35,8 @@ from bayesdist.reading.tables import read_table
 
 PathLike = str | os.PathLike[str]
 IN_MEMORY = "table"  # name of a table that is no file, in errors
+# the other quantities are left out: 'mag', if there is one, is the index star's
+_CORR = dict.fromkeys(ALIASES, "") | CORR_COLUMNS
 
 
 def read_matches(
@@ -161,7 +162,7 @@ def _with_common_point(
     if options.tangent_point is not None or len(tables) < 2:
         return options
     corr = "astrometry.net" in set(kinds)
-    columns = CORR_COLUMNS if corr else options.columns
+    columns = _CORR if corr else options.columns
     sky = [sky_positions(table, columns, source=str(file)) for file, table in tables.items()]
     on_sky = [one for one in sky if one is not None and len(one[0])]
     if not on_sky:
@@ -192,10 +193,18 @@ def _read_list(file: Path, name: str | None, options: ReadOptions) -> Matches:
 
 
 def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions) -> Matches:
+    """Matches from a `corr.fits`, which fixes columns, origin and unit.
+
+    field_x and field_y are FITS 1-based pixels; index_ra and index_dec come to the tangent plane.
+    Magnitudes are instrumental, -2.5 log10 FLUX, where all fluxes are positive; there are no
+    errors.
+    """
     options.refuse(str(file), "astrometry.net", "columns", "pixel_origin")
     if options.unit not in (None, "arcsec"):
         options.refuse(str(file), "astrometry.net", "unit")
-    return matches_from_corr(table, options, source=str(file), exposure_name=name)
+    columns = _CORR | ({"flux": "FLUX"} if "FLUX" in table.colnames else {})
+    options = replace(options, columns=columns, unit=None, sigma="by_magnitude")
+    return matches_from_table(table, options, source=str(file), exposure_name=name)
 
 
 def _read_with_master(files: Sequence[Path], kinds: Sequence[str], options: ReadOptions) -> Matches:

@@ -14,12 +14,11 @@ from functools import cache
 from importlib import import_module
 
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.errors import InputError
+from bayesdist.errors import InputError, required
 from bayesdist.products import formats
 from bayesdist.products.formats.common.content import Content, read_content, readable
 from bayesdist.products.formats.common.document import (
     PARAMETERS,
-    Builder,
     BuildOptions,
     Built,
     Choice,
@@ -102,14 +101,9 @@ def product_settings() -> dict[str, type[FormatSettings]]:
 
 def format_of(key: str) -> Format:
     """Format of a key that can be built; InputError where there is none."""
-    return _builder_of(key)[0]
-
-
-def _builder_of(key: str) -> tuple[Format, Builder]:
-    """Format of a key, and what builds its files."""
     for one in all_formats():
         if one.key == key and one.build is not None:
-            return one, one.build
+            return one
     raise InputError(
         f"there is no format {key!r} that can be built",
         do=f"choose one of {', '.join(product_settings())}",
@@ -123,7 +117,7 @@ def build(
     options: BuildOptions = BuildOptions(),  # noqa: B008
 ) -> tuple[Built, ...]:
     """Files of a format, built and not written; values that the format cannot hold are refused."""
-    one, made = _builder_of(key)
+    one = format_of(key)
     if calibration.model.order > one.highest_order:
         raise InputError(
             f"the order is {calibration.model.order}, and polynomials of {one.title} go "
@@ -133,7 +127,7 @@ def build(
         )
     if one.holds_tables and not calibration.before:
         calibration = replace(calibration, before=options.tables)
-    return made(calibration, settings, options)
+    return required(one.build, "it can be built")(calibration, settings, options)
 
 
 def read_back(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
@@ -12,15 +13,17 @@ from numpy.typing import NDArray
 
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.orientation import lay_on, oriented
-from bayesdist.calibration.plane import Orientation
+from bayesdist.calibration.plane import Orientation, Plane
 from bayesdist.infer import Solution
 from bayesdist.model import Chip, DistortionModel, TimeDependence
-from bayesdist.products import IdcTab
+from bayesdist.products import IdcTab, registry
+from bayesdist.products.formats.common.document import BuildOptions
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
 
 Float = NDArray[np.float64]
 
 F606W = ("F606W", "CLEAR2L")
+POINT, PIXEL = (150.1, 2.2), 0.26  # of `on_sky`: degrees, arcsec
 WFC_SIZE, WFC_REF = (4096.0, 2048.0), (2048.0, 1024.0)
 
 
@@ -75,6 +78,29 @@ def some_solution(
     for axis in (0, 1):
         theta[model.coefficient_slice(None, axis)] = coefficients[axis]
     return StandIn(model, theta, some_covariance(theta.size, 1e-3 * pixel, rng))
+
+
+def on_sky(order: int, scale: tuple[float, str] | None = None, **what: float) -> Calibration:
+    """A turned and mirrored distortion of some pixels, on the sky about POINT."""
+    solution = some_solution(
+        order, unit="arcsec", pixel=PIXEL, angle=0.4, flip=True, offset=(12.0, -30.0), **what
+    )
+    return calibration_of(solution, "made up", plane=Plane("sky", point=POINT), scale=scale)
+
+
+def build_into(
+    key: str,
+    folder: Path,
+    calibration: Calibration,
+    options: BuildOptions = BuildOptions(),  # noqa: B008
+    **settings: object,
+) -> Path:
+    """The file of a format in a folder, after those that stand beside it."""
+    chosen = registry.product_settings()[key](**settings)
+    for one in registry.build(key, calibration, chosen, options):
+        path = folder / one.file_name
+        path.write_bytes(one.content)
+    return path
 
 
 def wfc_model(order: int, *, drift: bool) -> DistortionModel:

@@ -19,7 +19,7 @@ from bayesdist.calibration.subarray import (
     subarrays_of_image,
 )
 from bayesdist.errors import FormatError, InputError
-from bayesdist.products import idctab_from_solution, read_idctab
+from bayesdist.products import idctab_from_solution
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
 
 from .acs_offline import Pointing, corrected, to_sky
@@ -47,11 +47,6 @@ def headers(path):
 @pytest.fixture(scope="module")
 def table(data_dir):
     return data_dir / "hst_reference" / "0461802ej_idc.fits"
-
-
-@pytest.fixture(scope="module")
-def real(table):
-    return read_idctab(table)
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,30 +11,25 @@ import pytest
 from astropy.table import Table
 from numpy.testing import assert_allclose
 
-from bayesdist.calibration.calibration import Calibration, calibration_of
-from bayesdist.calibration.plane import Plane
+from bayesdist.calibration.calibration import calibration_of
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import registry
 from tests.app.support import good
 
-from .support import StandIn, random_pixels, some_covariance, some_solution
+from .support import (
+    PIXEL,
+    POINT,
+    StandIn,
+    build_into,
+    on_sky,
+    random_pixels,
+    some_covariance,
+    some_solution,
+)
 
-POINT, SIZE, PIXEL = (150.1, 2.2), (1200.0, 900.0), 0.26
-
-
-def on_sky(order: int = 4) -> Calibration:
-    solution = some_solution(
-        order, unit="arcsec", pixel=PIXEL, angle=0.4, flip=True, offset=(12.0, -30.0)
-    )
-    return calibration_of(solution, "made up", plane=Plane("sky", point=POINT))
-
-
-def write(folder: Path, calibration: Calibration, **settings) -> Path:
-    chosen = registry.product_settings()["ast"](**settings)
-    for one in registry.build("ast", calibration, chosen):
-        (folder / one.file_name).write_bytes(one.content)
-    return folder / one.file_name
+SIZE = (1200.0, 900.0)
+write = partial(build_into, "ast")
 
 
 class _Lines:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import astropy.wcs
@@ -13,8 +14,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from numpy.testing import assert_allclose
 
-from bayesdist.calibration.calibration import Calibration, calibration_of
-from bayesdist.calibration.plane import Plane
+from bayesdist.calibration.calibration import calibration_of
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import LookupTable
 from bayesdist.products import registry
@@ -22,24 +22,10 @@ from bayesdist.products.formats.common.document import BuildOptions
 from tests.app.support import good
 
 from .skies import apart_mas, sky_of
-from .support import random_pixels, some_solution
+from .support import PIXEL, POINT, build_into, on_sky, random_pixels, some_solution
 
-POINT, SIZE, PIXEL = (150.1, 2.2), (1200.0, 900.0), 0.26
-
-
-def on_sky(order: int = 4, **what) -> Calibration:
-    solution = some_solution(
-        order, unit="arcsec", pixel=PIXEL, angle=0.4, flip=True, offset=(12.0, -30.0), **what
-    )
-    return calibration_of(solution, "made up", plane=Plane("sky", point=POINT))
-
-
-def write(folder: Path, calibration: Calibration, options=BuildOptions(), **settings) -> Path:  # noqa: B008
-    chosen = registry.product_settings()["cpdis"](**settings)
-    [one] = registry.build("cpdis", calibration, chosen, options)
-    path = folder / one.file_name
-    path.write_bytes(one.content)
-    return path
+SIZE = (1200.0, 900.0)
+write = partial(build_into, "cpdis")
 
 
 def sky_by_astropy(path: Path, x: np.ndarray, y: np.ndarray, key: str = " ") -> np.ndarray:

@@ -21,11 +21,6 @@ ACS = {"instrument": "ACS", "detector": "WFC"}
 UVIS = {"instrument": "WFC3", "detector": "UVIS"}
 
 
-@pytest.fixture(scope="module")
-def real(data_dir):
-    return read_idctab(data_dir / "hst_reference" / "0461802ej_idc.fits")
-
-
 def test_real_coefficients_survive_the_model(real, tmp_path: Path) -> None:
     solution = wfc_solution(real)
     record = real.rows[real.row(2, F606W)]

@@ -9,18 +9,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bayesdist.products import IdcTab, idctab_from_solution, read_idctab, write_idctab
+from bayesdist.products import IdcTab, idctab_from_solution, write_idctab
 
 from .stwcs_offline import archived_sky, gnomonic, separation_mas, sky
 from .support import F606W, wfc_solution
 
 pytest.importorskip("stwcs")
 VAFACTOR = {2: 1.000018683511, 1: 1.000018683511}  # of the exposure
-
-
-@pytest.fixture(scope="module")
-def real(data_dir) -> IdcTab:
-    return read_idctab(data_dir / "hst_reference" / "0461802ej_idc.fits")
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from bayesdist.errors import BayesdistError, DegenerateError, FormatError, InputError
 from bayesdist.model.lookup import LookupTable
-from bayesdist.products import IdcTab, describe, idctab_from_solution, read_idctab
+from bayesdist.products import IdcTab, describe, idctab_from_solution
 from bayesdist.products.formats.lookup.d2im import read_d2im, write_d2im
 from bayesdist.products.formats.lookup.file import LookupFile, read_lookup_file, write_lookup_file
 from bayesdist.products.formats.lookup.lint import lint_lookup_file
@@ -26,11 +26,6 @@ D2IM, NPOL_606, NPOL_814 = "02c1450oj_d2i.fits", "02c14514j_npl.fits", "02c1450r
 @pytest.fixture(scope="module")
 def reference(data_dir) -> Path:
     return data_dir / "hst_reference"
-
-
-@pytest.fixture(scope="module")
-def real(reference) -> IdcTab:
-    return read_idctab(reference / "0461802ej_idc.fits")
 
 
 @pytest.fixture(scope="module")

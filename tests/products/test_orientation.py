@@ -247,11 +247,6 @@ def test_a_rotation_of_the_solution_is_no_error_of_the_table(truth) -> None:
 # -- real tables and published numbers ------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def real(data_dir) -> IdcTab:
-    return read_idctab(data_dir / "hst_reference" / "0461802ej_idc.fits")
-
-
 def test_the_delivered_table_is_the_reports_solution_turned(real) -> None:
     """ACS ISR 2015-06, Tables 1-3 and section 4.4.1, from its successor, turned back to the gauge.
 

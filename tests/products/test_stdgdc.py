@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from bayesdist.products.formats.common.content import read_content
 from bayesdist.products.formats.stdgdc.file import EXTENSIONS, CorrectedFrame, stdgdc_of
 from tests.app.support import good
 
-from .support import some_solution, wfc_model
+from .support import build_into, some_solution, wfc_model
 
 SIZE = (150.0, 100.0)
 
@@ -30,12 +31,7 @@ def some_calibration(**what) -> Calibration:
     return calibration_of(some_solution(3, **what), "made up")
 
 
-def write(folder: Path, calibration: Calibration, precision: str = "single") -> Path:
-    settings = registry.product_settings()["stdgdc"](precision=precision)
-    [one] = registry.build("stdgdc", calibration, settings)
-    path = folder / one.file_name
-    path.write_bytes(one.content)
-    return path
+write = partial(build_into, "stdgdc")
 
 
 def plain(path: Path) -> Path:
@@ -60,7 +56,7 @@ def test_bp3m_has_the_positions_of_the_calibration(tmp_path, precision):
     """At the pixels to rounding, between them to the error that the file states."""
     io = pytest.importorskip("pypass.io", reason="bp3m is not installed")
     found = some_calibration()
-    path = write(tmp_path, found, precision)
+    path = write(tmp_path, found, precision=precision)
     gdc = io.load_stdgdc(path)
     frame = CorrectedFrame.of_header(stdgdc_of(read_content(path)).header)
     j, i = np.indices((99, 149), float)
@@ -101,7 +97,7 @@ def test_what_is_read_back_is_the_calibration_with_its_covariance(tmp_path, turn
 def test_the_frame_lies_along_the_detector_and_keeps_the_skew(tmp_path):
     """The corrected frame is the plane of the calibration but for a similarity."""
     found = some_calibration(unit="arcsec", pixel=0.05, angle=2.0, flip=True)
-    tables = registry.read_calibration(plain(write(tmp_path, found, "double")))
+    tables = registry.read_calibration(plain(write(tmp_path, found, precision="double")))
     j, i = np.indices((100, 150), float)
     x, y = i.ravel() + 1, j.ravel() + 1
     z = found.forward(x, y, chip=1) @ [1, -1j]  # mirrored
@@ -126,7 +122,7 @@ def test_sigmas_are_those_of_the_covariance(tmp_path):
 
 def test_the_magnitude_is_that_of_the_area(tmp_path):
     """By differences of corrected positions."""
-    file = stdgdc_of(read_content(write(tmp_path, some_calibration(), "double")))
+    file = stdgdc_of(read_content(write(tmp_path, some_calibration(), precision="double")))
     xy, xx = np.gradient(file.table("XGC"))
     yy, yx = np.gradient(file.table("YGC"))
     area = (xx * yy - xy * yx)[20, 30]
@@ -135,7 +131,7 @@ def test_the_magnitude_is_that_of_the_area(tmp_path):
 
 def test_areas_are_those_of_the_tables(tmp_path):
     """Of the five tables alone, whose polynomial is the identity: the file's own magnitudes."""
-    path = plain(write(tmp_path, some_calibration(strength=1.5), "double"))
+    path = plain(write(tmp_path, some_calibration(strength=1.5), precision="double"))
     one = registry.read_calibration(path).in_frame()[1]
     inside = slice(1, -1)  # at the edge a table ends at the centre of the pixel
     area, _ = pixel_areas(one, np.arange(2.0, 150), np.arange(2.0, 100))
@@ -149,7 +145,7 @@ def test_look_up_tables_go_into_the_file(tmp_path):
     table = LookupTable(1, np.random.default_rng(1).normal(0, 0.1, (2, 10, 15)), step=(10.0, 10.0),
                         first=(5.0, 5.0))  # fmt: skip
     found = replace(some_calibration(), before=(table,))
-    back = registry.read_calibration(write(tmp_path, found, "double"))
+    back = registry.read_calibration(write(tmp_path, found, precision="double"))
     x, y = (v.round() for v in pixels_inside())
     assert_allclose(back.forward(x, y, chip=1), found.forward(x, y, chip=1), atol=1e-9)
     assert_allclose(back.solution.cov, found.solution.cov, rtol=0, atol=0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import astropy.wcs
@@ -11,8 +12,7 @@ import pytest
 from astropy.io import fits
 from numpy.testing import assert_allclose
 
-from bayesdist.calibration.calibration import Calibration, calibration_of
-from bayesdist.calibration.plane import Plane
+from bayesdist.calibration.calibration import calibration_of
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.products import registry
@@ -22,9 +22,17 @@ from bayesdist.products.formats.tpv.head import tpv_of
 from tests.app.support import good
 
 from .skies import PROGRAMS, apart_mas, sky_by, sky_of
-from .support import StandIn, random_pixels, some_covariance, some_solution
+from .support import (
+    PIXEL,
+    POINT,
+    StandIn,
+    build_into,
+    on_sky,
+    random_pixels,
+    some_covariance,
+    some_solution,
+)
 
-POINT = (150.1, 2.2)
 # SCAMP's head of a mosaic: two chips of one exposure, CRPIX far off the chips, order 3
 _SCAMP = """\
 HISTORY   Astrometric solution by SCAMP version 2.10.0
@@ -76,19 +84,7 @@ def scamp_head() -> str:
     return _SCAMP.format(crpix1=-1066.5) + _SCAMP.format(crpix1=1087.25)
 
 
-def on_sky(order: int = 5, **what) -> Calibration:
-    solution = some_solution(
-        order, unit="arcsec", pixel=0.26, angle=0.4, flip=True, offset=(12.0, -30.0), **what
-    )
-    return calibration_of(solution, "made up", plane=Plane("sky", point=POINT), scale=(0.26, ""))
-
-
-def write(folder: Path, calibration: Calibration, options=BuildOptions(), **settings) -> Path:  # noqa: B008
-    for one in registry.build(
-        "tpv", calibration, registry.product_settings()["tpv"](**settings), options
-    ):
-        (folder / one.file_name).write_bytes(one.content)
-    return folder / "tpv.head"
+write = partial(build_into, "tpv")
 
 
 def header_of(path: Path) -> fits.Header:
@@ -100,7 +96,7 @@ def header_of(path: Path) -> fits.Header:
 @pytest.mark.parametrize("order", [1, 3, 7])
 def test_programs_have_the_sky_of_the_calibration(tmp_path, program, order):
     """A pixel of 260 mas: 1e-6 of it are 2.6e-4 mas."""
-    found = on_sky(order)
+    found = on_sky(order, (PIXEL, ""))
     x, y = random_pixels((1200.0, 900.0), 2000)
     theirs = sky_by(program, header_of(write(tmp_path, found)), x, y)
     assert apart_mas(sky_of(found, x, y), theirs) < 2.6e-4
@@ -108,7 +104,7 @@ def test_programs_have_the_sky_of_the_calibration(tmp_path, program, order):
 
 @pytest.mark.parametrize("order", [1, 4, 7])
 def test_what_is_read_back_is_the_calibration_with_its_covariance(tmp_path, order):
-    found = on_sky(order)
+    found = on_sky(order, (PIXEL, ""))
     back = registry.read_calibration(write(tmp_path, found))
     assert back.errors == "covariance" and back.unit == "arcsec"
     assert (back.plane.kind, back.plane.point) == ("sky", POINT)
@@ -120,7 +116,7 @@ def test_what_is_read_back_is_the_calibration_with_its_covariance(tmp_path, orde
 
 def test_the_header_alone_has_the_positions(tmp_path):
     """Without the file beside it; its own numbers, to rounding."""
-    found = on_sky(7)
+    found = on_sky(7, (PIXEL, ""))
     path = write(tmp_path, found)
     (tmp_path / "tpv_parameters.fits").unlink()
     back = registry.read_calibration(path)
@@ -131,7 +127,7 @@ def test_the_header_alone_has_the_positions(tmp_path):
 
 
 def test_crder_is_the_rms_error_over_the_detector(tmp_path):
-    found = on_sky(3)
+    found = on_sky(3, (PIXEL, ""))
     header = header_of(write(tmp_path, found))
     x, y = random_pixels((1200.0, 900.0), 100_000)
     cov = found.chip(origin="stated").covariance_at(x, y)
@@ -295,7 +291,7 @@ def test_bad_headers_get_a_sentence(tmp_path):
 
 
 def test_a_changed_header_does_not_take_the_errors_beside_it(tmp_path):
-    path = write(tmp_path, on_sky(3))
+    path = write(tmp_path, on_sky(3, (PIXEL, "")))
     text = path.read_text()
     value = header_of(path)["PV1_4"]
     path.write_text(text.replace(repr(value), repr(value * 1.01)))
@@ -313,11 +309,11 @@ def test_a_changed_header_does_not_take_the_errors_beside_it(tmp_path):
 )
 def test_what_tpv_cannot_hold_is_refused(tmp_path, change, message):
     with pytest.raises(InputError, match=message):
-        write(tmp_path, change(on_sky(3)), crval=(10.0, 10.0))
+        write(tmp_path, change(on_sky(3, (PIXEL, ""))), crval=(10.0, 10.0))
 
 
 def test_commands_take_heads(tmp_path):
-    path = write(tmp_path, on_sky(4))
+    path = write(tmp_path, on_sky(4, (PIXEL, "")))
     assert "covariance in tpv_parameters.fits" in good("inspect", path).out
     (tmp_path / "stars.csv").write_text("x,y\n600,400\n10,890\n")
     good("apply", path, tmp_path / "stars.csv", "-o", tmp_path / "out.csv")

@@ -98,11 +98,9 @@ def _released(
     for entry in entries:
         if entry["kind"] == "IDCTAB":
             one = read_calibration(folder / entry["path"], filter=filter)
-            after = (
-                ()
-                if npol is None
-                else [npol.table(c, one.pixel()[0] * npol.values(c), None) for c in npol.chips]
-            )
+            tables = [] if npol is None else [npol.table(chip) for chip in npol.chips]
+            pixel = one.pixel()[0]
+            after = [replace(table, values=pixel * table.values, sigma=None) for table in tables]
             sets[entry["period"]] = replace(one, before=tuple(before), after=tuple(after))
     segments: dict[int, Calibration] = {}
     for period in block.period:

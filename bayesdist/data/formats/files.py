@@ -10,7 +10,6 @@ from pathlib import Path
 
 from astropy.table import Table
 
-from bayesdist.data.formats.astrometrynet import is_astrometrynet
 from bayesdist.data.formats.hst1pass import is_hst1pass, is_matchup
 from bayesdist.errors import FormatError, InputError
 from bayesdist.mission import load_object, missions
@@ -20,6 +19,8 @@ from bayesdist.reading.text_tables import is_text_table
 
 PathLike = str | os.PathLike[str]
 
+# of the correspondences of astrometry.net (`corr.fits`): detections with their index stars
+CORR_COLUMNS = {"x": "field_x", "y": "field_y", "ra": "index_ra", "dec": "index_dec"}
 FORMATS = ("auto", "table", "hst1pass", "matchup", "astrometry.net")
 
 
@@ -104,7 +105,8 @@ def kind_of(file: Path, columns: Mapping[str, str] | None) -> str:
     name = file.name.lower().removesuffix(".gz")
     if name.endswith(tuple(TABLE_SUFFIXES)):
         if columns is None and name.endswith((".fits", ".fit")):
-            return "astrometry.net" if is_astrometrynet(read_table(file).colnames) else "table"
+            corr = set(CORR_COLUMNS.values()) <= set(read_table(file).colnames)
+            return "astrometry.net" if corr else "table"
         return "table"
     lines = [] if is_binary(file) else read_lines(file)
     if is_matchup(lines):

@@ -86,8 +86,7 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Any) -> Matches
 
     Examples
     --------
-    >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
     >>> paths = bd.write_partitioned([matches], "stars")
     >>> stars = bd.open_matches("stars")  # stays on disk
     >>> sum(len(batch) for batch in stars.batches())

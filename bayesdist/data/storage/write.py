@@ -66,8 +66,7 @@ def write_partitioned(
 
     Examples
     --------
-    >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
     >>> [path.name for path in bd.write_partitioned([matches, matches], "stars")]
     ['part-00000.parquet', 'part-00001.parquet']
     """

@@ -3,23 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.products.formats.common.asdf.format import Observatory
-from bayesdist.products.formats.common.asdf.tree import (
-    Detector,
-    PlacedSettings,
-    is_asdf,
-    plain,
-    tree_of,
-)
+from bayesdist.products.formats.common.asdf.tree import Detector, PlacedSettings, tree_of
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import Finding
-
-if TYPE_CHECKING:
-    from bayesdist.products.formats.common.asdf.build import ChipTransform
-    from bayesdist.products.formats.common.asdf.distortion import DistortionFile
 
 
 class Settings(PlacedSettings):
@@ -31,13 +21,8 @@ class Settings(PlacedSettings):
     exp_type: str | None = None
 
 
-def _parse(content: Content) -> DistortionFile | None:
-    """Any ASDF file that is not Roman's: of another kind it is refused."""
-    if not is_asdf(content):
-        return None
-    # astropy.modeling takes longer to import than other files to read
-    from bayesdist.products.formats.common.asdf.distortion import DistortionFile, transform_in
-
+def _node(content: Content) -> tuple[Mapping[str, Any], str] | None:
+    """Node of any ASDF file that is not Roman's: of another kind it is refused."""
     tree = tree_of(content)
     if "roman" in tree:
         return None
@@ -49,35 +34,11 @@ def _parse(content: Content) -> DistortionFile | None:
             where=content.name,
             do="give a distortion reference file of an imager",
         )
-    meta = plain(tree["meta"])
-    instrument = meta.setdefault("instrument", {})
-    record = tree.get("bayesdist")
-    return DistortionFile(
-        content.name,
-        "JWST",
-        transform_in(tree, "model", content.name),
-        meta,
-        (str(meta.get("input_units", "")), str(meta.get("output_units", ""))),
-        None if record is None else plain(record),
-        detector_of(instrument.get("name"), instrument.get("detector")),
-    )
+    return tree, "model"
 
 
-def _tree(one: ChipTransform, detector: str, settings: Settings, _: str) -> dict[str, Any]:
-    from bayesdist.products.formats.common.asdf.build import refuse_larger
-
-    meta = meta_of(detector, settings.model_dump(), "products.jwst")
-    refuse_larger(one, detector, detector_of(settings.instrument, detector), "products.jwst")
-    return {"meta": meta, "model": one.model, "bayesdist": one.record}
-
-
-_SHORT, _LONG = (
-    ("NRCA1", "NRCA2", "NRCA3", "NRCA4", "NRCB1", "NRCB2", "NRCB3", "NRCB4"),
-    (
-        "NRCALONG",
-        "NRCBLONG",
-    ),
-)
+_SHORT = ("NRCA1", "NRCA2", "NRCA3", "NRCA4", "NRCB1", "NRCB2", "NRCB3", "NRCB4")
+_LONG = ("NRCALONG", "NRCBLONG")
 _SIDE = (2048.0, 2048.0)
 # Scales: mean pixels of the FULL apertures in the SIAF (PRDOPSSOC-075).
 _DETECTORS = {
@@ -96,9 +57,9 @@ EXPOSURE_TYPES = {
 }
 
 
-def detector_of(instrument: object, detector: object) -> Detector | None:
-    """Size and scale of a detector; None if unknown."""
-    return _DETECTORS.get(str(instrument), {}).get(str(detector))
+def _detector(instrument: Mapping[str, Any]) -> Detector | None:
+    name, detector = str(instrument.get("name")), str(instrument.get("detector"))
+    return _DETECTORS.get(name, {}).get(detector)
 
 
 def module_and_channel(detector: str) -> tuple[str, str]:
@@ -106,27 +67,26 @@ def module_and_channel(detector: str) -> tuple[str, str]:
     return detector[3], "LONG" if detector in _LONG else "SHORT"
 
 
-def instrument_meta(
-    instrument: str, detector: str, filter: str | None, pupil: str | None, where: str
-) -> dict[str, Any]:
+def _instrument(detector: str, settings: Settings) -> dict[str, Any]:
     """Node meta.instrument; InputError for a detector that the instrument has not."""
+    instrument = settings.instrument
     known = _DETECTORS[instrument]
     if detector not in known:
         raise InputError(
             f"the detector is {detector!r}, none of {instrument}",
-            where=where,
+            where="products.jwst",
             do=f"choose one of {', '.join(known)}",
         )
     meta: dict[str, Any] = {"name": instrument, "detector": detector}
     if instrument == "NIRCAM":
         meta["module"], meta["channel"] = module_and_channel(detector)
-    if filter:
-        meta["filter"] = filter
-    if pupil:
-        meta["pupil"] = pupil
+    if settings.filter:
+        meta["filter"] = settings.filter
+    if settings.pupil:
+        meta["pupil"] = settings.pupil
     if instrument == "NIRCAM":
         # the data model asks for the pupils that the file is for
-        meta["p_pupil"] = f"{pupil or 'ANY'}|"
+        meta["p_pupil"] = f"{settings.pupil or 'ANY'}|"
     return meta
 
 
@@ -135,21 +95,15 @@ _REQUIRED = ("reftype", "description", "author", "pedigree", "useafter", "telesc
 _NIRCAM = ("module", "channel", "p_pupil")
 
 
-def meta_of(detector: str, settings: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Node for one detector; InputError as for `instrument_meta`."""
-    instrument = settings["instrument"]
+def _meta(detector: str, settings: Settings) -> dict[str, Any]:
+    """Node meta of the file of one detector."""
     return {
         "telescope": "JWST",
         "reftype": "distortion",
         "model_type": "DistortionModel",
-        "pedigree": settings["pedigree"],
-        "useafter": settings["useafter"],
-        "author": settings["author"],
-        "description": settings["description"],
-        "instrument": instrument_meta(
-            instrument, detector, settings["filter"], settings["pupil"], where
-        ),
-        "exposure": {"type": settings["exp_type"] or EXPOSURE_TYPES[instrument]},
+        **settings.identity(),
+        "instrument": _instrument(detector, settings),
+        "exposure": {"type": settings.exp_type or EXPOSURE_TYPES[settings.instrument]},
         "input_units": "pix",
         "output_units": "arcsec",
     }
@@ -184,5 +138,11 @@ def lint_meta(meta: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 FORMAT = Observatory[Settings](
-    "jwst", "JWST", _parse, lint_meta, lambda settings: settings.instrument, _tree
+    "jwst",
+    "JWST",
+    _node,
+    _detector,
+    lint_meta,
+    _meta,
+    lambda meta, model, record, _: {"meta": meta, "model": model, "bayesdist": record},
 ).format("a JWST distortion reference file", 7, Settings)

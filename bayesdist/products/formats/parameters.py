@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from bayesdist.calibration.calibration import Calibration
 from bayesdist.products.formats.common.content import Content, Hdu
-from bayesdist.products.formats.common.document import Choice, Format, finding_lines
+from bayesdist.products.formats.common.document import Format, finding_lines
 from bayesdist.products.formats.common.parameters import stored_calibration, stored_in
 
 
@@ -14,10 +13,6 @@ def _parse(content: Content) -> tuple[str, Hdu] | None:
     if hdu is None or not hdu.number == len(content.tables) - 1 == 1:
         return None
     return content.name, hdu
-
-
-def _calibration(table: tuple[str, Hdu], name: str, _: Choice) -> Calibration:
-    return stored_calibration(table[1], name)
 
 
 def _describe(table: tuple[str, Hdu]) -> list[str]:
@@ -41,5 +36,5 @@ FORMAT = Format(
     30,
     _parse,
     _describe,
-    calibration=_calibration,
+    calibration=lambda table, name, _: stored_calibration(table[1], name),
 )

@@ -8,22 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.products.formats.common.asdf.format import Observatory
-from bayesdist.products.formats.common.asdf.tree import (
-    Detector,
-    PlacedSettings,
-    is_asdf,
-    plain,
-    tagged,
-    tree_of,
-)
+from bayesdist.products.formats.common.asdf.tree import Detector, PlacedSettings, tagged, tree_of
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import Finding
 
 if TYPE_CHECKING:
     from astropy.time import Time
-
-    from bayesdist.products.formats.common.asdf.build import ChipTransform
-    from bayesdist.products.formats.common.asdf.distortion import DistortionFile
 
 KEY = "coordinate_distortion_transform"
 
@@ -34,13 +24,10 @@ class Settings(PlacedSettings):
     optical_element: str
 
 
-def _parse(content: Content) -> DistortionFile | None:
-    """ASDF files with the node roman: of another kind they are refused."""
-    if not is_asdf(content) or b"\nroman:" not in content.raw:
+def _node(content: Content) -> tuple[Mapping[str, Any], str] | None:
+    """Node roman of an ASDF file: of another kind than ours it is refused."""
+    if b"\nroman:" not in content.raw:
         return None
-    # astropy.modeling takes longer to import than other files to read
-    from bayesdist.products.formats.common.asdf.distortion import DistortionFile, transform_in
-
     tree = tree_of(content).get("roman")
     if not isinstance(tree, Mapping) or KEY not in tree or "meta" not in tree:
         held = ", ".join(sorted(tree)) if isinstance(tree, Mapping) else "nothing"
@@ -49,26 +36,7 @@ def _parse(content: Content) -> DistortionFile | None:
             where=content.name,
             do="give a distortion reference file of the WFI",
         )
-    meta = plain(tree["meta"])
-    instrument = meta.setdefault("instrument", {})
-    record = tree.get("bayesdist")
-    return DistortionFile(
-        content.name,
-        "Roman",
-        transform_in(tree, KEY, content.name),
-        meta,
-        units_of(meta),
-        None if record is None else plain(record),
-        detector_of(instrument.get("detector")),
-    )
-
-
-def _tree(one: ChipTransform, detector: str, settings: Settings, file: str) -> dict[str, Any]:
-    from bayesdist.products.formats.common.asdf.build import refuse_larger
-
-    meta = meta_of(detector, settings.model_dump(), "products.roman")
-    refuse_larger(one, detector, detector_of(detector), "products.roman")
-    return {"roman": tagged({"meta": meta, KEY: one.model, "bayesdist": one.record}, TAG, file)}
+    return tree, KEY
 
 
 # The newest one that both romancal 1.1 and roman_datamodels 1.2 read.
@@ -81,54 +49,42 @@ _WFI = Detector((4088.0, 4088.0), 0.1075)  # mean pixel of the FULL apertures: 0
 _REQUIRED = ("reftype", "description", "author", "pedigree", "useafter", "telescope", "origin")
 
 
-def detector_of(name: object) -> Detector | None:
-    """Size and scale of a detector of the WFI; None for any other."""
-    return _WFI if name in DETECTORS else None
-
-
-def units_of(meta: Mapping[str, Any]) -> tuple[str, str]:
-    """Units of input and output: pixel and arcsec by the schema, where a file states none."""
-    return str(meta.get("input_units", "pixel")), str(meta.get("output_units", "arcsec"))
-
-
-def meta_of(detector: str, settings: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Node for one detector; InputError for values that the schema does not allow."""
+def _meta(detector: str, settings: Settings) -> dict[str, Any]:
+    """Node meta of the file of one detector; InputError for values that the schema has not."""
     for key, value, allowed in (
         ("detector", detector, DETECTORS),
-        ("optical_element", settings["optical_element"], ELEMENTS),
+        ("optical_element", settings.optical_element, ELEMENTS),
     ):
         if value not in allowed:
             raise InputError(
                 f"{key} is {value!r}, none of the WFI",
-                where=where,
+                where="products.roman",
                 do=f"choose one of {', '.join(allowed)}",
             )
     return {
         "telescope": "ROMAN",
         "origin": "STSCI",
         "reftype": "DISTORTION",
-        "pedigree": settings["pedigree"],
-        "useafter": _time(settings["useafter"], where),
-        "author": settings["author"],
-        "description": settings["description"],
+        **settings.identity(),
+        "useafter": _time(settings.useafter),
         "instrument": {
             "name": "WFI",
             "detector": detector,
-            "optical_element": settings["optical_element"],
+            "optical_element": settings.optical_element,
         },
         "input_units": "pixel",
         "output_units": "arcsec",
     }
 
 
-def _time(text: str, where: str) -> Time:
+def _time(text: str) -> Time:
     from astropy.time import Time  # slow to import
 
     try:
         return Time(datetime.fromisoformat(text).isoformat(), format="isot", scale="utc")
     except ValueError as error:
         raise InputError(
-            f"useafter is {text!r}", where=where, do="write it as in 2026-10-01T00:00:00"
+            f"useafter is {text!r}", where="products.roman", do="write it as in 2026-10-01T00:00:00"
         ) from error
 
 
@@ -152,5 +108,14 @@ def lint_meta(meta: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 FORMAT = Observatory[Settings](
-    "roman", "Roman", _parse, lint_meta, lambda settings: "WFI", _tree
+    "roman",
+    "Roman",
+    _node,
+    lambda instrument: _WFI if instrument.get("detector") in DETECTORS else None,
+    lint_meta,
+    _meta,
+    lambda meta, model, record, file: {
+        "roman": tagged({"meta": meta, KEY: model, "bayesdist": record}, TAG, file)
+    },
+    units=("pixel", "arcsec"),  # by the schema
 ).format("a Roman distortion reference file", 6, Settings)

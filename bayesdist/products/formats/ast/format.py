@@ -1,15 +1,145 @@
-"""Format entry of AST mappings: their checks, and their description as text."""
+"""Format entry of AST mappings: built as dumps, one of each chip, and checked."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import comb
 
 import numpy as np
+from pydantic import PositiveFloat, PositiveInt
 
-from bayesdist.products.formats.ast.build import Settings, build
+from bayesdist.arrays import Float
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.plane import arcsec_per
+from bayesdist.errors import InputError
 from bayesdist.products.formats.ast.file import AstFile, ast_calibration, ast_of
 from bayesdist.products.formats.ast.mapping import PolyMap
-from bayesdist.products.formats.common.document import Finding, Format, finding_lines
+from bayesdist.products.formats.common.coefficients import require_regular, substitution
+from bayesdist.products.formats.common.document import (
+    PARAMETERS,
+    BuildOptions,
+    Built,
+    Finding,
+    Format,
+    FormatSettings,
+    finding_lines,
+)
+from bayesdist.products.formats.common.parameters import parameters_content
+
+
+class Settings(FormatSettings):
+    """Configuration of an AST mapping, and of its iterative inverse."""
+
+    n_iter: PositiveInt = 20
+    tolerance: PositiveFloat = 1e-12
+
+
+def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
+    """For each chip a mapping, and the file with its covariance."""
+    if calibration.before or calibration.after:
+        raise InputError(
+            "a PolyMap has no look-up tables", where="products.ast", do="convert it, which says "
+            "what is lost",
+        )  # fmt: skip
+    out = []
+    for number in calibration.numbers:
+        several = f"_{number}" if len(calibration.numbers) > 1 else ""
+        one = calibration.only(number, options.epoch)
+        side = f"ast{several}_parameters.fits"
+        text = _text(one, settings, options.scale_arcsec, side)
+        out += [
+            Built(side, PARAMETERS, parameters_content(one), one, number),
+            Built(f"ast{several}.txt", "AST", text.encode("ascii", "replace"), one, number),
+        ]
+    return tuple(out)
+
+
+def _text(
+    calibration: Calibration, settings: Settings, scale_arcsec: float | None, side: str
+) -> str:
+    """Dump of a chain: pixels from 0 to -1 .. 1 over the detector, then the polynomial."""
+    [(number, one)] = calibration.at(origin="stated").items()
+    arcsec = arcsec_per(one.unit, scale_arcsec)
+    poly = one.monomials()
+    require_regular(poly.linear, number)
+    nx, ny = one.basis.size
+    x, y = one.basis.reference_pixel
+    # powers of w in place of those of x - xref, where x - xref = half (w - zero)
+    half = np.diag([nx / 2, ny / 2])
+    zero = np.array([(x - 1) * 2 / nx - 1, (y - 1) * 2 / ny - 1])
+    scaled = poly.values @ substitution(one.basis.order, half).T * arcsec / 3600.0
+    values = scaled @ _moved(poly.terms, zero).T
+    rows = [(c, k, i, j) for k in (0, 1) for c, (i, j) in zip(values[k], poly.terms, strict=True)]
+    remarks = {
+        "unit": one.unit,
+        "arcsec": repr(float(arcsec)),
+        "plane": calibration.plane.kind,
+        "size": f"{nx!r} {ny!r}",
+        "reference": f"{float(x)!r} {float(y)!r}",
+        "parameters": side,
+    }
+    if calibration.numbered:
+        remarks["chip"] = str(number)
+    if calibration.plane.point is not None:
+        remarks["point"] = " ".join(repr(float(v)) for v in calibration.plane.point)
+    lines = [
+        "# Pixels, counted from 0, to degrees on the tangent plane, by bayesdist",
+        *(f"# {note}" for note in calibration.remarks),
+        *(f"# bayesdist {key} {value}" for key, value in remarks.items()),
+        " Begin CmpMap",
+        "    Nin = 2",
+        " IsA Mapping",
+        "    MapA =",
+        "       Begin WinMap",
+        "          Nin = 2",
+        "       IsA Mapping",
+        *(
+            f"          {name}{k} = {value!r}"
+            for k, n in ((1, nx), (2, ny))
+            for name, value in (("Sft", -1.0), ("Scl", 2.0 / float(n)))
+        ),
+        "       End WinMap",
+        "    MapB =",
+        "       Begin PolyMap",
+        *(f"          {line}" for line in _poly_lines(rows, settings)),
+        "       End PolyMap",
+        " End CmpMap",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _moved(terms: tuple[tuple[int, int], ...], zero: Float) -> Float:
+    """Matrix (K, K) whose column k has the powers of w of term k in w - zero."""
+    index = {term: k for k, term in enumerate(terms)}
+    out = np.zeros((len(terms), len(terms)))
+    for k, (i, j) in enumerate(terms):
+        for a in range(i + 1):
+            for b in range(j + 1):
+                by = comb(i, a) * (-zero[0]) ** (i - a) * comb(j, b) * (-zero[1]) ** (j - b)
+                out[index[a, b], k] += by
+    return out
+
+
+def _poly_lines(rows: list[tuple[float, int, int, int]], settings: Settings) -> list[str]:
+    highest = [max(row[2 + a] for row in rows) for a in (0, 1)]
+    half = len(rows) // 2
+    lines = ["   Nin = 2", "IsA Mapping"]
+    lines += [f"   MPF{k} = {n}" for k, n in enumerate(highest, start=1)]
+    lines += [f"   NCF{k} = {half}" for k in (1, 2)]
+    lines += [f"   CF{n} = {float(row[0])!r}" for n, row in enumerate(rows, start=1)]
+    lines += [
+        f"   PF{2 * n - 1 + a} = {row[2 + a]}"
+        for n, row in enumerate(rows, start=1)
+        for a in (0, 1)
+        if row[2 + a]
+    ]
+    return [
+        *lines,
+        "   IterInv = 1",
+        f"   NiterInv = {settings.n_iter}",
+        f"   TolInv = {settings.tolerance!r}",
+    ]
+
 
 _SKEW = 0.5  # sine of the angle between the axes, and ratio of their scales: no camera is below
 

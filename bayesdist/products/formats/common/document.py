@@ -7,8 +7,8 @@ a document, and a calibration is made from it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from astropy.io import fits
@@ -37,6 +37,11 @@ class Finding:
 
     def __str__(self) -> str:
         return f"{self.level}: {self.where}: {self.message}"
+
+
+def of_part(part: str, findings: Iterable[Finding]) -> list[Finding]:
+    """Findings in a part of a file, whose name stands before; empty for a file of one part."""
+    return [replace(one, where=f"{part}, {one.where}" if part else one.where) for one in findings]
 
 
 def repeated_values(coefficients: Mapping[str, float]) -> list[tuple[str, ...]]:
@@ -139,9 +144,6 @@ class Built:
     warnings: tuple[str, ...] = ()  # on what programs will make of it, for the terminal
 
 
-Builder = Callable[[Calibration, Any, BuildOptions], tuple[Built, ...]]
-
-
 @dataclass(frozen=True)
 class Format:
     """Format of files, as its functions.
@@ -184,7 +186,7 @@ class Format:
     lint: Callable[[Any], Sequence[Finding]] | None = None
     calibration: Callable[[Any, str, Choice], Calibration] | None = None
     settings: type[FormatSettings] | None = None
-    build: Builder | None = None
+    build: Callable[[Calibration, Any, BuildOptions], tuple[Built, ...]] | None = None
     read_back: Callable[[Sequence[Built], Calibration, BuildOptions], Sequence[ReadBack]] | None = (
         None
     )

@@ -153,15 +153,11 @@ def _further(header: fits.Header) -> list[dict[str, Any]]:
     return out
 
 
-def largest_difference(a: Calibration, b: Calibration) -> float:
-    """Largest distance of positions by two calibrations of the same chips and unit, pixels."""
-    worst = 0.0
-    for chip in a.model.chips:
-        x, y = detector_grid(chip.size, _GRID)
-        far = np.hypot(*(a.forward(x, y, chip=chip.number) - b.forward(x, y, chip=chip.number)).T)
-        pixel = np.sqrt(abs(np.linalg.det(a.chip(chip.number).linear)))
-        worst = max(worst, float(far.max() / pixel))
-    return worst
+def largest_difference(a: Calibration, b: Calibration, number: int, nodes: int = _GRID) -> float:
+    """Largest distance over a chip of positions by two calibrations in one unit, pixels."""
+    x, y = detector_grid(a.model.chips[a.model.chip_code(number)].size, nodes)
+    far = np.hypot(*(a.forward(x, y, chip=number) - b.forward(x, y, chip=number)).T)
+    return float(far.max() / np.sqrt(abs(np.linalg.det(a.chip(number).linear))))
 
 
 def refuse_other(far: float, most: float, where: str) -> None:
@@ -186,7 +182,8 @@ def agreeing(stored: Calibration, read: Calibration) -> Calibration:
             where=read.name,
             do="keep together what was written together",
         )
-    refuse_other(largest_difference(stored, read), AGREE, read.name)
+    far = max(largest_difference(stored, read, number) for number in stored.numbers)
+    refuse_other(far, AGREE, read.name)
     return replace(stored, name=read.name, before=read.before, after=read.after, notes=read.notes)
 
 

@@ -6,18 +6,20 @@ were fitted, their covariance, what fixes the gauge, and where they are from.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, Field, TypeAdapter
 
 from bayesdist.arrays import Float
-from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of_maps
-from bayesdist.calibration.further import further_from, further_records, scaled
-from bayesdist.calibration.plane import ARCSEC, Plane
-from bayesdist.errors import FormatError, InputError
+from bayesdist.calibration.calibration import Calibration, GaussianSolution
+from bayesdist.calibration.further import further_from
+from bayesdist.calibration.inverse import detector_grid
+from bayesdist.calibration.orientation import in_arcsec
+from bayesdist.calibration.plane import Plane, arcsec_per
+from bayesdist.errors import BayesdistError, FormatError, InputError
 from bayesdist.model import Chip, DistortionModel, LookupTable
 from bayesdist.reading.documents import model_of
 from bayesdist.version import __version__
@@ -111,29 +113,15 @@ def at_date(
             do="give the pixel scale (of convert: --scale)",
         )
     date = epoch if calibration.model.time is not None else None
-    factor = float(scale_arcsec or 1.0) if unit == "pix" else ARCSEC[unit]
-    one = calibration.chip(chip, date, origin="stated")
-    if unit != "arcsec":
-        one = replace(one.transformed(factor * np.eye(2)), unit="arcsec")
-    tables = [t for t in calibration.before if t.chip == chip]
+    factor = arcsec_per(unit, scale_arcsec)
+    made = in_arcsec(calibration.only(chip, date), factor)
     known = calibration.model.chips[calibration.model.chip_code(chip)]
-    made = calibration_of_maps(
-        {chip: one},
-        calibration.name,
-        cov=one.cov,
-        errors=calibration.errors,
-        plane=calibration.plane,
-        instrument=calibration.instrument,
-        detector=calibration.detector,
-        filter=calibration.filter,
-        numbered=calibration.numbered,
-        before=tuple(t for t in tables if t.filter in ("", calibration.filter)),
-        notes=calibration.notes,
-        further=scaled(calibration.further, factor),
+    model = replace(made.model, chips=(known,))  # with its name
+    return replace(
+        made,
+        solution=GaussianSolution(model, made.solution.mean, made.solution.cov),
+        before=tuple(t for t in made.before if t.filter in ("", calibration.filter)),
     )
-    model = replace(made.model, chips=(known,))
-    solution = GaussianSolution(model, made.solution.mean, made.solution.cov)
-    return replace(made, solution=solution)
 
 
 def record_of(
@@ -190,7 +178,7 @@ def record_of(
     if closure is not None:
         record["inverse"] = {"closure_pix": float(closure)}
     if calibration.further:
-        record["further_errors"] = further_records(calibration.further)
+        record["further_errors"] = [asdict(row) for row in calibration.further]
     if calibration.errors != "none":
         record["covariance"] = np.array(calibration.solution.cov, float)
     return record
@@ -269,3 +257,22 @@ def calibration_from(
         notes=(*source.notes, *(["has not converged"] if source.converged is False else [])),
         further=further_from(known.further_errors, where),
     )
+
+
+def error_lines(read: Callable[[], Calibration] | None, source: str) -> list[str]:
+    """Line of text on the errors of a record, by what reads it; None where there is no record."""
+    if read is None:
+        return ["  errors    none stated"]
+    try:
+        found = read()
+        [chip] = found.by_chip().values()
+        cov = chip.covariance_at(*detector_grid(chip.basis.size, 65))
+    except BayesdistError:
+        return [f"  errors    of {source} that cannot be read"]
+    if cov is None:
+        return ["  errors    none stated"]
+    sigma = 1e3 * np.sqrt((cov[:, 0, 0] + cov[:, 1, 1]) / 2)
+    return [
+        f"  errors    {found.errors}: {np.median(sigma):.3g} mas per axis at the median, "
+        f"{sigma.max():.3g} at worst"
+    ]

@@ -19,13 +19,13 @@ from astropy.io import fits
 from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
-from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import LookupTable
 from bayesdist.products.formats.common.content import Content, Hdu
 from bayesdist.products.formats.common.document import Choice, required_size
 from bayesdist.products.formats.common.parameters import (
+    largest_difference,
     refuse_changed,
     stored_calibration,
     stored_in,
@@ -230,10 +230,8 @@ def _of_ours(file: CpdisFile, stored: Calibration, found: Calibration) -> Calibr
     if header.get("BDTABLES", False):
         return replace(stored, after=tuple(_rest(stored, found, t) for t in found.before))
     for image in file.images:
-        x, y = detector_grid(stored.model.chips[stored.numbers.index(image.number)].size, 129)
-        far = found.forward(x, y, chip=image.number) - stored.forward(x, y, chip=image.number)
-        pixel = np.sqrt(abs(np.linalg.det(stored.chip(image.number).linear)))
-        refuse_changed(float(np.hypot(*far.T).max() / pixel), image.header, image.where)
+        off = largest_difference(stored, found, image.number, 129)
+        refuse_changed(off, image.header, image.where)
     return stored
 
 

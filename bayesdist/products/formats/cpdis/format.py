@@ -1,12 +1,171 @@
-"""Format entry of look-up tables by CPDIS and DP records."""
+"""Format entry of look-up tables by CPDIS and DP records, built on nodes as fine as asked for."""
 
 from __future__ import annotations
 
-from bayesdist.products.formats.common.document import Format
-from bayesdist.products.formats.cpdis.build import Settings, build
-from bayesdist.products.formats.cpdis.file import CpdisFile, cpdis_calibration, cpdis_of
+import numpy as np
+from astropy.io import fits
+from pydantic import PositiveFloat
+
+from bayesdist.arrays import Float
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.calibration.inverse import detector_grid
+from bayesdist.calibration.orientation import placed_at
+from bayesdist.calibration.plane import arcsec_per
+from bayesdist.model import LookupTable
+from bayesdist.products.formats.common.cards import (
+    append_cards,
+    convergence_cards,
+    node_cards,
+    number_card,
+    solution_cards,
+    tangent_cards,
+    text_card,
+    wrapped_cards,
+)
+from bayesdist.products.formats.common.coefficients import require_regular
+from bayesdist.products.formats.common.content import fits_bytes
+from bayesdist.products.formats.common.document import BuildOptions, Built, Format, FormatSettings
+from bayesdist.products.formats.common.parameters import parameters_hdu
+from bayesdist.products.formats.cpdis.file import (
+    ERRORS,
+    TABLES,
+    CpdisFile,
+    cpdis_calibration,
+    cpdis_of,
+)
 from bayesdist.products.formats.cpdis.lint import lint_cpdis
 from bayesdist.products.formats.sip.format import describe_wcs
+
+_CLOSE = 1e-4  # pixels: error between nodes that is aimed at where no step is asked for
+_STEPS = (64.0, 32.0, 16.0, 8.0, 4.0)  # pixels
+_MOST = 1025  # nodes of an axis
+_CHECK = 397  # points of each axis at which the tables are compared with the map
+
+
+class Settings(FormatSettings):
+    """Configuration of a file with look-up tables."""
+
+    step: PositiveFloat | None = None  # pixels between nodes; as many as leave 1e-4 pixels
+    crval: tuple[float, float] | None = None
+
+
+def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
+    """The file, with its largest error in pixels: of rounding, and between its nodes."""
+    scale = options.scale_arcsec
+    calibration = placed_at(calibration, settings.crval, scale, where="products.cpdis")
+    plane, unit = calibration.plane, calibration.unit
+    arcsec = arcsec_per(unit, scale)
+    maps = calibration.with_tables(calibration.at(options.epoch, origin="stated"))
+    images, tables, worst = [], [], 0.0
+    for k, (number, one) in enumerate(maps.items()):
+        linear, crpix = _linear_part(one, number)
+        table, off = _sampled(one, linear, crpix, settings.step)
+        worst = max(worst, off)
+        versions = (2 * k + 1, 2 * k + 2)
+        ctype, crval = ("RA---TAN", "DEC--TAN"), plane.point or (0.0, 0.0)
+        cards = tangent_cards(ctype, crval, crpix, linear * arcsec / 3600)
+        if plane.point is None:
+            cards.append(text_card("COMMENT", "CRVAL is a placeholder."))
+        cards += _record_cards(table, versions)
+        cards.append(number_card("BDWORST", off, "[pix] of rounding and between nodes"))
+        if one.before or one.after:
+            cards.append(number_card("BDTABLES", 1, "look-up tables are in it"))
+        cards += solution_cards(plane.kind, unit, arcsec, number, one.basis.size)
+        cards += wrapped_cards("COMMENT", calibration.remarks)
+        cards += convergence_cards(calibration.solution)
+        image = fits.ImageHDU(name="SCI", ver=k + 1)
+        append_cards(image, cards)
+        images.append(image)
+        sigma = _sigma(one, linear, table)
+        for axis, version in enumerate(versions):
+            tables.append(_table_hdu(TABLES, version, table.values[axis], table))
+            if sigma is not None:
+                tables.append(_table_hdu(ERRORS, version, sigma[axis], table))
+    parameters = parameters_hdu(calibration, options.epoch)
+    content = fits_bytes([fits.PrimaryHDU(), *images, *tables, parameters])
+    return (Built("cpdis.fits", "CPDIS", content, calibration, None, {"tables_pix": worst}),)
+
+
+def _linear_part(one: ChipMap, number: int) -> tuple[Float, tuple[float, float]]:
+    """Linear part (2, 2) of the polynomial, and the pixel at which it has (u, v) = 0."""
+    poly = one.monomials()
+    require_regular(poly.linear, number)
+    zero = np.array(one.basis.reference_pixel) - np.linalg.solve(poly.linear, poly.constant)
+    return poly.linear, (float(zero[0]), float(zero[1]))
+
+
+def _sampled(
+    one: ChipMap, linear: Float, crpix: tuple[float, float], step: float | None
+) -> tuple[LookupTable, float]:
+    """Table of the shifts in single precision, and its largest error, pixels."""
+    if one.basis.order == 1 and len(one.before) == 1 and not one.after:
+        table = one.before[0]
+        return _checked(one, linear, crpix, table.first, table.step, table.shape[::-1])
+    for asked in _STEPS if step is None else (step,):
+        counts = [int(min(max(np.ceil(n / asked), 1), _MOST - 1)) + 1 for n in one.basis.size]
+        steps = [n / (count - 1) for n, count in zip(one.basis.size, counts, strict=True)]
+        found = _checked(
+            one, linear, crpix, (0.5, 0.5), (steps[0], steps[1]), (counts[0], counts[1])
+        )
+        if found[1] <= _CLOSE:
+            break
+    return found
+
+
+def _checked(
+    one: ChipMap,
+    linear: Float,
+    crpix: tuple[float, float],
+    first: tuple[float, float],
+    step: tuple[float, float],
+    counts: tuple[int, int],
+) -> tuple[LookupTable, float]:
+    def shifts(x: Float, y: Float) -> Float:
+        moved = np.linalg.solve(linear, one.at(x, y)) + np.array(crpix)[:, None]
+        return moved - np.stack([x, y])
+
+    x, y = np.meshgrid(*(f + s * np.arange(n) for f, s, n in zip(first, step, counts, strict=True)))
+    values = shifts(x.ravel(), y.ravel()).reshape(2, *x.shape).astype(np.float32)
+    table = LookupTable(one.chip or 1, np.asarray(values, float), first=first, step=step)
+    x, y = detector_grid(one.basis.size, _CHECK)
+    off = np.hypot(*(table.evaluate(x, y).T - shifts(x, y)))
+    return table, float(off.max())
+
+
+def _sigma(one: ChipMap, linear: Float, table: LookupTable) -> Float | None:
+    """Standard errors (2, ny, nx) of the nodes, pixels; None without errors."""
+    cov = one.covariance_at(*(v.ravel() for v in np.meshgrid(*table.nodes())))
+    if cov is None:
+        return None
+    back = np.linalg.inv(linear)
+    moved = back @ cov @ back.T
+    return np.sqrt(moved.diagonal(axis1=1, axis2=2)).T.reshape(2, *table.shape)
+
+
+def _record_cards(table: LookupTable, versions: tuple[int, int]) -> list[str]:
+    """Cards of CPDIS and of the DP records."""
+    cards = []
+    for axis, version in enumerate(versions, start=1):
+        largest = float(np.abs(table.values[axis - 1]).max())
+        cards += [
+            text_card(f"CPDIS{axis}", "LOOKUP", "prior distortion by a table"),
+            number_card(f"CPERR{axis}", largest, "[pix] largest correction"),
+            *(
+                text_card(f"DP{axis}", f"{field}: {value:.1f}")
+                for field, value in (
+                    ("EXTVER", version), ("NAXES", 2), ("AXIS.1", 1), ("AXIS.2", 2),
+                )
+            ),
+        ]  # fmt: skip
+    return cards
+
+
+def _table_hdu(name: str, version: int, plane: Float, table: LookupTable) -> fits.ImageHDU:
+    hdu = fits.ImageHDU(np.asarray(plane, np.float32), name=name, ver=version)
+    append_cards(hdu, node_cards(table))
+    hdu.header["BUNIT"] = "pixel"
+    return hdu
 
 
 def _describe(file: CpdisFile) -> list[str]:

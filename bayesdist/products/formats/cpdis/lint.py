@@ -7,7 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from bayesdist.errors import FormatError
-from bayesdist.products.formats.common.document import Choice, Finding, MissingSizeError
+from bayesdist.products.formats.common.document import (
+    Choice,
+    Finding,
+    MissingSizeError,
+    of_part,
+)
 from bayesdist.products.formats.cpdis.file import (
     ERRORS,
     TABLES,
@@ -28,9 +33,9 @@ def lint_cpdis(file: CpdisFile) -> tuple[Finding, ...]:
     """Findings in a file with CPDIS look-up tables."""
     out: list[Finding] = []
     for image in file.images:
-        prefix = f"{image.hdu.label}, " if len(file.images) > 1 else ""
+        part = image.hdu.label if len(file.images) > 1 else ""
         found = (*_records(image), *_tables(image), *_linear(image), *_alternates(image))
-        out += [Finding(f.level, prefix + f.where, f.message) for f in found]
+        out += of_part(part, found)
     if not [f for f in out if f.level == "error"]:
         try:
             cpdis_calibration(file, file.name, Choice())

@@ -12,12 +12,14 @@ from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import InputError
 from bayesdist.infer.solution import Solution
 from bayesdist.products.formats.common.cards import (
+    append_cards,
     convergence_cards,
     number_card,
     text_card,
     wrapped_cards,
 )
 from bayesdist.products.formats.common.content import hdus_of
+from bayesdist.products.formats.idctab.drift import rates_of
 from bayesdist.products.formats.idctab.hdus import (
     Piece,
     closure_cards,
@@ -127,16 +129,10 @@ def idctab_from_solution(
 
     Examples
     --------
-    >>> chip = bd.Chip(1, "WFC2", (4096, 2048), (2048.0, 1024.0))
-    >>> model = bd.DistortionModel(1, (chip,))
-    >>> theta = np.zeros(model.n_params)
-    >>> theta[model.coefficient_slice(None, 0)] = model.basis().from_monomials([0.0, 1.0, 0.0])
-    >>> theta[model.coefficient_slice(None, 1)] = model.basis().from_monomials([0.0, 0.0, 1.0])
-    >>> matches, _ = bd.simulate_matches(model, theta, 500, rng=np.random.default_rng(1))
-    >>> fit = bd.fit_linear(matches, model)
-    >>> tab = bd.idctab_from_solution(
-    ...     fit, instrument="ACS", detector="WFC", scale_arcsec=0.05, filters=[("F606W", "CLEAR2L")]
-    ... )
+    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
+    >>> camera = {"instrument": "WFC3", "detector": "IR", "scale_arcsec": 0.13}
+    >>> tab = bd.idctab_from_solution(fit, **camera, filters=["F160W"])
     >>> [int(row["DETCHIP"]) for row in tab.rows]
     [1]
     """
@@ -168,7 +164,7 @@ def idctab_from_solution(
 
     texts = {"DESCRIP": description, "USEAFTER": useafter, "PEDIGREE": pedigree}
     primary = fits.PrimaryHDU()
-    for card in [
+    cards = [
         text_card("INSTRUME", instrument),
         text_card("DETECTOR", detector),
         number_card("NORDER", model.order, "order of the polynomials"),
@@ -180,8 +176,8 @@ def idctab_from_solution(
         *closure_cards(pieces),
         *convergence_cards(first.solution),
         *wrapped_cards("HISTORY", history, 72),
-    ]:
-        primary.header.append(fits.Card.fromstring(card), end=True)
+    ]
+    append_cards(primary, cards)
     hdus = [
         primary,
         coefficient_hdu(pieces, scale),
@@ -282,16 +278,14 @@ def _check_alike(
     if a.time is None:
         return
     same = b.time is not None and a.time.epoch0 == b.time.epoch0
-    if same and b.time is not None:
+    if same:
         mine, theirs = (
             {
-                (chip.number, term): float(value)
-                for chip in m.chips
-                for term, value in zip(
-                    time.terms, np.asarray(s.solution.mean)[m.tdd_slice(chip.number)], strict=True
-                )
+                (chip.number, term): rate
+                for chip in one.model.chips
+                for term, rate in rates_of(one.solution, chip.number)[0].items()
             }
-            for s, m, time in ((calibration, a, a.time), (first, b, b.time))
+            for one in (calibration, first)
         )
         scale = max(map(abs, theirs.values()), default=0.0)
         same = all(

@@ -177,8 +177,8 @@ def _lost(
     span = max(abs(t - model.time.epoch0[0]) for t in years)
     out = []
     for chip in model.chips:
-        rates, sigmas = _rates(view, chip.number)
-        stored = {} if like is None else _rates(like, chip.number)[0]
+        rates, sigmas = rates_of(view, chip.number)
+        stored = {} if like is None else rates_of(like, chip.number)[0]
         for term in dict.fromkeys([*rates, *stored]):
             if term in kept:
                 continue
@@ -196,7 +196,7 @@ def _lost(
     return tuple(out)
 
 
-def _rates(solution: Solution, chip: int) -> tuple[dict[Term, float], dict[Term, float]]:
+def rates_of(solution: Solution, chip: int) -> tuple[dict[Term, float], dict[Term, float]]:
     """Rates and their sigmas, for a model of one segment."""
     model = solution.model
     if model.time is None:

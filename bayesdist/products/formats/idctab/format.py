@@ -11,7 +11,6 @@ from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import (
     BuildOptions,
     Built,
-    Choice,
     Format,
     FormatSettings,
     finding_lines,
@@ -139,10 +138,6 @@ def _parse(content: Content) -> IdcTab | None:
     return IdcTab(hdus, content.name)
 
 
-def _calibration(tab: IdcTab, _: str, choice: Choice) -> Calibration:
-    return idctab_calibration(tab, choice.filter)
-
-
 def _build(
     calibration: Calibration, settings: Settings, options: BuildOptions
 ) -> tuple[Built, ...]:
@@ -163,7 +158,7 @@ FORMAT = Format(
     _parse,
     describe_idctab,
     lint_idctab,
-    _calibration,
+    lambda tab, _, choice: idctab_calibration(tab, choice.filter),
     Settings,
     _build,
     highest_order=HIGHEST,

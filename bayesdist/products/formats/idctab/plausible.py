@@ -30,32 +30,34 @@ def rows_text(indices: Iterable[int]) -> str:
     return f"row{'s' if len(numbers) > 1 else ''} {shown}{more}"
 
 
+def _beyond(value: float, name: str) -> str:
+    least, most, unit = LIMITS[name]
+    return f"{value:g} is not between {least:g} and {most:g} {unit}"
+
+
 def implausible(tab: IdcTab) -> Iterator[Finding]:
     """Findings on finite values that cannot be meant."""
     if not len(tab.rows):
         yield Finding("error", "rows", "there are none")
-    for name, (least, most, unit) in LIMITS.items():
+    for name, (least, most, _) in LIMITS.items():
         if name in tab.columns:
             values = tab.rows[name].astype(float)
             bad = np.flatnonzero((values < least) | (values > most))
             if name == "SCALE":
                 bad = bad[values[bad] != 0]  # which is a finding of its own
             if bad.size:
-                yield Finding(
-                    "error",
-                    f"{rows_text(bad)}, column {name}",
-                    f"{values[bad[0]]:g} is not between {least:g} and {most:g} {unit}",
-                )
+                where = f"{rows_text(bad)}, column {name}"
+                yield Finding("error", where, _beyond(values[bad[0]], name))
 
 
 def refuse_implausible(tab: IdcTab, rows: Iterable[int]) -> None:
     """Refuse rows of a table that a calibration cannot be made of."""
     for row in rows:
-        for name, (least, most, unit) in LIMITS.items():
+        for name, (least, most, _) in LIMITS.items():
             value = float(tab.rows[name][row]) if name in tab.columns else least
             if not least <= value <= most:
                 raise FormatError(
-                    f"{value:g} is not between {least:g} and {most:g} {unit}",
+                    _beyond(value, name),
                     where=f"{tab.name}, row {row + 1}, column {name}",
                     do="correct the table, or fetch it again",
                 )

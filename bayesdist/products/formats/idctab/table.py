@@ -37,6 +37,8 @@ from bayesdist.products.formats.common.content import Hdu, read_hdus, write_hdus
 from bayesdist.products.formats.idctab.drift import drift, scheme_of
 from bayesdist.products.formats.idctab.hst import serves
 
+Filter = str | Sequence[str] | None  # one name, or those of both wheels
+
 FILTER_COLUMNS = ("FILTER1", "FILTER2", "FILTER", "OPT_ELEM")
 HIGHEST = 9  # order: CX and CY have one digit for each power
 # The chip to whose zero point stwcs refers both chips of ACS/WFC and of WFC3/UVIS.
@@ -62,16 +64,10 @@ class IdcTab:
 
     Examples
     --------
-    >>> chip = bd.Chip(1, "WFC2", (4096, 2048), (2048.0, 1024.0))
-    >>> model = bd.DistortionModel(1, (chip,))
-    >>> theta = np.zeros(model.n_params)
-    >>> theta[model.coefficient_slice(None, 0)] = model.basis().from_monomials([0.0, 1.0, 0.0])
-    >>> theta[model.coefficient_slice(None, 1)] = model.basis().from_monomials([0.0, 0.0, 1.0])
-    >>> matches, _ = bd.simulate_matches(model, theta, 500, rng=np.random.default_rng(1))
-    >>> fit = bd.fit_linear(matches, model)
-    >>> tab = bd.idctab_from_solution(
-    ...     fit, instrument="ACS", detector="WFC", scale_arcsec=0.05, filters=[("F606W", "CLEAR2L")]
-    ... )
+    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
+    >>> camera = {"instrument": "WFC3", "detector": "IR", "scale_arcsec": 0.13}
+    >>> tab = bd.idctab_from_solution(fit, **camera, filters=["F160W"])
     >>> len(tab.rows)  # without an inverse
     1
     """
@@ -209,12 +205,7 @@ class IdcTab:
 
     # -- one row ---------------------------------------------------------------------------------
 
-    def row(
-        self,
-        chip: int,
-        filter: str | Sequence[str] | None = None,
-        direction: str = "FORWARD",
-    ) -> int:
+    def row(self, chip: int, filter: Filter = None, direction: str = "FORWARD") -> int:
         """Index of the row that stwcs would use.
 
         Parameters
@@ -249,12 +240,7 @@ class IdcTab:
             )
         return int(found[0])
 
-    def matching_rows(
-        self,
-        chip: int,
-        filter: str | Sequence[str] | None = None,
-        direction: str = "FORWARD",
-    ) -> Int:
+    def matching_rows(self, chip: int, filter: Filter = None, direction: str = "FORWARD") -> Int:
         """Indices of all rows of a chip, filter and direction.
 
         Parameters
@@ -302,10 +288,7 @@ class IdcTab:
         return x, y
 
     def coefficients(
-        self,
-        chip: int,
-        filter: str | Sequence[str] | None = None,
-        direction: str = "FORWARD",
+        self, chip: int, filter: Filter = None, direction: str = "FORWARD"
     ) -> tuple[Float, Float]:
         """Coefficients of x^i y^j, for (i, j) in `terms`.
 
@@ -333,7 +316,7 @@ class IdcTab:
         x: ArrayLike,
         y: ArrayLike,
         *,
-        filter: str | Sequence[str] | None = None,
+        filter: Filter = None,
         direction: str = "FORWARD",
         epoch: float | None = None,
     ) -> tuple[Float, Float]:
@@ -378,12 +361,7 @@ class IdcTab:
         return u, v
 
     def invert(
-        self,
-        chip: int,
-        Xc: ArrayLike,
-        Yc: ArrayLike,
-        *,
-        filter: str | Sequence[str] | None = None,
+        self, chip: int, Xc: ArrayLike, Yc: ArrayLike, *, filter: Filter = None
     ) -> tuple[Float, Float]:
         """Pixels of positions in the aperture's frame, by the INVERSE row.
 
@@ -434,16 +412,10 @@ def read_idctab(path: str | os.PathLike[str]) -> IdcTab:
 
     Examples
     --------
-    >>> chip = bd.Chip(1, "WFC2", (4096, 2048), (2048.0, 1024.0))
-    >>> model = bd.DistortionModel(1, (chip,))
-    >>> theta = np.zeros(model.n_params)
-    >>> theta[model.coefficient_slice(None, 0)] = model.basis().from_monomials([0.0, 1.0, 0.0])
-    >>> theta[model.coefficient_slice(None, 1)] = model.basis().from_monomials([0.0, 0.0, 1.0])
-    >>> matches, _ = bd.simulate_matches(model, theta, 500, rng=np.random.default_rng(1))
-    >>> fit = bd.fit_linear(matches, model)
-    >>> tab = bd.idctab_from_solution(
-    ...     fit, instrument="ACS", detector="WFC", scale_arcsec=0.05, filters=[("F606W", "CLEAR2L")]
-    ... )
+    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
+    >>> camera = {"instrument": "WFC3", "detector": "IR", "scale_arcsec": 0.13}
+    >>> tab = bd.idctab_from_solution(fit, **camera, filters=["F160W"])
     >>> bd.write_idctab(tab, "test_idc.fits")
     >>> bool((bd.read_idctab("test_idc.fits").rows == tab.rows).all())
     True
@@ -467,16 +439,10 @@ def write_idctab(tab: IdcTab, path: str | os.PathLike[str]) -> None:
 
     Examples
     --------
-    >>> chip = bd.Chip(1, "WFC2", (4096, 2048), (2048.0, 1024.0))
-    >>> model = bd.DistortionModel(1, (chip,))
-    >>> theta = np.zeros(model.n_params)
-    >>> theta[model.coefficient_slice(None, 0)] = model.basis().from_monomials([0.0, 1.0, 0.0])
-    >>> theta[model.coefficient_slice(None, 1)] = model.basis().from_monomials([0.0, 0.0, 1.0])
-    >>> matches, _ = bd.simulate_matches(model, theta, 500, rng=np.random.default_rng(1))
-    >>> fit = bd.fit_linear(matches, model)
-    >>> tab = bd.idctab_from_solution(
-    ...     fit, instrument="ACS", detector="WFC", scale_arcsec=0.05, filters=[("F606W", "CLEAR2L")]
-    ... )
+    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
+    >>> camera = {"instrument": "WFC3", "detector": "IR", "scale_arcsec": 0.13}
+    >>> tab = bd.idctab_from_solution(fit, **camera, filters=["F160W"])
     >>> bd.write_idctab(tab, "test_idc.fits")
     >>> bool((bd.read_idctab("test_idc.fits").rows == tab.rows).all())
     True

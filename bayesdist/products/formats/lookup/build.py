@@ -11,7 +11,7 @@ so that nothing changes there, then one that is positive and that no pixel reach
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -117,23 +117,28 @@ def _place_cards(table: LookupTable, version: int, size: tuple[int, int]) -> lis
     ]
 
 
-def identity_cards(instrument: str, detector: str, filetype: str, description: str) -> list[str]:
-    """Cards that every reference file has."""
-    return [
-        text_card("TELESCOP", "HST"),
-        text_card("INSTRUME", instrument),
-        text_card("DETECTOR", detector),
-        text_card("FILETYPE", filetype),
-        text_card("OBSTYPE", "IMAGING"),
-        text_card("DESCRIP", description),
-        text_card("CREATOR", "bayesdist"),
-    ]
-
-
-def optional_cards(useafter: str | None, pedigree: str | None, history: Sequence[str]) -> list[str]:
-    """Cards of values that only the user knows."""
-    return [
-        *([text_card("USEAFTER", useafter)] if useafter else []),
-        *([text_card("PEDIGREE", pedigree)] if pedigree else []),
-        *wrapped_cards("HISTORY", history),
-    ]
+def reference_cards(
+    instrument: str,
+    detector: str,
+    filetype: str,
+    description: str,
+    filters: Mapping[str, str],
+    useafter: str | None,
+    pedigree: str | None,
+    history: Sequence[str],
+) -> list[str]:
+    """Cards of a reference file, those of values that only the user knows at the end."""
+    texts = {
+        "TELESCOP": "HST",
+        "INSTRUME": instrument,
+        "DETECTOR": detector,
+        "FILETYPE": filetype,
+        "OBSTYPE": "IMAGING",
+        "DESCRIP": description,
+        "CREATOR": "bayesdist",
+        **filters,
+    }
+    known = {"USEAFTER": useafter, "PEDIGREE": pedigree}
+    texts |= {keyword: text for keyword, text in known.items() if text}
+    cards = [text_card(keyword, text) for keyword, text in texts.items()]
+    return cards + wrapped_cards("HISTORY", history)

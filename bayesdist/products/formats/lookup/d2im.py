@@ -9,10 +9,9 @@ from bayesdist.errors import InputError
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products.formats.lookup.build import (
     Part,
-    identity_cards,
     lookup_file,
     one_per_chip,
-    optional_cards,
+    reference_cards,
 )
 from bayesdist.products.formats.lookup.file import (
     LookupFile,
@@ -80,14 +79,13 @@ def write_d2im(
                 where=where,
                 do="give the tables of filters to write_npol",
             )
-    chips = one_per_chip(tables, where)
+    chips, kind = one_per_chip(tables, where), f"{detector} D2I FILE"
     file = lookup_file(
         [Part(t, t.values, t.sigma) for t in chips],
         size=size,
-        cards=[
-            *identity_cards(instrument, detector, f"{detector} D2I FILE", description),
-            *optional_cards(useafter, pedigree, history),
-        ],
+        cards=reference_cards(
+            instrument, detector, kind, description, {}, useafter, pedigree, history
+        ),
         name=str(path),
     )
     write_lookup_file(file, path)
@@ -127,4 +125,4 @@ def read_d2im(
     """
     file = read_lookup_file(path)
     check_kind(file, "d2im")
-    return tuple(file.table(c, file.values(c), file.sigma(c), first=first) for c in file.chips)
+    return tuple(file.table(chip, first=first) for chip in file.chips)

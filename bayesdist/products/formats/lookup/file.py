@@ -141,22 +141,19 @@ class LookupFile:
     def table(
         self,
         chip: int,
-        values: Float,
-        sigma: Float | None,
         *,
         filter: str = "",
         first: Sequence[float] | None = None,
     ) -> LookupTable:
-        """Values on the grid of a chip.
+        """Tables of a chip as they stand in the file, of a filter.
 
-        `values`, `sigma`: (2, ny, nx), pixels, as in `LookupTable`; `sigma` may be None. `filter`:
-        as in `LookupTable`. `first`: pixel (x, y) of the first node, in place of the file's own.
-        FormatError as `pair`, and for values that `LookupTable` refuses.
+        `first` is the pixel (x, y) of the first node, in place of the file's own.  FormatError as
+        `pair`, and for values that `LookupTable` refuses.
         """
         x, _ = self.pair(chip)
         place = x.first if first is None else (float(first[0]), float(first[1]))
         try:
-            return LookupTable(chip, values, filter, place, x.step, sigma)
+            return LookupTable(chip, self.values(chip), filter, place, x.step, self.sigma(chip))
         except InputError as error:
             raise FormatError(
                 error.cause, where=f"{self.name}, {error.where}", do=error.do

@@ -19,15 +19,14 @@ import numpy as np
 from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError, FormatError, InputError
 from bayesdist.model.lookup import LookupTable
-from bayesdist.products.formats.common.cards import number_card, text_card
+from bayesdist.products.formats.common.cards import number_card
 from bayesdist.products.formats.common.coefficients import evaluate
 from bayesdist.products.formats.idctab.table import IdcTab
 from bayesdist.products.formats.lookup.build import (
     Part,
-    identity_cards,
     lookup_file,
     one_per_chip,
-    optional_cards,
+    reference_cards,
 )
 from bayesdist.products.formats.lookup.file import (
     LookupFile,
@@ -91,18 +90,12 @@ def write_npol(
 
     Examples
     --------
-    >>> chip = bd.Chip(1, "WFC2", (4096, 2048), (2048.0, 1024.0))
-    >>> model = bd.DistortionModel(1, (chip,))
-    >>> theta = np.zeros(model.n_params)
-    >>> theta[model.coefficient_slice(None, 0)] = model.basis().from_monomials([0.0, 1.0, 0.0])
-    >>> theta[model.coefficient_slice(None, 1)] = model.basis().from_monomials([0.0, 0.0, 1.0])
-    >>> matches, _ = bd.simulate_matches(model, theta, 500, rng=np.random.default_rng(1))
-    >>> fit = bd.fit_linear(matches, model)
-    >>> tab = bd.idctab_from_solution(
-    ...     fit, instrument="ACS", detector="WFC", scale_arcsec=0.05, filters=[("F606W", "CLEAR2L")]
-    ... )
-    >>> table = bd.LookupTable(1, np.full((2, 32, 64), 0.1), filter="F606W")
-    >>> file = bd.write_npol([table], "test_npl.fits", idctab=tab, filters=("F606W", "CLEAR2L"))
+    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
+    >>> camera = {"instrument": "WFC3", "detector": "IR", "scale_arcsec": 0.13}
+    >>> tab = bd.idctab_from_solution(fit, **camera, filters=["F160W"])
+    >>> table = bd.LookupTable(1, np.full((2, 32, 64), 0.1), filter="F160W")
+    >>> file = bd.write_npol([table], "test_npl.fits", idctab=tab, filters=("F160W",))
     >>> (back,) = bd.read_npol("test_npl.fits", tab)
     >>> np.allclose(back.values, 0.1)
     True
@@ -138,17 +131,18 @@ def write_npol(
         worst = max(worst, local.error_mas(table, part.values))
         parts.append(part)
     labels = ("FILTER1", "FILTER2") if len(filters) == 2 else ("FILTER",)
-    file = lookup_file(
-        parts,
-        size=size,
-        cards=[
-            *identity_cards(idctab.instrument, idctab.detector, "DXY GRID", description),
-            *(text_card(k, v) for k, v in zip(labels, filters, strict=False)),
-            *optional_cards(useafter, pedigree, history),
-            number_card("BDNPLERR", worst, "[mas] largest error of the linear form"),
-        ],
-        name=str(path),
+    cards = reference_cards(
+        idctab.instrument,
+        idctab.detector,
+        "DXY GRID",
+        description,
+        dict(zip(labels, filters, strict=False)),
+        useafter,
+        pedigree,
+        history,
     )
+    cards.append(number_card("BDNPLERR", worst, "[mas] largest error of the linear form"))
+    file = lookup_file(parts, size=size, cards=cards, name=str(path))
     write_lookup_file(file, path)
     return file
 
@@ -185,18 +179,12 @@ def read_npol(
 
     Examples
     --------
-    >>> chip = bd.Chip(1, "WFC2", (4096, 2048), (2048.0, 1024.0))
-    >>> model = bd.DistortionModel(1, (chip,))
-    >>> theta = np.zeros(model.n_params)
-    >>> theta[model.coefficient_slice(None, 0)] = model.basis().from_monomials([0.0, 1.0, 0.0])
-    >>> theta[model.coefficient_slice(None, 1)] = model.basis().from_monomials([0.0, 0.0, 1.0])
-    >>> matches, _ = bd.simulate_matches(model, theta, 500, rng=np.random.default_rng(1))
-    >>> fit = bd.fit_linear(matches, model)
-    >>> tab = bd.idctab_from_solution(
-    ...     fit, instrument="ACS", detector="WFC", scale_arcsec=0.05, filters=[("F606W", "CLEAR2L")]
-    ... )
-    >>> table = bd.LookupTable(1, np.full((2, 32, 64), 0.1), filter="F606W")
-    >>> file = bd.write_npol([table], "test_npl.fits", idctab=tab, filters=("F606W", "CLEAR2L"))
+    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
+    >>> camera = {"instrument": "WFC3", "detector": "IR", "scale_arcsec": 0.13}
+    >>> tab = bd.idctab_from_solution(fit, **camera, filters=["F160W"])
+    >>> table = bd.LookupTable(1, np.full((2, 32, 64), 0.1), filter="F160W")
+    >>> file = bd.write_npol([table], "test_npl.fits", idctab=tab, filters=("F160W",))
     >>> (back,) = bd.read_npol("test_npl.fits", tab)
     >>> np.allclose(back.values, 0.1)
     True
@@ -205,9 +193,7 @@ def read_npol(
     check_kind(file, "npol")
     out = []
     for chip in file.chips:
-        stored = file.table(
-            chip, file.values(chip), file.sigma(chip), filter=filter_name(file), first=first
-        )
+        stored = file.table(chip, filter=filter_name(file), first=first)
         out.append(_Local(idctab, chip, file.filters).before(stored))
     return tuple(out)
 

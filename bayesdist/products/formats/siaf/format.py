@@ -1,38 +1,175 @@
-"""Format entry of SIAF tables of coefficients, and their description as text."""
+"""Format entry of SIAF tables of coefficients: described, built with their side file, read back."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
+from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.calibration.inverse import detector_grid
-from bayesdist.errors import BayesdistError, InputError
+from bayesdist.calibration.chip_map import ChipMap, Monomials
+from bayesdist.calibration.inverse import fit_inverse
+from bayesdist.errors import InputError, required
+from bayesdist.model.basis import polynomial_terms
+from bayesdist.products.formats.common.coefficients import require_regular
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import (
     PARAMETERS,
     BuildOptions,
     Built,
-    Choice,
     Format,
     FormatSettings,
     finding_lines,
 )
 from bayesdist.products.formats.common.read_back import ReadBack, of_chips
-from bayesdist.products.formats.common.record import calibration_from
+from bayesdist.products.formats.common.record import (
+    at_date,
+    calibration_from,
+    error_lines,
+    record_of,
+)
 from bayesdist.products.formats.siaf.lint import lint_siaf
 from bayesdist.products.formats.siaf.table import (
+    COLUMNS,
+    COVARIANCE,
     HIGHEST,
+    KEYWORDS,
     NAMES,
+    SIDE,
     SiafTable,
     holds_table,
     siaf_calibration,
     siaf_read_back,
+    side_name,
     table_of,
 )
+
+WHERE = "products.siaf"
+
+
+class Settings(FormatSettings):
+    """Configuration of a SIAF table of coefficients."""
+
+    aperture: str | None = None  # by default the names of the chips, or of the detector
+    order: Annotated[int, Field(ge=1, le=HIGHEST)] | None = None
+
+
+def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
+    """A side file and a table for each chip, in this order: whoever reads the table finds both."""
+    several = len(calibration.numbers) > 1
+    out: list[Built] = []
+    for chip in calibration.model.chips:
+        aperture = (chip.name if several else settings.aperture) or calibration.detector
+        if not aperture:
+            raise InputError(
+                "the aperture has no name",
+                where=WHERE,
+                do="give aperture, as in 'NIS_CEN' (of convert: --option aperture=NIS_CEN)",
+            )
+        out += _files(calibration, chip.number, aperture, settings.order, options)
+    return tuple(out)
+
+
+def _files(
+    calibration: Calibration, chip: int, aperture: str, order: int | None, options: BuildOptions
+) -> tuple[Built, Built]:
+    """Side file and table of one chip, at one date.
+
+    (u, v) are taken as Ideal coordinates of the aperture.  Look-up tables are left out.  `order` is
+    that of the rows and with it of the inverse, by default that of the polynomial; errors as for
+    `at_date` and `fit_inverse`.
+    """
+    one = at_date(calibration, chip, options.epoch, options.scale_arcsec, where=WHERE)
+    one = replace(one, before=())
+    known = one.chip(chip, origin="stated")
+    poly = known.monomials()
+    require_regular(poly.linear, chip)
+    rows_order = max(order or 0, known.basis.order)
+    columns = [*_forward(poly), *_inverse(known, rows_order)]
+    date = options.epoch if calibration.model.time is not None else None
+    name = f"siaf_distortion_{aperture}.txt".lower()
+    side = side_name(name)
+    size, reference = known.basis.size, known.basis.reference_pixel
+    tables = any(table.chip == chip for table in calibration.before)
+    head = [
+        f"{aperture} distortion coefficients by bayesdist",
+        f"from {calibration.name}" + ("" if date is None else f", at {date:g}"),
+        *calibration.notes,
+        *(["Look-up tables are left out."] if tables else []),
+        f"{COVARIANCE} {side}.",
+        *(f"{k} = {v!r}" for k, v in zip(KEYWORDS, (*size, *reference), strict=True)),
+    ]
+    lines = _lines(aperture, rows_order, columns)
+    table = table_of(Content("new table", _joined(head, lines)))
+    closure = required(table.closure(), "a new table states no size")
+    head.append(f"Idl2Sci of Sci2Idl misses a pixel by {closure:.2g} pixels at worst.")
+    record = record_of(one, calibration, epoch=date, closure=closure)
+    record["provenance"]["detector"] = aperture
+    values = {SIDE: 1, "table": name} | _covariance(poly) | {"bayesdist": record}
+    text = json.dumps(_listed(values), indent=1, allow_nan=False) + "\n"
+    return (
+        Built(side, PARAMETERS, text.encode("ascii"), record),
+        Built(name, "SIAF table", _joined(head, lines), table, chip, {"closure_pix": closure}),
+    )
+
+
+def _forward(poly: Monomials) -> list[dict[tuple[int, int], float]]:
+    return [dict(zip(poly.terms, c.tolist(), strict=True)) for c in poly.values]
+
+
+def _inverse(chip: ChipMap, order: int) -> list[dict[tuple[int, int], float]]:
+    """Terms of the way back by powers of the Ideal coordinates."""
+    sign = float(np.sign(np.linalg.det(chip.linear)))  # the fit wants axes that are not mirrored
+
+    def forward(x: Float, y: Float) -> tuple[Float, Float]:
+        u, v = chip.at(x, y)
+        return u, sign * v
+
+    reference, size = chip.basis.reference_pixel, chip.basis.size
+    out = []
+    for axis, terms in enumerate(fit_inverse(forward, reference, size, order)):
+        power = (1, 0) if axis == 0 else (0, 1)
+        whole = dict(terms) | {power: terms.get(power, 0.0) + 1.0}
+        out.append({(i, j): c * sign**j for (i, j), c in whole.items()})
+    return out
+
+
+def _lines(aperture: str, order: int, columns: Sequence[dict[tuple[int, int], float]]) -> list[str]:
+    width = max(len(aperture), len(COLUMNS[0]))
+    lines = [" , ".join([COLUMNS[0].rjust(width), *COLUMNS[1:4], *(n.rjust(24) for n in NAMES)])]
+    for i, j in polynomial_terms(order):
+        numbers = [f"{float(column.get((i, j), 0.0))!r:>24}" for column in columns]
+        cells = [aperture.rjust(width), f"{i + j}{j}".rjust(10), f"{i:>10}", f"{j:>10}"]
+        lines.append(" , ".join([*cells, *numbers]))
+    return lines
+
+
+def _joined(head: Sequence[str], lines: Sequence[str]) -> bytes:
+    plain = (f"# {line}" for text in head for line in text.splitlines())
+    return ("\n".join([*plain, "#", *lines]) + "\n").encode("ascii", "replace")
+
+
+def _covariance(poly: Monomials) -> dict[str, Any]:
+    """Coefficients of Sci2Idl with sigmas and covariance, u before v, under their SIAF names."""
+    names = [f"Sci2Idl{axis}{i + j}{j}" for axis in "XY" for i, j in poly.terms]
+    out: dict[str, Any] = {"names": names, "values": poly.values.ravel()}
+    if poly.cov is not None:
+        out["sigma"] = np.sqrt(np.maximum(np.diag(poly.cov), 0.0))
+        out["covariance"] = poly.cov
+    return out
+
+
+def _listed(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _listed(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_listed(one) for one in value]
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 
 
 def describe_siaf(table: SiafTable) -> list[str]:
@@ -64,70 +201,13 @@ def describe_siaf(table: SiafTable) -> list[str]:
 
 
 def _uncertainty(table: SiafTable) -> list[str]:
-    if table.record is None:
-        return ["  errors    none stated"]
-    try:
-        found = calibration_from(table.record, table.name)
-    except BayesdistError:
-        return ["  errors    of a side file that cannot be read"]
-    [chip] = found.by_chip().values()
-    cov = chip.covariance_at(*detector_grid(chip.basis.size, 65))
-    if cov is None:
-        return ["  errors    none stated"]
-    sigma = 1e3 * np.sqrt((cov[:, 0, 0] + cov[:, 1, 1]) / 2)
-    return [
-        f"  errors    {found.errors}: {np.median(sigma):.3g} mas per axis at the median, "
-        f"{sigma.max():.3g} at worst"
-    ]
-
-
-WHERE = "products.siaf"
-
-
-class Settings(FormatSettings):
-    """Configuration of a SIAF table of coefficients."""
-
-    aperture: str | None = None  # by default the names of the chips, or of the detector
-    order: Annotated[int, Field(ge=1, le=HIGHEST)] | None = None
+    record = table.record
+    found = None if record is None else lambda: calibration_from(record, table.name)
+    return error_lines(found, "a side file")
 
 
 def _parse(content: Content) -> SiafTable | None:
     return table_of(content) if holds_table(content) else None
-
-
-def _calibration(table: SiafTable, _: str, choice: Choice) -> Calibration:
-    return siaf_calibration(table, choice)
-
-
-def _build(
-    calibration: Calibration, settings: Settings, options: BuildOptions
-) -> tuple[Built, ...]:
-    """A table and its side file for each chip."""
-    # no file that is read needs it
-    from bayesdist.products.formats.siaf.build import siaf_files
-
-    several = len(calibration.numbers) > 1
-    out: list[Built] = []
-    for chip in calibration.model.chips:
-        aperture = (chip.name if several else settings.aperture) or calibration.detector
-        if not aperture:
-            raise InputError(
-                "the aperture has no name",
-                where=WHERE,
-                do="give aperture, as in 'NIS_CEN' (of convert: --option aperture=NIS_CEN)",
-            )
-        made = siaf_files(
-            calibration, chip.number, aperture, order=settings.order, options=options, where=WHERE
-        )
-        # the side file first: whoever reads the table finds it
-        out += [
-            Built(made.side_name, PARAMETERS, made.side_text.encode("ascii"), made),
-            Built(
-                made.name, "SIAF table", made.text.encode("ascii"), made.table, chip.number,
-                {"closure_pix": made.closure},
-            ),
-        ]  # fmt: skip
-    return tuple(out)
 
 
 def _read_back(files: Sequence[Built], *_: Any) -> list[ReadBack]:
@@ -147,9 +227,9 @@ FORMAT = Format(
     _parse,
     describe_siaf,
     lint_siaf,
-    _calibration,
+    siaf_calibration,
     Settings,
-    _build,
+    build,
     _read_back,
     highest_order=HIGHEST,
 )

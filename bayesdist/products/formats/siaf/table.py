@@ -265,7 +265,7 @@ def siaf_read_back(table: SiafTable) -> ReadBack:
     return ReadBack(table.name, forward, missed, own_axes=True)
 
 
-def siaf_calibration(table: SiafTable, choice: Choice) -> Calibration:
+def siaf_calibration(table: SiafTable, _: str, choice: Choice) -> Calibration:
     """Calibration in Ideal coordinates, with the covariance of the side file where both agree.
 
     MissingSizeError for a table of an unknown aperture without a size.

@@ -68,10 +68,8 @@ class SipHeader:
 
     Examples
     --------
-    >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
-    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
-    >>> fit = bd.fit_linear(matches, model)
+    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
     >>> sip = bd.sip_from_solution(fit, scale_arcsec=2.757)
     >>> sorted(sip.a)
     [(0, 2), (1, 1), (2, 0)]

@@ -45,10 +45,8 @@ def read_sip(path: str | os.PathLike[str], *, ext: int | str | None = None) -> S
 
     Examples
     --------
-    >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
-    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
-    >>> fit = bd.fit_linear(matches, model)
+    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
     >>> bd.write_sip(bd.sip_from_solution(fit, scale_arcsec=2.757), "sip.hdr")
     >>> bd.read_sip("sip.hdr").ctype
     ('RA---TAN-SIP', 'DEC--TAN-SIP')

@@ -1,13 +1,134 @@
-"""Format entry of STDGDC files."""
+"""Format entry of STDGDC files: built with the position of every pixel and its error."""
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any, Literal
 
-from bayesdist.products.formats.common.document import Format, finding_lines
-from bayesdist.products.formats.stdgdc.build import Settings, build
-from bayesdist.products.formats.stdgdc.file import SIGMAS, StdGdc, stdgdc_calibration, stdgdc_of
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from bayesdist.arrays import Float
+from bayesdist.calibration.area import pixel_areas
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.calibration.inverse import check_one_to_one, detector_grid
+from bayesdist.errors import InputError
+from bayesdist.model import LookupTable
+from bayesdist.products.formats.common.cards import (
+    append_cards,
+    convergence_cards,
+    number_card,
+    wrapped_cards,
+)
+from bayesdist.products.formats.common.content import fits_bytes
+from bayesdist.products.formats.common.document import (
+    BuildOptions,
+    Built,
+    Format,
+    FormatSettings,
+    finding_lines,
+)
+from bayesdist.products.formats.common.parameters import parameters_hdu
+from bayesdist.products.formats.stdgdc.file import (
+    EXTENSIONS,
+    SIGMAS,
+    CorrectedFrame,
+    StdGdc,
+    frame_of,
+    stdgdc_calibration,
+    stdgdc_of,
+)
 from bayesdist.products.formats.stdgdc.lint import lint_stdgdc
+
+_BETWEEN = 997  # points along each axis at most, between pixels, at which the tables are checked
+_LARGEST = 2**26  # pixels: beyond it a detector is a misprint
+
+
+class Settings(FormatSettings):
+    """Configuration of an STDGDC file."""
+
+    precision: Literal["single", "double"] = "single"
+
+
+def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
+    """The file, with its largest error in pixels: of rounding, and between its nodes."""
+    if len(calibration.numbers) > 1:
+        raise InputError(
+            f"an STDGDC file is of one detector, and this one has the chips "
+            f"{', '.join(map(str, calibration.numbers))}",
+            where="products.stdgdc",
+            do="convert them one by one with --chip",
+        )
+    number = calibration.numbers[0]
+    one = calibration.with_tables(calibration.at(options.epoch, origin="stated"))[number]
+    nx, ny = (int(n) for n in one.basis.size)
+    if nx * ny > _LARGEST:
+        raise InputError(f"the detector has {nx} x {ny} pixels", where="products.stdgdc")
+    x, y = detector_grid(one.basis.size, 65)
+    areas = np.linalg.det(one.slope(x, y)) / np.linalg.det(one.linear)
+    U, V = one.at(x, y)
+    check_one_to_one(U, V, 65, areas)
+    frame = frame_of(one, calibration.scale)
+    planes = _planes(one, frame, (nx, ny), settings.precision)
+    worst = _error(one, frame, np.asarray(planes["XGC"], float), np.asarray(planes["YGC"], float))
+    primary = fits.PrimaryHDU()
+    header = primary.header
+    for name in ("XGC", "YGC", "XCG", "YCG"):
+        header[f"HIERARCH NDIM_{name}"] = nx if name[0] == "X" else ny
+    for name in ("XGC", "YGC"):
+        header[f"HIERARCH {name}_0"] = 0
+    header["BDCHIP"] = number, "chip number"
+    if one.before or one.after:
+        header["BDTABLES"] = True, "XGC and YGC hold look-up tables, too"
+    if calibration.detector:
+        header["DETECTOR"] = calibration.detector
+    if calibration.filter:
+        header["FILTER"] = calibration.filter
+    stated = frame.keywords() | {"BDWORST": (worst, "[pix] of rounding and between nodes")}
+    append_cards(primary, (number_card(keyword, *value) for keyword, value in stated.items()))
+    append_cards(primary, wrapped_cards("COMMENT", calibration.remarks))
+    append_cards(primary, convergence_cards(calibration.solution))
+    images = [fits.ImageHDU(plane, name=name) for name, plane in planes.items()]
+    content = fits_bytes([primary, *images, parameters_hdu(calibration, options.epoch)])
+    return (Built("stdgdc.fits", "STDGDC", content, calibration, None, {"tables_pix": worst}),)
+
+
+def _planes(
+    one: ChipMap, frame: CorrectedFrame, size: tuple[int, int], precision: str
+) -> dict[str, NDArray[Any]]:
+    """Values of all extensions (ny, nx), the errors in single precision."""
+    shape = size[::-1]
+    rows, columns = np.indices(shape, float)
+    x, y = columns.ravel() + 1, rows.ravel() + 1
+    there = frame.corrected(one.at(x, y)).reshape(2, *shape)
+    area, _ = pixel_areas(one, np.arange(1.0, size[0] + 1), np.arange(1.0, size[1] + 1))
+    area = area / abs(np.linalg.det(frame.similarity))
+    back, _ = one.pixels(frame.positions(np.stack([x, y])))
+    # beyond the image of the detector a map may have no inverse
+    back = np.where(np.isfinite(back), back, np.stack([x, y]))
+    tables = (*there, -2.5 * np.log10(area), *np.reshape(back, (2, *shape)))
+    kind = np.float32 if precision == "single" else np.float64
+    planes: dict[str, NDArray[Any]] = dict(
+        zip(EXTENSIONS, (np.asarray(t, kind) for t in tables), strict=True)
+    )
+    cov = one.covariance_at(x, y)
+    if cov is None:
+        return planes
+    turn = np.linalg.inv(frame.similarity)
+    cov = turn @ cov @ turn.T
+    sx, sy = np.sqrt(cov[:, 0, 0]), np.sqrt(cov[:, 1, 1])
+    product = sx * sy
+    both = np.divide(cov[:, 0, 1], product, out=np.zeros_like(product), where=product > 0)
+    sigmas = (np.asarray(t.reshape(shape), np.float32) for t in (sx, sy, np.clip(both, -1.0, 1.0)))
+    return planes | dict(zip(SIGMAS, sigmas, strict=True))
+
+
+def _error(one: ChipMap, frame: CorrectedFrame, xgc: Float, ygc: Float) -> float:
+    """Largest distance of what the tables give from the map, at nodes and between them, pixels."""
+    x, y = detector_grid(one.basis.size, min(_BETWEEN, 3 * int(max(one.basis.size))))
+    table = LookupTable(1, np.stack([xgc, ygc]), first=(1.0, 1.0), step=(1.0, 1.0))
+    return float(np.hypot(*(table.evaluate(x, y).T - frame.corrected(one.at(x, y)))).max())
 
 
 def _describe(file: StdGdc) -> list[str]:

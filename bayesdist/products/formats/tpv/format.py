@@ -1,14 +1,135 @@
-"""Format entry of TPV headers."""
+"""Format entry of TPV headers: built from a calibration by exact algebra, without a fit."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
+
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.calibration.inverse import detector_grid
+from bayesdist.calibration.orientation import placed_at
+from bayesdist.calibration.plane import arcsec_per
+from bayesdist.errors import InputError
+from bayesdist.products.formats.common.cards import (
+    convergence_cards,
+    header_of,
+    number_card,
+    solution_cards,
+    tangent_cards,
+    text_card,
+    wrapped_cards,
+)
+from bayesdist.products.formats.common.coefficients import require_regular, substitution
 from bayesdist.products.formats.common.content import Content
-from bayesdist.products.formats.common.document import Format, finding_lines
+from bayesdist.products.formats.common.document import (
+    PARAMETERS,
+    BuildOptions,
+    Built,
+    Format,
+    FormatSettings,
+    finding_lines,
+)
+from bayesdist.products.formats.common.parameters import parameters_content
 from bayesdist.products.formats.sip.format import describe_wcs
-from bayesdist.products.formats.tpv.build import Settings, build
-from bayesdist.products.formats.tpv.calibration import tpv_calibration
-from bayesdist.products.formats.tpv.head import HIGHEST, TpvFile, tpv_of
+from bayesdist.products.formats.tpv.head import (
+    HIGHEST,
+    SIDE_FILE,
+    TpvFile,
+    TpvHead,
+    pv_values_of,
+    tpv_calibration,
+    tpv_of,
+)
 from bayesdist.products.formats.tpv.lint import lint_tpv
+
+NAME, SIDE = "tpv.head", "tpv_parameters.fits"
+_GRID = 33  # points of each axis over which CRDER is the rms error
+
+
+class Settings(FormatSettings):
+    """Configuration of TPV headers."""
+
+    crval: tuple[float, float] | None = None
+
+
+def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
+    """One text file with the headers of all chips, and the file with their covariance.
+
+    CD is the linear part at the reference pixel, and PV hold the rest, the constants too: so CRVAL
+    is the point at which the plane touches the sky, whatever pixel lies there.  Without it CRVAL is
+    (0, 0), a placeholder.  InputError for an order above 7, or a calibration with look-up tables.
+    """
+    where = "products.tpv"
+    calibration = placed_at(calibration, settings.crval, options.scale_arcsec, where=where)
+    model = calibration.model
+    if model.order > HIGHEST:
+        raise InputError(
+            f"TPV holds polynomials up to order {HIGHEST}, and this one has order {model.order}",
+            where=where,
+            do="fit a lower order, or convert with --order 7, which says what is lost",
+        )
+    if calibration.before or calibration.after:
+        raise InputError(
+            "TPV has no look-up tables", where=where, do="convert it, which says what is lost"
+        )
+    arcsec = arcsec_per(model.unit, options.scale_arcsec)
+    maps = calibration.at(options.epoch, origin="stated")
+    heads = tuple(_head(one, number, arcsec, calibration) for number, one in maps.items())
+    named = text_card(SIDE_FILE, SIDE, "file with the covariance")
+    cards = [str(card) for head in heads for card in (*head.header.cards, named, "END")]
+    text = "\n".join(card.rstrip() for card in cards) + "\n"
+    return (
+        Built(SIDE, PARAMETERS, parameters_content(calibration, options.epoch), calibration),
+        Built(NAME, "TPV", text.encode("ascii"), heads),
+    )
+
+
+def _head(one: ChipMap, number: int, arcsec: float, calibration: Calibration) -> TpvHead:
+    """Header of a chip, `arcsec` in one unit of its map."""
+    poly = one.monomials()
+    require_regular(poly.linear, number)
+    cd = poly.linear * arcsec / 3600.0
+    values = poly.values * arcsec / 3600.0
+    back = np.asarray(np.linalg.inv(cd), float)
+    in_plane = np.asarray(values @ substitution(one.basis.order, back).T, float)
+    in_plane[:, 1:3] = np.eye(2)  # by the choice of CD, but for rounding
+    pv = [pv_values_of(axis, poly.terms, in_plane[axis]) for axis in (0, 1)]
+    size = (int(one.basis.size[0]), int(one.basis.size[1]))
+    crval = calibration.plane.point or (0.0, 0.0)
+    head = TpvHead(
+        number, calibration.numbered, ("RA---TPV", "DEC--TPV"), one.basis.reference_pixel,
+        (float(crval[0]), float(crval[1])), cd, (pv[0], pv[1]), size,
+    )  # fmt: skip
+    cards = _cards(head, one, arcsec, calibration)
+    return replace(head, header=header_of(cards))
+
+
+def _cards(head: TpvHead, one: ChipMap, arcsec: float, calibration: Calibration) -> list[str]:
+    cards = [
+        text_card("COMMENT", f"Distortion of chip {head.number}, by bayesdist."),
+        *wrapped_cards("COMMENT", calibration.remarks),
+        *convergence_cards(calibration.solution),
+        *tangent_cards(
+            head.ctype, head.crval, head.crpix, head.cd, "tangent plane with polynomial"
+        ),
+    ]
+    for axis, pv in enumerate(head.pv, start=1):
+        cards += [number_card(f"PV{axis}_{m}", value) for m, value in pv.items()]
+    cov = one.covariance_at(*detector_grid(one.basis.size, _GRID))
+    if cov is not None:
+        rms = np.sqrt(cov.mean(axis=0).diagonal()) * arcsec / 3600.0
+        cards += [
+            number_card(f"CRDER{k}", float(v), "[deg] rms error by the solution")
+            for k, v in enumerate(rms, 1)
+        ]
+    plane = "sky" if calibration.plane.point is not None else calibration.plane.kind
+    if plane != "sky":
+        cards.append(
+            text_card("COMMENT", "Where u, v lie on the sky is not known: CRVAL is a placeholder.")
+        )
+    return cards + solution_cards(plane, one.unit, arcsec, head.number, one.basis.size, one.epoch)
 
 
 def _describe(file: TpvFile) -> list[str]:

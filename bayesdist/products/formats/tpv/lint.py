@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from bayesdist.calibration.inverse import detector_grid
-from bayesdist.products.formats.common.document import Finding, repeated_values
+from bayesdist.products.formats.common.document import Finding, of_part, repeated_values
 from bayesdist.products.formats.tpv.head import POWERS, TpvFile, TpvHead, pv_value
 
 _LARGE = 0.3  # of the distance from CRPIX: no camera is distorted so much
@@ -20,11 +20,8 @@ def lint_tpv(file: TpvFile) -> tuple[Finding, ...]:
     out: list[Finding] = []
     several = len(file.heads) > 1
     for head in file.heads:
-        prefix = f"chip {head.number}, " if several else ""
-        out += [
-            Finding(f.level, prefix + f.where, f.message)
-            for f in (*_types(head), *_first_terms(head), *_scale(head), *_copies(head))
-        ]
+        found = (*_types(head), *_first_terms(head), *_scale(head), *_copies(head))
+        out += of_part(f"chip {head.number}" if several else "", found)
     out += list(_mosaic(file))
     if file.side_file and file.content.path and file.content.beside(file.side_file) is None:
         out.append(

@@ -12,7 +12,6 @@ from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import (
     BuildOptions,
     Built,
-    Choice,
     Finding,
     Format,
     FormatSettings,
@@ -94,10 +93,6 @@ def _lint(named: tuple[str, Bands]) -> list[Finding]:
     return [finding for band in named[1] for finding in lint_wise_band(band)]
 
 
-def _calibration(named: tuple[str, Bands], name: str, choice: Choice) -> Calibration:
-    return wise_calibration(named[1], name, choice.filter)
-
-
 def _read_back(
     files: Sequence[Built], calibration: Calibration, options: BuildOptions
 ) -> list[ReadBack]:
@@ -143,7 +138,7 @@ FORMAT = Format(
     _parse,
     _describe,
     _lint,
-    _calibration,
+    lambda named, name, choice: wise_calibration(named[1], name, choice.filter),
     Settings,
     _build,
     _read_back,

@@ -7,7 +7,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.products.formats.common.asdf.tree import PlacedSettings, packed
+from bayesdist.products.formats.common.asdf.tree import (
+    Detector,
+    PlacedSettings,
+    is_asdf,
+    packed,
+    plain,
+)
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import (
     BuildOptions,
@@ -20,7 +26,8 @@ from bayesdist.products.formats.common.read_back import ReadBack
 
 # astropy.modeling, which these need, takes longer to import than other files to read
 if TYPE_CHECKING:
-    from bayesdist.products.formats.common.asdf.build import ChipTransform
+    from astropy.modeling import Model
+
     from bayesdist.products.formats.common.asdf.distortion import DistortionFile
 
 Settings = TypeVar("Settings", bound=PlacedSettings)
@@ -32,12 +39,16 @@ class Observatory(Generic[Settings]):
 
     key: str  # as of `Format`
     name: str  # as in "JWST"
-    parse: Callable[[Content], DistortionFile | None]  # as of `Format`
+    # from a file to the node with meta and transform, and to the key of the transform; None for a
+    # file of another kind, FormatError for one without these
+    node: Callable[[Content], tuple[Mapping[str, Any], str] | None]
+    detector: Callable[[Mapping[str, Any]], Detector | None]  # from the node meta.instrument
     lint_meta: Callable[[Mapping[str, Any]], Iterable[Finding]]  # from the node meta to findings
-    instrument: Callable[[Settings], str]  # from settings to the name of the instrument
-    # from the transform of a chip, the name of its detector, settings and the name of the file to
-    # the tree of the file
-    tree: Callable[[ChipTransform, str, Settings, str], dict[str, Any]]
+    # from the name of the detector and settings to the node meta; InputError for unknown values
+    meta: Callable[[str, Settings], dict[str, Any]]
+    # from meta, transform, record and the name of the file to the tree of the file
+    tree: Callable[[dict[str, Any], Model, dict[str, Any], str], dict[str, Any]]
+    units: tuple[str, str] = ("", "")  # of pixels and positions, where a file states none
 
     def format(self, title: str, rank: int, settings: type[Settings]) -> Format:
         """Format entry; title, rank and settings are as of `Format`."""
@@ -45,7 +56,7 @@ class Observatory(Generic[Settings]):
             self.key,
             title,
             rank,
-            self.parse,
+            self._parse,
             self._describe,
             self._lint,
             _calibration,
@@ -53,6 +64,27 @@ class Observatory(Generic[Settings]):
             self._build,
             self._read_back,
             holds_tables=True,
+        )
+
+    def _parse(self, content: Content) -> DistortionFile | None:
+        found = self.node(content) if is_asdf(content) else None
+        if found is None:
+            return None
+        from bayesdist.products.formats.common.asdf.distortion import DistortionFile, transform_in
+
+        tree, key = found
+        meta, record = plain(tree["meta"]), tree.get("bayesdist")
+        instrument = meta.setdefault("instrument", {})
+        stated = zip(("input_units", "output_units"), self.units, strict=True)
+        units = tuple(str(meta.get(name, usual)) for name, usual in stated)
+        return DistortionFile(
+            content.name,
+            self.name,
+            transform_in(tree, key, content.name),
+            meta,
+            (units[0], units[1]),
+            None if record is None else plain(record),
+            self.detector(instrument),
         )
 
     def _lint(self, file: DistortionFile) -> list[Finding]:
@@ -69,16 +101,19 @@ class Observatory(Generic[Settings]):
         self, calibration: Calibration, settings: Settings, options: BuildOptions
     ) -> tuple[Built, ...]:
         """A file for each chip."""
-        from bayesdist.products.formats.common.asdf.build import chip_transforms
+        from bayesdist.products.formats.common.asdf.build import chip_transforms, refuse_larger
 
         out = []
-        several = len(calibration.numbers) > 1
-        instrument = self.instrument(settings)
-        for one in chip_transforms(calibration, settings, options, f"products.{self.key}"):
+        several, where = len(calibration.numbers) > 1, f"products.{self.key}"
+        for one in chip_transforms(calibration, settings, options, where):
             detector = (one.chip_name if several else settings.detector) or calibration.detector
+            meta = self.meta(detector, settings)
+            refuse_larger(one, detector, self.detector(meta["instrument"]), where)
+            instrument = meta["instrument"]["name"]
             one.record["provenance"] |= {"instrument": instrument, "detector": detector}
             file = f"{self.key}_{instrument}_{detector}_distortion.asdf".lower()
-            content = packed(self.tree(one, detector, settings, file), file, one.table_arrays)
+            tree = self.tree(meta, one.model, one.record, file)
+            content = packed(tree, file, one.table_arrays)
             kind, found = f"{self.name} distortion", {"closure_pix": one.closure}
             out.append(Built(file, kind, content, one.model, one.chip, found))
         return tuple(out)
@@ -87,7 +122,7 @@ class Observatory(Generic[Settings]):
         """Positions and inverse by the transforms, as pipelines have them."""
         from bayesdist.products.formats.common.asdf.distortion import transforms_read_back
 
-        parsed = {one.chip: self.parse(Content(one.file_name, one.content)) for one in files}
+        parsed = {one.chip: self._parse(Content(one.file_name, one.content)) for one in files}
         return [transforms_read_back({n: f for n, f in parsed.items() if n is not None and f})]
 
 

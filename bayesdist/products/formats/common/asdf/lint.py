@@ -18,6 +18,7 @@ from bayesdist.products.formats.common.asdf.distortion import (
 )
 from bayesdist.products.formats.common.asdf.transforms import exchanged, leaves, order_of, tables_of
 from bayesdist.products.formats.common.document import Finding, finding_lines, repeated_values
+from bayesdist.products.formats.common.record import error_lines
 
 PIXEL, SKY = ("pix", "pixel"), ("arcsec",)
 # Closure that a good inverse reaches, and one that only a wrong coefficient leaves; pixels.
@@ -60,11 +61,16 @@ def _units(file: DistortionFile) -> Iterator[Finding]:
             yield Finding("warning", f"meta.{name}", f"is missing; it should be {wanted[0]!r}")
 
 
-def _linear(file: DistortionFile, size: tuple[float, float]) -> Iterator[Finding]:
-    """Findings on parity and scale at the middle of the detector."""
+def _middle(file: DistortionFile, size: tuple[float, float]) -> tuple[Float, Float]:
+    """V2, V3 (2,) at the middle of the detector, and their derivatives (2, 2) by the pixel."""
     x, y = ((n + 1) / 2 for n in size)
     at = file.v2v3([x, x + 0.5, x - 0.5, x, x], [y, y, y, y + 0.5, y - 0.5])
-    slope = np.stack([at[:, 1] - at[:, 2], at[:, 3] - at[:, 4]], axis=1)
+    return at[:, 0], np.stack([at[:, 1] - at[:, 2], at[:, 3] - at[:, 4]], axis=1)
+
+
+def _linear(file: DistortionFile, size: tuple[float, float]) -> Iterator[Finding]:
+    """Findings on parity and scale at the middle of the detector."""
+    _, slope = _middle(file, size)
     area = float(np.linalg.det(slope))
     if area > 0:
         yield Finding(
@@ -193,16 +199,11 @@ def describe_distortion(file: DistortionFile, findings: Sequence[Finding]) -> li
 
 def _measured(file: DistortionFile, size: tuple[float, float]) -> list[str]:
     """Lines on what the transform gives."""
-    middle = [(n + 1) / 2 for n in size]
-    at = file.v2v3(
-        [middle[0], middle[0] + 0.5, middle[0] - 0.5, middle[0], middle[0]],
-        [middle[1], middle[1], middle[1], middle[1] + 0.5, middle[1] - 0.5],
-    )
-    slope = np.stack([at[:, 1] - at[:, 2], at[:, 3] - at[:, 4]], axis=1)
+    at, slope = _middle(file, size)
     area = float(np.linalg.det(slope))
     lines = [
         f"  detector  {size[0]:g} x {size[1]:g} px",
-        f"  V2, V3    {at[0, 0]:.6f}, {at[1, 0]:.6f} arcsec at its middle",
+        f"  V2, V3    {at[0]:.6f}, {at[1]:.6f} arcsec at its middle",
         f"  pixel     {np.sqrt(abs(area)):.8f} arcsec, parity {'-1' if area < 0 else '+1'}",
     ]
     back = file.inverse
@@ -213,23 +214,15 @@ def _measured(file: DistortionFile, size: tuple[float, float]) -> list[str]:
 
 def _uncertainty(file: DistortionFile) -> list[str]:
     """Lines on the record."""
-    if file.record is None:
-        return ["  errors    none stated"]
-    try:
-        found = recorded(file, file.record)
-        [chip] = found.by_chip().values()
-        cov = chip.covariance_at(*file.grid())
-    except BayesdistError:
-        return ["  errors    of a record that cannot be read"]
-    if cov is None:
-        lines = ["  errors    none stated"]
-    else:
-        sigma = 1e3 * np.sqrt((cov[:, 0, 0] + cov[:, 1, 1]) / 2)
-        lines = [
-            f"  errors    {found.errors}: {np.median(sigma):.3g} mas per axis at the median, "
-            f"{sigma.max():.3g} at worst"
-        ]
-    lines.append(f"  gauge     {file.record['gauge']}")
-    provenance = file.record["provenance"]
-    lines.append(f"  from      {provenance['source']} by {provenance['software']}")
-    return lines
+    record = file.record
+    if record is None:
+        return error_lines(None, "")
+    provenance = record["provenance"]
+    lines = error_lines(lambda: recorded(file, record), "a record")
+    if lines[0].endswith("cannot be read"):
+        return lines
+    return [
+        *lines,
+        f"  gauge     {record['gauge']}",
+        f"  from      {provenance['source']} by {provenance['software']}",
+    ]

@@ -37,6 +37,11 @@ class PlacedSettings(FormatSettings):
     parity: Literal[-1, 1] | None = None
     inverse_order: Annotated[int, Field(ge=1, le=12)] | None = None
 
+    def identity(self) -> dict[str, str]:
+        """What every reference file says of itself."""
+        names = ("pedigree", "useafter", "author", "description")
+        return {name: getattr(self, name) for name in names}
+
 
 @dataclass(frozen=True)
 class Detector:
