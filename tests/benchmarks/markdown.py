@@ -394,11 +394,10 @@ def _processes(part: dict[str, Any]) -> list[str]:
         "",
         f"{first['n_stars']:,} detections in {first['exposures']} exposures of two chips, order "
         f"{part['order']}, {first['n_params']} parameters, in pieces of {part['piece']:,} "
-        "detections on workers of this machine: grouped into stars once, solved once, and sampled to "
-        "ESS 400. "
-        "Seconds by the clock, of the processor in the program that starts the run (with the "
-        "scheduler), and of the processor on all workers together; peak memory of both, libraries "
-        "included.",
+        "detections on workers of this machine: grouped into stars once, solved once, and sampled "
+        "to ESS 400. Seconds by the clock, of the processor in the program that starts the run "
+        "(with the scheduler), and of the processor on all workers together; peak memory of both, "
+        "libraries included.",
         "",
     ]
     head = ("workers", "group [s]", "solve [s]", "sample [s]", "passes", "peak [MB]")
