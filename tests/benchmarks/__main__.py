@@ -23,6 +23,7 @@ from tests.benchmarks import (
     dithers,
     likelihood,
     linear,
+    processes,
     samplers,
     scaling,
     scamp,
@@ -48,6 +49,7 @@ PARTS = {
     "budget": budget,
     "scamp": scamp,
     "dithers": dithers,
+    "processes": processes,
 }
 
 

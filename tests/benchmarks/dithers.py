@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,7 +13,10 @@ from tests.benchmarks.machine import peak_rss_mb
 from tests.benchmarks.scaling import exponent
 from tests.benchmarks.timing import say
 
-__all__ = ["FULL", "QUICK", "Sizes", "measure", "run"]
+if TYPE_CHECKING:
+    from tests.dithered_fields import DitheredField
+
+__all__ = ["FULL", "QUICK", "WARM", "Sizes", "measure", "run", "simulated"]
 
 ROLLS = (0.0, 60.0, 130.0)
 SIDE = (4096.0, 4146.0)  # of both chips, with their gap
@@ -41,16 +44,15 @@ def measure(exposures: int, stars: int, order: int) -> dict[str, Any]:
     return _calibrated(exposures, stars, order)
 
 
-def _calibrated(exposures: int, stars: int, order: int) -> dict[str, Any]:
-    from bayesdist.infer.selfcal import sample_selfcal, self_calibrate
-    from bayesdist.infer.selfcal.catalogue import star_catalogue
+def simulated(exposures: int, stars: int, order: int) -> DitheredField:
+    """Field of two chips, with 5 % of false detections."""
     from bayesdist.model import Chip
     from bayesdist.simulate.dithers import dither_pattern
     from tests.dithered_fields import simulate_dithers, smooth_distortion
 
     rng = np.random.default_rng(1)
     chips = tuple(Chip(n, f"WFC{n}", (4096.0, 2048.0), (2048.0, 1024.0)) for n in (1, 2))
-    field = simulate_dithers(
+    return simulate_dithers(
         chips,
         smooth_distortion(order, chips, 30.0, rng),
         *dither_pattern(exposures, SIDE, ROLLS, rng, largest=LARGEST),
@@ -60,6 +62,13 @@ def _calibrated(exposures: int, stars: int, order: int) -> dict[str, Any]:
         disturbed=0.025,
         spurious=0.025,
     )
+
+
+def _calibrated(exposures: int, stars: int, order: int) -> dict[str, Any]:
+    from bayesdist.infer.selfcal import sample_selfcal, self_calibrate
+    from bayesdist.infer.selfcal.catalogue import star_catalogue
+
+    field = simulated(exposures, stars, order)
     detections = field.unlabelled
     clock = [time.perf_counter()]
     found = self_calibrate(

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from tests.benchmarks.processes import STAGES
 from tests.benchmarks.scamp import summarised
 
 __all__ = ["to_markdown"]
@@ -386,6 +387,37 @@ def _dithers(part: dict[str, Any]) -> list[str]:
     return out
 
 
+def _processes(part: dict[str, Any]) -> list[str]:
+    first = part["rows"][0]
+    out = [
+        "## Self-calibration on several processes",
+        "",
+        f"{first['n_stars']:,} detections in {first['exposures']} exposures of two chips, order "
+        f"{part['order']}, {first['n_params']} parameters, in pieces of {part['piece']:,} "
+        "detections on workers of this machine: grouped into stars once, solved once, and sampled "
+        "to ESS 400. Seconds by the clock, of the processor in the program that starts the run "
+        "(with the scheduler), and of the processor on all workers together; peak memory of both, "
+        "libraries included.",
+        "",
+    ]
+    head = ("workers", "group [s]", "solve [s]", "sample [s]", "passes", "peak [MB]")
+    out += _table(
+        head,
+        [
+            (
+                str(r["workers"]) if r["workers"] else "none",
+                *(", ".join(_number(v) for v in r[name].values()) for name in STAGES),
+                f"{r['passes']:,}",
+                f"{r['peak_mb']:,.0f}, {r['workers_peak_mb']:,.0f}",
+            )
+            for r in part["rows"]
+        ],
+    )
+    for n in part["stopped"]:
+        out += [f"{n} workers were stopped after {part['limit_s']:g} s.", ""]
+    return out
+
+
 _PARTS = {
     "commands": _commands,
     "samplers": _samplers,
@@ -396,6 +428,7 @@ _PARTS = {
     "budget": _budget,
     "scamp": _scamp,
     "dithers": _dithers,
+    "processes": _processes,
 }
 
 

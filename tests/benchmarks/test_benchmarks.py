@@ -217,6 +217,10 @@ def test_json_and_markdown_are_complete(quick):
     assert len(selfcal["rows"]) == (2 if selfcal["absent"] else 5)
     (dithers,) = bench["parts"]["dithers"]["rows"]
     assert dithers["converged"] and dithers["n_stars"] > dithers["stars"] > 0
+    here, there = bench["parts"]["processes"]["rows"]
+    assert (here["workers"], there["workers"]) == (0, 2) and here["passes"] == there["passes"]
+    for stage in ("group", "solve", "sample"):
+        assert here[stage]["workers_s"] == 0 < there[stage]["workers_s"]
     commands = {row["what"]: row["cpu_s"] for row in bench["parts"]["commands"]["rows"]}
     assert commands["run, first of all"] > commands["run, warm"] > commands["--help"] > 0
     budget = bench["parts"]["budget"]["rows"]

@@ -19,7 +19,7 @@ with kept_by_content():
         least_squares_moments,
         mixture_moments,
     )
-    from bayesdist.infer.kernel.sky_places import linearised, positions
+    from bayesdist.infer.kernel.sky_places import linearised, positions, slopes
     from bayesdist.infer.kernel.small import (
         densities,
         draw_deviations,
@@ -70,6 +70,7 @@ __all__ = [
     "residuals",
     "set_threads",
     "shear",
+    "slopes",
     "truncated_log_likelihood",
     "truncated_memberships",
     "truncated_moments",

@@ -33,22 +33,38 @@ def legendre(x, y, order, px, py, phi):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def powers(coef, order, x, y):
-    """Sum of c_ij x^i y^j by Horner's rule, terms sorted as the basis functions."""
-    out = 0.0
+    """Sums u, v of c_ij x^i y^j by Horner's rule from coefficients (2, K), sorted as the basis."""
+    u = v = 0.0
     for i in range(order, -1, -1):
-        inner = coef[order * (order + 1) // 2 + (order - i)]
+        at = order * (order + 1) // 2 + order - i
+        of_u, of_v = coef[0, at], coef[1, at]
         for j in range(order - i - 1, -1, -1):
-            total = i + j
-            inner = inner * y + coef[total * (total + 1) // 2 + j]
-        out = out * x + inner
-    return out
+            at -= i + j + 2  # one power of y less
+            of_u, of_v = of_u * y + coef[0, at], of_v * y + coef[1, at]
+        u, v = u * x + of_u, v * x + of_v
+    return u, v
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def powers_and_slopes(coef, order, x, y):
+    """Sums u, v as of `powers`, and their derivatives u_x, u_y, v_x, v_y."""
+    u = ux = uy = v = vx = vy = 0.0
+    for i in range(order, -1, -1):
+        at = order * (order + 1) // 2 + order - i
+        of_u, of_v, of_uy, of_vy = coef[0, at], coef[1, at], 0.0, 0.0
+        for j in range(order - i - 1, -1, -1):
+            at -= i + j + 2
+            of_uy, of_vy = of_uy * y + of_u, of_vy * y + of_v
+            of_u, of_v = of_u * y + coef[0, at], of_v * y + coef[1, at]
+        ux, uy, u = ux * x + u, uy * x + of_uy, u * x + of_u
+        vx, vy, v = vx * x + v, vy * x + of_vy, v * x + of_v
+    return u, v, ux, uy, vx, vy
 
 
 @nb.njit(**PASS)
 def _positions(first, end, group, X, Y, coef, order, out):
     for i in range(first, end):
-        out[i, 0] = powers(coef[group[i], 0], order, X[i], Y[i])
-        out[i, 1] = powers(coef[group[i], 1], order, X[i], Y[i])
+        out[i, 0], out[i, 1] = powers(coef[group[i]], order, X[i], Y[i])
 
 
 def positions(group: Int, X: Float, Y: Float, coef: Float, order: int) -> Float:
@@ -59,21 +75,30 @@ def positions(group: Int, X: Float, Y: Float, coef: Float, order: int) -> Float:
 
 
 @nb.njit(**PASS)
-def _linearised(
-    first, end, group, seen_X, seen_Y, X, Y, places, coef, by_X, by_Y, half, order, out
-):
+def _slopes(first, end, group, X, Y, coef, order, out):
+    for i in range(first, end):
+        _, _, ux, uy, vx, vy = powers_and_slopes(coef[group[i]], order, X[i], Y[i])
+        out[i, 0, 0], out[i, 0, 1], out[i, 1, 0], out[i, 1, 1] = ux, uy, vx, vy
+
+
+def slopes(group: Int, X: Float, Y: Float, coef: Float, order: int) -> Float:
+    """Derivatives (N, 2, 2) of sky positions by X and Y; arguments as of `positions`."""
+    out = np.empty((len(X), 2, 2))
+    share_out(_slopes, len(X), group, X, Y, coef, order, out)
+    return out
+
+
+@nb.njit(**PASS)
+def _linearised(first, end, group, seen_X, seen_Y, X, Y, places, coef, half, order, out):
     new_X, new_Y, offset, W = out
     for i in range(first, end):
         g, x, y = group[i], X[i], Y[i]
-        ru = powers(coef[g, 0], order, x, y) - places[i, 0]
-        rv = powers(coef[g, 1], order, x, y) - places[i, 1]
-        for last in range(2):
-            ux, uy = powers(by_X[g, 0], order, x, y), powers(by_Y[g, 0], order, x, y)
-            vx, vy = powers(by_X[g, 1], order, x, y), powers(by_Y[g, 1], order, x, y)
-            if last == 0:
-                det = ux * vy - uy * vx
-                x -= (vy * ru - uy * rv) / det
-                y -= (ux * rv - vx * ru) / det
+        u, v, ux, uy, vx, vy = powers_and_slopes(coef[g], order, x, y)
+        ru, rv = u - places[i, 0], v - places[i, 1]
+        det = ux * vy - uy * vx
+        x -= (vy * ru - uy * rv) / det
+        y -= (ux * rv - vx * ru) / det
+        _, _, ux, uy, vx, vy = powers_and_slopes(coef[g], order, x, y)
         dx, dy = seen_X[i] - x, seen_Y[i] - y
         offset[i, 0], offset[i, 1] = ux * dx + uy * dy, vx * dx + vy * dy
         ux, uy, vx, vy = ux / half[g, 0], uy / half[g, 1], vx / half[g, 0], vy / half[g, 1]
@@ -90,22 +115,19 @@ def linearised(
     Y: Float,
     places: Float,
     coef: Float,
-    by_X: Float,
-    by_Y: Float,
     half: Float,
     order: int,
 ) -> tuple[Float, Float, Float, Float]:
     """Positions of stars on the detector by a solution, and the linearised model about them.
 
     Scaled positions of the detections are `seen` (2, N), those of their stars as far as
-    known X, Y (N,), and the stars' sky positions `places` (N, 2).  `coef`, `by_X`, `by_Y` (G, 2, K)
-    are coefficients of the scaled powers, of the model and of its derivatives by X and by Y; `half`
-    (G, 2) is the size of X = 1 and Y = 1 in pixels.
+    known X, Y (N,), and the stars' sky positions `places` (N, 2).  `coef` (G, 2, K): of the scaled
+    powers; `half` (G, 2): the size of X = 1 and Y = 1 in pixels.
 
     Returns X, Y (N,) one Newton step further; the offset (N, 2), J times the pixels from there to
     the detection; and W (N, 3), uu, uv, vv of the inverse of J J^T.
     """
     n = len(X)
     out = np.empty(n), np.empty(n), np.empty((n, 2)), np.empty((n, 3))
-    share_out(_linearised, n, group, *seen, X, Y, places, coef, by_X, by_Y, half, order, out)
+    share_out(_linearised, n, group, *seen, X, Y, places, coef, half, order, out)
     return out

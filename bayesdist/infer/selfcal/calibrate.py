@@ -139,9 +139,15 @@ def self_calibrate(
         )
         if references is not None:
             problem = replace(problem, priors=references(problem, theta))
-        known = None if mode is None else _still(problem, mode)
+        near = mode if mode is not None and _still(problem, mode) else None
         mode = solve_in_gauge(
-            problem, theta, prior_at, jitter=jitter, mixture=known, compute=compute
+            problem,
+            theta,
+            prior_at,
+            mixture=None if near is None else near.mixture,
+            decision=None if near is None else near.decision,
+            jitter=jitter,
+            compute=compute,
         )
         theta = mode.theta
         log(
@@ -163,6 +169,7 @@ def self_calibrate(
                     stars=mode.stars,
                     jitter=jitter,
                     mixture=mode.mixture,
+                    decision=mode.decision,
                     compute=compute,
                 )
             gauge = gauge_of(mode.problem, mode.theta, prior_at(mode.theta), mode)
@@ -185,14 +192,14 @@ def self_calibrate(
     )
 
 
-def _still(problem: Problem, mode: SelfCalibrationMode) -> Mixture | None:
-    """Mixture of the last iteration, if this one starts with nearly the same detections.
+def _still(problem: Problem, mode: SelfCalibrationMode) -> bool:
+    """True where errors and free directions of the last iteration are those of this one at first.
 
-    New ones may lie far from their positions by the solution, and so do stars with motions, which
-    start at rest: then the first errors have to be large.
+    Nearly the same detections: new ones may lie far from their positions by the solution.  Stars
+    with motions start at rest, and then the first errors have to be large.
     """
     same = abs(len(problem) / len(mode.problem) - 1.0) < ALIKE
-    return mode.mixture if same and problem.n_star == 2 else None
+    return same and problem.n_star == 2
 
 
 def _errors_of(detections: Detections, mode: SelfCalibrationMode) -> Float:

@@ -35,6 +35,7 @@ WEAK_PIX = 0.1  # error at the detector's edge above which a direction counts as
 FAR = 3.0  # times the final error: information no better than this does not fix a direction
 EXPLAINED = 1e-2  # fraction of a free direction that its names may leave out
 SAME_ROLL = np.radians(0.1)
+TIE = 1e-6  # relative difference of pivots that are equal
 MIN_PIVOT = 0.02
 HIDDEN = 1e-5  # of a property that lies along undetermined directions: it is free
 
@@ -302,7 +303,9 @@ def _pivots(model: DistortionModel, null: Float) -> Int:
         rows = np.flatnonzero(degree == level)
         if left.shape[1] == 0:
             break
-        _, R, order = qr(left[rows].T, pivoting=True, mode="economic")
+        # u and v have equal shares in a rotation: the first is taken, and rounding does not choose
+        tilt = 1.0 - TIE * np.arange(len(rows))
+        _, R, order = qr(left[rows].T * tilt, pivoting=True, mode="economic")
         size = np.abs(np.diag(R))
         take = rows[order[: int((size > MIN_PIVOT).sum())]]
         held += list(take)

@@ -288,44 +288,48 @@ def solve_in_gauge(
     *,
     stars: Float | None = None,
     mixture: Mixture | None = None,
+    decision: Decision | None = None,
     jitter: float | None = None,
     compute: Compute | None = None,
 ) -> SelfCalibrationMode:
     """Mode of a problem, with the parameters fixed by convention as decided there.
 
-    The search starts at theta (D,); `prior_at` gives information from other sources than the
-    detections, linearised at parameters (D,).  Where the detections determine more at the mode than
+    The search starts at theta (D,), with a `decision` on the free directions that was made near by,
+    or with that at the start; `prior_at` gives information from other sources than the detections,
+    linearised at parameters (D,).  Where the detections determine more at the mode than
     at the start, that is fitted; where it then turns out to be free after all, it stays fixed.
     Other arguments, DegenerateError and NotSettledError as `solve`.
     """
     prior = prior_at(theta)
 
-    def solved(gauge: Gauge, begin: _Begun) -> _Found:
-        free = np.setdiff1d(np.arange(problem.model.n_params), gauge.held)
-        return replace(_solved(problem, begin, free, prior, jitter), decision=gauge.decision)
+    def solved(decision: Decision, begin: _Begun) -> _Found:
+        free = np.setdiff1d(np.arange(problem.model.n_params), decision.held)
+        return replace(_solved(problem, begin, free, prior, jitter), decision=decision)
 
-    def asked_at(found: _Found) -> Gauge:
+    def asked_at(found: _Found) -> Decision:
         alone, known = found.curvatures
-        return find_gauge(problem, found.theta, alone, prior_at(found.theta), known=known)
+        there = prior_at(found.theta)
+        return find_gauge(problem, found.theta, alone, there, known=known).decision
 
     with _loaded(problem, stars, compute) as loaded:
-        gauge = _gauge_at_start(problem, loaded, theta, prior)
-        found = solved(gauge, _Begun(loaded, theta, mixture, medians=stars is None))
+        taken = decision
+        if taken is None:
+            taken = _gauge_at_start(problem, loaded, theta, prior).decision
+        found = solved(taken, _Begun(loaded, theta, mixture, medians=stars is None))
         at_mode = asked_at(found)
-        if at_mode.held.size > gauge.held.size:
+        if at_mode.held.size > taken.held.size:
             return solved(at_mode, found.again).mode(problem)
-        while at_mode.held.size < gauge.held.size:
+        while at_mode.held.size < taken.held.size:
             try:
                 freer = solved(at_mode, found.again)
             except (DegenerateError, NotSettledError):
                 return found.mode(problem)
-            gauge, at_mode = at_mode, asked_at(freer)
-            if at_mode.held.size > gauge.held.size:
+            taken, at_mode = at_mode, asked_at(freer)
+            if at_mode.held.size > taken.held.size:
                 return found.mode(problem)
             found = freer
         # as many are fixed: the choice of the parameters is arbitrary
-        decision = replace(at_mode.decision, held=gauge.held)
-        return replace(found, decision=decision).mode(problem)
+        return replace(found, decision=replace(at_mode, held=taken.held)).mode(problem)
 
 
 def mode_at(

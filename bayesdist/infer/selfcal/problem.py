@@ -151,26 +151,12 @@ class Problem:
         chips = [self.model.chips[c].number for c in self.groups.chip]
         return np.array([self.model.basis(chip).half_size for chip in chips])
 
-    def _slopes(self, theta: Float) -> tuple[Float, Float]:
-        """Coefficients (G, 2, K) of the scaled powers of the derivatives by X and by Y."""
-        bases = [self.model.basis(self.model.chips[c].number) for c in self.groups.chip]
-        E, half, scaled = self.effective(theta), self._half, bases[0].to_scaled_powers
-        by_X, by_Y = (
-            scaled(np.stack([E[g] @ b.derivatives[k].T * half[g, k] for g, b in enumerate(bases)]))
-            for k in (0, 1)
-        )
-        return by_X, by_Y
-
     def jacobians(self, theta: Float, rows: slice) -> Float:
         """Derivatives (n, 2, 2) of positions of some detections by their pixels."""
-        g, order = self.groups.index[rows], self.model.order
-        slopes = self._slopes(theta)
+        g = self.groups.index[rows]
         with threads_for(len(g)):
-            columns = [
-                kernel.positions(g, self.X[rows], self.Y[rows], by, order) / self._half[g, k, None]
-                for k, by in enumerate(slopes)
-            ]
-        return np.stack(columns, axis=2)
+            by = kernel.slopes(g, self.X[rows], self.Y[rows], self.powers(theta), self.model.order)
+        return np.asarray(by / self._half[g, None])
 
     def star_places(self, stars: Float) -> Float:
         """Sky position (N, 2) of the star of each detection at its date."""
@@ -239,7 +225,6 @@ class Problem:
     def at(self, theta: Float, stars: Float) -> Problem:
         """Problem linearised about a solution: theta (D,) and stars (S, q)."""
         groups, half = self.groups, self._half
-        by_X, by_Y = self._slopes(theta)
         places, powers = self.star_places(stars), self.powers(theta)
         with threads_for(5 * len(self.X)):
             X, Y, offset, W = kernel.linearised(
@@ -249,8 +234,6 @@ class Problem:
                 self.Y,
                 places,
                 powers,
-                by_X,
-                by_Y,
                 half,
                 self.model.order,
             )

@@ -7,6 +7,7 @@ rounding alone.
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import sys
 from dataclasses import dataclass, field
@@ -30,6 +31,7 @@ from bayesdist.infer.selfcal.pieces import (
     slope,
     to_sample,
 )
+from bayesdist.infer.selfcal.posterior import SelfTarget
 from bayesdist.infer.selfcal.problem import StarPriors
 from bayesdist.infer.selfcal.tangent import places_of
 from bayesdist.infer.stars import cluster as cluster_module
@@ -279,6 +281,38 @@ def test_one_of_two_workers_is_killed_while_solving(start, solution, compute, st
 def test_posterior_is_that_of_one_process(solution, compute):
     expected = sample_selfcal(solution, seed=5, target_ess=100)
     assert_same_draws(sample_selfcal(solution, seed=5, target_ess=100, compute=compute), expected)
+
+
+class InterruptionError(Exception):
+    """Of a run, by its user."""
+
+
+def test_run_that_was_interrupted_on_a_cluster_is_resumed(solution, compute, tmp_path, monkeypatch):
+    """There or in one process: with what was computed before, and the draws of a whole run."""
+    points, inner, reached = [], SelfTarget.log_density, []
+
+    def counted(self, psi):
+        points.append(len(psi))
+        return inner(self, psi)
+
+    def interrupting(step, _):
+        reached.append(step)
+        if len(reached) == 3:
+            raise InterruptionError
+
+    given = {"seed": 5, "target_ess": 400, "checkpoint_every": 20}
+    monkeypatch.setattr(SelfTarget, "log_density", counted)
+    expected, begun = sample_selfcal(solution, **given), tmp_path / "begun"
+    whole = sum(points)
+    begun.mkdir()
+    with pytest.raises(InterruptionError):
+        sample_selfcal(solution, **given, folder=begun, progress=interrupting, compute=compute)
+    for name, where in (("here", None), ("there", compute)):
+        shutil.copytree(begun, tmp_path / name)
+        points.clear()
+        resumed = sample_selfcal(solution, **given, folder=tmp_path / name, compute=where)
+        assert 0 < sum(points) < 0.8 * whole
+        assert_same_draws(resumed, expected)
 
 
 @dataclass
