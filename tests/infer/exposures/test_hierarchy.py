@@ -128,7 +128,7 @@ def test_gradient_by_differences(size):
         assert scatter.gradient(tau)[k] == pytest.approx((up - down) / (2 * h), rel=1e-5, abs=1e-5)
 
 
-def test_draws_of_tau_are_its_posterior():
+def test_draws_of_tau_are_its_posterior(full):
     """Against the density on a mesh, one kind of deviation: with scatter, and with none at all."""
     rng = np.random.default_rng(3)
     for true in (5e-6, 0.0):
@@ -139,7 +139,7 @@ def test_draws_of_tau_are_its_posterior():
         x = np.linspace(-30, -5, 1501)
         density = np.array([scatter.log_density(np.exp([t])) for t in x])
         cdf = np.cumsum(np.exp(density - density.max()))
-        draws = np.log(scatter.draws(1500, rng)[:, 0])
+        draws = np.log(scatter.draws(4000 if full else 1500, rng)[:, 0])
         p = np.interp(draws, x, cdf / cdf[-1])
         # resampled points repeat: a sample of a few hundred independent ones at least
         assert stats.kstest(p, "uniform").statistic < 0.06
