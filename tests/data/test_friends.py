@@ -45,6 +45,20 @@ def test_one_detection_of_an_exposure():
     assert (found.n_stars, found.n_doubled, found.n_dropped) == (2, 1, 1)
 
 
+def test_rounding_does_not_choose_among_two():
+    """Both are as far from their mean: the first stays, wherever the last digit is rounded."""
+    rng = np.random.default_rng(3)
+    middle = rng.uniform(0, 3000, (500, 2))
+    half = 0.3 * rng.uniform(-1, 1, (500, 2))
+    found = friends_of_friends(
+        np.concatenate([middle + half, middle - half]), np.zeros(1000, int), 1
+    )
+    pairs = found.star[:500], found.star[500:]
+    alone = (pairs[0] == NO_STAR) | (pairs[1] == NO_STAR)
+    assert alone.sum() > 400
+    assert (pairs[0][alone] != NO_STAR).all()
+
+
 def test_chains_are_given_up():
     places = np.stack([np.arange(20) * 0.8, np.zeros(20)], axis=1)
     found = friends_of_friends(places, np.arange(20), 1.0)

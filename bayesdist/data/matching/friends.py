@@ -22,6 +22,7 @@ FINE = 16  # grid squares in a linking length: detections in one are friends wit
 MAX_EXTENT = 3.0  # linking lengths that a group may span: a longer one is a chain of stars
 MARGIN = 5  # linking lengths about a cell: a group that begins in it, and whoever is linked to that
 MIN_SIDE = 16 * MARGIN  # linking lengths: smaller cells would be margin for the most part
+EQUAL = 6  # digits of a linking length to which distances are compared
 CELL = 2**16  # detections, on average: their columns fit into the cache of a core
 
 # function of each source, in their order: `map`, or the same on a cluster
@@ -144,7 +145,7 @@ def grouped(cell: Cell) -> Grouped:
     heads = np.full(n, len(rows))
     np.minimum.at(heads, group, np.arange(len(rows)))
     own = cell.inside[heads] & ~chain
-    second = _seconds(places, cell.exposure, group, own)
+    second = _seconds(places / cell.length, cell.exposure, group, own)
     kept = own[group]
     kept[second] = False
     stars, which = group[kept], rows[kept]
@@ -167,7 +168,11 @@ def _spans(places: Float, group: Int, n: int) -> Float:
 
 
 def _seconds(places: Float, exposure: Int, group: Int, own: Bool) -> Int:
-    """Indices of detections of groups (n,) that are not their exposure's nearest to the mean."""
+    """Indices of detections of groups (n,) that are not their exposure's nearest to the mean.
+
+    `places` are in linking lengths.  The mean of two detections is as far from one as from the
+    other: rounding does not choose, and the first is taken.
+    """
     key = group * (int(exposure.max()) + 1) + exposure
     order = np.argsort(key, kind="stable")
     same = key[order][1:] == key[order][:-1]
@@ -177,7 +182,7 @@ def _seconds(places: Float, exposure: Int, group: Int, own: Bool) -> Int:
     at = np.flatnonzero(several)
     counts = np.bincount(group)
     middle = np.stack([np.bincount(group, places[:, axis]) / counts for axis in (0, 1)], axis=1)
-    distance = np.hypot(*(places[at] - middle[group[at]]).T)
+    distance = np.round(np.hypot(*(places[at] - middle[group[at]]).T), EQUAL)
     at = at[np.lexsort((distance, key[at]))]
     return at[1:][key[at][1:] == key[at][:-1]]
 
