@@ -147,7 +147,7 @@ def calibrated(setting: Setting, seed: int) -> Iterator[Calibrated]:
             yield Calibrated(
                 campaign=read_acs(base),
                 results=results,
-                tables=made["fit_tables"].fit,
+                tables=made["fit_tables"][1],
                 bare=bare,
                 joint=_with_catalogue(bare, results.data),
                 terms=results.fitted.alone,
