@@ -1,7 +1,7 @@
 """Error budget of a solution over the grid of its chips."""
 
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.error_model import error_model
+from bayesdist.assess.model import error_model
 from bayesdist.model.grid import DEFAULT_GRID
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import json
 import os
 import re
@@ -23,6 +24,7 @@ import bayesdist as bd
 from bayesdist.app.cli import bayesdist as root
 from bayesdist.app.config import KINDS
 from bayesdist.app.config.data import data_sections
+from bayesdist.mission import load_object
 
 from .docs_blocks import DOCS, blocks, run_page
 from .sketches import sketched
@@ -268,6 +270,21 @@ def _values(annotation: object) -> set[object]:
     if typing.get_origin(annotation) is typing.Literal:
         return set(parts)
     return {value for part in parts for value in _values(part)}
+
+
+def test_commands_hand_their_options_to_functions_that_take_them():
+    called = 0
+    for words, command in _commands(root):
+        known = inspect.getclosurevars(command.callback).nonlocals
+        if not known.get("calls"):
+            continue
+        given = [p.name for p in command.params if p.expose_value] + ["command"] * known["recorded"]
+        try:
+            inspect.signature(load_object(known["calls"])).bind(**dict.fromkeys(given))
+        except TypeError as error:
+            pytest.fail(f"{words}: {error}")
+        called += 1
+    assert called >= 10
 
 
 def _commands(group: click.Group, path: str = ""):

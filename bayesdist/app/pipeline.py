@@ -35,7 +35,7 @@ from bayesdist.app.products.made_files import product_input, solution_of
 from bayesdist.app.products.product_terms import file_errors
 from bayesdist.app.report import report
 from bayesdist.assess import evaluation as assessed
-from bayesdist.assess.error_model import ErrorModel
+from bayesdist.assess.model import ErrorModel
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
 

@@ -23,8 +23,8 @@ from bayesdist.app.products.made_files import ProductInput, product_of, solution
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.diagnostics_files import load_diagnostics
 from bayesdist.app.tables.evaluation_files import load_evaluation
-from bayesdist.assess.error_model import ErrorModel
 from bayesdist.assess.evaluation import Evaluation, EvaluationSettings
+from bayesdist.assess.model import ErrorModel
 from bayesdist.checks import Check, in_order
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import LinearFit, Posterior, load_posterior

@@ -9,7 +9,7 @@ from .budget.budget import (
     ErrorBudget as ErrorBudget,
 )
 from .domain import EvaluationDomain as EvaluationDomain
-from .error_model import (
+from .model import (
     ErrorModel as ErrorModel,
     error_budget as error_budget,
     error_model as error_model,

@@ -13,8 +13,8 @@ from bayesdist.assess.budget.budget import ErrorBudget, budget_of
 from bayesdist.assess.budget.surface import BudgetSurface, budget_surface
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
-from bayesdist.assess.error_model import ErrorModel
 from bayesdist.assess.maps import RELATIVE, UncertaintyMap, uncertainty_map, with_local
+from bayesdist.assess.model import ErrorModel
 from bayesdist.assess.requirements.margins import Margin, judge
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.validity import ValidityPeriod, validity_period

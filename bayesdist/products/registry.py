@@ -127,7 +127,9 @@ def build(
         )
     if one.holds_tables and not calibration.before:
         calibration = replace(calibration, before=options.tables)
-    return required(one.build, "it can be built")(calibration, settings, options)
+    return required(one.build, f"files of {one.title} cannot be built")(
+        calibration, settings, options
+    )
 
 
 def read_back(

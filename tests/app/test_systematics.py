@@ -10,7 +10,7 @@ from scipy import stats
 
 from bayesdist.app.kinds.campaign.aberration import PERIOD, SWING, scale_error
 from bayesdist.app.kinds.campaign.catalogue import errors_by_star
-from bayesdist.assess.error_model import with_shared_stars
+from bayesdist.assess.model import with_shared_stars
 from bayesdist.assess.terms.parameters import CATALOGUE as POSITIONS
 from bayesdist.assess.terms.parameters import MOTIONS, catalogue_terms
 from bayesdist.data import Matches, ReferenceCatalog

@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
-from bayesdist.assess.error_model import error_model
+from bayesdist.assess.model import error_model
 
 JOINT = "model"
 

@@ -5,7 +5,7 @@ import pytest
 
 from bayesdist.assess.budget.budget import place_budget
 from bayesdist.assess.budget.surface import JOINT, budget_surface
-from bayesdist.assess.error_model import error_model
+from bayesdist.assess.model import error_model
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence

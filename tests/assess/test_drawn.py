@@ -6,7 +6,7 @@ import pytest
 from bayesdist.assess import UserTerm
 from bayesdist.assess import drawn as module
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.error_model import error_model
+from bayesdist.assess.model import error_model
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
 CHIPS = tuple(Chip(k, f"C{k}", (101.0, 81.0), (51.0, 41.0)) for k in (1, 2))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import LocalErrors, Requirement, UserTerm, check_requirements
-from bayesdist.assess.error_model import error_model
+from bayesdist.assess.model import error_model
 from bayesdist.assess.terms.forms.polynomials import without_rigid
 from bayesdist.assess.terms.parameters import (
     MOTIONS,

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.error_model import error_model
+from bayesdist.assess.model import error_model
 from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.diagnose.tables.between_nodes import MeanSquare
 from bayesdist.infer import fit_linear

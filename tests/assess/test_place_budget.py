@@ -3,7 +3,7 @@ import pytest
 
 from bayesdist.assess import UserTerm, error_budget
 from bayesdist.assess.budget.budget import place_budget
-from bayesdist.assess.error_model import error_model
+from bayesdist.assess.model import error_model
 from bayesdist.assess.terms.given import Centroids
 from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.data import MagnitudeErrors

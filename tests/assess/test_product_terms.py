@@ -9,7 +9,7 @@ import pytest
 
 from bayesdist.assess.budget.budget import place_budget, with_product
 from bayesdist.assess.budget.surface import budget_surface
-from bayesdist.assess.error_model import error_model
+from bayesdist.assess.model import error_model
 from bayesdist.assess.terms.forms import PRODUCT, Known, Row
 from bayesdist.model import Chip, DistortionModel
 from tests.budgets import detector_budget

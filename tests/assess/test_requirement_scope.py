@@ -6,7 +6,7 @@ from scipy import stats
 from scipy.spatial.distance import pdist
 
 from bayesdist.assess import Requirement, UserTerm, check_requirements
-from bayesdist.assess.error_model import error_model
+from bayesdist.assess.model import error_model
 from bayesdist.assess.requirements.validity import validity_period
 from bayesdist.assess.statistics import extent
 from bayesdist.assess.terms.given import Centroids

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from bayesdist.assess.error_model import error_model
+from bayesdist.assess.model import error_model
 from bayesdist.assess.terms.parameters import CatalogueErrors, ExposureVariation
 from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.infer import fit_linear

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bayesdist.assess import Requirement, UserTerm
-from bayesdist.assess.error_model import error_model
+from bayesdist.assess.model import error_model
 from bayesdist.assess.requirements.validity import validity_period
 from bayesdist.infer import Solution
 from bayesdist.model import Chip, DistortionModel, TimeDependence

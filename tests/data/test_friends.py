@@ -124,6 +124,14 @@ def test_groups_do_not_depend_on_the_cells(seed, monkeypatch):
         assert_same(backwards, whole)
 
 
+def test_many_exposures_and_groups():
+    """The product of their numbers needs more than 32 bits."""
+    places = np.stack(np.divmod(np.arange(30_000), 200), axis=1) * 3.0
+    exposure = np.random.default_rng(3).integers(0, 300_000, len(places))
+    found = friends_of_friends(places, exposure, 1.0)
+    assert (found.n_stars, found.n_doubled, found.n_dropped) == (len(places), 0, 0)
+
+
 def test_one_cell_at_a_time_is_in_memory():
     """Those of a sky that is not yet grouped do not exist."""
     places, exposure = field_of_cells(1)

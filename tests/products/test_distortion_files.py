@@ -211,6 +211,15 @@ def test_faults_are_found(key, change, where, message):
     ]
 
 
+@pytest.mark.parametrize("lost", ["provenance", "chip", "gauge"])
+def test_a_record_that_lacks_something_is_said(lost):
+    tree = tree_of(made("jwst")[1])
+    record = {name: value for name, value in tree["bayesdist"].items() if name != lost}
+    document = with_tree({**tree, "bayesdist": record})
+    assert "errors    of a record that cannot be read" in document.describe()
+    assert any(f"{lost}: Field required" in f.message for f in document.lint())
+
+
 @both
 def test_a_truncated_file_is_refused_in_a_sentence(key):
     raw = made(key)[1].content

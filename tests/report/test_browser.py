@@ -15,7 +15,7 @@ import pytest
 from bayesdist.assess import UserTerm
 from bayesdist.assess.budget.budget import place_budget
 from bayesdist.assess.budget.surface import budget_surface
-from bayesdist.assess.error_model import error_model
+from bayesdist.assess.model import error_model
 from bayesdist.assess.terms.forms import PRODUCT, Known, Row
 from bayesdist.assess.terms.given import Centroids
 from bayesdist.assess.terms.local import LocalErrors

@@ -18,7 +18,7 @@ from lxml import html as lxml_html
 
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.budget.surface import budget_surface
-from bayesdist.assess.error_model import error_model
+from bayesdist.assess.model import error_model
 from bayesdist.checks import Check
 from bayesdist.report.context import Product
 from bayesdist.report.overview import OverviewRow, write_overview

@@ -13,7 +13,7 @@ from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import StoredLookupTables
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.assess import pixel_scale_of
-from bayesdist.assess.error_model import ErrorModel, diagnosed_error_model, error_model
+from bayesdist.assess.model import ErrorModel, diagnosed_error_model, error_model
 from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorTerm
 from bayesdist.assess.terms.local import LocalErrors, interpolation_term
 from bayesdist.assess.terms.parameters import ExposureVariation

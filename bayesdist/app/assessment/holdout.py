@@ -10,8 +10,8 @@ from astropy.table import Table
 
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.store.summary import CoverageRow, Holdout, HoldoutTest
-from bayesdist.assess.error_model import ErrorModel, with_diagnosed_errors
 from bayesdist.assess.evaluation import EvaluationSettings
+from bayesdist.assess.model import ErrorModel, with_diagnosed_errors
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
 from bayesdist.diagnose.holdout.validation import HoldoutValidation

@@ -14,7 +14,7 @@ from bayesdist.app.kinds.campaign.aberration import ABERRATION
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.assess.budget.budget import TOTAL
-from bayesdist.assess.error_model import with_diagnosed_errors
+from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE_IN_FIT
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.assess.terms.parameters import CATALOGUE, MOTIONS

@@ -57,10 +57,10 @@ def base_of(facts: Mapping[str, Any], run: Path) -> Path:
 # stages in order; `revision` is raised when the numbers of a stage, or its files, change
 STAGES = {
     "match": Stage(),
-    "fit": Stage(),
-    "sample": Stage(checkpoints=("chain-*.h5",)),
+    "fit": Stage(revision=2),
+    "sample": Stage(revision=2, checkpoints=("chain-*.h5",)),
     "diagnose": Stage(revision=3),
-    "evaluate": Stage(revision=2),
+    "evaluate": Stage(revision=3),
     "export": Stage(),
     "report": Stage(),
 }

@@ -11,7 +11,7 @@ import numpy as np
 from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain, WorstPosition
 from bayesdist.assess.drawn import DrawnErrors
-from bayesdist.assess.error_model import error_model
+from bayesdist.assess.model import error_model
 from bayesdist.assess.requirements.reduction import RequiredReduction, required_reduction
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.verdict import counting_error, verdict_of

@@ -137,7 +137,7 @@ def grouped(cell: Cell) -> Grouped:
     pairs = cKDTree(places[some]).query_pairs(cell.length, output_type="ndarray")
     links = coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), shape=(len(some),) * 2)
     n, group_of_square = connected_components(links, directed=False)
-    group = group_of_square[of_square]
+    group = group_of_square[of_square].astype(np.int64)  # codes of groups and exposures multiply
     chain = _spans(places, group, n) > MAX_EXTENT * cell.length
     reaches = np.zeros(n, bool)
     reaches[group[cell.inside]] = True  # the first detection of a chain may be far off

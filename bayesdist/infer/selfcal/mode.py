@@ -312,10 +312,16 @@ def solve_in_gauge(
         return find_gauge(problem, found.theta, alone, there, known=known).decision
 
     with _loaded(problem, stars, compute) as loaded:
-        taken = decision
-        if taken is None:
+        begin = _Begun(loaded, theta, mixture, medians=stars is None)
+        try:
+            taken = decision or _gauge_at_start(problem, loaded, theta, prior).decision
+            found = solved(taken, begin)
+        except (DegenerateError, NotSettledError):
+            if decision is None:
+                raise
+            # the detections determine less than those of the decision
             taken = _gauge_at_start(problem, loaded, theta, prior).decision
-        found = solved(taken, _Begun(loaded, theta, mixture, medians=stars is None))
+            found = solved(taken, begin)
         at_mode = asked_at(found)
         if at_mode.held.size > taken.held.size:
             return solved(at_mode, found.again).mode(problem)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal import pointing_prior, tie
 from bayesdist.infer.selfcal.elimination import Mixture, expand
 from bayesdist.infer.selfcal.gauge import find_gauge
+from bayesdist.infer.selfcal.mode import solve_in_gauge
 from bayesdist.infer.selfcal.sky_moves import POINTS, functionals, moves
 from tests.infer.selfcal.fields import field, problem_of
 
@@ -45,6 +48,18 @@ def test_free_directions_by_roll(rolls, free, n_chips):
     assert np.linalg.eigvalsh(H / np.outer(scale, scale))[0] > 1e-8
     told = " ".join(gauge.sentences)
     assert ("one roll angle" in told) == (free >= SKEW)
+
+
+def test_a_decision_of_other_detections_is_made_anew_where_it_fixes_too_little():
+    simulated = field(5, 6, 200, rolls=(0, 60))
+    problem, stars = problem_of(simulated)
+    start = problem, simulated.theta, Prior.none
+    usual = solve_in_gauge(*start, stars=stars)
+    assert usual.decision.held.size
+    fewer = replace(usual.decision, held=usual.decision.held[:-1])
+    found = solve_in_gauge(*start, stars=stars, decision=fewer)
+    assert np.array_equal(found.decision.held, usual.decision.held)
+    assert found.theta == pytest.approx(usual.theta, abs=1e-9)
 
 
 def test_moves_of_the_sky_change_no_residual():

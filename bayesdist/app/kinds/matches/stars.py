@@ -21,7 +21,7 @@ from bayesdist.app.kinds.matches.plausibility import doubts_on_stars, refuse_emp
 from bayesdist.app.kinds.matches.sources import check_chips, read_configured
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.diagnostics_files import load_diagnostics
-from bayesdist.assess.error_model import with_diagnosed_errors
+from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.prior import CalibrationPrior, prior_of_calibration
 from bayesdist.data import Matches

@@ -259,8 +259,13 @@ def calibration_from(
     )
 
 
-def error_lines(read: Callable[[], Calibration] | None, source: str) -> list[str]:
-    """Line of text on the errors of a record, by what reads it; None where there is no record."""
+def error_lines(
+    read: Callable[[], Calibration] | None, source: str, more: Callable[[], list[str]] = list
+) -> list[str]:
+    """Lines of text on the errors of a record, by what reads it; None where there is no record.
+
+    `more`: further lines, of a record that can be read.
+    """
     if read is None:
         return ["  errors    none stated"]
     try:
@@ -270,9 +275,10 @@ def error_lines(read: Callable[[], Calibration] | None, source: str) -> list[str
     except BayesdistError:
         return [f"  errors    of {source} that cannot be read"]
     if cov is None:
-        return ["  errors    none stated"]
+        return ["  errors    none stated", *more()]
     sigma = 1e3 * np.sqrt((cov[:, 0, 0] + cov[:, 1, 1]) / 2)
     return [
         f"  errors    {found.errors}: {np.median(sigma):.3g} mas per axis at the median, "
-        f"{sigma.max():.3g} at worst"
+        f"{sigma.max():.3g} at worst",
+        *more(),
     ]

@@ -96,7 +96,7 @@ def _mixture_curves(r: ReportInput) -> tuple[MixtureCurve, MixtureCurve]:
     taken = 0.0 if r.stars.taken is None else r.stars.taken
     uniform = mixture.model == "uniform"
     scale = (
-        required(mixture.match_radius, "a uniform mixture has a match radius")
+        required(mixture.match_radius, "a uniform mixture needs a match radius")
         if uniform
         else r.sampled_mean("s_out")
     )

@@ -51,10 +51,14 @@ class DistortionFile:
     @property
     def size(self) -> tuple[float, float] | None:
         """Columns and rows: those of the record, else of the known detector."""
-        if self.record is not None:
+        known = None if self.detector is None else self.detector.size
+        if self.record is None:
+            return known
+        try:
             columns, rows = self.record["chip"]["size"]
             return float(columns), float(rows)
-        return None if self.detector is None else self.detector.size
+        except (KeyError, TypeError, ValueError):  # it is checked where it is read whole
+            return known
 
     @property
     def stated_closure(self) -> float | None:

@@ -217,12 +217,12 @@ def _uncertainty(file: DistortionFile) -> list[str]:
     record = file.record
     if record is None:
         return error_lines(None, "")
-    provenance = record["provenance"]
-    lines = error_lines(lambda: recorded(file, record), "a record")
-    if lines[0].endswith("cannot be read"):
-        return lines
-    return [
-        *lines,
-        f"  gauge     {record['gauge']}",
-        f"  from      {provenance['source']} by {provenance['software']}",
-    ]
+
+    def origin() -> list[str]:
+        provenance = record["provenance"]
+        return [
+            f"  gauge     {record['gauge']}",
+            f"  from      {provenance['source']} by {provenance['software']}",
+        ]
+
+    return error_lines(lambda: recorded(file, record), "a record", origin)

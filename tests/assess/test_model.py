@@ -13,7 +13,7 @@ from bayesdist.assess import Requirement, UserTerm, check_requirements
 from bayesdist.assess.budget.budget import budget_of, place_budget
 from bayesdist.assess.budget.surface import budget_surface
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.error_model import error_model
+from bayesdist.assess.model import error_model
 from bayesdist.assess.requirements.validity import validity_period
 from bayesdist.assess.terms.correlated import (
     STRUCTURE,
