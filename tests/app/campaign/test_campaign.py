@@ -64,6 +64,28 @@ def test_published_drifts_are_found(run):
     assert np.median(np.abs(pulls)) < 1.5
 
 
+def test_exposures_by_themselves_show_the_published_drifts(run):
+    time = summary_of(run)["time_dependence"]
+    rows = {(r["term"], r["segment"]): r for r in time["lines"]}
+    pulls = []
+    for (term, chip, segment), (alpha, beta) in PUBLISHED.items():
+        row = rows[f"WFC{chip}.{term}", segment]
+        pulls.append((row["alpha"] - alpha) / row["sigma_alpha"])
+        pulls.append((row["beta"] - beta) / row["sigma_beta"])
+    assert np.abs(pulls).max() < 5
+    assert np.median(np.abs(pulls)) < 1.5
+    assert {r["term"] for r in time["breaks"]} == set(time["scatter"])
+    exposures, drift = (Table.read(run / name) for name in ("series.ecsv", "drift.ecsv"))
+    assert len(exposures) == 16 and not time["outlying_exposures"]
+    assert np.all(exposures["outlier_probability"] < 0.5)
+    for term in time["scatter"]:
+        first = rows[term, 0]
+        before = drift[drift["epoch"] < time["breaks"][0]["break"]]
+        line = first["alpha"] + first["beta"] * (before["epoch"] - first["epoch0"])
+        assert np.all(np.abs(before[term] - line) < 0.2 * before[f"sigma_{term}"])
+        assert np.all(before[f"sigma_new_{term}"] > before[f"sigma_{term}"])
+
+
 def test_the_gauge_is_that_of_the_reference_chip(run):
     view = reference_gauge(without_frames(load_posterior(run)), 2)
     monomials = {
