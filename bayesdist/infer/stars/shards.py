@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import reduce
 from itertools import islice
+from operator import add
 from typing import Any, Self
 
 from bayesdist.data.matches import BatchReader, Matches
@@ -156,10 +157,6 @@ def total(parts: Iterable[Any]) -> Any:
     None for no parts.
     """
     rest, sums = iter(parts), []
-    while (some := reduce(_added, islice(rest, BRANCHES), None)) is not None:
-        sums.append(some)
+    for first in rest:
+        sums.append(reduce(add, islice(rest, BRANCHES - 1), first))
     return total(sums) if len(sums) > 1 else next(iter(sums), None)
-
-
-def _added(a: Any, b: Any) -> Any:
-    return b if a is None else a + b

@@ -92,7 +92,8 @@ def apply_to_sky(
     Raises
     ------
     InputError
-        For a calibration that does not lie on the sky, unknown columns or chips.
+        For a calibration that does not lie on the sky, unknown columns or chips, and a file of
+        positions without rows.
 
     Examples
     --------

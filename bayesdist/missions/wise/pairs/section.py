@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import ClassVar, Literal
 
-from pydantic import PositiveFloat, PositiveInt, model_validator
+from pydantic import PositiveFloat, PositiveInt
 
 from bayesdist.app.config.data import Data
 from bayesdist.app.config.section import Section
@@ -26,21 +27,20 @@ class RvbBlock(Section):
     accept_chi2_corner: PositiveFloat | None = None
     accept_power: PositiveFloat = 2.0
 
-    @model_validator(mode="after")
-    def _ranges(self) -> RvbBlock:
+    def faults(self) -> Iterator[str]:
+        """Ranges without an end, or from the upper to the lower one."""
         if self.colour is not None and not self.colour[0] <= self.colour[1]:
-            raise ValueError(
+            yield (
                 f"data.rvb.colour goes from {self.colour[0]:g} to {self.colour[1]:g}; "
                 "give the lower limit first"
             )
         for name in ("accept", "accept_chi2"):
             given = [key for key in (f"{name}_centre", f"{name}_corner") if getattr(self, key)]
             if len(given) == 1:
-                raise ValueError(
+                yield (
                     f"data.rvb.{given[0]} stands alone; give {name}_centre and {name}_corner, "
                     "equal ones for a limit that is the same everywhere"
                 )
-        return self
 
     @property
     def offset(self) -> RadialLimit | None:
@@ -77,16 +77,14 @@ class RvbData(Data):
 
     one_array: ClassVar[bool] = True
 
-    @model_validator(mode="after")
-    def _in_the_band_frame(self) -> RvbData:
+    def faults(self) -> Iterator[str]:
+        """Those of every table, and settings of the sky."""
+        yield from super().faults()
         if self.tangent_point is not None:
-            raise ValueError(
+            yield (
                 "data.tangent_point is given, but RvB pairs lie in pixels of the band frame; "
                 "leave it out"
             )
         for key in ("epoch", "catalogue_epoch"):
             if getattr(self, key) is not None:
-                raise ValueError(
-                    f"data.{key} is given, and RvB pairs have no proper motions; leave it out"
-                )
-        return self
+                yield (f"data.{key} is given, and RvB pairs have no proper motions; leave it out")
